@@ -1,0 +1,65 @@
+# Every target sets up what it needs: a Python >= 3.11 and make are enough. A second call is quick.
+PYTHON ?= python3
+VENV := .venv
+PY := $(VENV)/bin/python
+PIP := $(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+# Meshes and images of other people, where they are at hand; what needs them is skipped elsewhere.
+ifneq ($(wildcard ../shared/assets/.),)
+export TORCHPT_ASSETS ?= $(abspath ../shared/assets)
+endif
+
+SCENE ?= cornell_box
+OUT ?= $(notdir $(basename $(SCENE))).png
+ARGS ?=
+
+.PHONY: help render test test-all check format clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make render    render configs/scene/$(SCENE).yaml to $(OUT)   (SCENE=name OUT=file ARGS='render.spp=256')"
+	@echo "make test      the fast tests"
+	@echo "make test-all  all tests, the slow ones and the comparison with Mitsuba included"
+	@echo "make check     ruff, pyright, import layers"
+	@echo "make format    let ruff rewrite the files"
+	@echo "make clean     remove the virtual environment and caches"
+
+render: $(VENV)/run.stamp
+	@$(PY) -m torchpt render "scene=$(SCENE)" "out=$(OUT)" $(ARGS)
+	@echo "The picture is $(abspath .)/$(OUT)"
+
+test: $(VENV)/dev.stamp
+	$(PY) -m pytest -m "not slow and not gpu" $(ARGS)
+
+test-all: $(VENV)/bench.stamp
+	$(PY) -m pytest $(ARGS)
+
+check: $(VENV)/dev.stamp
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright --pythonpath $(PY)
+	$(PY) -c "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports())"
+
+format: $(VENV)/dev.stamp
+	$(PY) -m ruff check --fix .
+	$(PY) -m ruff format .
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+
+$(PY):
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "torchpt needs Python >= 3.11; name one with PYTHON=...")'
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/run.stamp: pyproject.toml constraints.txt | $(PY)
+	@echo "Installing into $(VENV) (a few minutes the first time)"
+	$(PIP) -e .
+	@touch $@
+
+$(VENV)/dev.stamp: $(VENV)/run.stamp
+	$(PIP) -e ".[dev]"
+	@touch $@
+
+$(VENV)/bench.stamp: $(VENV)/dev.stamp
+	$(PIP) -e ".[dev,bench]"
+	@touch $@

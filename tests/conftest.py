@@ -1,0 +1,25 @@
+"""What every test needs: reasons for skipping, and quiet libraries."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what this machine cannot run, and say why."""
+    no_mitsuba = pytest.mark.skip(reason="mitsuba is not installed (extra `bench`)")
+    no_gpu = pytest.mark.skip(reason="no CUDA device")
+    has_mitsuba = importlib.util.find_spec("mitsuba") is not None
+    for item in items:
+        if "mitsuba" in item.keywords and not has_mitsuba:
+            item.add_marker(no_mitsuba)
+        if "gpu" in item.keywords and not _has_cuda():
+            item.add_marker(no_gpu)
+
+
+def _has_cuda() -> bool:
+    import torch
+
+    return torch.cuda.is_available()

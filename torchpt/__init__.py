@@ -1,0 +1,70 @@
+"""torchpt: a wavefront path tracer that is a PyTorch program.
+
+``torchpt.load`` a scene, ``torchpt.render`` it, ``torchpt.write_image`` the picture. Names are resolved on first use,
+so ``import torchpt`` itself is quick.
+"""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from torchpt.errors import AssetError, NotBuiltError, OutputError, RenderError, SceneError, TorchptError
+
+if TYPE_CHECKING:
+    from torchpt.images import read_image, read_layers, write_image
+    from torchpt.render import render
+    from torchpt.scene import Scene, load
+
+__version__ = "0.1.0"
+__all__ = [
+    "AssetError",
+    "NotBuiltError",
+    "OutputError",
+    "RenderError",
+    "Scene",
+    "SceneError",
+    "TorchptError",
+    "load",
+    "read_image",
+    "read_layers",
+    "render",
+    "write_image",
+]
+
+# public name -> the module that has it
+_LAZY = {
+    "Scene": "torchpt.scene",
+    "load": "torchpt.scene",
+    "read_image": "torchpt.images",
+    "read_layers": "torchpt.images",
+    "render": "torchpt.render",
+    "write_image": "torchpt.images",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module 'torchpt' has no attribute {name!r}")
+    from importlib import import_module
+
+    value = getattr(import_module(_LAZY[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _Package(ModuleType):
+    """Keeps ``torchpt.render`` the function: importing the module of that name would bind the module over it."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name == "render" and isinstance(value, ModuleType):
+            value = value.render
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

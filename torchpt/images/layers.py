@@ -1,0 +1,56 @@
+"""How named layers become EXR channels and how they are found again.
+
+``image`` is the picture itself (``R G B``); the others carry their own name as a prefix (``albedo.R``). A layer that
+this table does not know is named after its number of components.
+"""
+
+from __future__ import annotations
+
+__all__ = ["channel_names", "group_channels"]
+
+# layer -> its channels
+KNOWN = {
+    "image": ("R", "G", "B"),
+    "albedo": ("albedo.R", "albedo.G", "albedo.B"),
+    "normal": ("normal.X", "normal.Y", "normal.Z"),
+    "depth": ("Z",),
+    "position": ("position.X", "position.Y", "position.Z"),
+    "uv": ("uv.U", "uv.V"),
+    "object_id": ("object_id",),
+    "variance": ("variance.R", "variance.G", "variance.B"),
+}
+_SUFFIXES = {2: "XY", 3: "RGB", 4: "RGBA"}
+_ORDER = "RGBXYZUVA"
+
+
+def channel_names(layer: str, components: int) -> tuple[str, ...]:
+    """The EXR channels of a layer with so many components."""
+    known = KNOWN.get(layer)
+    if known is not None and len(known) == components:
+        return known
+    if layer == "image":
+        return {1: ("Y",), 4: ("R", "G", "B", "A")}.get(components) or tuple(f"image.{i}" for i in range(components))
+    if components == 1:
+        return (layer,)
+    suffixes = _SUFFIXES.get(components) or [str(i) for i in range(components)]
+    return tuple(f"{layer}.{s}" for s in suffixes)
+
+
+def _rank(channel: str) -> tuple[int, int, str]:
+    last = channel.rpartition(".")[2]
+    if last.isdigit():
+        return 0, int(last), last
+    return 1, _ORDER.find(last) if len(last) == 1 else -1, last
+
+
+def group_channels(channels: tuple[str, ...] | list[str]) -> dict[str, list[int]]:
+    """Channel indices of each layer, components in order: the inverse of `channel_names`."""
+    groups: dict[str, list[int]] = {}
+    for index, channel in enumerate(channels):
+        prefix, _, last = channel.rpartition(".")
+        if not prefix and last == "Z":
+            prefix = "depth"
+        elif not prefix:
+            prefix = "image" if last in ("R", "G", "B", "A", "Y") else last
+        groups.setdefault(prefix, []).append(index)
+    return {name: sorted(found, key=lambda i: _rank(channels[i])) for name, found in groups.items()}

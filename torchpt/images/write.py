@@ -1,0 +1,167 @@
+"""Write pictures: whole or not at all.
+
+A file is encoded beside its destination under a name of its own and then moved over it, so a reader never sees half a
+picture and a failure leaves what was there before.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from contextlib import suppress
+from functools import partial
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.errors import OutputError
+from torchpt.images.colour import display
+from torchpt.images.layers import channel_names
+
+__all__ = ["WRITABLE", "check_writable", "write_image"]
+
+WRITABLE = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".ppm")
+
+
+def write_image(
+    path: str | PathLike[str],
+    image: Tensor,
+    layers: dict[str, Tensor] | None = None,
+    exposure: float = 0.0,
+    tonemap: str = "none",
+    gamma: str | float = "srgb",
+) -> None:
+    """Write a picture in the format that the file's ending names.
+
+    ``.exr`` holds float32 and the layers, as channels of one part; ``.hdr`` holds RGBE (steps of 0.4 % of the
+    brightest channel, no negative values): both keep linear radiance untouched. ``.png .jpg .jpeg .ppm`` hold 8 bits
+    of what `colour.display` makes of it.
+
+    Args:
+        path: where to; an existing file is replaced.
+        image: ``(H, W, C)`` linear, C = 1, 3 or 4 (alpha is kept by EXR and PNG).
+        layers: name to ``(H, W, C)`` or ``(H, W)``; kept by ``.exr`` only. The names of `film.aovs` get the usual
+            channels: ``albedo.R/G/B normal.X/Y/Z Z position.X/Y/Z uv.U/V object_id variance.R/G/B``.
+        exposure: stops (8-bit formats).
+        tonemap: none, reinhard, aces or filmic (8-bit formats).
+        gamma: ``"srgb"`` or an exponent (8-bit formats).
+
+    Raises:
+        OutputError: an ending that is not written, or a place that cannot be written.
+        ValueError: an image or layer of another shape.
+    """
+    destination = _known(path)
+    pixels = _pixels("image", image)
+    temporary = _temporary(destination)
+    if temporary.suffix == ".exr":
+        named = {"image": pixels} | {name: _pixels(name, layer) for name, layer in (layers or {}).items()}
+        for name, layer in named.items():
+            if layer.shape[:2] != pixels.shape[:2]:
+                raise ValueError(f"layer {name!r} is {tuple(layer.shape[:2])}, the picture {tuple(pixels.shape[:2])}")
+        channels = [channel for name, layer in named.items() for channel in channel_names(name, layer.shape[2])]
+        encode = partial(_encode_float, temporary, np.concatenate(list(named.values()), axis=2), channels)
+    elif temporary.suffix == ".hdr":  # RGBE has no sign: the encoder would wrap around
+        rgb = np.nan_to_num(_rgb(pixels), nan=0.0, posinf=1e30).clip(0, 1e30)
+        encode = partial(_encode_float, temporary, rgb, ["R", "G", "B"])
+    else:
+        levels = _levels(pixels, temporary.suffix == ".png", exposure, tonemap, gamma)
+        encode = partial(_encode_integer, temporary, levels)
+    try:
+        encode()
+        os.replace(temporary, destination)
+    except (OSError, ValueError) as problem:
+        raise OutputError(path, _reason(problem, destination)) from problem
+    finally:
+        with suppress(OSError):  # it is only there after a failure
+            temporary.unlink()
+
+
+def check_writable(path: str | PathLike[str]) -> None:
+    """Find out before a long render whether its picture can be written; leaves nothing behind.
+
+    Raises:
+        OutputError: an ending that is not written, a folder that is missing or cannot be written, a folder in the way.
+    """
+    destination = _known(path)
+    try:
+        if destination.is_dir():
+            raise OutputError(path, "is a folder")
+        temporary = _temporary(destination)
+        temporary.touch(exist_ok=False)
+        temporary.unlink()
+        destination.exists()  # raises for a name too long
+        os.stat(destination.parent)
+    except (OSError, ValueError) as problem:
+        raise OutputError(path, _reason(problem, destination)) from problem
+
+
+def _known(path: str | PathLike[str]) -> Path:
+    destination = Path(fspath(path))
+    if destination.suffix.lower() not in WRITABLE:
+        found = f"cannot write the kind {destination.suffix!r}" if destination.suffix else "needs an ending"
+        raise OutputError(path, f"{found}; accepted: {' '.join(WRITABLE)}")
+    try:
+        return Path(os.path.realpath(destination))  # a link stays a link: its target is replaced
+    except (OSError, ValueError) as problem:
+        raise OutputError(path, _reason(problem, destination)) from problem
+
+
+def _temporary(destination: Path) -> Path:
+    return destination.parent / f".torchpt-{secrets.token_hex(8)}{destination.suffix.lower()}"
+
+
+def _reason(problem: Exception, destination: Path) -> str:
+    if not destination.parent.exists():
+        return f"cannot be written: there is no folder {destination.parent}"
+    return f"cannot be written ({getattr(problem, 'strerror', None) or problem})"
+
+
+def _pixels(name: str, image: Tensor) -> np.ndarray:
+    pixels = image.detach().to("cpu", torch.float32)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    if pixels.ndim != 3 or 0 in pixels.shape:
+        raise ValueError(f"{name}: expected (H, W, C), got {tuple(image.shape)}")
+    if name == "image" and pixels.shape[2] not in (1, 3, 4):
+        raise ValueError(f"image: expected 1, 3 or 4 channels, got {pixels.shape[2]}")
+    return np.ascontiguousarray(pixels.numpy())
+
+
+def _rgb(pixels: np.ndarray) -> np.ndarray:
+    return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
+
+
+def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str]) -> None:
+    import OpenImageIO as oiio
+
+    height, width, count = pixels.shape
+    spec = oiio.ImageSpec(width, height, count, "float")
+    spec.channelnames = channels
+    if temporary.suffix == ".exr":
+        spec.attribute("compression", "zip")
+    encoder = oiio.ImageOutput.create("picture" + temporary.suffix)
+    if encoder is None or not encoder.open(str(temporary), spec):
+        raise OSError(encoder.geterror() if encoder else oiio.geterror())
+    written = encoder.write_image(np.ascontiguousarray(pixels))
+    if not (encoder.close() and written):
+        raise OSError(encoder.geterror() or "the encoder failed")
+
+
+def _encode_integer(temporary: Path, levels: np.ndarray) -> None:
+    import imageio.v3 as iio
+
+    options: dict[str, Any] = {"quality": 95} if temporary.suffix in (".jpg", ".jpeg") else {}
+    temporary.write_bytes(iio.imwrite("<bytes>", levels, plugin="pillow", extension=temporary.suffix, **options))
+
+
+def _levels(pixels: np.ndarray, alpha: bool, exposure: float, tonemap: str, gamma: str | float) -> np.ndarray:
+    """The bytes that a screen shows, ``(H, W, 3)``, or 4 where there is an alpha channel and the format keeps it."""
+    shown = display(torch.from_numpy(_rgb(pixels)), exposure, tonemap, gamma)
+    if alpha and pixels.shape[2] == 4:
+        coverage = torch.nan_to_num(torch.from_numpy(pixels[..., 3:]), nan=0.0).clamp(0, 1)
+        shown = torch.cat([shown, coverage], dim=-1)
+    return (shown * 255 + 0.5).to(torch.uint8).numpy()
