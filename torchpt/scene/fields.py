@@ -1,0 +1,256 @@
+"""Field types of the scene format: each takes plain YAML values, and says what it accepts when it refuses one.
+
+Numbers are strict: no booleans, no numeric text, nothing that is not finite in float32.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from itertools import chain
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PlainValidator
+from pydantic_core import PydanticCustomError
+
+from torchpt.errors import SceneError
+from torchpt.math import transforms
+
+__all__ = [
+    "Affine", "Color", "FaceArray", "Flag", "Rows2", "Rows3", "Text", "Transform", "Vec3",
+    "choice", "color", "integer", "memory_size", "number", "number_field", "vector", "wrong",
+]  # fmt: skip
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+def wrong(
+    expected: str, value: Any = ..., at: tuple[str | int, ...] = (), *, not_built: bool = False
+) -> PydanticCustomError:
+    """The error of a field validator: what is accepted, and (where it lies deeper) which value under which sub-key."""
+    return PydanticCustomError(
+        "scene", "refused", {"expected": expected, "value": value, "at": at, "not_built": not_built}
+    )
+
+
+def number(value: Any, expected: str = "a finite number") -> float:
+    """A finite float from an int or float (numpy's too), never from a boolean or text."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
+        raise wrong(expected)
+    if not -_LARGEST <= value <= _LARGEST:  # false for NaN too
+        raise wrong(expected)
+    return float(value)
+
+
+def number_field(
+    expected: str, accept: Callable[[float], bool] = lambda _: True, *, optional: bool = False
+) -> PlainValidator:
+    """A validator for one number that ``accept`` allows; with ``optional`` None stays None."""
+
+    def check(value: Any) -> float | None:
+        if value is None and optional:
+            return None
+        result = number(value, expected)
+        if not accept(result):
+            raise wrong(expected)
+        return result
+
+    return PlainValidator(check)
+
+
+def integer(low: int, high: int, *, also: tuple[Any, ...] = ()) -> PlainValidator:
+    """A validator for a whole number in ``low..high``, or one of the values in ``also``."""
+    words = "".join(f" or {'null' if item is None else item}" for item in also)
+    expected = f"a whole number {low}..{high}{words}"
+
+    def check(value: Any) -> Any:
+        if isinstance(value, bool | np.bool_):
+            raise wrong(expected)
+        if (value is None or isinstance(value, int | str)) and value in also:
+            return value
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
+        if not isinstance(value, int | np.integer) or not low <= value <= high:
+            raise wrong(expected)
+        return int(value)
+
+    return PlainValidator(check)
+
+
+def choice(*names: str, booleans: Mapping[bool, str] | None = None) -> PlainValidator:
+    """A validator for one of some words; ``booleans`` says which word a YAML boolean stands for."""
+    expected = f"one of {', '.join(names)}"
+
+    def check(value: Any) -> str:
+        if booleans is not None and isinstance(value, bool):
+            value = booleans[value]
+        if not isinstance(value, str) or value not in names:
+            raise wrong(expected)
+        return value
+
+    return PlainValidator(check)
+
+
+def vector(value: Any, expected: str = "three finite numbers [x, y, z]") -> tuple[float, float, float]:
+    """Three finite numbers from a list, tuple or array."""
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) != 3:
+        raise wrong(expected)
+    x, y, z = (number(item, expected) for item in value)
+    return x, y, z
+
+
+def color(low: float = 0.0, high: float = _LARGEST, *, optional: bool = False) -> PlainValidator:
+    """A validator for a linear RGB colour: three numbers or one for all, each in ``low..high``."""
+    bound = f"in {low:g}..{high:g}" if high < _LARGEST else f">= {low:g}"
+    expected = f"[r, g, b] or one number, each finite and {bound}"
+
+    def check(value: Any) -> tuple[float, float, float] | None:
+        if value is None and optional:
+            return None
+        if isinstance(value, Mapping):
+            raise _texture(value, expected)
+        rgb = (
+            vector(value, expected) if isinstance(value, list | tuple | np.ndarray) else (number(value, expected),) * 3
+        )
+        if not all(low <= channel <= high for channel in rgb):
+            raise wrong(expected)
+        return rgb
+
+    return PlainValidator(check)
+
+
+def _texture(value: Mapping[str, Any], expected: str) -> PydanticCustomError:
+    """The error for a texture where a colour stands: misspelt, or not built yet."""
+    from torchpt.scene.not_built import TYPES
+
+    if set(value) == {"texture"} and isinstance(value["texture"], str):
+        return wrong(expected, not_built=True)
+    known = TYPES["texture"]
+    kind = value.get("type")
+    if not isinstance(kind, str) or kind not in known:
+        at = ("type",) if "type" in value else ()
+        return wrong(f"{{texture: NAME}} or a type of {', '.join(known)}", kind if at else value, at)
+    for key in value:
+        if key != "type" and key not in known[kind]:
+            return wrong(f"a known key: {', '.join(('type', *known[kind]))}", value[key], (key,))
+    return wrong(expected, not_built=True)
+
+
+def _flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise wrong("true or false")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value.strip() or not value.isprintable():
+        raise wrong("printable text")
+    return value
+
+
+def _relocated(error: SceneError) -> PydanticCustomError:
+    at = tuple(part for part in error.key.split(".") if part)
+    return wrong(error.expected, error.value, at)
+
+
+def _transform(value: Any) -> NDArray[np.float64]:
+    try:
+        return transforms.compose(value)
+    except SceneError as error:
+        raise _relocated(error) from None
+
+
+def _affine(value: Any) -> NDArray[np.float64] | None:
+    if value is None:
+        return None
+    try:
+        return transforms.matrix4(value, "")
+    except SceneError as error:
+        raise _relocated(error) from None
+
+
+def _rows(columns: int, what: str) -> PlainValidator:
+    """A validator for ``(V, columns)`` float64 from nested lists or an array; checked and converted in bulk."""
+    expected = f"a list of {what}, finite numbers each"
+
+    def check(value: Any) -> NDArray[np.float64] | None:
+        if value is None:
+            return None
+        if isinstance(value, list | tuple):
+            if not value or not set(map(type, value)) <= {list, tuple} or set(map(len, value)) != {columns}:
+                _first_bad(value, columns, expected)
+                raise wrong(expected)
+            if not set(map(type, chain.from_iterable(value))) <= {int, float}:
+                _first_bad(value, columns, expected)
+        try:
+            rows = np.array(value, dtype=np.float64)
+        except (OverflowError, TypeError, ValueError, RuntimeError):
+            raise wrong(expected) from None
+        if rows.ndim != 2 or rows.shape[1] != columns or not len(rows):
+            raise wrong(expected)
+        bad = np.flatnonzero(~(np.abs(rows) <= _LARGEST).all(axis=1))
+        if len(bad):
+            raise wrong(expected, rows[bad[0]].tolist(), (int(bad[0]),))
+        return rows
+
+    return PlainValidator(check)
+
+
+def _first_bad(value: Any, columns: int, expected: str) -> None:
+    """Raises for the first row of a list that is not ``columns`` numbers."""
+    for index, row in enumerate(value):
+        if not isinstance(row, list | tuple) or len(row) != columns or not all(type(x) in (int, float) for x in row):
+            raise wrong(expected, row, (index,))
+
+
+def _faces(value: Any) -> NDArray[np.int64] | None:
+    """``(F, 3)`` int64 from lists of three or more indices; polygons are split into fans."""
+    expected = "a list of faces, each three or more vertex indices (whole numbers >= 0)"
+    if value is None:
+        return None
+    if isinstance(value, list | tuple):
+        for index, row in enumerate(value):
+            if not isinstance(row, list | tuple) or len(row) < 3 or not all(type(x) is int for x in row):
+                raise wrong(expected, row, (index,))
+        triangles = [(row[0], row[i], row[i + 1]) for row in value for i in range(1, len(row) - 1)]
+    else:
+        triangles = value
+    try:
+        faces = np.array(triangles)
+    except (OverflowError, TypeError, ValueError, RuntimeError):
+        raise wrong(expected) from None
+    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces) or faces.dtype.kind not in "iu":
+        raise wrong(expected)
+    return faces.astype(np.int64)
+
+
+_SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([kKMGT]?)(i?)[bB]?\s*\Z")
+
+
+def memory_size(value: Any) -> int | None:
+    """Bytes from a whole number or text such as ``4GB`` (10^9) or ``512 MiB`` (2^20)."""
+    expected = "null, a number of bytes, or a size such as 4GB or 512MiB"
+    if value is None:
+        return None
+    if isinstance(value, str):
+        match = _SIZE.match(value)
+        if not match:
+            raise wrong(expected)
+        base = 1024 if match[3] else 1000
+        value = int(float(match[1]) * base ** " KMGT".index(match[2].upper() or " "))
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 2**60:
+        raise wrong(expected)
+    return value
+
+
+Vec3 = Annotated[tuple[float, float, float], PlainValidator(lambda value: vector(value))]
+Color = Annotated[tuple[float, float, float], color()]
+Flag = Annotated[bool, PlainValidator(_flag)]
+Text = Annotated[str, PlainValidator(_text)]
+Transform = Annotated[NDArray[np.float64], PlainValidator(_transform)]
+Affine = Annotated[NDArray[np.float64] | None, PlainValidator(_affine)]
+Rows3 = Annotated[NDArray[np.float64] | None, _rows(3, "[x, y, z]")]
+Rows2 = Annotated[NDArray[np.float64] | None, _rows(2, "[u, v]")]
+FaceArray = Annotated[NDArray[np.int64] | None, PlainValidator(_faces)]

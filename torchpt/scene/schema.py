@@ -1,0 +1,231 @@
+"""The blocks of a scene file as models: camera, materials, shapes, lights. One table of types for each."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PlainValidator, model_validator
+
+from torchpt.errors import SceneError
+from torchpt.math import transforms
+from torchpt.scene.fields import (
+    Affine,
+    Color,
+    FaceArray,
+    Flag,
+    Rows2,
+    Rows3,
+    Transform,
+    Vec3,
+    choice,
+    color,
+    number_field,
+    wrong,
+)  # fmt: skip
+from torchpt.scene.validate import Model
+
+__all__ = [
+    "CAMERAS", "FOV_AXES", "LIGHTS", "MATERIALS", "SHAPES",
+    "ConstantLight", "Cube", "Diffuse", "Disk", "Material", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
+]  # fmt: skip
+
+FOV_AXES = ("x", "y", "diagonal", "smaller", "larger")
+_UP = (0.0, 1.0, 0.0)
+
+
+class Perspective(Model):
+    """A pinhole camera, posed by ``origin``, ``target``, ``up`` or by ``to_world``.
+
+    Attributes:
+        fov: full angle of view in degrees along ``fov_axis`` of the whole film.
+    """
+
+    type: Literal["perspective"] = "perspective"
+    origin: Vec3 | None = None
+    target: Vec3 | None = None
+    up: Vec3 | None = None
+    to_world: Affine = None
+    fov: Annotated[float, number_field("an angle in degrees, 0 < fov < 180", lambda x: 0 < x < 180)] = 39.3
+    fov_axis: Annotated[str, choice(*FOV_AXES)] = "x"
+
+    @model_validator(mode="after")
+    def _posed(self) -> Perspective:
+        if self.to_world is not None:
+            for name in ("origin", "target", "up"):
+                if getattr(self, name) is not None:
+                    raise wrong("either to_world or origin, target and up, not both", getattr(self, name), (name,))
+            if np.abs((self.to_world[:3, :3] ** 2).sum(axis=1) - 1.0).max() > 1e-3:
+                raise wrong("a pose without scale", self.to_world.tolist(), ("to_world",))
+            return self
+        for name in ("origin", "target"):
+            if getattr(self, name) is None:
+                raise wrong("a point [x, y, z] (a camera needs origin and target, or to_world)", None, (name,))
+        try:
+            self.pose()
+        except SceneError as error:
+            raise wrong(error.expected, error.value, (error.key,)) from None
+        return self
+
+    def pose(self) -> NDArray[np.float64]:
+        """Camera to world, ``(4, 4)``: the camera looks along its +z, +y is up, +x is left in the picture (Mitsuba)."""
+        if self.to_world is not None:
+            return self.to_world
+        return transforms.look_at(self.origin, self.target, self.up or _UP, key="")
+
+
+class Material(Model):
+    """What every material has.
+
+    Attributes:
+        two_sided: whether the back reflects as the front does; else it is black.
+    """
+
+    two_sided: Flag = True
+
+
+class Diffuse(Material):
+    """A Lambertian reflector; ``reflectance`` is linear RGB in 0..1."""
+
+    type: Literal["diffuse"] = "diffuse"
+    reflectance: Annotated[tuple[float, float, float], color(0.0, 1.0)] = (0.5, 0.5, 0.5)
+
+
+def _material(value: Any) -> Any:
+    """A material's name; an inline one has become a model before the shape is validated."""
+    if value is None or isinstance(value, Material) or (isinstance(value, str) and value):
+        return value
+    raise wrong("the name of a material, or a material")
+
+
+class Shape(Model):
+    """What every shape has.
+
+    Attributes:
+        material: a name from the materials block, a material of its own, or None (the file's, else diffuse 0.5).
+        transform: ``(4, 4)`` float64, object to world.
+        emission: radiance leaving the front side, linear RGB, or None.
+        flip_normals: turn the front side around.
+    """
+
+    material: Annotated[str | Material | None, PlainValidator(_material)] = None
+    transform: Transform | None = None
+    emission: Annotated[tuple[float, float, float] | None, color(optional=True)] = None
+    flip_normals: Flag = False
+
+    def to_world(self) -> NDArray[np.float64]:
+        """Object to world, ``(4, 4)`` float64."""
+        return np.eye(4) if self.transform is None else self.transform
+
+
+def _path(value: Any) -> tuple[str, ...] | None:
+    if value is None:
+        return None
+    paths = tuple(value) if isinstance(value, list | tuple) else (value,)
+    if not paths or not all(isinstance(path, str) and path.strip() and path.isprintable() for path in paths):
+        raise wrong("a file path, or a list of them (the first that is there is used)")
+    return paths
+
+
+class Mesh(Shape):
+    """Triangles from a file, or from inline ``vertices`` and ``faces``.
+
+    Attributes:
+        path: candidates, the first existing one is used; None for an inline mesh.
+        vertices: ``(V, 3)`` float64.
+        faces: ``(F, 3)`` int64, polygons already split into fans.
+        normals: ``(V, 3)`` or None.
+        uvs: ``(V, 2)`` or None.
+        face_normals: shade flat, whatever normals there are.
+    """
+
+    type: Literal["mesh"] = "mesh"
+    path: Annotated[tuple[str, ...] | None, PlainValidator(_path)] = None
+    vertices: Rows3 = None
+    faces: FaceArray = None
+    normals: Rows3 = None
+    uvs: Rows2 = None
+    face_normals: Flag = False
+
+    @model_validator(mode="after")
+    def _complete(self) -> Mesh:
+        inline = {name: getattr(self, name) for name in ("vertices", "faces", "normals", "uvs")}
+        if self.path is not None:
+            for name, value in inline.items():
+                if value is not None:
+                    raise wrong("either path or an inline mesh, not both", value.tolist(), (name,))
+            return self
+        if self.vertices is None or self.faces is None:
+            missing = (
+                "path"
+                if self.vertices is None and self.faces is None
+                else "vertices"
+                if self.vertices is None
+                else "faces"
+            )
+            raise wrong("a path, or vertices and faces", None, (missing,))
+        bad = np.flatnonzero(((self.faces < 0) | (self.faces >= len(self.vertices))).any(axis=1))
+        if len(bad):
+            expected = f"vertex indices in 0..{len(self.vertices) - 1}"
+            raise wrong(expected, self.faces[bad[0]].tolist(), ("faces", int(bad[0])))
+        for name in ("normals", "uvs"):
+            value = inline[name]
+            if value is not None and len(value) != len(self.vertices):
+                raise wrong(f"one row for each of the {len(self.vertices)} vertices", len(value), (name,))
+        if self.face_normals and self.normals is not None:
+            raise wrong("no normals where face_normals is true", len(self.normals), ("normals",))
+        return self
+
+
+class Sphere(Shape):
+    """An analytic sphere; ``center`` and ``radius`` before the transform."""
+
+    type: Literal["sphere"] = "sphere"
+    center: Vec3 = (0.0, 0.0, 0.0)
+    radius: Annotated[float, number_field("a number > 0", lambda x: x > 0)] = 1.0
+
+    @model_validator(mode="after")
+    def _round(self) -> Sphere:
+        if self.transform is not None and transforms.similarity_scale(self.transform) is None:
+            raise wrong(
+                "a transform that keeps a sphere round (uniform scale)", self.transform.tolist(), ("transform",)
+            )
+        return self
+
+
+class Rectangle(Shape):
+    """The square ``[-1, 1]^2`` in the xy plane with normal +z, then transformed."""
+
+    type: Literal["rectangle"] = "rectangle"
+
+
+class Disk(Shape):
+    """The unit disk in the xy plane with normal +z, then transformed."""
+
+    type: Literal["disk"] = "disk"
+
+
+class Cube(Shape):
+    """The cube ``[-1, 1]^3`` with outward face normals, then transformed."""
+
+    type: Literal["cube"] = "cube"
+
+
+class ConstantLight(Model):
+    """An environment of one radiance from all directions."""
+
+    type: Literal["constant"] = "constant"
+    radiance: Color = (1.0, 1.0, 1.0)
+
+
+CAMERAS: dict[str, type[Perspective]] = {"perspective": Perspective}
+MATERIALS: dict[str, type[Material]] = {"diffuse": Diffuse}
+SHAPES: dict[str, type[Shape]] = {
+    "mesh": Mesh,
+    "sphere": Sphere,
+    "rectangle": Rectangle,
+    "disk": Disk,
+    "cube": Cube,
+}
+LIGHTS: dict[str, type[ConstantLight]] = {"constant": ConstantLight}

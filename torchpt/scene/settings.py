@@ -1,0 +1,319 @@
+"""The run settings (film, integrator, sampler, render): built-in default < scene file < explicit override."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import PlainValidator, model_validator
+
+from torchpt.errors import SceneError
+from torchpt.scene import not_built
+from torchpt.scene.fields import Flag, choice, integer, memory_size, number_field, wrong
+from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_not_built, select
+
+__all__ = [
+    "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter", "Integrator",
+    "PathIntegrator", "Render", "Sampler", "Settings", "merge",
+]  # fmt: skip
+
+AOVS = ("albedo", "normal", "depth", "position", "uv", "object_id", "variance")
+BLOCKS = ("film", "integrator", "sampler", "render")
+MAX_SIDE = 65_536
+MAX_PIXELS = 2**28
+
+Positive = Annotated[float, number_field("a number > 0", lambda x: x > 0)]
+
+
+class BoxFilter(Model):
+    """The pixel's own square (radius 0.5 pixels)."""
+
+    type: Literal["box"] = "box"
+
+    @property
+    def radius(self) -> float:
+        """Half the width in pixels."""
+        return 0.5
+
+
+class GaussianFilter(Model):
+    """A truncated gaussian, as Mitsuba's: ``exp(-x^2 / 2 stddev^2)`` minus its value at ``radius``, in pixels."""
+
+    type: Literal["gaussian"] = "gaussian"
+    stddev: Positive = 0.5
+    radius: Positive = 2.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_radius(cls, raw: Any) -> Any:
+        stddev = raw.get("stddev", 0.5)
+        if raw.get("radius") is None and isinstance(stddev, int | float):
+            return {**raw, "radius": 4.0 * stddev}
+        return raw
+
+
+Filter = BoxFilter | GaussianFilter
+FILTERS: dict[str, type[Any]] = {"gaussian": GaussianFilter, "box": BoxFilter}
+
+
+def _crop(value: Any) -> tuple[int, int, int, int] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list | tuple) or len(value) != 4 or not all(type(x) is int for x in value):
+        raise wrong("[x, y, width, height], whole numbers of pixels")
+    x, y, width, height = value
+    if x < 0 or y < 0 or width < 1 or height < 1:
+        raise wrong("[x, y, width, height] with x, y >= 0 and width, height >= 1")
+    return x, y, width, height
+
+
+def _aovs(value: Any) -> tuple[str, ...]:
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list | tuple):
+        raise wrong(f"a list of {', '.join(AOVS)}")
+    for index, name in enumerate(names):
+        if name not in AOVS or name in names[:index]:
+            raise wrong(f"a list of different ones of {', '.join(AOVS)}", name, (index,))
+    return tuple(names)
+
+
+def _gamma(value: Any) -> float | str:
+    if value == "srgb":
+        return "srgb"
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 100:
+        raise wrong("srgb or an exponent > 0 such as 0.4545")
+    return float(value)
+
+
+def _filter(value: Any) -> Any:
+    if isinstance(value, BoxFilter | GaussianFilter):
+        return value
+    raise wrong("a filter")
+
+
+class Film(Model):
+    """The picture: its size in pixels, its reconstruction filter, and how 8-bit files show it.
+
+    Attributes:
+        crop: ``(x, y, width, height)`` in pixels, or None for the whole film.
+        aovs: extra layers.
+        exposure: stops, for the 8-bit formats.
+        gamma: ``srgb`` or the exponent itself (``out = in ** gamma``).
+    """
+
+    width: Annotated[int, integer(1, MAX_SIDE)] = 512
+    height: Annotated[int, integer(1, MAX_SIDE)] = 512
+    filter: Annotated[BoxFilter | GaussianFilter, PlainValidator(_filter)] = GaussianFilter()
+    crop: Annotated[tuple[int, int, int, int] | None, PlainValidator(_crop)] = None
+    aovs: Annotated[tuple[str, ...], PlainValidator(_aovs)] = ()
+    exposure: Annotated[float, number_field("a number of stops in -64..64", lambda x: abs(x) <= 64)] = 0.0
+    tonemap: Annotated[str, choice("none", "filmic", "aces", "reinhard")] = "none"
+    gamma: Annotated[float | str, PlainValidator(_gamma)] = "srgb"
+
+    @model_validator(mode="after")
+    def _sizes(self) -> Film:
+        if self.width * self.height > MAX_PIXELS:
+            raise wrong(f"a film of at most {MAX_PIXELS} pixels", [self.width, self.height], ("width",))
+        if self.crop is not None:
+            x, y, width, height = self.crop
+            if x + width > self.width or y + height > self.height:
+                raise wrong(
+                    f"a crop inside the film of {self.width} x {self.height} pixels", list(self.crop), ("crop",)
+                )
+        return self
+
+
+class PathIntegrator(Model):
+    """Unidirectional path tracing.
+
+    Attributes:
+        max_depth: longest path in edges: 1 sees emission only, 2 adds direct light; -1 ends by roulette alone.
+        rr_depth: the depth from which Russian roulette may end a path.
+        rr_prob: a constant survival probability, or None (by throughput).
+        strategy: how light is found: mis, bsdf, light, uniform (hemisphere).
+        clamp: largest contribution of a sample, or None.
+        strict: whether a sample that is not finite is an error.
+    """
+
+    type: Literal["path"] = "path"
+    max_depth: Annotated[int, integer(-1, 2**31 - 1)] = 16
+    rr_depth: Annotated[int, integer(1, 2**31 - 1)] = 5
+    rr_prob: Annotated[
+        float | None, number_field("null or a number, 0 < rr_prob <= 1", lambda x: 0 < x <= 1, optional=True)
+    ] = None
+    strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
+    clamp: Annotated[float | None, number_field("null or a number > 0", lambda x: x > 0, optional=True)] = None
+    strict: Flag = False
+
+    @model_validator(mode="after")
+    def _ends(self) -> PathIntegrator:
+        if self.max_depth == -1 and self.rr_prob == 1.0:
+            raise wrong("a survival probability below 1 where max_depth is -1 (paths would not end)", 1.0, ("rr_prob",))
+        return self
+
+
+class DirectIntegrator(Model):
+    """Emission and direct light only; the keys are those of :class:`PathIntegrator`."""
+
+    type: Literal["direct"] = "direct"
+    strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
+    clamp: Annotated[float | None, number_field("null or a number > 0", lambda x: x > 0, optional=True)] = None
+    strict: Flag = False
+
+
+class AovIntegrator(Model):
+    """The layers of ``film.aovs`` without any light transport."""
+
+    type: Literal["aov"] = "aov"
+
+
+Integrator = PathIntegrator | DirectIntegrator | AovIntegrator
+INTEGRATORS: dict[str, type[Any]] = {"path": PathIntegrator, "direct": DirectIntegrator, "aov": AovIntegrator}
+
+
+class Sampler(Model):
+    """Where sample points come from."""
+
+    type: Literal["sobol", "independent"] = "sobol"
+
+
+SAMPLERS: dict[str, type[Sampler]] = {"sobol": Sampler, "independent": Sampler}
+
+_DEVICE = re.compile(r"(auto|cpu|cuda|cuda:[0-9]{1,3})\Z")
+
+
+def _device(value: Any) -> str:
+    if not isinstance(value, str) or not _DEVICE.match(value):
+        raise wrong("auto, cpu, cuda or cuda:N")
+    return value
+
+
+def _preview(value: Any) -> str | None:
+    if value is None or (isinstance(value, str) and value.strip() and value.isprintable()):
+        return value
+    raise wrong("null or a file path")
+
+
+class Render(Model):
+    """How the work is done; none of it but ``spp`` and ``seed`` changes what the picture converges to.
+
+    Attributes:
+        max_memory: bytes, or None.
+        preview: a file that shows the picture so far, or None.
+    """
+
+    spp: Annotated[int, integer(1, 2**31 - 1)] = 64
+    seed: Annotated[int, integer(0, 2**63 - 1)] = 0
+    device: Annotated[str, PlainValidator(_device)] = "auto"
+    accel: Annotated[str, choice("auto", "torch", "numba", "brute")] = "auto"
+    compile: Annotated[str, choice("auto", "on", "off", booleans={True: "on", False: "off"})] = "auto"
+    threads: Annotated[int | str, integer(1, 1024, also=("auto",))] = "auto"
+    max_memory: Annotated[int | None, PlainValidator(memory_size)] = None
+    preview: Annotated[str | None, PlainValidator(_preview)] = None
+
+
+class Settings(Model):
+    """All run settings, complete."""
+
+    film: Film = Film()
+    integrator: PathIntegrator | DirectIntegrator | AovIntegrator = PathIntegrator()
+    sampler: Sampler = Sampler()
+    render: Render = Render()
+
+
+_TYPED: dict[str, tuple[dict[str, type[Any]], str]] = {
+    "integrator": (INTEGRATORS, "path"),
+    "sampler": (SAMPLERS, "sobol"),
+    "filter": (FILTERS, "gaussian"),
+}
+
+
+def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
+    """The keys of a block that are really set (null means unset); a filter's or block's bare name is its type."""
+    if raw is None:
+        return {}
+    if isinstance(raw, str) and key.rpartition(".")[2] in _TYPED:
+        return {"type": raw}
+    if not isinstance(raw, Mapping):
+        raise SceneError(key, raw, "a mapping of settings", file)
+    return {str(name): value for name, value in raw.items() if value is not None}
+
+
+def _overlay(kind: str, below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """``above`` over ``below``; keys of ``below`` that another type was meant to read do not follow."""
+    table, default = _TYPED[kind]
+    before, after = below.get("type", default), above.get("type", below.get("type", default))
+    if before != after and after in table:
+        fields = table[after].model_fields
+        below = {name: value for name, value in below.items() if name in fields and name != "type"}
+    return {**below, **above}
+
+
+def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None) -> Settings:
+    """Complete settings from the blocks of a scene file and explicit overrides, both by block name.
+
+    Raises:
+        SceneError: an unknown block or key, a key that does nothing for the chosen type, a bad value.
+        NotBuiltError: a setting that this version does not build.
+    """
+    check_keys(overrides, BLOCKS, "", "the settings", None)
+    blocks: dict[str, Any] = {}
+    for block in BLOCKS:
+        below, above = _set(scene.get(block), block, file), _set(overrides.get(block), block, None)
+        if block in _TYPED:
+            raw = _overlay(block, below, above)
+        else:
+            raw = {**below, **above}
+        if "filter" in raw:
+            inner = [_set(part.get("filter"), "film.filter", name) for part, name in ((below, file), (above, None))]
+            raw["filter"] = _overlay("filter", *inner)
+        try:
+            blocks[block] = _block(block, raw)
+        except SceneError as error:
+            blame = None if _given(overrides, error.key) else file
+            raise type(error)(error.key, error.value, error.expected, blame) from None
+    return Settings.model_construct(**blocks)
+
+
+def _given(overrides: Mapping[str, Any], key: str) -> bool:
+    """Whether the override names the key that is wrong."""
+    value: Any = overrides
+    for part in key.split(".")[:3]:
+        if not isinstance(value, Mapping) or value.get(part) is None:
+            return isinstance(value, str)
+        value = value[part]
+    return True
+
+
+def _block(block: str, raw: dict[str, Any]) -> Model:
+    if block in _TYPED:
+        table, default = _TYPED[block]
+        if block == "integrator":
+            _useless(raw, table, default)
+        return select(block, table, raw, block, None, default)
+    if block == "film":
+        if "filter" in raw:
+            raw["filter"] = select("filter", FILTERS, raw["filter"], "film.filter", None, "gaussian")
+        return construct(Film, raw, block, None, "the film")
+    later = not_built.KEYS["render"]
+    check_keys(
+        {k: v for k, v in raw.items() if k not in later}, Render.model_fields, block, "the render settings", None
+    )
+    rest = refuse_not_built(raw, later, block, ", ".join(Render.model_fields), None)
+    return construct(Render, rest, block, None, "the render settings")
+
+
+def _useless(raw: Mapping[str, Any], table: Mapping[str, type[Model]], default: str) -> None:
+    """Raises for a key of another integrator: it would be accepted and do nothing."""
+    kind = raw.get("type", default)
+    if kind not in table:
+        return
+    own = table[kind].model_fields
+    for name, value in raw.items():
+        owners = [other for other, model in table.items() if name in model.model_fields]
+        if name not in own and owners:
+            expected = (
+                f"only keys that the {kind} integrator reads ({', '.join(own)}); {name} belongs to {', '.join(owners)}"
+            )
+            raise SceneError(dotted("integrator", name), value, expected)
