@@ -1,0 +1,72 @@
+"""The exceptions users meet. Each is one readable line: where, what was found, what is accepted."""
+
+from __future__ import annotations
+
+__all__ = ["AssetError", "NotBuiltError", "OutputError", "RenderError", "SceneError", "TorchptError"]
+
+
+def _shown(value: object, limit: int = 80) -> str:
+    text = repr(value).replace("\n", " ")
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+class TorchptError(Exception):
+    """Base of every error that is the input's fault. ``str()`` is always a single line."""
+
+
+class SceneError(TorchptError):
+    """A scene or setting that cannot be used.
+
+    Attributes:
+        key: dotted key, e.g. ``materials.red.reflectance``.
+        value: what was found there.
+        expected: what is accepted.
+        file: the scene file, where the scene came from one.
+    """
+
+    def __init__(self, key: str, value: object, expected: str, file: str | None = None) -> None:
+        self.key, self.value, self.expected, self.file = key, value, expected, file
+        where = f"{file}: {key}" if file else key
+        super().__init__(f"{where}: expected {expected}, got {_shown(value)}")
+
+    def __reduce__(self) -> tuple:  # crosses process boundaries in worker pools
+        return type(self), (self.key, self.value, self.expected, self.file)
+
+
+class NotBuiltError(SceneError):
+    """A key of the scene format that this version does not build yet."""
+
+    def __init__(self, key: str, value: object, expected: str = "", file: str | None = None) -> None:
+        TorchptError.__init__(
+            self,
+            (f"{file}: " if file else "")
+            + f"{key}: {_shown(value)} is not built yet"
+            + (f"; available: {expected}" if expected else ""),
+        )
+        self.key, self.value, self.expected, self.file = key, value, expected, file
+
+
+class AssetError(TorchptError):
+    """A file (mesh, image) that is missing, unreadable or malformed."""
+
+    def __init__(self, file: object, problem: str) -> None:
+        self.file, self.problem = str(file), problem.replace("\n", " ")
+        super().__init__(f"{self.file}: {self.problem}")
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.file, self.problem)
+
+
+class OutputError(TorchptError):
+    """A picture that cannot be written where it was asked for."""
+
+    def __init__(self, file: object, problem: str) -> None:
+        self.file, self.problem = str(file), problem.replace("\n", " ")
+        super().__init__(f"{self.file}: {self.problem}")
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.file, self.problem)
+
+
+class RenderError(TorchptError):
+    """A render that could not be carried out as asked (device, compiler, strict mode)."""

@@ -1,0 +1,145 @@
+"""Unidirectional path tracing with next event estimation, as a wavefront.
+
+camera rays -> intersect -> emission with MIS -> sort by BSDF and compact -> light sampling with shadow rays -> BSDF sampling
+-> Russian roulette -> next. ``max_depth`` and ``rr_depth`` count as Mitsuba's: 1 is emission only, 2 direct light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from torchpt.accel import Accel
+from torchpt.integrators.stages import Plan, emit, escape, scatter, shade
+from torchpt.math.vectors import take
+from torchpt.records import Hit, PathState, World
+from torchpt.samplers import salts
+from torchpt.shapes import interact
+
+__all__ = ["ENDLESS", "Limits", "Tally", "trace"]
+
+#: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted.
+ENDLESS = 4096
+
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where paths end."""
+
+    max_depth: int  # -1: only roulette ends them
+    rr_depth: int  # roulette from this vertex on
+
+
+@dataclass
+class Tally:
+    """What a wave did."""
+
+    rays: int = 0
+    truncated: int = 0  # paths still alive at ENDLESS
+
+
+def trace(plan: Plan, limits: Limits, world: World, accel: Accel, state: PathState) -> tuple[Tensor, Tally]:
+    """Radiance ``(3, N)`` carried back along camera rays ``state``, and what it took."""
+    tally = Tally()
+    n = len(state.lane)
+    gathered = torch.zeros_like(state.radiance)
+
+    def search(state: PathState) -> Hit:
+        tally.rays += len(state.lane)
+        t, prim, u, v = accel.intersect(state.o, state.d, state.t_max)
+        return Hit(t.to(plan.dtype), prim.to(torch.int64), u.to(plan.dtype), v.to(plan.dtype))
+
+    def retire(state: PathState) -> None:
+        gathered.scatter_(1, state.lane.expand(3, -1), state.radiance)
+
+    last = limits.max_depth if limits.max_depth >= 0 else ENDLESS
+    depth, hit = 1, None
+    while n and depth <= last:
+        if hit is None:
+            hit = search(state)
+        # Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64
+        # the camera's point is found anew, since the search rounds it to float32.
+        slide = depth == 1 and (plan.attached or plan.dtype == torch.float64)
+        ends, groups = partition(world, hit)
+        if world.lights is not None:
+            _gather_light(plan, world, state, hit, ends, slide)
+        retire(_rows(state, ends.missed))
+        if depth == last or not groups:
+            for _, index in groups:
+                retire(_rows(state, index))
+                tally.truncated += len(index) if limits.max_depth < 0 else 0
+            break
+        roulette = depth >= limits.rr_depth
+        names = salts(depth, state.lane.device)
+        parts = []
+        for model, index in groups:
+            here, found = _rows(state, index), _rows(hit, index)
+            at = interact(world, here.o, here.d, found, slide)
+            surface, shadow = shade(plan, world, model, here, at, names)
+            if shadow is not None:
+                tally.rays += len(index)
+                blocked = accel.occluded(shadow.o, shadow.d, shadow.t_max)
+                here = replace(here, radiance=here.radiance + shadow.radiance * (~blocked))
+            parts.append(scatter(plan, world, model, here, at, surface, names, roulette, search))
+        state = _join([after for after, _ in parts])
+        hit = _join([hit for _, hit in parts]) if plan.attached else None
+        depth += 1
+    else:
+        retire(state)
+    return gathered, tally
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Lanes ``(n,)`` whose paths meet light by chance."""
+
+    emissive: Tensor
+    missed: Tensor
+
+
+def partition(world: World, hit: Hit) -> tuple[Ends, list[tuple[int, Tensor]]]:
+    """Sort lanes by what they hit; one sort of small keys and one transfer of the counts.
+
+    Returns:
+        Which lanes hit an emitter or nothing, and for each model present its number and lanes.
+    """
+    models = len(world.models)
+    keys, order = torch.sort(take(world.key, hit.prim + 1), stable=True)
+    bounds = torch.searchsorted(keys, torch.arange(2 * models + 1, dtype=keys.dtype, device=keys.device)).tolist()
+    bounds.append(len(order))
+    groups = []
+    for m in range(models):
+        pieces = [order[bounds[k] : bounds[k + 1]] for k in (m, models + m) if bounds[k + 1] > bounds[k]]
+        if pieces:
+            groups.append((m, pieces[0] if len(pieces) == 1 else torch.cat(pieces)))
+    return Ends(order[: bounds[models]], order[bounds[2 * models] :]), groups
+
+
+def _gather_light(plan: Plan, world: World, state: PathState, hit: Hit, ends: Ends, slide: bool) -> None:
+    """Add to ``state.radiance`` what the lanes gather from emitters they hit and from the environment."""
+    assert world.lights is not None
+    if len(ends.emissive):
+        index = ends.emissive
+        at = interact(world, take(state.o, index), take(state.d, index), _rows(hit, index), slide)
+        state.radiance.scatter_add_(1, index.expand(3, -1), emit(plan, world, state, at, index))
+    if world.lights.environment is not None and len(ends.missed):
+        index = ends.missed
+        state.radiance.scatter_add_(1, index.expand(3, -1), escape(plan, world, state, index))
+
+
+def _rows(record: R, index: Tensor) -> R:
+    """The lanes ``index`` of a record of tensors."""
+    return type(record)(**{f.name: take(getattr(record, f.name), index) for f in fields(record)})
+
+
+def _join(records: list[R]) -> R:
+    """Records joined along the lane axis."""
+    if len(records) == 1:
+        return records[0]
+    names = [f.name for f in fields(records[0])]
+    return type(records[0])(**{name: torch.cat([getattr(r, name) for r in records], -1) for name in names})

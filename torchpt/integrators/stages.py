@@ -1,0 +1,204 @@
+"""The stages of the wavefront: pure functions of whole-wave tensors and an index of the lanes concerned.
+
+Python ``if`` here asks only what the scene or the settings hold (:class:`Plan` is static), so a stage leaves out what is
+not needed, and compiles to one graph whatever the number of lanes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchpt import bsdfs, lights
+from torchpt.cameras import Perspective
+from torchpt.film import Filter
+from torchpt.math.frames import Frame
+from torchpt.math.mis import power_heuristic
+from torchpt.math.vectors import dot, take
+from torchpt.math.warps import uniform_hemisphere
+from torchpt.records import Hit, Interaction, PathState, World
+from torchpt.samplers import Dimension, Draws
+from torchpt.shapes import offset_origin, reattach
+from torchpt.shapes.interaction import OFFSET
+
+__all__ = ["STRATEGIES", "Plan", "Shadow", "Surface", "emit", "escape", "generate", "scatter", "shade"]
+
+#: mis: light and BSDF sampling combined; bsdf, light: one of them; uniform: directions uniform over the hemisphere.
+STRATEGIES = ("mis", "bsdf", "light", "uniform")
+
+#: Shadow rays end this fraction of their length short of the light, beside the offset off its surface.
+SHORTEN = 1e-4
+#: Roulette never lets a path live on for sure: throughput above one would make it immortal.
+SURVIVAL_CAP = 0.95
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a render asks of the stages; static."""
+
+    sampler: str
+    strategy: str
+    rr_prob: float | None
+    dtype: torch.dtype
+    attached: bool  # whether derivatives with respect to geometry are wanted
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface point with its material resolved."""
+
+    frame: Frame  # about the shading normal
+    parameters: bsdfs.Parameters  # lane values of the BSDF
+    wo: Tensor  # (3, N) local
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """Shadow rays and what the light brings where they pass."""
+
+    o: Tensor  # (3, N)
+    d: Tensor  # (3, N)
+    t_max: Tensor  # (N,) 0 where the light brings nothing
+    radiance: Tensor  # (3, N)
+
+
+def generate(plan: Plan, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+    """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter."""
+    place = filter.offset(Draws(plan.sampler, key, salts).two(Dimension.PIXEL)).to(plan.dtype)
+    o, d = camera.rays(x + 0.5 + place[0], y + 0.5 + place[1])
+    n = d.shape[1]
+    ones = torch.ones_like(d)
+    everywhere = torch.full((n,), math.inf, dtype=plan.dtype, device=d.device)
+    lane = torch.arange(n, device=d.device)
+    return PathState(o.expand(3, n).contiguous(), d, everywhere, ones, torch.zeros_like(d), everywhere, lane, key)
+
+
+def emit(plan: Plan, world: World, state: PathState, at: Interaction, index: Tensor) -> Tensor:
+    """Radiance ``(3, n)`` that the paths at ``index`` gather from the emitters they hit, weighted by MIS."""
+    assert world.lights is not None
+    o, d = take(state.o, index), take(state.d, index)
+    radiance, pdf = lights.emitted(world.lights, o, at, d)
+    return _weighted(take(state.throughput, index), radiance, take(state.pdf, index), pdf)
+
+
+def escape(plan: Plan, world: World, state: PathState, index: Tensor) -> Tensor:
+    """Radiance ``(3, n)`` that the paths at ``index`` gather from the environment they escape to."""
+    assert world.lights is not None
+    radiance, pdf = lights.environment(world.lights, take(state.d, index))
+    return _weighted(take(state.throughput, index), radiance, take(state.pdf, index), pdf)
+
+
+def _weighted(throughput: Tensor, radiance: Tensor, pdf: Tensor, light_pdf: Tensor) -> Tensor:
+    # PathState.pdf is inf where emission counts whole and 0 where it does not count: the heuristic's own limits.
+    whole = torch.isinf(pdf)
+    weight = torch.where(whole, 1.0, power_heuristic(torch.where(whole, 1.0, pdf), light_pdf))
+    return throughput * radiance * weight.detach()
+
+
+def shade(
+    plan: Plan, world: World, model: int, state: PathState, at: Interaction, salts: Tensor
+) -> tuple[Surface, Shadow | None]:
+    """Resolve the material at the surface points and sample a light for each.
+
+    Returns:
+        The surface, and the shadow rays (None where no light is sampled).
+    """
+    frame = Frame.about(at.ns)
+    wo = frame.to_local(-state.d)
+    parameters = bsdfs.gather(world.bsdfs[model], take(world.material, at.prim))
+    surface = Surface(frame, parameters, wo)
+    if world.lights is None or plan.strategy in ("bsdf", "uniform"):
+        return surface, None
+    table = world.lights
+    kind = bsdfs.KINDS[world.models[model]]
+    draws = Draws(plan.sampler, state.key, salts)
+    choice = None if table.choice is None else draws.one(Dimension.LIGHT_CHOICE)
+    light = lights.sample(table, at.p, choice, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET)
+    wi = frame.to_local(light.wi)
+    # A shading normal must not let light through the surface: both directions on the sides that geometry says.
+    through = dot(light.wi, at.ng) * wi[2]
+    reflected = kind.eval(parameters, wo, wi)
+    weight = light.weight
+    if plan.strategy == "mis":
+        weight = weight * power_heuristic(light.pdf, kind.pdf(parameters, wo, wi)).detach()
+    if world.normals is not None:
+        weight = weight * (through > 0)
+    radiance = state.throughput * reflected * light.radiance * weight
+    o = offset_origin(world, at, light.wi)
+    d = light.target - o
+    lit = radiance.detach().amax(0) > 0
+    t_max = lit.to(plan.dtype) * (1.0 - SHORTEN)
+    if light.distant is not None:
+        d = torch.where(light.distant, light.wi, d)
+        t_max = torch.where(light.distant & lit, math.inf, t_max)
+    return surface, Shadow(o, d, t_max, radiance)
+
+
+def scatter(
+    plan: Plan,
+    world: World,
+    model: int,
+    state: PathState,
+    at: Interaction,
+    surface: Surface,
+    salts: Tensor,
+    roulette: bool,
+    search: Callable[[PathState], Hit],
+) -> tuple[PathState, Hit | None]:
+    """Draw the next direction from the BSDF and let roulette decide who goes on.
+
+    Where derivatives with respect to geometry are wanted, the next hit is found here already, since the throughput must
+    follow both ends of the ray; it is returned beside the state.
+    """
+    name = world.models[model]
+    kind = bsdfs.KINDS[name]
+    frame, parameters, wo = surface.frame, surface.parameters, surface.wo
+    draws = Draws(plan.sampler, state.key, salts)
+    u = draws.two(Dimension.BSDF).to(plan.dtype)
+    if plan.strategy == "uniform":
+        wi = uniform_hemisphere(u)
+        wi = torch.stack((wi[0], wi[1], torch.copysign(wi[2], wo[2])))
+        pdf = torch.full_like(wi[2], 0.5 / math.pi)
+        weight = kind.eval(parameters, wo, wi) / pdf
+    else:
+        lobe = draws.one(Dimension.LOBE) if name in bsdfs.LOBED else None
+        drawn = kind.sample(parameters, wo, lobe, u)
+        wi, pdf, weight = drawn.wi, drawn.pdf, drawn.weight
+    d = frame.to_world(wi).detach()
+    o = offset_origin(world, at, d)
+    alive = pdf > 0
+    if world.normals is not None:
+        alive = alive & (dot(d, at.ng) * wi[2] > 0)
+    forever = torch.full_like(pdf, math.inf)
+    hit = None
+    if plan.attached:
+        # Detached sampling: direction and density are constants, the integrand follows the geometry.
+        pdf = pdf.detach()
+        hit = search(replace(state, o=o, d=d, t_max=torch.where(alive, forever, 0.0)))
+        d, measure = reattach(world, at.p, hit, d)
+        weight = kind.eval(parameters, wo, frame.to_local(d)) * (measure / torch.where(alive, pdf, 1.0))
+    throughput = state.throughput * weight
+    brightest = throughput.detach().amax(0)
+    alive = alive & (brightest > 0)
+    if roulette:
+        survival = brightest.clamp_max(SURVIVAL_CAP) if plan.rr_prob is None else torch.full_like(brightest, plan.rr_prob)
+        alive = alive & (draws.one(Dimension.ROULETTE) < survival)
+        throughput = throughput / torch.where(alive, survival, 1.0)
+    if hit is not None:
+        hit = replace(hit, prim=torch.where(alive, hit.prim, -1))
+    counts = {"mis": pdf, "light": torch.zeros_like(pdf)}.get(plan.strategy, forever)
+    after = PathState(
+        o=o,
+        d=d,
+        t_max=torch.where(alive, forever, 0.0),
+        throughput=throughput * alive,
+        radiance=state.radiance,
+        pdf=(counts if world.lights is not None else forever).detach(),
+        lane=state.lane,
+        key=state.key,
+    )
+    return after, hit

@@ -1,0 +1,74 @@
+"""One render's waves: a pure function from a range of pixels and samples to radiance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.accel import Accel
+from torchpt.cameras import Perspective
+from torchpt.film import Filter
+from torchpt.integrators import aov
+from torchpt.integrators.path import Limits, Tally, trace
+from torchpt.integrators.stages import Plan, generate
+from torchpt.records import PathState, World
+from torchpt.samplers import Sampler, salts
+
+__all__ = ["Wave"]
+
+
+@dataclass(frozen=True)
+class Wave:
+    """What a render fixes for all of its waves.
+
+    Attributes:
+        plan: static needs.
+        limits: where paths end; None where no light is carried.
+        world: tensors of the scene.
+        accel: the search.
+        camera: on the whole film.
+        filter: reconstruction filter.
+        sampler: random numbers.
+        crop: ``(x, y, width, height)`` of the picture on the film.
+        centre: ``(3,)`` float64, see Scene.centre.
+    """
+
+    plan: Plan
+    limits: Limits | None
+    world: World
+    accel: Accel
+    camera: Perspective
+    filter: Filter
+    sampler: Sampler
+    crop: tuple[int, int, int, int]
+    centre: Tensor
+
+    def rays(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> PathState:
+        """Camera rays of consecutive pixels of the picture, row by row; lanes run over pixels, then over samples."""
+        device = self.centre.device
+        x0, y0, width, _ = self.crop
+        place = torch.arange(first_pixel, first_pixel + pixels, device=device)
+        x, y = place % width + x0, place // width + y0
+        # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
+        pixel = (y * self.camera.width + x).repeat(samples)
+        sample = torch.arange(first_sample, first_sample + samples, device=device).repeat_interleave(pixels)
+        key = self.sampler.key(pixel, sample)
+        x, y = (a.to(self.plan.dtype).repeat(samples) for a in (x, y))
+        return generate(self.plan, self.camera, self.filter, x, y, key, salts(0, device))
+
+    def radiance(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> tuple[Tensor, Tally]:
+        """Radiance ``(3, samples, pixels)`` and what it took."""
+        assert self.limits is not None
+        state = self.rays(first_pixel, pixels, first_sample, samples)
+        radiance, tally = trace(self.plan, self.limits, self.world, self.accel, state)
+        return radiance.view(3, samples, pixels), tally
+
+    def layers(
+        self, names: tuple[str, ...], first_pixel: int, pixels: int, first_sample: int, samples: int
+    ) -> dict[str, Tensor]:
+        """The layers ``names``, each ``(C, samples, pixels)``."""
+        state = self.rays(first_pixel, pixels, first_sample, samples)
+        found = aov.first_hit(names, self.world, self.accel, state, self.centre, self.plan.dtype)
+        return {name: value.view(len(value), samples, pixels) for name, value in found.items()}

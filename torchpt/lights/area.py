@@ -1,0 +1,37 @@
+"""Planar emitters (triangle, rectangle, disk), sampled uniformly by area. They shine from the side of their normal."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import dot
+from torchpt.math.warps import concentric_disk, uniform_triangle
+
+__all__ = ["WARPS", "inverse_pdf", "point"]
+
+
+def _identity(u: Tensor) -> Tensor:
+    return u
+
+
+#: Unit square to the primitive's own ``(u, v)``, uniform by area.
+WARPS = {"triangle": uniform_triangle, "rectangle": _identity, "disk": concentric_disk}
+
+
+def point(p0: Tensor, e1: Tensor, e2: Tensor, uv: Tensor) -> Tensor:
+    """The point ``(3, N)`` at ``(u, v)`` of affine primitives."""
+    return p0 + e1 * uv[0] + e2 * uv[1]
+
+
+def inverse_pdf(normal: Tensor, area: Tensor, wi: Tensor, square: Tensor) -> Tensor:
+    """``1 / pdf`` in solid angle, ``area cos / r^2``; 0 behind the emitter.
+
+    Args:
+        normal: of the emitting side ``(3, N)``.
+        area: ``(N,)``.
+        wi: unit direction toward the light ``(3, N)``.
+        square: squared distance ``(N,)``.
+    """
+    cosine = (-dot(wi, normal)).clamp_min(0.0)
+    return area * cosine / torch.where(square > 0, square, torch.inf)

@@ -1,0 +1,141 @@
+"""The table of lights: choice by power, sampling, and the densities that MIS asks for.
+
+A row is an emissive primitive; the environment, where there is one, is the last row. Kinds absent from the scene cost
+nothing: ``Lights.kinds`` is static, and a single row is neither chosen nor gathered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchpt.lights import area, constant, sphere
+from torchpt.math.vectors import dot, take
+from torchpt.records import Interaction, Lights, LightSample
+
+__all__ = ["emitted", "environment", "sample"]
+
+
+def _rows(lights: Lights, row: Tensor | None) -> Lights:
+    """Lane values of the table at ``row``; with a single row the table itself, which broadcasts."""
+    if row is None:
+        return lights
+    names = ("p0", "e1", "e2", "normal", "flip", "area", "bound", "radiance")
+    return replace(lights, **{name: take(getattr(lights, name), row) for name in names})
+
+
+def _is(lights: Lights, kind: str, row: Tensor | None) -> Tensor | None:
+    """Mask of the lanes whose row is of ``kind``; ``None`` where all are."""
+    if len(lights.kinds) == 1:
+        return None
+    assert lights.kind is not None and row is not None
+    return take(lights.kind, row) == lights.kinds.index(kind)
+
+
+def _pick(mask: Tensor | None, a: Tensor, b: Tensor | None) -> Tensor:
+    return a if mask is None or b is None else torch.where(mask, a, b)
+
+
+def _probability(lights: Lights, row: Tensor | None) -> Tensor | float:
+    return 1.0 if lights.choice is None or row is None else take(lights.choice.pmf, row)
+
+
+def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: float) -> LightSample:
+    """A point on the lights, seen from ``x (3, N)``.
+
+    Args:
+        lights: the table.
+        x: reference points ``(3, N)``.
+        choice: ``(N,)`` in [0, 1), picks the light; unused (``None``) where there is but one.
+        u: ``(2, N)`` in [0, 1), picks the point.
+        offset: how far shadow rays stop off the light's surface, in units of ``Lights.bound``.
+    """
+    row = None if lights.choice is None or choice is None else lights.choice.sample(choice)
+    at = _rows(lights, row)
+    target: Tensor | None = None
+    normal: Tensor | None = None
+    for kind in lights.kinds:
+        if kind == "constant":
+            continue
+        mask = _is(lights, kind, row)
+        if kind == "sphere":
+            # Detached: from a moving reference point the same spot on the light is held, as on planar lights.
+            spot, facing = sphere.sample(x.detach(), at.p0.detach(), at.e1[0].detach(), at.flip, u)
+            spot = at.p0 + (spot - at.p0).detach() * (at.e1[0] / at.e1[0].detach())
+        else:
+            spot, facing = area.point(at.p0, at.e1, at.e2, area.WARPS[kind](u)), at.normal
+        target, normal = _pick(mask, spot, target), _pick(mask, facing, normal)
+
+    if target is None or normal is None:  # nothing but the environment
+        wi = constant.sample(u)
+        return _environment_sample(lights, wi, 1.0)
+    to = target - x
+    square = dot(to, to)
+    wi = to / torch.where(square > 0, square, 1.0).sqrt()
+    inverse = area.inverse_pdf(normal, at.area, wi, square)
+    if "sphere" in lights.kinds:
+        ball = sphere.inverse_pdf(x.detach(), at.p0.detach(), at.e1[0].detach(), normal, wi.detach(), square.detach())
+        # In area measure the derivative of a sphere's share is that of the planar form.
+        value = inverse.detach()
+        ball = ball * torch.where(value > 0, inverse / torch.where(value > 0, value, 1.0), 1.0)
+        inverse = _pick(_is(lights, "sphere", row), ball, inverse)
+    probability = _probability(lights, row)
+    inverse = inverse / probability
+    value = inverse.detach()
+    pdf = torch.where(value > 0, 1.0 / torch.where(value > 0, value, 1.0), 0.0)
+    target = target + normal * (at.bound * offset)
+    here = LightSample(wi, target, None, at.radiance.expand_as(wi), pdf, inverse)
+    if "constant" not in lights.kinds:
+        return here
+    distant = _is(lights, "constant", row)
+    assert distant is not None
+    there = _environment_sample(lights, constant.sample(u), probability)
+    return LightSample(
+        *(torch.where(distant, getattr(there, n), getattr(here, n)) for n in ("wi", "target")),
+        distant,
+        *(torch.where(distant, getattr(there, n), getattr(here, n)) for n in ("radiance", "pdf", "weight")),
+    )
+
+
+def _environment_sample(lights: Lights, wi: Tensor, probability: Tensor | float) -> LightSample:
+    assert lights.environment is not None
+    weight = torch.full_like(wi[0], constant.INVERSE_PDF) / probability
+    everywhere = torch.ones_like(wi[0], dtype=torch.bool)
+    return LightSample(wi, wi, everywhere, lights.environment[:, None].expand_as(wi), 1.0 / weight, weight)
+
+
+def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Tensor, Tensor]:
+    """What emitters that were hit send back along ``wi``.
+
+    Args:
+        lights: the table.
+        x: where the rays came from ``(3, N)``.
+        at: points on emissive primitives.
+        wi: unit directions from ``x`` to them ``(3, N)``.
+
+    Returns:
+        Radiance ``(3, N)``, zero from behind, and the density ``(N,)`` with which :func:`sample` would have drawn ``wi``.
+    """
+    assert lights.row_of_prim is not None
+    row = take(lights.row_of_prim, at.prim) if len(lights.area) > 1 else None
+    table = _rows(lights, row)
+    with torch.no_grad():
+        to = at.p - x
+        inverse = area.inverse_pdf(at.ng, table.area, wi, dot(to, to))
+        if "sphere" in lights.kinds:
+            ball = sphere.inverse_pdf(x, table.p0, table.e1[0], at.ng, wi, dot(to, to))
+            inverse = _pick(_is(lights, "sphere", row), ball, inverse)
+        inverse = inverse / _probability(lights, row)
+        pdf = torch.where(inverse > 0, 1.0 / torch.where(inverse > 0, inverse, 1.0), 0.0)
+        facing = dot(wi, at.ng) < 0
+    return torch.where(facing, table.radiance, 0.0), pdf
+
+
+def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them."""
+    assert lights.environment is not None
+    probability = 1.0 if lights.choice is None else lights.choice.pmf[-1]
+    pdf = torch.full_like(d[0], 1.0 / constant.INVERSE_PDF) * probability
+    return lights.environment[:, None].expand_as(d), pdf

@@ -1,0 +1,1 @@
+"""Pure functions on tensors: vectors, frames, warps, MIS, distributions. Nothing here knows of scenes."""

@@ -1,0 +1,140 @@
+"""Records that travel through the wave: tensors that share a lane axis.
+
+Vectors are component-first ``(3, N)``, lane scalars ``(N,)``. A miss is ``prim = -1, t = inf``.
+Directions (pbrt): ``wo`` points toward the previous vertex, ``wi`` toward the next one or the light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchpt.math.distributions import Discrete
+
+__all__ = ["KINDS", "BsdfSample", "Geometry", "Hit", "Interaction", "LightSample", "Lights", "PathState", "World"]
+
+#: Primitive kinds in the order in which a :class:`Geometry` stores them.
+KINDS = ("triangle", "rectangle", "disk", "sphere")
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """The primitives as the search sees them: float32, detached, contiguous, on one device.
+
+    A planar primitive is the affine map ``p = p0 + u (p1 - p0) + v (p2 - p0)``: a triangle holds ``u, v >= 0, u + v <= 1``,
+    a rectangle (parallelogram) ``0 <= u, v <= 1``, a disk (ellipse) ``u^2 + v^2 <= 1`` about its centre ``p0``.
+    A sphere has its centre in ``p0`` and its radius in ``p1[0]``.
+
+    Attributes:
+        p0: ``(3, P)``.
+        p1: ``(3, P)``.
+        p2: ``(3, P)``.
+        counts: how many triangles, rectangles, disks and spheres; stored in that order.
+    """
+
+    p0: Tensor
+    p1: Tensor
+    p2: Tensor
+    counts: tuple[int, int, int, int]
+
+    @property
+    def size(self) -> int:
+        """Number of primitives P."""
+        return sum(self.counts)
+
+
+@dataclass(frozen=True)
+class Lights:
+    """The emitters: one row per emissive primitive, and the environment as the last row where there is one."""
+
+    choice: Discrete | None  # over the rows; None where there is but one
+    kinds: tuple[str, ...]  # primitive kinds among the rows, and "constant"
+    kind: Tensor | None  # (K,) index into `kinds`; None where there is but one
+    p0: Tensor  # (3, K), as the primitives' own
+    e1: Tensor  # (3, K)
+    e2: Tensor  # (3, K)
+    normal: Tensor  # (3, K) unit, the side that emits
+    flip: Tensor  # (K,) -1 where a sphere emits inward
+    area: Tensor  # (K,)
+    bound: Tensor  # (K,) see World.bound
+    radiance: Tensor  # (3, K)
+    environment: Tensor | None  # (3,) radiance that comes from outside
+    row_of_prim: Tensor | None  # (P,) int64, -1 where a primitive does not emit; None where none does
+
+
+@dataclass(frozen=True)
+class World:
+    """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``."""
+
+    counts: tuple[int, int, int, int]  # as in Geometry
+    p0: Tensor  # (3, P)
+    e1: Tensor  # (3, P)
+    e2: Tensor  # (3, P)
+    normal: Tensor  # (3, P) unit geometric normal; zero for spheres
+    bound: Tensor  # (P,) sum |n_i| max |p_i| over the primitive: scales the rounding of its plane
+    flip: Tensor | None  # (P,) orientation of spheres
+    normals: tuple[Tensor, Tensor, Tensor] | None  # (3, P) shading normals at the corners, where any are smooth
+    material: Tensor  # (P,) int64 row in the parameters of its model
+    key: Tensor  # (P + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
+    models: tuple[str, ...]  # names of the BSDFs present
+    bsdfs: tuple[dict[str, Tensor | None], ...]  # stacked parameters of each model
+    object_id: Tensor  # (P,) int64, order of the shape in the scene
+    lights: Lights | None  # None where nothing emits
+
+
+@dataclass(frozen=True)
+class Hit:
+    """What the search found."""
+
+    t: Tensor  # (N,) in units of |d|
+    prim: Tensor  # (N,) int64, -1 for a miss
+    u: Tensor  # (N,)
+    v: Tensor  # (N,)
+
+
+@dataclass(frozen=True)
+class Interaction:
+    """A surface point, ready to be shaded."""
+
+    p: Tensor  # (3, N)
+    ng: Tensor  # (3, N) unit geometric normal, on the shape's own outside
+    ns: Tensor  # (3, N) unit shading normal
+    prim: Tensor  # (N,)
+
+
+@dataclass(frozen=True)
+class BsdfSample:
+    """A direction drawn from a BSDF; ``pdf = 0`` says that the draw failed."""
+
+    wi: Tensor  # (3, N) local
+    pdf: Tensor  # (N,) in solid angle
+    weight: Tensor  # (3, N) = eval / pdf
+
+
+@dataclass(frozen=True)
+class LightSample:
+    """A point drawn on the lights, seen from a reference point."""
+
+    wi: Tensor  # (3, N) unit, toward the light
+    target: Tensor  # (3, N) end of the shadow ray, moved off the light's surface; a direction where `distant`
+    distant: Tensor | None  # (N,) bool: the environment; None where no lane can draw it
+    radiance: Tensor  # (3, N), zero where the draw failed
+    pdf: Tensor  # (N,) in solid angle, with the choice of the light, detached
+    weight: Tensor  # (N,) = 1 / pdf, differentiable in the geometry
+
+
+@dataclass(frozen=True)
+class PathState:
+    """One path a lane."""
+
+    o: Tensor  # (3, N) ray origin
+    d: Tensor  # (3, N) ray direction, unit
+    t_max: Tensor  # (N,) inf; 0 once the path has ended
+    throughput: Tensor  # (3, N)
+    radiance: Tensor  # (3, N) gathered so far
+    pdf: Tensor  # (N,) with which d was drawn: inf where emission counts whole, 0 where it does not count
+    lane: Tensor  # (N,) int64 place in the wave
+    key: Tensor  # (2, N) int32 of the sampler

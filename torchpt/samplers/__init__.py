@@ -1,0 +1,78 @@
+"""Stateless samplers: ``(seed, pixel, sample, dimension) -> u``.
+
+A picture is the mean over several independent *randomizations*: sample ``i`` is point ``i // R`` of randomization
+``i % R``. Their spread gives the picture's own error; the spread of points within one Sobol' sequence would not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from torchpt.samplers import independent, sobol
+from torchpt.samplers.dimensions import Dimension, salt
+from torchpt.samplers.hashing import as_int32, mix, mix_int
+
+__all__ = ["KINDS", "Dimension", "Draws", "Sampler", "salts"]
+
+#: Sampler types by name: modules with ``draw_1d(key, salt)`` and ``draw_2d(key, salt)``.
+KINDS: dict[str, ModuleType] = {"sobol": sobol, "independent": independent}
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """A sampler of one type under one seed.
+
+    Attributes:
+        kind: name of the type, from :data:`KINDS`.
+        seed: any integer from 0 to 2^63 - 1.
+        randomizations: how many independent sequences share the samples of a pixel.
+    """
+
+    kind: str
+    seed: int
+    randomizations: int = 1
+
+    def key(self, pixel: Tensor, sample: Tensor) -> Tensor:
+        """``(2, N)`` int32 for int64 pixel and sample indices ``(N,)``: a pixel's seed and a point's index.
+
+        The seed is a bijection of the pixel index for each (seed, randomization), so no two pixels share a sequence.
+        """
+        group, point = sample % self.randomizations, sample // self.randomizations
+        seeds = [
+            mix_int(mix_int(mix_int(self.seed) ^ as_int32(self.seed >> 32)) + g) for g in range(self.randomizations)
+        ]
+        seed = torch.tensor(seeds, dtype=torch.int32, device=pixel.device)[group]
+        return torch.stack((mix(mix(pixel.to(torch.int32)) ^ seed), point.to(torch.int32)))
+
+
+class Draws:
+    """The numbers of one path vertex for a batch of lanes: ``draws.one(Dimension.ROULETTE)``, ``draws.two(...)``.
+
+    Args:
+        sampler: whose numbers.
+        key: ``(2, N)`` int32 as given by :meth:`Sampler.key`.
+        salts: ``(STREAMS,)`` int32, the dimensions' names at this depth; a tensor, so that a compiled stage does not
+            specialize on the depth.
+    """
+
+    def __init__(self, kind: str, key: Tensor, salts: Tensor) -> None:
+        self._module, self._key, self._salts = KINDS[kind], key, salts
+
+    def one(self, dimension: Dimension) -> Tensor:
+        """``(N,)`` float32 in ``[0, 1)``."""
+        return self._module.draw_1d(self._key, self._salts[int(dimension)])
+
+    def two(self, dimension: Dimension) -> Tensor:
+        """``(2, N)`` float32 in ``[0, 1)``."""
+        return self._module.draw_2d(self._key, self._salts[int(dimension)])
+
+
+@lru_cache(maxsize=4096)
+def salts(depth: int, device: torch.device) -> Tensor:
+    """The dimensions' names at path vertex ``depth``: ``(STREAMS,)`` int32; 0 is the camera."""
+    return torch.tensor([salt(d, depth) for d in Dimension], dtype=torch.int32, device=device)

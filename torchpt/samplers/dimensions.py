@@ -1,0 +1,29 @@
+"""The dimensions of a path, named once. A random number is a pure function of (seed, pixel, sample, dimension)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from torchpt.samplers.hashing import mix_int
+
+__all__ = ["STREAMS", "Dimension", "salt"]
+
+
+class Dimension(IntEnum):
+    """What a number is drawn for. ``PIXEL`` and ``LENS`` are drawn once a path, the others at every vertex."""
+
+    PIXEL = 0  # 2D, place within the pixel's filter
+    LENS = 1  # 2D, place on the aperture
+    LIGHT_CHOICE = 2  # 1D
+    LIGHT = 3  # 2D, place on the light
+    LOBE = 4  # 1D, which part of the BSDF
+    BSDF = 5  # 2D, direction
+    ROULETTE = 6  # 1D
+
+
+STREAMS = len(Dimension)
+
+
+def salt(dimension: Dimension, depth: int) -> int:
+    """A signed 32-bit constant that names ``dimension`` at path vertex ``depth``."""
+    return mix_int(0x9E3779B9 * (1 + depth * STREAMS + int(dimension)))

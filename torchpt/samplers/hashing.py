@@ -1,0 +1,42 @@
+"""Integer hashing on int32 lanes (wrap-around arithmetic), the same bits on every device and in every kernel.
+
+``mix`` is Wellons' two-round multiply-xorshift of low bias ("Prospecting for hash functions", 2018): a bijection of 32 bits.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+__all__ = ["M0", "M1", "as_int32", "logical_shift", "mix", "mix_int", "to_unit"]
+
+M0, M1 = 0x7FEB352D, 0x846CA68B - (1 << 32)
+
+
+def as_int32(x: int) -> int:
+    """The low 32 bits of a Python integer, as a signed value that an int32 tensor accepts."""
+    return ((x + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
+
+
+def logical_shift(x: Tensor, bits: int) -> Tensor:
+    """Right shift that feeds in zeros; torch's own is arithmetic on int32."""
+    return (x >> bits) & ((1 << (32 - bits)) - 1)
+
+
+def mix(x: Tensor) -> Tensor:
+    """Hash int32 lanes ``(N,)``."""
+    x = (x ^ logical_shift(x, 16)) * M0
+    x = (x ^ logical_shift(x, 15)) * M1
+    return x ^ logical_shift(x, 16)
+
+
+def mix_int(x: int) -> int:
+    """The same hash of a Python integer, as a signed 32-bit value."""
+    x &= 0xFFFFFFFF
+    x = ((x ^ (x >> 16)) * 0x7FEB352D) & 0xFFFFFFFF
+    x = ((x ^ (x >> 15)) * 0x846CA68B) & 0xFFFFFFFF
+    return as_int32(x ^ (x >> 16))
+
+
+def to_unit(x: Tensor) -> Tensor:
+    """The top 24 bits as float32 in ``[0, 1 - 2^-24]``, every value of which is exact."""
+    return logical_shift(x, 8) * (1.0 / (1 << 24))

@@ -1,0 +1,59 @@
+"""Owen-scrambled Sobol' points, padded: each 1D or 2D set of dimensions is its own shuffled, scrambled (0, 2)-sequence.
+
+Burley, *Practical Hash-based Owen Scrambling*, JCGT 10(4), 2020. The scrambling hash is Vegdahl's refinement
+("Owen scrambling based permutation hash", 2021) of the Laine-Karras permutation.
+
+Working with bit-reversed numbers throughout spares most reversals. The first coordinate of point ``i`` is the reversal of
+``i``; the second is the reversal of ``p(x + 1)`` where ``p`` is the polynomial over GF(2) whose coefficients are the bits
+of ``i`` (its direction numbers are the powers of ``x + 1``), and that shift takes five masked xor-shifts.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpt.samplers.hashing import as_int32, logical_shift, mix, to_unit
+
+__all__ = ["draw_1d", "draw_2d", "reverse_bits", "scramble", "second_dimension"]
+
+_K0, _K1, _K2 = 0x3D20ADEA, 0x05526C56, 0x53A22864
+_X, _Y = as_int32(0x68BC21EB), as_int32(0x02E5BE93)
+_HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
+
+
+def reverse_bits(x: Tensor) -> Tensor:
+    """Reverse the 32 bits of int32 lanes."""
+    for shift, mask in _HALVES:
+        x = ((x >> shift) & mask) | ((x & mask) << shift)
+    return x
+
+
+def scramble(x: Tensor, seed: Tensor) -> Tensor:
+    """Nested uniform scramble of bit-reversed numbers: each bit is flipped by a hash of the bits below it."""
+    x = x ^ (x * _K0)
+    x = x + seed
+    x = x * (logical_shift(seed, 16) | 1)
+    x = x ^ (x * _K1)
+    return x ^ (x * _K2)
+
+
+def second_dimension(index: Tensor) -> Tensor:
+    """Bit-reversed second Sobol' coordinate of point ``index``."""
+    for shift, mask in reversed(_HALVES):
+        index = index ^ ((index >> shift) & mask)
+    return index
+
+
+def draw_1d(key: Tensor, salt: Tensor | int) -> Tensor:
+    """``(N,)`` float32 in ``[0, 1)``. ``key (2, N)`` int32 holds the pixel's seed and the sample's index."""
+    return to_unit(reverse_bits(scramble(key[1], mix(key[0] ^ salt))))
+
+
+def draw_2d(key: Tensor, salt: Tensor | int) -> Tensor:
+    """``(2, N)`` float32 in ``[0, 1)``."""
+    seed = mix(key[0] ^ salt)
+    index = reverse_bits(scramble(reverse_bits(key[1]), seed))
+    x = scramble(index, mix(seed ^ _X))
+    y = scramble(second_dimension(index), mix(seed ^ _Y))
+    return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))

@@ -1,0 +1,248 @@
+"""From parts and parameters to a :class:`~torchpt.records.World`: one differentiable function of the parameters.
+
+Whatever the scene does not hold is left out here: no smooth normals, no lights, no spheres, no second BSDF, then no tensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.math.distributions import Discrete
+from torchpt.math.vectors import cross, dot, luminance, normalize
+from torchpt.records import KINDS, Geometry, Lights, World
+from torchpt.scene.parts import Part
+from torchpt.shapes.normals import smooth_normals
+
+__all__ = ["Corners", "assemble", "corners_of"]
+
+
+@dataclass(frozen=True)
+class Corners:
+    """The primitives of one part: ``(3, P)`` each, see :class:`~torchpt.records.Geometry`; normals at corners or None."""
+
+    p0: Tensor
+    p1: Tensor
+    p2: Tensor
+    normals: tuple[Tensor, Tensor, Tensor] | None
+
+
+def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dtype: torch.dtype) -> Corners:
+    """Place a part in the world, moved by ``-centre (3,)`` (float64)."""
+    # The move is folded into the pose in float64, before anything is rounded to the lanes' dtype.
+    pose = parameters[f"{part.name}.to_world"].double()
+    linear, move = pose[:3, :3], pose[:3, 3:4] - centre[:, None]
+    if part.kind == "sphere":
+        radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)
+        zero = torch.zeros_like(radius)
+        return Corners(
+            *(x.to(dtype) for x in (move, torch.stack((radius, zero, zero))[:, None], torch.zeros_like(move))), None
+        )
+    if part.kind == "rectangle":  # Mitsuba's unit shape [-1, 1]^2 from its lower corner
+        x, y = 2.0 * linear[:, 0:1], 2.0 * linear[:, 1:2]
+        p0 = move - 0.5 * (x + y)
+        return Corners(*(p.to(dtype) for p in (p0, p0 + x, p0 + y)), None)
+    if part.kind == "disk":
+        return Corners(*(p.to(dtype) for p in (move, move + linear[:, 0:1], move + linear[:, 1:2])), None)
+    vertices = linear @ parameters[f"{part.name}.vertices"].T.double() + move
+    device = vertices.device
+    assert part.faces is not None
+    faces = torch.from_numpy(part.faces).to(device)
+    if bool(torch.linalg.det(linear.detach()) < 0):
+        faces = faces[:, [0, 2, 1]]  # a mirrored mesh keeps its outside
+    vertices = vertices.to(dtype)
+    p0, p1, p2 = (vertices.index_select(1, faces[:, k]) for k in range(3))
+    if not part.smooth:
+        return Corners(p0, p1, p2, None)
+    if part.normals is None:
+        normals = smooth_normals(vertices, faces)
+    else:
+        own = torch.from_numpy(part.normals).to(device)
+        normals = normalize(torch.linalg.inv(linear).T @ own.T).to(dtype)
+    flat = normalize(cross(p1 - p0, p2 - p0))
+    n0, n1, n2 = (normals.index_select(1, faces[:, k]) for k in range(3))
+    # A corner without a normal takes its face's.
+    n0, n1, n2 = (torch.where(dot(n, n) > 0, n, flat) for n in (n0, n1, n2))
+    return Corners(p0, p1, p2, (n0, n1, n2))
+
+
+def assemble(
+    parts: Sequence[Part],
+    parameters: Mapping[str, Tensor],
+    environment: Tensor | None,
+    centre: Tensor,
+    dtype: torch.dtype,
+) -> tuple[World, Geometry]:
+    """The world of ``parts`` under ``parameters``, and what the search sees of it.
+
+    Args:
+        parts: ordered by kind as ``records.KINDS``.
+        parameters: every tensor by dotted name.
+        environment: radiance ``(3,)`` of a constant environment, or None.
+        centre: ``(3,)`` float64 that becomes the origin.
+        dtype: of the lanes.
+    """
+    device = centre.device
+    corners = [corners_of(part, parameters, centre, dtype) for part in parts]
+    sizes = [c.p0.shape[1] for c in corners]
+    counts = tuple(sum(n for n, part in zip(sizes, parts, strict=True) if part.kind == kind) for kind in KINDS)
+
+    def joined(pieces: list[Tensor]) -> Tensor:
+        return torch.cat(pieces, -1) if pieces else torch.zeros(3, 0, dtype=dtype, device=device)
+
+    def spread(values: list[int]) -> Tensor:
+        return torch.repeat_interleave(
+            torch.tensor(values, dtype=torch.int64, device=device),
+            torch.tensor(sizes, dtype=torch.int64, device=device),
+        )
+
+    ball = counts[3] > 0
+    first_sphere = sum(counts[:3])
+    p0, p1, p2 = (joined([getattr(c, name) for c in corners]) for name in ("p0", "p1", "p2"))
+    planar = (torch.arange(p0.shape[1], device=device) < first_sphere) if ball else None
+    e1 = p1 - p0 if planar is None else torch.where(planar, p1 - p0, p1)
+    e2 = p2 - p0 if planar is None else torch.where(planar, p2 - p0, p2)
+    sign = torch.where(spread([int(part.flip) for part in parts]) > 0, -1.0, 1.0).to(dtype)
+    face = cross(e1, e2)
+    normal = normalize(face) * sign
+    normals = None
+    if any(c.normals is not None for c in corners):
+        flat = normal.split(sizes, 1)
+        triples = [c.normals or (n, n, n) for c, n in zip(corners, flat, strict=True)]
+        flips = [-1.0 if part.flip and c.normals is not None else 1.0 for part, c in zip(parts, corners, strict=True)]
+        n0, n1, n2 = (joined([t[k] * f for t, f in zip(triples, flips, strict=True)]) for k in range(3))
+        normals = (n0, n1, n2)
+        # The outside is where the shading normals point, whatever way a file winds its faces.
+        against = dot(normal, n0 + n1 + n2).detach() < 0
+        normal = torch.where(against, -normal, normal)
+    bound = dot(normal.detach().abs(), _largest(p0, e1, e2).detach())
+    if planar is not None:
+        bound = torch.where(planar, bound, (p0.abs().sum(0) + 2.0 * e1[0].abs()).detach())
+
+    models, rows, stacked = _materials(parts, parameters, dtype, device)
+    emissive = spread([int(part.emission is None) for part in parts])  # 0 where it emits
+    keys = emissive * len(models) + spread([models.index(part.material.model) for part in parts])
+    key = torch.cat((torch.full((1,), 2 * len(models), device=device), keys)).to(torch.uint8)
+    lights = _lights(parts, sizes, parameters, environment, p0, e1, e2, normal, bound, sign, face, emissive, dtype)
+    # The search gets the corners themselves: rebuilt from edges, neighbours would no longer share them to the bit.
+    search = (x.detach().to(torch.float32).contiguous() for x in (p0, p1, p2))
+    size = (counts[0], counts[1], counts[2], counts[3])
+    world = World(
+        counts=size,
+        p0=p0,
+        e1=e1,
+        e2=e2,
+        normal=normal,
+        bound=bound,
+        flip=sign if ball else None,
+        normals=normals,
+        material=spread(rows),
+        key=key,
+        models=models,
+        bsdfs=stacked,
+        object_id=spread([part.object_id for part in parts]),
+        lights=lights,
+    )
+    return world, Geometry(*search, size)
+
+
+def _largest(p0: Tensor, e1: Tensor, e2: Tensor) -> Tensor:
+    """Largest coordinate magnitudes over each primitive, its whole parallelogram or ellipse included."""
+    return p0.abs() + e1.abs() + e2.abs()
+
+
+def _materials(
+    parts: Sequence[Part], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
+) -> tuple[tuple[str, ...], list[int], tuple[dict[str, Tensor | None], ...]]:
+    """Models present, the row of each part in its model, and the stacked parameters."""
+    models = tuple(dict.fromkeys(part.material.model for part in parts)) or ("diffuse",)
+    rows: list[int] = []
+    slots: dict[str, dict[str, int]] = {model: {} for model in models}
+    used = {}
+    for part in parts:
+        names = slots[part.material.model]
+        rows.append(names.setdefault(part.material.name, len(names)))
+        used[part.material.name] = part.material
+    stacked = []
+    for model in models:
+        names = list(slots[model])
+        table: dict[str, Tensor | None] = {}
+        for key in used[names[0]].values if names else ():
+            table[key] = torch.stack([parameters[f"{name}.{key}"].to(dtype) for name in names], -1)
+        both = [used[name].two_sided for name in names]
+        table["two_sided"] = None if all(both) else torch.tensor(both, device=device)
+        stacked.append(table)
+    return models, rows, tuple(stacked)
+
+
+def _lights(
+    parts: Sequence[Part],
+    sizes: list[int],
+    parameters: Mapping[str, Tensor],
+    environment: Tensor | None,
+    p0: Tensor,
+    e1: Tensor,
+    e2: Tensor,
+    normal: Tensor,
+    bound: Tensor,
+    sign: Tensor,
+    face: Tensor,
+    emissive: Tensor,
+    dtype: torch.dtype,
+) -> Lights | None:
+    rows = (emissive == 0).nonzero().squeeze(1)
+    if not len(rows) and environment is None:
+        return None
+    device = p0.device
+    glowing = [(part, n) for part, n in zip(parts, sizes, strict=True) if part.emission is not None]
+    kinds = tuple(kind for kind in KINDS if any(part.kind == kind and n for part, n in glowing))
+    scale = {"triangle": 0.5, "rectangle": 1.0, "disk": math.pi, "sphere": 0.0}
+    counts = torch.tensor([n for _, n in glowing], dtype=torch.int64, device=device)
+    of_kind = torch.tensor([KINDS.index(part.kind) for part, _ in glowing], dtype=torch.int64, device=device)
+    of_kind = torch.repeat_interleave(of_kind, counts)
+    share = torch.tensor([scale[kind] for kind in KINDS], dtype=dtype, device=device)[of_kind]
+    raw = face.index_select(1, rows)
+    area = dot(raw, raw).clamp_min(torch.finfo(dtype).tiny).sqrt() * share
+    q0, q1, q2, qn = (x.index_select(1, rows) for x in (p0, e1, e2, normal))
+    area = torch.where(of_kind == KINDS.index("sphere"), (4.0 * math.pi) * q1[0] * q1[0], area)
+    radiance = [parameters[part.emission_name].to(dtype)[:, None].expand(3, n) for part, n in glowing]
+    radiance = torch.cat(radiance, 1) if radiance else torch.zeros(3, 0, dtype=dtype, device=device)
+    power = (luminance(radiance.detach().double()) * area.detach().double()) * math.pi
+    kind = torch.tensor([kinds.index(k) if k in kinds else 0 for k in KINDS], device=device)[of_kind]
+    extra = [bound.index_select(0, rows), sign.index_select(0, rows)]
+    if environment is not None:
+        # A row of its own, whose surface is never read; its flux through the sphere about the scene, 4 pi^2 R^2 L.
+        low, high = (p0 - e1.abs() - e2.abs()).double(), (p0 + e1.abs() + e2.abs()).double()
+        reach = (high.amax(1) - low.amin(1)).norm() * 0.5 if p0.shape[1] else torch.ones((), device=device)
+        flux = 4.0 * math.pi**2 * reach.detach() ** 2 * luminance(environment.detach().double())
+        power = torch.cat((power, flux.reshape(1)))
+        kinds = (*kinds, "constant")
+        kind = torch.cat((kind, torch.tensor([len(kinds) - 1], device=device)))
+        blank = torch.zeros(3, 1, dtype=dtype, device=device)
+        q0, q1, q2, qn = (torch.cat((x, blank), 1) for x in (q0, q1, q2, qn))
+        area, *extra = (torch.cat((x, torch.ones(1, dtype=dtype, device=device))) for x in (area, *extra))
+        radiance = torch.cat((radiance, environment.to(dtype)[:, None]), 1)
+    index = None
+    if len(rows):
+        index = torch.full((len(emissive),), -1, dtype=torch.int64, device=device)
+        index[rows] = torch.arange(len(rows), device=device)
+    many = len(area) > 1
+    return Lights(
+        choice=Discrete.of(power, dtype) if many else None,
+        kinds=kinds,
+        kind=kind if many else None,
+        p0=q0,
+        e1=q1,
+        e2=q2,
+        normal=qn,
+        flip=extra[1],
+        area=area,
+        bound=extra[0],
+        radiance=radiance,
+        environment=None if environment is None else environment.to(dtype),
+        row_of_prim=index,
+    )

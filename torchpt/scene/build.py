@@ -1,0 +1,197 @@
+"""From a description to parts and parameters: files are read, names resolved, what cannot be hit is dropped and counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchpt.errors import AssetError, SceneError
+from torchpt.math.transforms import similarity_scale
+from torchpt.records import KINDS
+from torchpt.scene.description import Description
+from torchpt.scene.loaders import MeshPart, load_mesh, unit_cube
+from torchpt.scene.parts import MaterialSlot, Part
+from torchpt.scene.schema import Cube, Diffuse, Disk, Material, Mesh, Rectangle, Shape, Sphere
+
+__all__ = ["Built", "build_parts"]
+
+#: A scene is moved to the origin where it lies further away than this many times its own size.
+RECENTRE = 8.0
+_GREY = (0.5, 0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class Built:
+    """Parts in the order of ``records.KINDS``, their parameters, and where the origin is put.
+
+    Attributes:
+        parts: what can be hit.
+        parameters: arrays by dotted name, float64.
+        centre: ``(3,)`` float64, subtracted from all positions.
+        environment: dotted name of the constant environment's radiance, or None.
+    """
+
+    parts: tuple[Part, ...]
+    parameters: dict[str, np.ndarray]
+    centre: np.ndarray
+    environment: str | None
+
+
+def build_parts(description: Description) -> Built:
+    """Resolve a description.
+
+    Raises:
+        SceneError: more than one environment, or a shape that cannot be placed.
+        AssetError: a mesh file that is missing or malformed.
+    """
+    parameters: dict[str, np.ndarray] = {}
+    parts: list[Part] = []
+    for number, (name, shape) in enumerate(description.shapes.items(), 1):
+        parts += _shape_parts(description, name, shape, number, parameters)
+    for name, material in description.materials.items():
+        for slot in (_slot(f"materials.{name}", material),):
+            parameters.update({f"{slot.name}.{key}": np.asarray(value, np.float64) for key, value in slot.values.items()})
+    if len(description.lights) > 1:
+        first, second = list(description.lights)[:2]
+        raise SceneError(f"lights.{second}", "constant", f"one environment only ({first} is one)", description.file)
+    environment = None
+    for name, light in description.lights.items():
+        environment = f"lights.{name}.radiance"
+        parameters[environment] = np.asarray(light.radiance, np.float64)
+    parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
+    parameters["camera.fov"] = np.asarray(description.camera.fov, np.float64)
+    parts.sort(key=lambda part: KINDS.index(part.kind))
+    return Built(tuple(parts), parameters, _centre(parts, parameters), environment)
+
+
+def _slot(prefix: str, material: Material) -> MaterialSlot:
+    assert isinstance(material, Diffuse)
+    return MaterialSlot("diffuse", prefix, {"reflectance": material.reflectance}, material.two_sided)
+
+
+def _shape_parts(
+    description: Description, name: str, shape: Shape, number: int, parameters: dict[str, np.ndarray]
+) -> list[Part]:
+    prefix = f"shapes.{name}"
+    pose = shape.to_world()
+    if not isinstance(shape, Mesh | Cube):
+        kind = {Sphere: "sphere", Rectangle: "rectangle", Disk: "disk"}[type(shape)]
+        if isinstance(shape, Sphere):
+            pose = pose @ np.array(
+                [[shape.radius, 0, 0, shape.center[0]], [0, shape.radius, 0, shape.center[1]],
+                 [0, 0, shape.radius, shape.center[2]], [0, 0, 0, 1]]
+            )  # fmt: skip
+            if similarity_scale(pose) is None:
+                raise SceneError(f"{prefix}.transform", pose.tolist(), "a transform of uniform scale", description.file)
+        parameters[f"{prefix}.to_world"] = pose
+        return [_part(description, shape, prefix, name, number, kind, pose, None, parameters)]
+    if isinstance(shape, Cube):
+        pieces, source, flat = [unit_cube()], "", True
+    elif shape.path is None:
+        assert shape.vertices is not None and shape.faces is not None
+        piece = MeshPart("", shape.vertices, shape.faces, shape.normals, shape.uvs, None)
+        pieces, source, flat = [piece], "", shape.face_normals
+    else:
+        path = description.resolve(shape.path, f"{prefix}.path")
+        pieces, source, flat = load_mesh(path), str(path), shape.face_normals
+    labels = _labels([piece.name for piece in pieces])
+    parts = []
+    for piece, label in zip(pieces, labels, strict=True):
+        stem = prefix if len(pieces) == 1 else f"{prefix}.{label}"
+        parameters[f"{stem}.vertices"] = np.asarray(piece.vertices, np.float64)
+        parameters[f"{stem}.to_world"] = pose
+        part = _part(description, shape, stem, name, number, "triangle", pose, piece, parameters, flat=flat, source=source)
+        parts.append(part)
+    if all(len(part.faces) == 0 for part in parts if part.faces is not None):
+        problem = "every face is degenerate (without area)"
+        if source:
+            raise AssetError(source, f"{problem}, named by {prefix}.path")
+        raise SceneError(f"{prefix}.faces", "no face with area", "a face with area", description.file)
+    return parts
+
+
+def _labels(names: list[str]) -> list[str]:
+    """Distinct labels without dots for the pieces of a mesh."""
+    labels: list[str] = []
+    for number, name in enumerate(names):
+        label = name.replace(".", "_") or f"part{number}"
+        labels.append(label if label not in labels else f"{label}_{number}")
+    return labels
+
+
+def _part(
+    description: Description,
+    shape: Shape,
+    prefix: str,
+    name: str,
+    number: int,
+    kind: str,
+    pose: np.ndarray,
+    piece: MeshPart | None,
+    parameters: dict[str, np.ndarray],
+    *,
+    flat: bool = True,
+    source: str = "",
+) -> Part:
+    own = piece.material if piece is not None else None
+    if isinstance(shape.material, str):
+        slot = _slot(f"materials.{shape.material}", description.materials[shape.material])
+    elif shape.material is not None:
+        slot = _slot(f"{prefix}.material", shape.material)
+    else:
+        colour = own.reflectance if own is not None and own.reflectance is not None else _GREY
+        slot = MaterialSlot("diffuse", f"{prefix}.material", {"reflectance": tuple(colour)}, True)
+    for key, value in slot.values.items():
+        parameters[f"{slot.name}.{key}"] = np.asarray(value, np.float64)
+    emission = shape.emission
+    if emission is None and shape.material is None and own is not None and own.emission is not None and any(own.emission):
+        emission = tuple(own.emission)
+    if emission is not None and not any(emission):
+        emission = None
+    emission_name = f"shapes.{name}.emission" if shape.emission is not None else f"{prefix}.emission"
+    if emission is not None:
+        parameters[emission_name] = np.asarray(emission, np.float64)
+    faces, dropped = _solid(piece, pose) if piece is not None else (None, 0)
+    return Part(
+        name=prefix,
+        shape=name,
+        object_id=number,
+        kind=kind,
+        material=slot,
+        emission=emission,
+        emission_name=emission_name if emission is not None else "",
+        flip=shape.flip_normals,
+        to_world=pose,
+        vertices=None if piece is None else piece.vertices,
+        faces=faces,
+        normals=None if piece is None or flat else piece.normals,
+        smooth=not flat,
+        dropped=dropped,
+        source=source,
+        ignored=tuple(own.ignored) if own is not None else (),
+    )
+
+
+def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
+    """Faces that have an area once they are float32 numbers, and how many do not."""
+    corners = (piece.vertices @ pose[:3, :3].T)[piece.faces]
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    # Relative to the longest edge, so that neither tiny nor huge meshes are mistaken for degenerate ones.
+    longest = np.maximum(np.abs(e1).max(1), np.abs(e2).max(1))
+    safe = np.where(longest > 0, longest, 1.0)[:, None]
+    solid = (longest > 0) & (np.linalg.norm(np.cross(e1 / safe, e2 / safe), axis=1) > 1e-12)
+    return np.ascontiguousarray(piece.faces[solid]), int((~solid).sum())
+
+
+def _centre(parts: list[Part], parameters: dict[str, np.ndarray]) -> np.ndarray:
+    """Where the origin goes: the middle of a scene that lies far off, else where it is."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for part in parts:
+        points = part.vertices if part.vertices is not None else np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        world = points @ part.to_world[:3, :3].T + part.to_world[:3, 3]
+        low, high = np.minimum(low, world.min(0)), np.maximum(high, world.max(0))
+    if not parts:
+        return np.zeros(3)
+    middle = 0.5 * (low + high)
+    return middle if np.abs(middle).max() > RECENTRE * (high - low).max() else np.zeros(3)

@@ -1,0 +1,157 @@
+"""A loaded scene: its parameters as tensors, and the worlds and search structures made of them on demand."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt import accel as search
+from torchpt.accel import Accel
+from torchpt.cameras import Perspective
+from torchpt.errors import RenderError, SceneError
+from torchpt.records import Geometry, World
+from torchpt.scene.assemble import assemble
+from torchpt.scene.build import Built, build_parts
+from torchpt.scene.description import Description, read_description
+from torchpt.scene.info import describe
+from torchpt.scene.settings import Film, Settings
+
+__all__ = ["Scene", "device_of", "load"]
+
+
+def load(source: str | os.PathLike[str] | Mapping[str, Any], device: str | torch.device = "auto") -> Scene:
+    """Load a scene.
+
+    Args:
+        source: the name of a scene that ships, a path ending in ``.yaml``, or a dict of the same schema.
+        device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``.
+
+    Raises:
+        SceneError: the description is wrong; says where and what is accepted.
+        AssetError: a file that it names is missing or malformed.
+        RenderError: the device is not there.
+    """
+    return Scene(read_description(source), device_of(device))
+
+
+def device_of(name: str | torch.device) -> torch.device:
+    """The device for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
+    if isinstance(name, torch.device):
+        return name
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device(name)
+    if device.type == "cuda" and (not torch.cuda.is_available() or (device.index or 0) >= torch.cuda.device_count()):
+        found = f"{torch.cuda.device_count()} CUDA devices" if torch.cuda.is_available() else "no CUDA device"
+        raise RenderError(f"render.device: {name} is not available; this machine has {found}")
+    return device
+
+
+class Scene:
+    """A scene on one device.
+
+    Attributes:
+        description: what was read.
+        device: where its tensors live.
+        params: every tensor by dotted name (``materials.*``, ``shapes.*``, ``lights.*``, ``camera.*``): colours ``(3,)``,
+            vertices ``(V, 3)`` in the mesh's own space, poses ``(4, 4)``. Changing one in place takes effect at the
+            next render; to differentiate, hand replacements to ``torchpt.render(scene, params=...)``.
+    """
+
+    def __init__(self, description: Description, device: torch.device) -> None:
+        self.description, self.device = description, device
+        self._built: Built = build_parts(description)
+        # Geometry far from the origin would lose its detail in float32 before it can be moved there.
+        far = bool(self._built.centre.any())
+        self.params: dict[str, Tensor] = {
+            name: torch.from_numpy(value.copy()).to(
+                device, torch.float64 if far and name.endswith((".vertices", ".to_world")) else torch.float32
+            )
+            for name, value in self._built.parameters.items()
+        }
+        self._centre = torch.from_numpy(self._built.centre).to(device)
+        self._lock = threading.Lock()
+        self._worlds: dict[torch.dtype, tuple[World, Geometry]] = {}
+        self._accels: dict[tuple[str, int | None], Accel] = {}
+        self._state: tuple[Any, ...] = ()
+
+    @property
+    def parts(self) -> Built:
+        """The resolved parts, static."""
+        return self._built
+
+    @property
+    def centre(self) -> Tensor:
+        """``(3,)`` float64: where the lanes' origin lies in the scene's own coordinates."""
+        return self._centre
+
+    def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
+        """All parameters, those of ``params`` in place of the scene's.
+
+        Raises:
+            SceneError: an unknown name, or a tensor of another shape.
+        """
+        merged = dict(self.params)
+        for name, value in (params or {}).items():
+            if name not in merged:
+                close = difflib.get_close_matches(name, merged, 3) or list(merged)[:8]
+                raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {', '.join(close)}")
+            if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != merged[name].shape:
+                found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
+                raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(merged[name].shape)}")
+            merged[name] = value.to(self.device)
+        return merged
+
+    def world(self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None) -> tuple[World, Geometry]:
+        """The tensors that lanes gather from, and what the search sees; made once for the scene's own parameters."""
+        if params:
+            return self._assemble(self.merged(params), dtype)
+        with self._lock:
+            self._refresh()
+            if dtype not in self._worlds:
+                with torch.no_grad():
+                    self._worlds[dtype] = self._assemble(self.params, dtype)
+            return self._worlds[dtype]
+
+    def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
+        """A search structure: built for ``geometry``, or kept for the scene's own."""
+        if geometry is not None:
+            return search.build(geometry, kind, threads)
+        _, own = self.world(torch.float32)
+        with self._lock:
+            if (kind, threads) not in self._accels:
+                self._accels[kind, threads] = search.build(own, kind, threads)
+            return self._accels[kind, threads]
+
+    def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Perspective:
+        """The camera on a film of a given size, in the lanes' coordinates."""
+        pose = params["camera.to_world"].double()
+        shift = torch.zeros(4, 4, dtype=torch.float64, device=self.device)
+        shift[:3, 3] = self._centre
+        return Perspective(
+            (pose - shift).to(dtype), params["camera.fov"].to(dtype), self.description.camera.fov_axis, film.width, film.height
+        )
+
+    def info(self, settings: Settings) -> dict[str, Any]:
+        """What the scene holds, what was built for it and what was left out."""
+        world, _ = self.world(torch.float32)
+        threads = None if settings.render.threads == "auto" else int(settings.render.threads)
+        return describe(self.description, self._built, world, self.accel(settings.render.accel, threads), settings)
+
+    def _assemble(self, params: Mapping[str, Tensor], dtype: torch.dtype) -> tuple[World, Geometry]:
+        environment = params[self._built.environment] if self._built.environment else None
+        return assemble(self._built.parts, params, environment, self._centre, dtype)
+
+    def _refresh(self) -> None:
+        """Forget what was made of parameters that have since been replaced or changed in place."""
+        state = tuple((name, id(value), value._version) for name, value in self.params.items())
+        if state != self._state:
+            self._state = state
+            self._worlds.clear()
+            self._accels.clear()
