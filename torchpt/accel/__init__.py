@@ -1,0 +1,66 @@
+"""Search structures: which primitive does a ray hit first, and does it hit anything.
+
+One contract (:class:`~torchpt.accel.base.Accel`), three backends:
+
+- ``brute`` (numba, CPU): every ray against every primitive in packets; for a few dozen primitives.
+- ``numba`` (CPU): a wide tree built by the surface area heuristic.
+- ``torch`` (any device, the reference): a linear BVH built and traversed by tensor operations.
+
+Nothing here imports numba until a numba backend is built.
+"""
+
+from __future__ import annotations
+
+from torchpt.accel.base import Accel, Hits
+from torchpt.errors import SceneError
+from torchpt.records import Geometry
+
+__all__ = ["BRUTE_LIMIT", "KINDS", "Accel", "Hits", "build"]
+
+#: What ``kind`` accepts.
+KINDS = ("auto", "torch", "numba", "brute")
+#: Up to this many primitives ``auto`` takes the packet search on a CPU (measured crossover, scripts/bench_accel.py).
+BRUTE_LIMIT = 64
+
+
+def build(geometry: Geometry, kind: str = "auto", threads: int | None = None) -> Accel:
+    """Builds a search structure.
+
+    Args:
+        geometry: the primitives, on the device where rays will live.
+        kind: ``auto``, ``torch``, ``numba`` or ``brute``.
+        threads: CPU threads of the numba backends; ``None`` is torch's own number. Results do not depend on it.
+
+    Returns:
+        The structure. ``auto`` gives ``torch`` on an accelerator; on a CPU ``brute`` for few primitives of like scale,
+        else ``numba``.
+
+    Raises:
+        SceneError: an unknown kind, or one that cannot serve this geometry.
+    """
+    if kind not in KINDS:
+        raise SceneError("render.accel", kind, " | ".join(KINDS))
+    on_cpu = geometry.p0.device.type == "cpu"
+    if kind == "auto":
+        kind = _choose(geometry) if on_cpu else "torch"
+    if kind == "torch":
+        from torchpt.accel.lbvh import Lbvh
+
+        return Lbvh(geometry)
+    if not on_cpu:
+        raise SceneError("render.accel", kind, f"torch (this scene is on {geometry.p0.device.type})")
+    if kind == "brute":
+        from torchpt.accel.brute import Brute
+
+        return Brute(geometry, threads)
+    from torchpt.accel.wide import Wide
+
+    return Wide(geometry, threads)
+
+
+def _choose(geometry: Geometry) -> str:
+    if geometry.size > BRUTE_LIMIT:
+        return "numba"
+    from torchpt.accel.brute import eligible
+
+    return "brute" if eligible(geometry) else "numba"

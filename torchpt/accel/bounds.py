@@ -1,0 +1,37 @@
+"""Axis-aligned boxes of primitives."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpt.records import Geometry
+
+__all__ = ["primitive_bounds", "surface"]
+
+
+def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
+    """Boxes of all primitives, rounded outward: ``low, high``, each ``(3, P)`` float32.
+
+    A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse reaches ``sqrt(e1^2 + e2^2)`` from its centre on each axis.
+    """
+    p0, p1, p2 = geometry.p0.double(), geometry.p1.double(), geometry.p2.double()
+    n_tri, n_rect, n_disk, _ = geometry.counts
+    low, high = torch.minimum(torch.minimum(p0, p1), p2), torch.maximum(torch.maximum(p0, p1), p2)
+    a, b, c = n_tri, n_tri + n_rect, n_tri + n_rect + n_disk
+    # the float32 sum is the corner that the searches see
+    fourth = ((geometry.p1 + geometry.p2) - geometry.p0)[:, a:b].double()
+    low[:, a:b], high[:, a:b] = torch.minimum(low[:, a:b], fourth), torch.maximum(high[:, a:b], fourth)
+    reach = ((p1 - p0)[:, b:c].square() + (p2 - p0)[:, b:c].square()).sqrt()
+    reach = torch.cat([reach, p1[:1, c:].abs().expand(3, -1)], 1)
+    low[:, b:], high[:, b:] = p0[:, b:] - reach, p0[:, b:] + reach
+    down, up = low.float(), high.float()
+    down = torch.where(down.double() > low, torch.nextafter(down, torch.full_like(down, -torch.inf)), down)
+    up = torch.where(up.double() < high, torch.nextafter(up, torch.full_like(up, torch.inf)), up)
+    return down.contiguous(), up.contiguous()
+
+
+def surface(low: Tensor, high: Tensor) -> Tensor:
+    """Half the surface area of boxes ``(3, N)``."""
+    x, y, z = (high - low).unbind(0)
+    return x * y + y * z + z * x

@@ -1,0 +1,119 @@
+"""How numba kernels are compiled and how they are run on several threads.
+
+Importing this module imports numba; only the numba backends do so.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from typing import Any
+
+import numba
+import torch
+
+__all__ = ["jit", "launch", "parallel_allowed", "thread_count"]
+
+_lock = threading.Lock()
+_state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "pools": {}}
+
+
+def _after_fork() -> None:
+    """A child starts without its parent's OpenMP team, lock and pool threads."""
+    global _lock
+    _lock = threading.Lock()
+    _state.update(forked=True, parallel=False, pools={})
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def jit(**options: Any) -> Callable[[Callable], Any]:
+    """``numba.njit`` with the house's options, cached on disk where a folder can be written.
+
+    ``error_model="numpy"`` is not a choice: Python's check for division by zero keeps LLVM from using vectors.
+    """
+    settings: dict[str, Any] = {"error_model": "numpy", "nogil": True, **options}
+
+    def wrap(function: Callable) -> Any:
+        try:
+            return numba.njit(cache=True, **settings)(function)
+        except (RuntimeError, OSError):  # numba: "no locator available", no folder for its cache
+            return numba.njit(**settings)(function)
+
+    return wrap
+
+
+def thread_count(threads: int | None) -> int:
+    """Threads to use: the caller's wish, else torch's own number."""
+    return max(1, int(threads)) if threads else max(1, torch.get_num_threads())
+
+
+def _probe() -> bool:
+    """Whether numba's threading layer lets several Python threads call parallel kernels (starts the layer)."""
+    if numba.config.THREADING_LAYER == "workqueue" or numba.config.NUMBA_NUM_THREADS < 2:
+        return False
+    try:
+        from numba.np.ufunc.parallel import _launch_threads
+
+        _launch_threads()
+        return numba.threading_layer() in ("omp", "tbb")
+    except (ImportError, ValueError, RuntimeError):
+        return False
+
+
+def parallel_allowed() -> bool:
+    """Whether ``prange`` kernels may run here.
+
+    Only in the process that first asked, never after a fork (GNU OpenMP kills forked children that use it), and never
+    under numba's ``workqueue`` layer, which aborts when two Python threads enter it.
+    """
+    if _state["forked"]:
+        return False
+    with _lock:
+        if _state["parallel"] is None:
+            _state.update(owner=os.getpid(), parallel=_probe())
+        return _state["parallel"] and _state["owner"] == os.getpid()
+
+
+def _pool(workers: int) -> ThreadPoolExecutor:
+    with _lock:
+        key = (os.getpid(), workers)
+        if key not in _state["pools"]:
+            _state["pools"][key] = ThreadPoolExecutor(workers, thread_name_prefix="torchpt-accel")
+        return _state["pools"][key]
+
+
+def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, args: tuple) -> None:
+    """Runs a kernel over ``range(items)``.
+
+    Args:
+        serial: compiled ``(first, last, *args)``, releases the GIL.
+        parallel: compiled ``(chunks, items, *args)``: the same body under ``prange``.
+        items: how many blocks of lanes there are.
+        threads: 1 runs strictly in the calling thread.
+        grain: fewest items that repay another thread.
+        args: what both take; results are written into it, each item its own part, so the split does not matter.
+    """
+    threads = min(threads, max(1, items // grain))
+    if threads == 1:
+        serial(0, items, *args)
+    elif parallel_allowed():
+        threads = min(threads, numba.config.NUMBA_NUM_THREADS)
+        before = numba.get_num_threads()
+        numba.set_num_threads(threads)
+        try:
+            parallel(threads, items, *args)
+        finally:
+            numba.set_num_threads(before)
+    else:
+        cuts = [items * k // threads for k in range(threads + 1)]
+        pool = _pool(threads - 1)
+        jobs = [pool.submit(serial, a, b, *args) for a, b in pairwise(cuts[1:])]
+        serial(0, cuts[1], *args)
+        for job in jobs:
+            job.result()
