@@ -111,9 +111,11 @@ def color(low: float = 0.0, high: float = _LARGEST, *, optional: bool = False) -
             return None
         if isinstance(value, Mapping):
             raise _texture(value, expected)
-        rgb = (
-            vector(value, expected) if isinstance(value, list | tuple | np.ndarray) else (number(value, expected),) * 3
-        )
+        if isinstance(value, list | tuple | np.ndarray):
+            rgb = vector(value, expected)
+        else:
+            gray = number(value, expected)
+            rgb = (gray, gray, gray)
         if not all(low <= channel <= high for channel in rgb):
             raise wrong(expected)
         return rgb
@@ -188,6 +190,8 @@ def _rows(columns: int, what: str) -> PlainValidator:
             rows = np.array(value, dtype=np.float64)
         except (OverflowError, TypeError, ValueError, RuntimeError):
             raise wrong(expected) from None
+        if isinstance(value, np.ndarray) and value.dtype.kind not in "iuf":
+            raise wrong(expected, value.dtype)
         if rows.ndim != 2 or rows.shape[1] != columns or not len(rows):
             raise wrong(expected)
         bad = np.flatnonzero(~(np.abs(rows) <= _LARGEST).all(axis=1))
@@ -211,10 +215,15 @@ def _faces(value: Any) -> NDArray[np.int64] | None:
     if value is None:
         return None
     if isinstance(value, list | tuple):
-        for index, row in enumerate(value):
-            if not isinstance(row, list | tuple) or len(row) < 3 or not all(type(x) is int for x in row):
-                raise wrong(expected, row, (index,))
-        triangles = [(row[0], row[i], row[i + 1]) for row in value for i in range(1, len(row) - 1)]
+        lists = bool(value) and set(map(type, value)) <= {list, tuple}
+        if not lists or set(map(type, chain.from_iterable(value))) != {int} or min(map(len, value)) < 3:
+            for index, row in enumerate(value):
+                if not isinstance(row, list | tuple) or len(row) < 3 or not all(type(x) is int for x in row):
+                    raise wrong(expected, row, (index,))
+            raise wrong(expected)
+        triangles: Any = value
+        if max(map(len, value)) > 3:
+            triangles = [(row[0], row[i], row[i + 1]) for row in value for i in range(1, len(row) - 1)]
     else:
         triangles = value
     try:

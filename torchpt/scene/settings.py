@@ -14,8 +14,8 @@ from torchpt.scene.fields import Flag, choice, integer, memory_size, number_fiel
 from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_not_built, select
 
 __all__ = [
-    "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter", "Integrator",
-    "PathIntegrator", "Render", "Sampler", "Settings", "merge",
+    "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter",
+    "Integrator", "PathIntegrator", "Render", "Sampler", "Settings", "merge",
 ]  # fmt: skip
 
 AOVS = ("albedo", "normal", "depth", "position", "uv", "object_id", "variance")
@@ -24,6 +24,10 @@ MAX_SIDE = 65_536
 MAX_PIXELS = 2**28
 
 Positive = Annotated[float, number_field("a number > 0", lambda x: x > 0)]
+Clamp = Annotated[float | None, number_field("null or a number > 0", lambda x: x > 0, optional=True)]
+Survival = Annotated[
+    float | None, number_field("null or a number, 0 < rr_prob <= 1", lambda x: 0 < x <= 1, optional=True)
+]
 
 
 class BoxFilter(Model):
@@ -139,11 +143,9 @@ class PathIntegrator(Model):
     type: Literal["path"] = "path"
     max_depth: Annotated[int, integer(-1, 2**31 - 1)] = 16
     rr_depth: Annotated[int, integer(1, 2**31 - 1)] = 5
-    rr_prob: Annotated[
-        float | None, number_field("null or a number, 0 < rr_prob <= 1", lambda x: 0 < x <= 1, optional=True)
-    ] = None
+    rr_prob: Survival = None
     strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
-    clamp: Annotated[float | None, number_field("null or a number > 0", lambda x: x > 0, optional=True)] = None
+    clamp: Clamp = None
     strict: Flag = False
 
     @model_validator(mode="after")
@@ -158,7 +160,7 @@ class DirectIntegrator(Model):
 
     type: Literal["direct"] = "direct"
     strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
-    clamp: Annotated[float | None, number_field("null or a number > 0", lambda x: x > 0, optional=True)] = None
+    clamp: Clamp = None
     strict: Flag = False
 
 
@@ -296,12 +298,10 @@ def _block(block: str, raw: dict[str, Any]) -> Model:
         if "filter" in raw:
             raw["filter"] = select("filter", FILTERS, raw["filter"], "film.filter", None, "gaussian")
         return construct(Film, raw, block, None, "the film")
-    later = not_built.KEYS["render"]
-    check_keys(
-        {k: v for k, v in raw.items() if k not in later}, Render.model_fields, block, "the render settings", None
-    )
+    later, what = not_built.KEYS["render"], "the render settings"
+    check_keys({k: v for k, v in raw.items() if k not in later}, Render.model_fields, block, what, None)
     rest = refuse_not_built(raw, later, block, ", ".join(Render.model_fields), None)
-    return construct(Render, rest, block, None, "the render settings")
+    return construct(Render, rest, block, None, what)
 
 
 def _useless(raw: Mapping[str, Any], table: Mapping[str, type[Model]], default: str) -> None:

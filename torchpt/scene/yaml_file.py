@@ -25,17 +25,9 @@ _INT = re.compile(r"[-+]?(?:[0-9][0-9_]*|0x[0-9a-fA-F_]+|0o[0-7_]+)\Z")
 _FLOAT = re.compile(r"[-+]?(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?\Z")
 _NON_FINITE = re.compile(r"(?:[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))\Z")
 _WORDS: dict[str, Any] = {"": None, "~": None}
-for _word, _meaning in (
-    ("null", None),
-    ("true", True),
-    ("yes", True),
-    ("on", True),
-    ("false", False),
-    ("no", False),
-    ("off", False),
-):
-    for _form in (_word, _word.capitalize(), _word.upper()):
-        _WORDS[_form] = _meaning
+for _meaning, _words in ((None, ("null",)), (True, ("true", "yes", "on")), (False, ("false", "no", "off"))):
+    for _word in _words:
+        _WORDS.update(dict.fromkeys((_word, _word.capitalize(), _word.upper()), _meaning))
 _CORE_TAGS = {f"tag:yaml.org,2002:{name}" for name in ("str", "int", "float", "bool", "null", "seq", "map")} | {"!"}
 
 
@@ -171,7 +163,7 @@ class _Builder:
             if self.merged > MAX_MERGED:
                 raise self.error(event, "<<", f"merges that copy at most {MAX_MERGED} keys in all")
             for source in reversed(frame.merges):  # the first one listed wins, own keys win over all
-                frame.value = {**source, **frame.value}
+                frame.value = dict(source) | frame.value
         if frame.anchor:
             self.anchors[frame.anchor] = frame.value
         self.add(event, frame.value, None)
