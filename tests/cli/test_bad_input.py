@@ -1,0 +1,94 @@
+"""Bad input: exit code 2, exactly one line on stderr that says what is accepted, nothing on stdout, no file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from torchpt.cli import main
+
+from .conftest import Renderer
+
+S = "scene=s.yaml"
+CASES = [
+    ([], "expected one of the commands render, info"),
+    (["paint"], "paint: expected one of the commands render, info"),
+    (["render"], "scene: expected scene=NAME"),
+    (["render", "cornell_box"], "expected key=value, for example scene=cornell_box"),
+    (["render", "scene=nowhere"], "cornell_box"),
+    (["render", "scene=nowhere.yaml"], "nowhere.yaml"),
+    (["render", "scene="], "scene: expected a name"),
+    (["render", S, "scene=t.yaml"], "scene: given twice"),
+    (["render", S, "film.widht=3"], "film.widht: unknown key; known: film.width, film.height"),
+    (["render", S, "film.filter.foo=3"], "film.filter.type"),
+    (["render", S, "+film.foo=3"], "width, height"),
+    (["render", S, "+foo=3"], "foo: unknown key; known: scene, out, film.*"),
+    (["render", S, "spp=3"], "did you mean render.spp?"),
+    (["render", S, "film.width=abc"], "film.width: expected a whole number"),
+    (["render", S, "film.width="], "film.width: expected a whole number"),
+    (["render", S, "film.width=-1"], "film.width: expected a whole number"),
+    (["render", S, "film.width=1,2"], "film.width: expected one value"),
+    (["render", S, "film.width=f(1)"], "film.width=f(1): expected key=value"),
+    (["render", S, "film.crop=[1"], "film.crop=[1: expected key=value"),
+    (["render", S, "film.width"], "film.width: expected key=value"),
+    (["render", S, "=3"], "=3: expected key=value"),
+    (["render", S, "film.width=${foo}"], "film.width: Interpolation key 'foo' not found"),
+    (["render", S, "film.width=???"], "film.width"),
+    (["render", S, "film=3"], "film: expected the name of a file"),
+    (["render", S, "film="], "film: expected the name of a file"),
+    (["render", S, "film=null"], "film: expected the name of a file"),
+    (["render", S, "integrator=bogus"], "integrator: expected one of aov, default, direct, path, got 'bogus'"),
+    (["render", S, "film=../scene/cornell_box"], "expected the name of a file in configs/film"),
+    (["render", S, "+scene@film=cornell_box"], "expected key=value"),
+    (["render", S, "integrator.type=bogus"], "integrator.type"),
+    (["render", S, "render.device=abacus"], "render.device: expected auto, cpu, cuda"),
+    (["render", S, "~film.foo"], "film.foo"),
+    (["render", S, "hydra.run=3"], "hydra.run"),
+    (["render", S, "hydra/launcher=nowhere"], "hydra/launcher: expected one of basic"),
+    (["render", S, "+film._target_=os.system"], "`_target_`"),
+    (["render", S, "film.filter={_target_: os.system}"], "`_target_`"),
+    (["render", S, "hydra.launcher._target_=os.system"], "`_target_`"),
+    (["render", S, "+hydra.callbacks.x=3"], "callbacks"),
+    (["render", S, "--frobnicate"], "--frobnicate: unknown option; known: --multirun"),
+    (["render", S, "--cfg"], "--cfg: expected one of job, hydra, all"),
+    (["render", S, "--cfg", "job", "-m"], "--multirun: cannot be combined"),
+    (["render", S, "--json"], "--json: only `torchpt info`"),
+    (["render", S, "out=a.bmp"], "a.bmp: cannot write the kind '.bmp'; accepted: .exr .hdr .png"),
+    (["render", S, "out=a"], "needs an ending"),
+    (["render", S, "out=nowhere/a.png"], "there is no folder"),
+    (["render", S, "out=[a.png,nowhere/b.png]"], "there is no folder"),
+    (["render", S, "out=[a.png,a.png]"], "out: a name is given twice"),
+    (["render", S, "out=[a.png,,b.png]"], "out: expected names between commas"),
+    (["render", S, "out=[]"], "out: expected names between commas"),
+    (["render", S, "out=folder.png"], "is a folder"),
+    (["render", S, "render.preview=nowhere/a.png"], "there is no folder"),
+    (["render", S, "render.preview=a.gif"], "accepted: .exr"),
+    (["render", S, "out=a.png", "film.aovs=[albedo]"], "film.aovs: expected a picture ending in .exr"),
+    (["render", "-m", S, "film.widht=1,2"], "film.widht: unknown key"),
+    (["render", "-m", "scene=s.yaml,nowhere.yaml", "render.spp=x"], "render.spp"),
+    (["render", "-m", "scene=s.yaml,,s.yaml"], "scene: expected names between commas"),
+    (["render", "scene=target.yaml"], "_target_"),
+    (["render", "scene=broken.yaml"], "broken.yaml"),
+    (["info", S, "out=a.png"], "out: `torchpt info` writes no picture"),
+    (["info", "scene=nowhere"], "cornell_box"),
+    (["info", S, "film.widht=3"], "film.widht: unknown key"),
+]
+
+
+@pytest.mark.parametrize(("words", "says"), CASES, ids=[" ".join(words) or "nothing" for words, _ in CASES])
+def test_bad_input(
+    folder: Path, renderer: Renderer, capfd: pytest.CaptureFixture[str], words: list[str], says: str
+) -> None:
+    (folder / "target.yaml").write_text("camera: {type: perspective, _target_: os.system}\n")
+    (folder / "broken.yaml").write_text("camera: [\n")
+    (folder / "folder.png").mkdir()
+    before = sorted(os.listdir(folder))
+    assert main(words) == 2
+    captured = capfd.readouterr()
+    assert captured.out == "" and captured.err.endswith("\n")
+    assert len(captured.err.splitlines()) == 1, captured.err
+    assert captured.err.startswith("torchpt: ") and says in captured.err
+    assert "Traceback" not in captured.err
+    assert sorted(os.listdir(folder)) == before and renderer.settings == []

@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchpt.cli import main
+from torchpt.images import read_image, read_layers
+
+from .conftest import SCENE, Renderer
+
+ODD = ["a b (1).exr", "x=[1],{y}.png", "ü ~'\"$.exr", "a,b.png", "[odd].jpg"]
+
+
+def files(folder: Path) -> set[str]:
+    return set(os.listdir(folder)) - {"s.yaml"}
+
+
+def summary(capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def test_the_last_line_is_json(folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", "scene=s.yaml", "out=a.exr"]) == 0
+    captured = capsys.readouterr()
+    facts = json.loads(captured.out.splitlines()[-1])
+    assert facts == {
+        "out": "a.exr",
+        "spp": 4,
+        "seconds": 1.5,
+        "paths_per_second": 2e6,
+        "rays": 77,
+        "nonfinite_samples": 0,
+        "mean": [1.0, 1.0, 1.0],
+        "relmse": None,
+    }
+    assert captured.err == ""  # no progress bar where stderr is no terminal
+    assert files(folder) == {"a.exr"}
+
+
+def test_settings_reach_the_renderer(folder: Path, renderer: Renderer) -> None:
+    words = "film.width=16 film.filter=box integrator.max_depth=3 sampler=independent render.spp=2 render.compile=off"
+    assert main(["render", "scene=s.yaml", *words.split(), "film.aovs=[albedo,depth]", "out=a.exr"]) == 0
+    settings = renderer.settings[0]
+    assert (settings.film.width, settings.film.height) == (16, 6)  # given; the scene's wish
+    assert settings.film.filter.type == "box" and settings.film.aovs == ("albedo", "depth")
+    assert settings.integrator.max_depth == 3 and settings.integrator.clamp == 10
+    assert settings.sampler.type == "independent" and settings.render.spp == 2 and settings.render.compile == "off"
+
+
+def test_an_explicit_null_unsets_the_scenes_wish(folder: Path, renderer: Renderer) -> None:
+    assert main(["render", "scene=s.yaml", "integrator.clamp=null", "render.spp=null", "film.filter.type=box"]) == 0
+    assert renderer.settings[0].integrator.clamp is None and renderer.settings[0].render.spp == 64
+    assert renderer.settings[0].film.filter.type == "box"
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_any_name_of_a_picture(folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    assert main(["render", "scene=s.yaml", f"out={name}"]) == 0
+    assert files(folder) == {name}
+    assert summary(capsys)["out"] == name
+
+
+def test_any_name_of_a_scene(folder: Path, renderer: Renderer) -> None:
+    scene = folder / "d [x]" / "a b=(1),{c}.yaml"
+    scene.parent.mkdir()
+    scene.write_text(SCENE)
+    assert main(["render", f"scene={scene}"]) == 0
+    assert files(folder) == {"d [x]", "a b=(1),{c}.png"}
+
+
+def test_several_pictures_at_once(folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", "scene=s.yaml", "out=[a.exr, b c.png,'d,e.hdr',\"f.ppm\"]"]) == 0
+    assert files(folder) == {"a.exr", "b c.png", "d,e.hdr", "f.ppm"}
+    assert summary(capsys)["out"] == ["a.exr", "b c.png", "d,e.hdr", "f.ppm"]
+
+
+def test_default_names(folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", "scene=s.yaml"]) == 0
+    assert main(["render", "scene=s.yaml", "film.aovs=[albedo]"]) == 0  # layers ask for a format that keeps them
+    assert files(folder) == {"s.png", "s.exr"}
+    assert set(read_layers("s.exr")) == {"image", "albedo"}
+    assert main(["render", "scene=s.yaml", "film.aovs=[albedo]", "out=a.png"]) == 2
+    assert "film.aovs" in capsys.readouterr().err
+
+
+def test_display_settings_reach_the_8_bit_picture(folder: Path, renderer: Renderer) -> None:
+    words = ["film.exposure=-1", "film.gamma=1.0", "film.tonemap=reinhard"]
+    assert main(["render", "scene=s.yaml", "out=[a.png,a.exr]", *words]) == 0
+    assert torch.allclose(read_image("a.png", linear=True), torch.tensor(1 / 3), atol=2e-3)
+    assert torch.equal(read_image("a.exr"), torch.ones(6, 8, 3))
+
+
+def test_preview_shows_albedo_and_normal_first(folder: Path, renderer: Renderer) -> None:
+    seen: list[tuple[set[str], float]] = []
+
+    def look(done: int) -> None:
+        now = files(folder)
+        seen.append((now, read_image("p q=1.exr")[0, 0, 0].item() if "p q=1.exr" in now else 0.0))
+
+    renderer.after_pass = look
+    assert main(["render", "scene=s.yaml", "out=a.exr", "render.preview=p q=1.exr"]) == 0
+    first = {"p q=1.albedo.exr", "p q=1.normal.exr"}
+    assert seen[0] == (first, 0.0)
+    assert [value for _, value in seen[1:]] == [0.25, 0.5, 0.75]
+    assert files(folder) == {*first, "p q=1.exr", "a.exr"}
+    assert read_image("p q=1.normal.exr")[0, 0].tolist() == [0, 0, 1]
+    assert read_image("p q=1.exr")[0, 0, 0] == 1
+
+
+def test_normals_are_shown_in_8_bits(folder: Path, renderer: Renderer) -> None:
+    assert main(["render", "scene=s.yaml", "out=a.exr", "render.preview=p.png"]) == 0
+    shown = read_image("p.normal.png", linear=True)[0, 0]
+    assert torch.allclose(shown, torch.tensor([0.5, 0.5, 1.0]), atol=3e-3)
+
+
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_keeps_the_picture_so_far(
+    folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str], signum: int, code: int
+) -> None:
+    before = signal.getsignal(signum)
+    renderer.after_pass = lambda done: os.kill(os.getpid(), signum) if done == 2 else None
+    assert main(["render", "scene=s.yaml", "out=[a.exr,b.png]", "render.preview=p.exr"]) == code
+    captured = capsys.readouterr()
+    facts = json.loads(captured.out.splitlines()[-1])
+    assert facts["spp"] == 2 and facts["complete"] is False
+    assert len(captured.err.splitlines()) == 1 and "a.exr holds the picture so far" in captured.err
+    for name in ("a.exr", "p.exr"):
+        assert torch.equal(read_image(name), torch.full((6, 8, 3), 0.5))
+    assert signal.getsignal(signum) is before
+
+
+def test_a_signal_before_there_is_a_picture(
+    folder: Path, renderer: Renderer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from torchpt.scene import scene as loading
+
+    monkeypatch.setattr(loading, "device_of", lambda name: os.kill(os.getpid(), signal.SIGTERM))
+    assert main(["render", "scene=s.yaml"]) == 143
+    assert files(folder) == set() and capsys.readouterr() == ("", "")
+
+
+def test_a_failed_write_does_not_cost_the_other_pictures(
+    folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "sub").mkdir()
+    renderer.after_pass = lambda done: (folder / "sub").rmdir() if done == 4 else None
+    assert main(["render", "scene=s.yaml", "out=[sub/a.png,b.png]"]) == 2
+    captured = capsys.readouterr()
+    assert files(folder) == {"b.png"} and len(captured.err.splitlines()) == 1 and "sub/a.png" in captured.err
+
+
+def test_multirun_numbers_the_pictures(folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "t, u.yaml").write_text(SCENE.replace("width: 8", "width: 4"))
+    words = ["scene=s.yaml,'t, u.yaml'", "render.spp=1,2", "out=[a b.exr,c=1.png]", "render.preview=p.exr"]
+    assert main(["render", "-m", *words]) == 0
+    made = {f"{stem}_{n}{end}" for n in range(4) for stem, end in [("a b", ".exr"), ("c=1", ".png"), ("p", ".exr")]}
+    made |= {f"p_{n}.{layer}.exr" for n in range(4) for layer in ("albedo", "normal")}
+    assert files(folder) == made | {"t, u.yaml"}
+    assert [(s.film.width, s.render.spp) for s in renderer.settings] == [(8, 1), (8, 2), (4, 1), (4, 2)]
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["out"][0] for line in lines] == [f"a b_{n}.exr" for n in range(4)]
+
+
+def test_multirun_stops_at_a_signal(folder: Path, renderer: Renderer) -> None:
+    renderer.after_pass = lambda done: os.kill(os.getpid(), signal.SIGINT) if done == 2 else None
+    assert main(["render", "--multirun", "scene=s.yaml", "render.spp=3,5"]) == 130
+    assert files(folder) == {"s_0.png"}
+
+
+def test_multirun_over_groups_without_out(folder: Path, renderer: Renderer) -> None:
+    assert main(["render", "-m", "scene=s.yaml", "sampler=sobol,independent", "integrator=path,direct"]) == 0
+    assert files(folder) == {f"s_{n}.png" for n in range(4)}
+    kinds = [(s.sampler.type, s.integrator.type) for s in renderer.settings]
+    assert kinds == [(s, i) for s in ("sobol", "independent") for i in ("path", "direct")]
+
+
+def test_a_defect_keeps_its_trace(folder: Path, renderer: Renderer) -> None:
+    def broken(done: int) -> None:
+        raise RuntimeError("a defect")
+
+    renderer.after_pass = broken
+    with pytest.raises(RuntimeError, match="a defect"):
+        main(["render", "scene=s.yaml"])
+    assert files(folder) == set()

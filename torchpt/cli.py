@@ -1,0 +1,328 @@
+"""The command line: words to a Hydra composition, to jobs, to an exit code. The only file that imports Hydra.
+
+Hydra composes the *run* settings (groups ``film integrator sampler render``), sweeps over them (``--multirun``), shows
+them (``--cfg job``) and launches the jobs. Scenes and file names stay outside (`torchpt.commands.arguments`). Whatever
+is wrong with the input ends as one line on stderr and exit code 2.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchpt import __version__
+from torchpt.commands.arguments import GROUPS, Arguments, UsageError, parse
+from torchpt.commands.interrupt import Interrupt, Interrupted
+from torchpt.errors import TorchptError
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+__all__ = ["main", "run"]
+
+HELP = """\
+torchpt: a wavefront path tracer that is a PyTorch program
+
+  torchpt render scene=cornell_box render.spp=64 out=cornell.exr    render a picture
+  torchpt info   scene=cornell_box                                  what the scene holds, what was built, what left out
+
+torchpt COMMAND --help says more. Scenes: {scenes}
+"""
+HELP_RENDER = """\
+torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
+
+  scene=   a scene that ships ({scenes}), or a file ending in .yaml
+  out=     .exr .hdr .png .jpg .ppm; several as out=[a.exr,a.png]; NAME.png where nothing is said
+  {keys}
+
+  integrator=NAME, sampler=NAME, ... take a group's file from configs/: integrator=direct sampler=independent
+  --multirun, -m      one render for every combination: sampler=sobol,independent render.spp=16,64 scene=a,b out=x.exr
+                      writes x_0.exr, x_1.exr, ...
+  --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
+
+The last line on stdout is a summary in JSON.
+Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the partial picture saved.
+"""
+HELP_INFO = """\
+torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
+
+  What the scene holds, what was built for it, and what was left out because nothing needs it.
+  scene=   a scene that ships ({scenes}), or a file ending in .yaml
+  {keys}
+"""
+
+
+def run() -> None:
+    """The console script."""
+    sys.exit(main())
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run ``torchpt`` with these words (default: those of the process) and return the exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    if argv[:1] in (["-h"], ["--help"], ["help"]):
+        print(_help(HELP), end="")
+        return 0
+    if argv == ["--version"]:
+        print(f"torchpt {__version__}")
+        return 0
+    with Interrupt() as interrupt:
+        try:
+            arguments = parse(argv)
+            if arguments.help:
+                print(_help(HELP_RENDER if arguments.command == "render" else HELP_INFO), end="")
+                return 0
+            if not arguments.scenes and not arguments.only_shows:
+                raise UsageError(f"scene: expected scene=NAME or scene=FILE.yaml; scenes that ship: {_scenes()}")
+            return _compose_and_run(arguments, interrupt)
+        except TorchptError as error:
+            return _refuse(str(error))
+        except Interrupted as interrupted:
+            return interrupted.exit_code
+        except MemoryError:
+            return _refuse("not enough memory: a smaller film, or render.max_memory, needs less")
+
+
+def _refuse(line: str) -> int:
+    print("torchpt: " + " ".join(line.split("\n")), file=sys.stderr)
+    return 2
+
+
+@dataclass
+class _Task:
+    """What Hydra calls with every composed configuration. Plain data, so that launchers may send it elsewhere."""
+
+    command: str
+    scenes: list[str]
+    outs: list[str]
+    paths: dict[str, str | None]
+    json: bool
+
+    def __call__(self, cfg: DictConfig) -> int:
+        """Do one job. Ends the process (of this job) where it does not end well."""
+        from torchpt.commands.info import info
+        from torchpt.commands.render import render
+
+        with Interrupt() as interrupt:
+            try:
+                job = self._job(cfg)
+                code = info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
+            except TorchptError as error:
+                code = _refuse(str(error))
+            except Interrupted as interrupted:
+                code = interrupted.exit_code
+        if code:
+            raise SystemExit(code)
+        return code
+
+    def _job(self, cfg: DictConfig) -> Any:
+        from hydra.core.hydra_config import HydraConfig
+        from hydra.types import RunMode
+        from omegaconf import OmegaConf
+        from omegaconf.errors import OmegaConfBaseException
+
+        from torchpt.commands.render import Job
+
+        hydra = HydraConfig.get()
+        try:
+            composed = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+        except OmegaConfBaseException as error:
+            raise UsageError(f"{error.full_key or 'settings'}: {_first_line(error)}") from error
+        assert isinstance(composed, dict)
+        scene = self.scenes[composed.pop("scene_number", 0)]
+        overrides = _given(composed, list(hydra.overrides.task))
+        for key, path in self.paths.items():
+            group, _, name = key.partition(".")
+            overrides.setdefault(group, {})[name] = path
+        number = hydra.job.num if hydra.mode == RunMode.MULTIRUN else None
+        return Job(scene, overrides, tuple(self.outs), number)
+
+
+def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, Any]]:
+    """The settings that somebody set: not null, or null by an explicit word of the command line.
+
+    Raises:
+        UsageError: a block that does not exist, or ``_target_`` anywhere.
+    """
+    unset = {word.lstrip("+").removesuffix("=null") for word in words if word.endswith("=null")}
+    _refuse_targets(composed, "")
+    given: dict[str, dict[str, Any]] = {}
+    for group, block in composed.items():
+        if group not in GROUPS:
+            raise UsageError(_unknown(str(group)))
+        if block is None:
+            continue
+        if not isinstance(block, dict):
+            raise UsageError(f"{group}: expected a file of configs/{group} or keys below it, got {block!r}")
+        kept = {key: _pruned(value) for key, value in block.items()}
+        given[group] = {key: value for key, value in kept.items() if value is not None or f"{group}.{key}" in unset}
+    return given
+
+
+def _pruned(value: Any) -> Any:
+    """A nested block without its nulls; None where nothing is left."""
+    if not isinstance(value, dict):
+        return value
+    return {key: item for key, item in value.items() if item is not None} or None
+
+
+def _refuse_targets(value: Any, where: str) -> None:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            if key == "_target_":
+                raise UsageError(f"{where}_target_: no setting names a Python object to call: `_target_` is refused")
+            _refuse_targets(item, f"{where}{key}.")
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            _refuse_targets(item, f"{where}{index}.")
+
+
+def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
+    """Hand over to Hydra; returns the exit code."""
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+
+    _check_grammar(arguments.overrides)
+    task = _Task(arguments.command, arguments.scenes, arguments.outs, arguments.paths, arguments.json)
+    words = [*arguments.options, *arguments.overrides]
+    with tempfile.TemporaryDirectory(prefix="torchpt-sweep-") as folder:
+        if arguments.multirun:  # the sweeper writes a multirun.yaml: not beside the pictures
+            words.append(f"hydra.sweep.dir={_quoted(folder)}")
+        with _hydra_environment(words):
+            try:
+                hydra.main(version_base="1.3", config_path=str(_configs()), config_name="config")(task)()
+            except SystemExit as end:
+                return end.code if isinstance(end.code, int) and end.code != 1 else 2 if end.code else 0
+            except Exception as error:
+                if _came_from_job(error):
+                    raise
+                raise UsageError(_one_line(error)) from error
+            finally:
+                GlobalHydra.instance().clear()
+    interrupt.check()
+    return 0
+
+
+def _check_grammar(words: list[str]) -> None:
+    """Name the word that Hydra cannot read: its own message shows a fragment of it.
+
+    Raises:
+        UsageError: a word that is no ``key=value`` of Hydra's grammar.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser = OverridesParser.create()
+    for word in words:
+        try:
+            parser.parse_override(word)
+        except HydraException as error:
+            reason = next((line for line in str(error).splitlines() if "evaluating" in line), "")
+            reason = reason.partition(": ")[2] or "quote what holds blanks, brackets or commas, as in key='a b'"
+            raise UsageError(f"{word}: expected key=value ({reason})") from error
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+@contextmanager
+def _hydra_environment(words: list[str]) -> Iterator[None]:
+    """Hydra reads ``sys.argv``, and hands its errors over (rather than print them) only under HYDRA_FULL_ERROR."""
+    argv, before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    sys.argv = ["torchpt", *words]
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        sys.argv = argv
+        if before is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = before
+
+
+def _came_from_job(error: BaseException) -> bool:
+    """Whether an error is a defect inside a job, whose trace must not be lost, rather than a word Hydra refused."""
+    trace = error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code is _Task.__call__.__code__:
+            return True
+        trace = trace.tb_next
+    return False
+
+
+def _one_line(error: Exception) -> str:
+    """Hydra's and OmegaConf's errors, shortened to what was given and what is accepted."""
+    text = str(error)
+    if match := re.search(r"Could not override '([^']+)'", text):
+        return _unknown(match[1])
+    if match := re.search(r"Could not (?:find|load) '(.+?)/([^/']+)'", text):
+        group, name = match[1], match[2]
+        options = re.findall(r"^\t([\w-]+)$", text, re.MULTILINE) or _options(group)
+        return f"{group}: expected one of {', '.join(options)}, got {name!r}"
+    if match := re.search(r"Ambiguous value for argument '(\w.*?)=(.*)'", text):
+        return f"{match[1]}: expected one value or a list [..,..], got {match[2]!r} (--multirun sweeps over several)"
+    cause = error.__cause__
+    if cause is not None and str(cause) not in text:
+        text = f"{text.splitlines()[0]}: {cause}"
+    return _first_line(text) if text.strip() else type(error).__name__
+
+
+def _first_line(error: object) -> str:
+    lines = [" ".join(line.split()) for line in str(error).splitlines()]
+    kept = [line for line in lines if line and not line.startswith(("See http", "full_key", "object_type", "^"))]
+    return "; ".join(kept[:3])
+
+
+def _unknown(key: str) -> str:
+    """The line for a key that does not exist."""
+    import difflib
+
+    known = _known_keys()
+    group = key.split(".")[0]
+    if group in known:
+        return f"{key}: unknown key; known: {', '.join(f'{group}.{name}' for name in known[group])}"
+    every = [f"{group}.{name}" for group, names in known.items() for name in names]
+    same = [name for name in every if name.endswith(f".{key}")]
+    near = same or difflib.get_close_matches(key, [*every, *GROUPS, "scene", "out"], 1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    return f"{key}: unknown key; known: scene, out, {', '.join(f'{name}.*' for name in GROUPS)}{hint}"
+
+
+def _known_keys() -> dict[str, list[str]]:
+    """Group to its keys, nested ones dotted, from the files in configs/."""
+    import yaml
+
+    known: dict[str, list[str]] = {}
+    for group in GROUPS:
+        block = yaml.safe_load((_configs() / group / "default.yaml").read_text())
+        nested = {key: value if isinstance(value, dict) else {"": None} for key, value in block.items()}
+        known[group] = [f"{key}.{name}" if name else key for key, names in nested.items() for name in names]
+    return known
+
+
+def _options(group: str) -> list[str]:
+    return sorted(path.stem for path in (_configs() / group).glob("*.yaml"))
+
+
+def _configs() -> Path:
+    from torchpt.paths import configs
+
+    return configs()
+
+
+def _scenes() -> str:
+    return ", ".join(_options("scene"))
+
+
+def _help(text: str) -> str:
+    keys = "\n  ".join(f"{group + '.':12}{' '.join(names)}" for group, names in _known_keys().items())
+    return text.format(scenes=_scenes(), keys=keys)

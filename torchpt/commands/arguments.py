@@ -1,0 +1,174 @@
+"""Take a command line apart: what belongs to torchpt itself, and what is left for Hydra.
+
+File names never enter Hydra's grammar, in which blanks, brackets, commas and ``=`` mean something: ``scene=``, ``out=``
+and the keys of `PATH_KEYS` are taken out here, as they are written.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from torchpt.errors import TorchptError
+
+__all__ = ["COMMANDS", "GROUPS", "Arguments", "UsageError", "parse"]
+
+COMMANDS = ("render", "info")
+GROUPS = ("film", "integrator", "sampler", "render")
+PATH_KEYS = ("render.preview", "render.checkpoint")
+_TAKEN = re.compile(r"\+{0,2}(scene|out|render\.preview|render\.checkpoint)=(.*)\Z", re.DOTALL)
+
+# option -> (its other name, whether a value follows)
+_OPTIONS = {
+    "--multirun": ("-m", False),
+    "--cfg": ("-c", True),
+    "--package": ("-p", True),
+    "--resolve": ("", False),
+    "--json": ("", False),
+    "--help": ("-h", False),
+    "--hydra-help": ("", False),
+}
+_CHOICE = re.compile(r"[A-Za-z_][\w,-]*\Z|\[[\w,-]+\]\Z|\{")
+_CONFIGS = ("job", "hydra", "all")
+
+
+class UsageError(TorchptError):
+    """A command line that cannot be understood."""
+
+
+@dataclass
+class Arguments:
+    """A command line in parts.
+
+    Attributes:
+        command: one of `COMMANDS`.
+        scenes: names or paths; several only with ``multirun``.
+        outs: pictures to write, as given; empty where nothing was said.
+        paths: values of the keys in `PATH_KEYS`.
+        overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``.
+        options: what Hydra gets besides, such as ``--multirun`` or ``--cfg job``.
+        multirun: whether this is a sweep.
+        json: print `info` as JSON.
+        help: print help and stop.
+    """
+
+    command: str
+    scenes: list[str] = field(default_factory=list)
+    outs: list[str] = field(default_factory=list)
+    paths: dict[str, str | None] = field(default_factory=dict)
+    overrides: list[str] = field(default_factory=list)
+    options: list[str] = field(default_factory=list)
+    multirun: bool = False
+    json: bool = False
+    help: bool = False
+
+    @property
+    def only_shows(self) -> bool:
+        """Hydra prints something and no job runs."""
+        return any(option in ("--cfg", "--hydra-help") for option in self.options)
+
+
+def parse(argv: list[str]) -> Arguments:
+    """Take the words after ``torchpt`` apart.
+
+    Raises:
+        UsageError: an unknown command or option, a word that is no ``key=value``, a key that is given twice.
+    """
+    if not argv or argv[0] not in COMMANDS:
+        raise UsageError(f"{argv[0] if argv else 'no command'}: expected one of the commands {', '.join(COMMANDS)}")
+    arguments = Arguments(argv[0])
+    taken: dict[str, str] = {}
+    words = iter(argv[1:])
+    for word in words:
+        if word.startswith("-"):
+            _option(arguments, word, words)
+            continue
+        match = _TAKEN.match(word)
+        if match is None:
+            _override(arguments, word)
+            continue
+        key, value = match.groups()
+        if key in taken:
+            raise UsageError(f"{key}: given twice, as {taken[key]!r} and {value!r}")
+        if not value:
+            raise UsageError(f"{key}: expected a name, got nothing")
+        taken[key] = value
+        if key == "scene":
+            arguments.overrides.append("scene")  # keeps its place among the sweeps
+    arguments.multirun |= any(word.replace(" ", "") == "hydra.mode=MULTIRUN" for word in arguments.overrides)
+    if arguments.multirun and arguments.only_shows:
+        raise UsageError("--multirun: cannot be combined with --cfg or --hydra-help")
+    if arguments.json and arguments.command != "info":
+        raise UsageError("--json: only `torchpt info` takes it; the last line of `torchpt render` is JSON anyway")
+    if arguments.command == "info" and "out" in taken:
+        raise UsageError("out: `torchpt info` writes no picture")
+    arguments.scenes = _scenes(taken.get("scene"), arguments.multirun)
+    arguments.outs = _names("out", taken.get("out"))
+    arguments.paths = {key: None if taken[key] == "null" else taken[key] for key in PATH_KEYS if key in taken}
+    sweep = f"+scene_number={','.join(map(str, range(len(arguments.scenes))))}"
+    arguments.overrides = [sweep if word == "scene" else word for word in arguments.overrides]
+    if len(arguments.scenes) < 2:
+        arguments.overrides = [word for word in arguments.overrides if word != sweep]
+    return arguments
+
+
+def _option(arguments: Arguments, word: str, rest: object) -> None:
+    name, _, value = word.partition("=")
+    long = next((option for option, (short, _) in _OPTIONS.items() if name in (option, short)), None)
+    if long is None:
+        raise UsageError(f"{word}: unknown option; known: {', '.join(_OPTIONS)}")
+    if _OPTIONS[long][1]:
+        value = value or next(rest, "")  # type: ignore[call-overload]
+        if long == "--cfg" and value not in _CONFIGS:
+            raise UsageError(f"--cfg: expected one of {', '.join(_CONFIGS)}, got {value!r}")
+        arguments.options += [long, value]
+    elif value:
+        raise UsageError(f"{word}: {long} takes no value")
+    elif long == "--help":
+        arguments.help = True
+    elif long == "--json":
+        arguments.json = True
+    else:
+        arguments.multirun |= long == "--multirun"
+        arguments.options.append(long)
+
+
+def _override(arguments: Arguments, word: str) -> None:
+    if "=" not in word and not word.startswith("~"):
+        raise UsageError(
+            f"{word}: expected key=value, for example scene={word if word.isidentifier() else 'cornell_box'}"
+        )
+    if "_target_" in word or word.lstrip("+").startswith("hydra.callbacks"):
+        raise UsageError(f"{word}: no setting names a Python object to call: `_target_` and callbacks are refused")
+    key, _, value = word.lstrip("+~").partition("=")
+    if not key.strip() or key in ("out", "scene_number") or re.match(r"scene\b", key):
+        raise UsageError(f"{word}: expected key=value")
+    if key in GROUPS and (value == "null" or not _CHOICE.match(value)):  # nor a way out of the group's folder
+        raise UsageError(f"{key}: expected the name of a file in configs/{key}, got {value!r}")
+    arguments.overrides.append(word)
+
+
+def _scenes(value: str | None, multirun: bool) -> list[str]:
+    if value is None:
+        return []
+    if not multirun or "," not in value or Path(value).exists():
+        return [value]
+    return _names("scene", f"[{value}]")
+
+
+def _names(key: str, value: str | None) -> list[str]:
+    """``a b.exr`` is one name; ``[a.exr, 'b,c.png']`` is a list, whose names are quoted where they hold a comma."""
+    if value is None:
+        return []
+    if not (value.startswith("[") and value.endswith("]")):
+        return [value]
+    parts = re.findall(r"""\s*("[^"]*"|'[^']*'|[^,]*?)\s*(?:,|\Z)""", value[1:-1])
+    names = [part[1:-1] if part[:1] in "'\"" and part[:1] == part[-1:] and len(part) > 1 else part for part in parts]
+    if len(names) > 1 and not names[-1]:
+        names.pop()  # what the pattern finds at the very end
+    if not all(names):
+        raise UsageError(f"{key}: expected names between commas, got {value!r}")
+    if key == "out" and len(set(names)) < len(names):
+        raise UsageError(f"out: a name is given twice in {value!r}")
+    return names

@@ -1,0 +1,72 @@
+"""`torchpt info`: what a scene holds, what was built for it, what was left out and why."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from torchpt.commands.interrupt import Interrupt
+from torchpt.commands.render import Job, described, plain
+
+__all__ = ["info", "lines"]
+
+
+def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
+    """Load and build the scene, print what came of it; returns the exit code.
+
+    Raises:
+        TorchptError: bad input.
+        Interrupted: a signal came.
+    """
+    from torchpt.scene.scene import Scene, device_of
+
+    description, wishes = described(job)
+    facts = Scene(description, device_of(wishes.render.device)).info(wishes)
+    interrupt.check()
+    if as_json:
+        print(json.dumps(plain(facts), allow_nan=False))
+        return 0
+    if not sys.stdout.isatty():
+        print("\n".join(key + value for key, value in lines(facts)))
+        return 0
+    from rich.console import Console
+    from rich.text import Text
+
+    for key, value in lines(facts):
+        Console().print(Text(key, style="bold") + Text(value), soft_wrap=True)
+    return 0
+
+
+def lines(facts: dict[str, Any], depth: int = 0) -> Iterator[tuple[str, str]]:
+    """A nested dict as indented lines: ``("  key:", " value")`` each."""
+    pad = "  " * depth
+    for key, value in facts.items():
+        if isinstance(value, dict) and value:
+            yield f"{pad}{key}:", ""
+            yield from lines(value, depth + 1)
+        elif isinstance(value, list | tuple) and any(isinstance(item, dict | str) for item in value):
+            yield f"{pad}{key}:", ""
+            for item in value:
+                if isinstance(item, dict):
+                    yield f"{pad}  - ", ", ".join(f"{name}: {_shown(part)}" for name, part in item.items())
+                else:
+                    yield f"{pad}  - ", _shown(item)
+        else:
+            yield f"{pad}{key}:", f" {_shown(value)}"
+
+
+def _shown(value: Any) -> str:
+    value = plain(value)
+    if value is None or value == {} or value == []:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ", ".join(_shown(item) for item in value)
+    return str(value)

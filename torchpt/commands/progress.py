@@ -1,0 +1,59 @@
+"""The bar of a long render: samples, rays a second, time left. On stderr, and only where that is a terminal."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+__all__ = ["Bar"]
+
+
+def _short(count: float) -> str:
+    for unit in ("", "k", "M"):
+        if count < 1000:
+            return f"{count:.3g}{unit}"
+        count /= 1000
+    return f"{count:.3g}G"
+
+
+class Bar:
+    """A progress bar, or nothing at all where stderr is no terminal."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._progress: Progress | None = None
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> Bar:
+        """Show the bar."""
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+            columns = (
+                TextColumn("{task.description}", markup=False),
+                BarColumn(),
+                TaskProgressColumn(),
+                TextColumn("{task.fields[work]}", markup=False),
+                TimeRemainingColumn(),
+            )
+            self._progress = Progress(*columns, console=Console(stderr=True))
+            self._task = self._progress.add_task(self.name, total=None, work="")
+            self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the terminal as it was."""
+        if self._progress is not None:
+            self._progress.stop()
+
+    def update(self, done: int, total: int, rays: int, seconds: float) -> None:
+        """Show so many of so many camera samples, so many rays in so many seconds."""
+        if self._progress is None or self._task is None:
+            return
+        rate = rays / seconds if seconds > 0 else 0.0
+        work = f"{_short(done)}/{_short(total)} samples, {_short(rate)} rays/s"
+        self._progress.update(self._task, completed=done, total=total, work=work)

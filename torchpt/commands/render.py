@@ -1,0 +1,180 @@
+"""`torchpt render`: from a scene's name to files on disk and one line of JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from torchpt.commands.interrupt import Interrupt, Interrupted
+from torchpt.commands.progress import Bar
+from torchpt.errors import OutputError, SceneError
+
+__all__ = ["Job", "described", "numbered", "plain", "render"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One render, in plain values.
+
+    Attributes:
+        scene: a name, or the path of a scene file.
+        overrides: block (``film integrator sampler render``) to the keys given on the command line.
+        outs: pictures to write; ``<scene>.png`` in the current folder where empty.
+        number: of the job in a sweep, which enters the file names; None outside one.
+    """
+
+    scene: str
+    overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
+    outs: tuple[str, ...] = ()
+    number: int | None = None
+
+
+def numbered(path: str, number: int | None) -> str:
+    """``a.exr`` as ``a_3.exr``: the number of a job in a sweep enters its file names."""
+    if number is None:
+        return path
+    file = Path(path)
+    return str(file.with_name(f"{file.stem}_{number}{file.suffix}"))
+
+
+def render(job: Job, interrupt: Interrupt) -> int:
+    """Render, write, print the summary; returns the exit code (0, or 128 + signal with the partial picture saved).
+
+    Raises:
+        TorchptError: bad input, found before anything is rendered wherever that is possible.
+        Interrupted: a signal came while there was no picture to keep.
+    """
+    from torchpt.images import check_writable
+
+    description, wishes = described(job)
+    outs = _outputs(job, wishes)
+    preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
+    for path in (*outs, *(_preview_files(preview) if preview else ())):
+        check_writable(path)
+
+    from torchpt.render import first_hit, render_scene
+    from torchpt.scene.scene import Scene, device_of
+
+    scene = Scene(description, device_of(wishes.render.device))
+    if preview:
+        hits = first_hit(scene, wishes)
+        for path, name in zip(_preview_files(preview), ("albedo", "normal"), strict=False):
+            _write_layer(path, name, hits[name])
+
+    with Bar(_name(job.scene)) as bar:
+
+        def on_progress(state: Any) -> bool:
+            bar.update(state.done, state.total, state.rays, state.seconds)
+            if preview and state.pass_finished and state.done < state.total:
+                _write(preview, state.snapshot(), wishes)
+            return interrupt.signum is not None
+
+        rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress))
+    _write_all([*outs, *((preview,) if preview else ())], rendering, wishes)
+    print(_summary(rendering, outs), flush=True)
+    if interrupt.signum is None:
+        return 0
+    print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far", file=sys.stderr)
+    return Interrupted(interrupt.signum).exit_code
+
+
+def described(job: Job) -> tuple[Any, Any]:
+    """The description and the complete settings of a job; a null given on the command line unsets the scene's own wish.
+
+    Raises:
+        TorchptError: a scene or setting that cannot be used.
+    """
+    from torchpt.scene.description import read_description, settings
+
+    description = read_description(job.scene)
+    for group, block in job.overrides.items():
+        own = {key: value for key, value in getattr(description, group).items() if block.get(key, key) is not None}
+        description = replace(description, **{group: own})
+    return description, settings(description, job.overrides)
+
+
+def _keeping(interrupt: Interrupt, work: Callable[[], Any]) -> Any:
+    """Do the work whose result is kept: a signal only ends it early."""
+    interrupt.check()
+    interrupt.deferred = True
+    return work()
+
+
+def _name(scene: str) -> str:
+    path = Path(scene)
+    return path.stem if path.suffix in (".yaml", ".yml") else path.name
+
+
+def _outputs(job: Job, wishes: Any) -> list[str]:
+    """Where the picture goes; layers that no file would keep are an error."""
+    layers = [name for name in wishes.film.aovs or ()]
+    outs = [str(Path(path).expanduser()) for path in job.outs]
+    if not outs:
+        outs = [_name(job.scene) + (".exr" if layers else ".png")]
+    if layers and "aovs" in job.overrides.get("film", {}) and not any(_is_exr(path) for path in outs):
+        raise SceneError("film.aovs", layers, "a picture ending in .exr among out= (no other format keeps layers)")
+    return [numbered(path, job.number) for path in outs]
+
+
+def _is_exr(path: str) -> bool:
+    return Path(path).suffix.lower() == ".exr"
+
+
+def _preview_files(preview: str) -> list[str]:
+    """Albedo, normal, and the picture itself."""
+    path = Path(preview)
+    return [*(str(path.with_name(f"{path.stem}.{name}{path.suffix}")) for name in ("albedo", "normal")), preview]
+
+
+def _write_all(paths: list[str], rendering: Any, wishes: Any) -> None:
+    """Write every picture that can be written before complaining of one that cannot."""
+    failed: OutputError | None = None
+    for path in paths:
+        try:
+            _write(path, rendering, wishes)
+        except OutputError as error:
+            failed = failed or error
+    if failed is not None:
+        raise failed
+
+
+def _write(path: str, rendering: Any, wishes: Any) -> None:
+    from torchpt.images import write_image
+
+    film = wishes.film
+    layers = rendering.layers if _is_exr(path) else None
+    write_image(path, rendering.image, layers, exposure=film.exposure, tonemap=film.tonemap, gamma=film.gamma)
+
+
+def _write_layer(path: str, name: str, layer: Any) -> None:
+    """A layer as a picture of its own; in 8 bits, a normal's -1..1 is shown as 0..1."""
+    from torchpt.images import write_image
+
+    shown = 0.5 * layer + 0.5 if name == "normal" and not _is_exr(path) else layer
+    write_image(path, shown, gamma=1.0 if name == "normal" else "srgb")
+
+
+def _summary(rendering: Any, outs: list[str]) -> str:
+    """The last line on stdout."""
+    facts = {"out": outs[0] if len(outs) == 1 else outs, **rendering.summary()}
+    if not rendering.complete:
+        facts["complete"] = False
+    return json.dumps(plain(facts), allow_nan=False)
+
+
+def plain(value: Any) -> Any:
+    """JSON knows neither NaN nor tensors."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
