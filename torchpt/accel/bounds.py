@@ -13,7 +13,8 @@ __all__ = ["primitive_bounds", "surface"]
 def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     """Boxes of all primitives, rounded outward: ``low, high``, each ``(3, P)`` float32.
 
-    A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse reaches ``sqrt(e1^2 + e2^2)`` from its centre on each axis.
+    A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse reaches ``sqrt(e1^2 + e2^2)`` from
+    its centre on each axis.
     """
     p0, p1, p2 = geometry.p0.double(), geometry.p1.double(), geometry.p2.double()
     n_tri, n_rect, n_disk, _ = geometry.counts

@@ -85,9 +85,7 @@ def _(o, d, t_max, tensors, counts, depth):
 
 
 @torch.library.custom_op("torchpt::lbvh_occluded", mutates_args=())
-def _occluded(
-    o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
-) -> Tensor:
+def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> Tensor:
     return traverse.occluded(o, d, t_max, tensors, counts, depth)
 
 

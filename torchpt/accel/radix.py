@@ -1,5 +1,6 @@
-"""The radix tree over Morton codes: Karras, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees"
-(HPG 2012), by tensor operations without a loop over primitives.
+"""The radix tree over Morton codes, by tensor operations without a loop over primitives.
+
+Karras, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees", HPG 2012.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ def morton_codes(centre: Tensor) -> Tensor:
 def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> Tree:
     """Builds the tree of primitives with boxes ``low, high`` ``(3, L)`` and primitive ids ``ids`` ``(L,)``.
 
-    Equal codes are told apart by their place in the stable order, so that a million coincident centroids give a balanced
-    tree. Boxes come from range minima over the sorted leaves: as many steps as the logarithm of L, whatever the depth.
+    Equal codes are told apart by their place in the stable order, so that a million coincident centroids give a
+    balanced tree. Boxes come from range minima over the sorted leaves: log L steps, whatever the depth.
     """
     n, device = ids.shape[0], ids.device
     if n < 2:
@@ -112,7 +113,7 @@ def _ranges(codes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _range_boxes(low: Tensor, high: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-    """Boxes of the leaves ``first..last``: two overlapping powers of two cover any range (a sparse table, row by row)."""
+    """Boxes of the leaves ``first..last``: two overlapping powers of two cover any range (a sparse table)."""
     count = last - first + 1
     out_low, out_high = torch.empty_like(low[:, : len(first)]), torch.empty_like(high[:, : len(first)])
     width = 1
