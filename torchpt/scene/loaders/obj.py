@@ -24,13 +24,13 @@ _CURVES = ("curv", "curv2", "surf", "l", "p")
 
 @dataclass
 class _Text:
-    """The file's statements, sorted by kind, with the line numbers for errors."""
+    """The file's statements as written, sorted by kind, with the line numbers for errors."""
 
-    v: list[tuple[int, list[str]]] = field(default_factory=list)
-    vt: list[tuple[int, list[str]]] = field(default_factory=list)
-    vn: list[tuple[int, list[str]]] = field(default_factory=list)
-    faces: list[list[str]] = field(default_factory=list)
-    face_lines: list[int] = field(default_factory=list)
+    v: list[str] = field(default_factory=list)
+    vt: list[str] = field(default_factory=list)
+    vn: list[str] = field(default_factory=list)
+    f: list[str] = field(default_factory=list)
+    lines: dict[str, list[int]] = field(default_factory=lambda: {key: [] for key in ("v", "vt", "vn", "f")})
     face_groups: list[int] = field(default_factory=list)
     groups: dict[str, int] = field(default_factory=dict)
     libraries: list[tuple[int, str]] = field(default_factory=list)
@@ -45,10 +45,10 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     """
     text = _split(decoded_lines(data), path)
     known = _libraries(text, path) if materials else {}
-    positions = _numbers(text.v, 3, "v", path)
-    uvs = _numbers(text.vt, 2, "vt", path)
-    normals = _numbers(text.vn, 3, "vn", path)
-    if not text.faces:
+    positions = _numbers(text, "v", 3, path)
+    uvs = _numbers(text, "vt", 2, path)
+    normals = _numbers(text, "vn", 3, path)
+    if not text.f:
         return []
     combos, index, counts = _corners(text, path, (len(positions), len(uvs), len(normals)))
     triangles = corners_of_polygons(np.cumsum(counts) - counts, counts)  # (F, 3) into the flat corners
@@ -78,23 +78,20 @@ def _split(lines: list[str], path: Path) -> _Text:
     tables = {"v": text.v, "vt": text.vt, "vn": text.vn}
     group = -1
     for number, line in enumerate(lines, 1):
-        words = line.split()
-        if not words:
-            continue
-        key = words[0]
+        key = line[:2].rstrip()
+        if key not in ("v", "vt", "vn", "f"):
+            key = (line.split(None, 1) or ("",))[0]
         if key in tables:
-            tables[key].append((number, words))
+            tables[key].append(line)
+            text.lines[key].append(number)
         elif key == "f":
             if group < 0:
                 group = text.groups.setdefault("", len(text.groups))
-            if "#" in line:
+            if "#" in line or "-" in line:
                 words = line.partition("#")[0].split()
-            if "-" in line:
-                words = _absolute(words, (len(text.v), len(text.vt), len(text.vn)), path, number)
-            if len(words) < 4:
-                raise AssetError(path, f"line {number}: a face needs three or more corners: {line.strip()[:60]!r}")
-            text.faces.append(words)
-            text.face_lines.append(number)
+                line = " ".join(_absolute(words, (len(text.v), len(text.vt), len(text.vn)), path, number))
+            text.f.append(line)
+            text.lines["f"].append(number)
             text.face_groups.append(group)
         elif key == "usemtl":
             name = line.strip()[6:].strip()
@@ -145,22 +142,25 @@ def _beside(path: Path, name: str) -> Path | None:
     return None
 
 
-def _numbers(rows: list[tuple[int, list[str]]], columns: int, key: str, path: Path) -> NDArray[np.float64]:
+def _numbers(text: _Text, key: str, columns: int, path: Path) -> NDArray[np.float64]:
     """``(n, columns)``: the first numbers of each statement; a one-number `vt` gets v = 0."""
-    try:
-        flat = [word for _, words in rows for word in words[1 : columns + 1]]
-        if len(flat) == columns * len(rows):
-            return np.array(list(map(float, flat)), dtype=np.float64).reshape(-1, columns)
-    except ValueError:
-        flat = []
-    result = np.zeros((len(rows), columns))
-    for index, (number, words) in enumerate(rows):
+    rows: list[str] = getattr(text, key)
+    words = " ".join(rows).split()
+    width = columns + 1
+    if len(words) == width * len(rows) and words[::width] == [key] * len(rows):  # the usual form, in bulk
+        del words[::width]
         try:
-            values = [float(word) for word in words[1 : columns + 1]]
+            return np.array(list(map(float, words)), dtype=np.float64).reshape(-1, columns)
+        except ValueError:
+            pass  # the loop below finds the line
+    result = np.zeros((len(rows), columns))
+    for index, (number, row) in enumerate(zip(text.lines[key], rows, strict=True)):
+        try:
+            values = [float(word) for word in row.partition("#")[0].split()[1:width]]
         except ValueError:
             values = []
         if len(values) != columns and not (key == "vt" and len(values) == 1):
-            raise AssetError(path, f"line {number}: expected {key} and {columns} numbers, got {' '.join(words)[:60]!r}")
+            raise AssetError(path, f"line {number}: expected {key} and {columns} numbers, got {row.strip()[:60]!r}")
         result[index, : len(values)] = values
     return result
 
@@ -168,33 +168,42 @@ def _numbers(rows: list[tuple[int, list[str]]], columns: int, key: str, path: Pa
 def _corners(
     text: _Text, path: Path, sizes: tuple[int, int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """The different corners ``(V, 3)`` as zero-based v, vt, vn (-1: absent), which one each corner is, corners a face."""
-    counts = np.array(list(map(len, text.faces)), dtype=np.int64) - 1
-    words = [word for face in text.faces for word in face[1:]]
-    numbers: dict[str, int] = {}
-    index = [numbers.setdefault(word, len(numbers)) for word in words]
+    """Corners of all faces.
+
+    Returns:
+        the different corners ``(V, 3)`` as zero-based v, vt, vn (-1: absent); which of them each corner is ``(C,)``;
+        how many corners each face has.
+    """
+    words = " ".join(text.f).split()
+    heads = np.array([at for at, word in enumerate(words) if word == "f"])
+    counts = np.diff(heads, append=len(words)) - 1
+    if len(heads) != len(text.f) or (counts < 3).any():
+        face = int(np.argmax(counts < 3)) if len(heads) == len(text.f) else 0
+        line = text.f[face].strip()[:60]
+        raise AssetError(path, f"line {text.lines['f'][face]}: a face needs three or more corners: {line!r}")
+    corners = [word for word in words if word != "f"]
+    numbers = {word: row for row, word in enumerate(dict.fromkeys(corners))}
+    index = np.array(list(map(numbers.__getitem__, corners)), dtype=np.int64)
+
+    def line_of(word: str) -> int:
+        return text.lines["f"][int(np.searchsorted(np.cumsum(counts), corners.index(word), side="right"))]
+
     table = np.full((len(numbers), 3), -1, dtype=np.int64)
-    try:
-        for row, word in enumerate(numbers):
+    for row, word in enumerate(numbers):
+        try:
             for slot, part in enumerate(word.split("/")):
                 if part:
-                    table[row, slot] = int(part) - 1
-                    if part[0] == "0" and int(part) == 0:
-                        table[row, slot] = -2
-    except (ValueError, IndexError, OverflowError):
-        number = text.face_lines[_face_of(counts, words.index(word))]
-        raise AssetError(path, f"line {number}: {word[:40]!r} is no corner v/vt/vn") from None
+                    table[row, slot] = int(part) - 1 if int(part) else -2
+        except (ValueError, IndexError, OverflowError):
+            raise AssetError(path, f"line {line_of(word)}: {word[:40]!r} is no corner v/vt/vn") from None
     bad = np.flatnonzero((table < -1).any(axis=1) | (table >= np.array(sizes)).any(axis=1) | (table[:, 0] < 0))
     if len(bad):
         word = list(numbers)[bad[0]]
-        number = text.face_lines[_face_of(counts, words.index(word))]
         found = f"{sizes[0]} v, {sizes[1]} vt, {sizes[2]} vn"
-        raise AssetError(path, f"line {number}: corner {word!r} has an index out of range (the file has {found})")
-    return table, np.array(index, dtype=np.int64), counts
-
-
-def _face_of(counts: NDArray[np.int64], corner: int) -> int:
-    return int(np.searchsorted(np.cumsum(counts), corner, side="right"))
+        raise AssetError(
+            path, f"line {line_of(word)}: corner {word!r} has an index out of range (the file has {found})"
+        )
+    return table, index, counts
 
 
 def _looked_up(indices: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64] | None:
