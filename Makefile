@@ -38,7 +38,7 @@ check: $(VENV)/dev.stamp
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m pyright --pythonpath $(PY)
-	$(PY) -c "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports())"
+	$(VENV)/bin/lint-imports --no-logo
 
 format: $(VENV)/dev.stamp
 	$(PY) -m ruff check --fix .

@@ -251,6 +251,8 @@ def _hydra_environment(words: list[str]) -> Iterator[None]:
 
 def _came_from_job(error: BaseException) -> bool:
     """Whether an error is a defect inside a job, whose trace must not be lost, rather than a word Hydra refused."""
+    if "RemoteTraceback" in type(error.__cause__).__name__:  # from a launcher's worker process
+        return True
     trace = error.__traceback__
     while trace is not None:
         if trace.tb_frame.f_code is _Task.__call__.__code__:
