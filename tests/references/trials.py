@@ -1,0 +1,88 @@
+"""Statistics and short renders that the tests of the physics share.
+
+Significance: a test that makes ``n`` comparisons takes each at ``SIGNIFICANCE / n`` (Bonferroni), so that a right renderer
+fails it with at most this probability; seeds are fixed, so it does not fail by turns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import torchpt
+from torchpt.render import Rendering, render_scene
+from torchpt.scene import Scene
+from torchpt.scene.description import settings
+
+SIGNIFICANCE = 1e-3
+
+
+def shoot(
+    scene: Scene | Mapping[str, Any] | str,
+    spp: int,
+    seed: int = 0,
+    sampler: str = "independent",
+    integrator: Mapping[str, Any] | None = None,
+    film: Mapping[str, Any] | None = None,
+    **render: Any,
+) -> Rendering:
+    """Render eagerly with the box filter; ``integrator`` is a path integrator's keys."""
+    scene = scene if isinstance(scene, Scene) else torchpt.load(scene, device="cpu")
+    wishes = {
+        "film": {"filter": "box", **(film or {})},
+        "sampler": {"type": sampler},
+        "integrator": {"type": "path", **(integrator or {})},
+        "render": {"spp": spp, "seed": seed, "compile": "off", **render},
+    }
+    result = render_scene(scene, settings(scene.description, wishes))
+    assert result.nonfinite_samples == 0
+    return result
+
+
+def film_of(size: int, height: int | None = None) -> dict[str, Any]:
+    return {"width": size, "height": height or size}
+
+
+def estimate(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean ``(C,)`` of a picture whose pixels are independent estimates of one value, and its standard error."""
+    pixels = image.double().reshape(-1, image.shape[-1])
+    return pixels.mean(0), pixels.std(0) / math.sqrt(len(pixels))
+
+
+def spread(images: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Mean of independent pictures and the variance of that mean."""
+    stack = torch.stack([image.double() for image in images])
+    return stack.mean(0), stack.var(0) / len(stack)
+
+
+def z_limit(comparisons: int, significance: float = SIGNIFICANCE) -> float:
+    """Two-sided bound on the largest of ``comparisons`` standard normal deviates."""
+    share = torch.tensor(1.0 - 0.5 * significance / comparisons, dtype=torch.float64)
+    return float(torch.special.ndtri(share))
+
+
+def chi_square_p(statistic: float, freedom: int) -> float:
+    """Probability that chi-square with ``freedom`` degrees exceeds ``statistic``."""
+    half = torch.tensor([0.5 * freedom, 0.5 * statistic], dtype=torch.float64)
+    return float(torch.special.gammaincc(half[0], half[1]))
+
+
+def uniform_p(cells: Tensor, number: int) -> float:
+    """p-value of the hypothesis that cell indices ``(N,)`` are uniform over ``number`` cells."""
+    counts = torch.bincount(cells.reshape(-1), minlength=number).double()
+    assert len(counts) == number
+    expected = counts.sum() / number
+    return chi_square_p(float(((counts - expected) ** 2 / expected).sum()), number - 1)
+
+
+def grid_cells(u: Tensor, side: int) -> Tensor:
+    """Index of the cell of a ``side^d`` grid that points ``(d, N)`` in [0, 1) fall into."""
+    cells = (u.double() * side).long().clamp_max(side - 1)
+    index = torch.zeros_like(cells[0])
+    for row in cells:
+        index = index * side + row
+    return index
