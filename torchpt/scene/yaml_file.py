@@ -100,6 +100,17 @@ class _Builder:
     def run(self, events: Iterator[Any]) -> Any:
         for event in events:
             name = event.__class__.__name__
+            if (
+                name == "ScalarEvent"
+                and self.stack
+                and event.tag is None
+                and event.anchor is None
+                and event.implicit[0]
+            ):
+                values = self.stack[-1].value
+                if values.__class__ is list:  # numbers by the thousand
+                    values.append(_resolve(event.value))
+                    continue
             if name == "ScalarEvent":
                 self.scalar(event)
             elif name in ("SequenceStartEvent", "MappingStartEvent"):
@@ -162,7 +173,7 @@ class _Builder:
             self.merged += sum(len(source) for source in frame.merges) + len(frame.value) * len(frame.merges)
             if self.merged > MAX_MERGED:
                 raise self.error(event, "<<", f"merges that copy at most {MAX_MERGED} keys in all")
-            for source in reversed(frame.merges):  # the first one listed wins, own keys win over all
+            for source in frame.merges:  # the first one listed wins, own keys win over all
                 frame.value = dict(source) | frame.value
         if frame.anchor:
             self.anchors[frame.anchor] = frame.value
