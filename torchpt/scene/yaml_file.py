@@ -108,7 +108,7 @@ class _Builder:
                 and event.implicit[0]
             ):
                 values = self.stack[-1].value
-                if values.__class__ is list:  # numbers by the thousand
+                if isinstance(values, list):  # numbers by the thousand
                     values.append(_resolve(event.value))
                     continue
             if name == "ScalarEvent":
