@@ -28,6 +28,8 @@ _WORDS: dict[str, Any] = {"": None, "~": None}
 for _meaning, _words in ((None, ("null",)), (True, ("true", "yes", "on")), (False, ("false", "no", "off"))):
     for _word in _words:
         _WORDS.update(dict.fromkeys((_word, _word.capitalize(), _word.upper()), _meaning))
+_SCALARS = frozenset({int, float, str, bool, type(None)})
+_CONTAINERS = (dict, list, tuple, Mapping)
 _CORE_TAGS = {f"tag:yaml.org,2002:{name}" for name in ("str", "int", "float", "bool", "null", "seq", "map")} | {"!"}
 
 
@@ -226,41 +228,46 @@ def plain(source: Any, file: str | None = None) -> Any:
             beyond ``MAX_DEPTH`` or more than ``MAX_VALUES`` values once aliases are expanded.
     """
     memo: dict[int, tuple[Any, int] | None] = {}
+    trail: list[str] = []  # the dotted key of what is being visited
 
-    def visit(item: Any, key: str, depth: int) -> tuple[Any, int]:
-        if id(item) in memo:
-            known = memo[id(item)]
-            if known is None:
-                raise SceneError(key, "an alias of itself", "a structure that does not contain itself", file)
+    def error(value: object, expected: str) -> SceneError:
+        return SceneError(".".join(trail) or "scene", value, expected, file)
+
+    def visit(item: Any) -> tuple[Any, int]:
+        known = memo.get(id(item), ())
+        if known is None:
+            raise error("an alias of itself", "a structure that does not contain itself")
+        if known:
             return known
+        if item.__class__ is list and _SCALARS.issuperset(map(type, item)):
+            return item.copy(), len(item) + 1  # the rows of an inline mesh
+        if len(trail) > MAX_DEPTH:
+            raise error("deeper nesting", f"at most {MAX_DEPTH} levels of nesting")
         memo[id(item)] = None
-        if depth > MAX_DEPTH:
-            raise SceneError(key, "deeper nesting", f"at most {MAX_DEPTH} levels of nesting", file)
+        copy: Any = {} if isinstance(item, Mapping) else []
         count = 1
-        if isinstance(item, Mapping):
-            copy: Any = {}
-            for name, value in item.items():
+        for name, value in item.items() if isinstance(item, Mapping) else enumerate(item):
+            count += 1
+            if isinstance(item, Mapping):
                 if not isinstance(name, str) or not name.strip() or not name.isprintable():
-                    raise SceneError(key or "scene", name, "keys that are printable text", file)
-                child = f"{key}.{name}" if key else name
+                    raise error(name, "keys that are printable text")
                 if name == "_target_":
-                    raise SceneError(child, value, "no `_target_`: a scene never names Python objects", file)
-                if isinstance(value, Mapping | list | tuple):
-                    value, inside = visit(value, child, depth + 1)
-                    count += inside
+                    trail.append(name)
+                    raise error(value, "no `_target_`: a scene never names Python objects")
+            if isinstance(value, _CONTAINERS):
+                trail.append(str(name))
+                value, inside = visit(value)
+                trail.pop()
+                count += inside
+            if isinstance(copy, list):
+                copy.append(value)
+            else:
                 copy[name] = value
-        else:
-            copy = list(item)
-            for index, value in enumerate(copy):
-                if isinstance(value, list | tuple | Mapping):
-                    copy[index], inside = visit(value, f"{key}.{index}", depth + 1)
-                    count += inside
-        count += len(copy)
         if count > MAX_VALUES:
-            raise SceneError(key or "scene", count, f"at most {MAX_VALUES} values once aliases are expanded", file)
+            raise error(count, f"at most {MAX_VALUES} values once aliases are expanded")
         memo[id(item)] = copy, count
         return copy, count
 
     if not isinstance(source, Mapping):
         raise SceneError("scene", source, "a mapping with the blocks camera, materials, shapes, ...", file)
-    return visit(source, "", 0)[0]
+    return visit(source)[0]
