@@ -36,7 +36,7 @@ class Filter:
     """
 
     def __init__(self, kind: str, radius: float, stddev: float, device: torch.device) -> None:
-        self.radius, self._inverse = radius, None
+        self.kind, self.radius, self._inverse = kind, radius, None
         if kind == "box":
             return
         # Inverse of the cumulative profile, tabulated in float64 and read linearly.

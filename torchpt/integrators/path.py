@@ -13,11 +13,10 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
-from torchpt.integrators.stages import Plan, emit, escape, scatter, shade
+from torchpt.integrators.compiled import Stages
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World
 from torchpt.samplers import salts
-from torchpt.shapes import interact
 
 __all__ = ["ENDLESS", "Limits", "Tally", "trace"]
 
@@ -43,54 +42,52 @@ class Tally:
     truncated: int = 0  # paths still alive at ENDLESS
 
 
-def trace(plan: Plan, limits: Limits, world: World, accel: Accel, state: PathState) -> tuple[Tensor, Tally]:
+def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tuple[Tensor, Tally]:
     """Radiance ``(3, N)`` carried back along camera rays ``state``, and what it took."""
+    plan, world = stages.plan, stages.world
     tally = Tally()
     n = len(state.lane)
     gathered = torch.zeros_like(state.radiance)
 
     def search(state: PathState) -> Hit:
-        tally.rays += len(state.lane)
         t, prim, u, v = accel.intersect(state.o, state.d, state.t_max)
         return Hit(t.to(plan.dtype), prim.to(torch.int64), u.to(plan.dtype), v.to(plan.dtype))
 
-    def retire(state: PathState) -> None:
-        gathered.scatter_(1, state.lane.expand(3, -1), state.radiance)
+    def retire(index: Tensor) -> None:
+        if len(index):
+            lanes = take(state.lane, index)
+            gathered.scatter_(1, lanes.expand(3, -1), take(state.radiance, index))
 
     last = limits.max_depth if limits.max_depth >= 0 else ENDLESS
     depth, hit = 1, None
     while n and depth <= last:
+        tally.rays += len(state.lane)
         if hit is None:
             hit = search(state)
         # Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64
         # the camera's point is found anew, since the search rounds it to float32.
         slide = depth == 1 and (plan.attached or plan.dtype == torch.float64)
         ends, groups = partition(world, hit)
-        if world.lights is not None:
-            _gather_light(plan, world, state, hit, ends, slide)
-        retire(_rows(state, ends.missed))
-        if depth == last or not groups:
+        _gather_light(stages, state, hit, ends, slide)
+        retire(ends.missed)
+        if depth == last:
             for _, index in groups:
-                retire(_rows(state, index))
+                retire(index)
                 tally.truncated += len(index) if limits.max_depth < 0 else 0
+        if depth == last or not groups:
             break
-        roulette = depth >= limits.rr_depth
-        names = salts(depth, state.lane.device)
+        salt = salts(depth, state.lane.device)
         parts = []
         for model, index in groups:
-            here, found = _rows(state, index), _rows(hit, index)
-            at = interact(world, here.o, here.d, found, slide)
-            surface, shadow = shade(plan, world, model, here, at, names)
+            after, found, shadow = stages.bounce(model, depth >= limits.rr_depth, slide, search, state, hit, index, salt)
             if shadow is not None:
-                tally.rays += len(index)
-                blocked = accel.occluded(shadow.o, shadow.d, shadow.t_max)
-                here = replace(here, radiance=here.radiance + shadow.radiance * (~blocked))
-            parts.append(scatter(plan, world, model, here, at, surface, names, roulette, search))
+                tally.rays += len(shadow.t_max)
+                clear = ~accel.occluded(shadow.o, shadow.d, shadow.t_max)
+                after = replace(after, radiance=after.radiance + shadow.radiance * clear)
+            parts.append((after, found))
         state = _join([after for after, _ in parts])
-        hit = _join([hit for _, hit in parts]) if plan.attached else None
+        hit = _join([found for _, found in parts if found is not None]) if plan.attached else None
         depth += 1
-    else:
-        retire(state)
     return gathered, tally
 
 
@@ -120,21 +117,15 @@ def partition(world: World, hit: Hit) -> tuple[Ends, list[tuple[int, Tensor]]]:
     return Ends(order[: bounds[models]], order[bounds[2 * models] :]), groups
 
 
-def _gather_light(plan: Plan, world: World, state: PathState, hit: Hit, ends: Ends, slide: bool) -> None:
+def _gather_light(stages: Stages, state: PathState, hit: Hit, ends: Ends, slide: bool) -> None:
     """Add to ``state.radiance`` what the lanes gather from emitters they hit and from the environment."""
-    assert world.lights is not None
+    lights = stages.world.lights
+    if lights is None:
+        return
     if len(ends.emissive):
-        index = ends.emissive
-        at = interact(world, take(state.o, index), take(state.d, index), _rows(hit, index), slide)
-        state.radiance.scatter_add_(1, index.expand(3, -1), emit(plan, world, state, at, index))
-    if world.lights.environment is not None and len(ends.missed):
-        index = ends.missed
-        state.radiance.scatter_add_(1, index.expand(3, -1), escape(plan, world, state, index))
-
-
-def _rows(record: R, index: Tensor) -> R:
-    """The lanes ``index`` of a record of tensors."""
-    return type(record)(**{f.name: take(getattr(record, f.name), index) for f in fields(record)})
+        state.radiance.scatter_add_(1, ends.emissive.expand(3, -1), stages.emit(state, hit, ends.emissive, slide))
+    if lights.environment is not None and len(ends.missed):
+        state.radiance.scatter_add_(1, ends.missed.expand(3, -1), stages.escape(state, ends.missed))
 
 
 def _join(records: list[R]) -> R:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -22,10 +23,10 @@ from torchpt.math.vectors import dot, take
 from torchpt.math.warps import uniform_hemisphere
 from torchpt.records import Hit, Interaction, PathState, World
 from torchpt.samplers import Dimension, Draws
-from torchpt.shapes import offset_origin, reattach
+from torchpt.shapes import interact, offset_origin, reattach
 from torchpt.shapes.interaction import OFFSET
 
-__all__ = ["STRATEGIES", "Plan", "Shadow", "Surface", "emit", "escape", "generate", "scatter", "shade"]
+__all__ = ["STRATEGIES", "Plan", "Shadow", "Surface", "bounce", "emit", "escape", "generate", "rows", "scatter", "shade"]
 
 #: mis: light and BSDF sampling combined; bsdf, light: one of them; uniform: directions uniform over the hemisphere.
 STRATEGIES = ("mis", "bsdf", "light", "uniform")
@@ -34,6 +35,8 @@ STRATEGIES = ("mis", "bsdf", "light", "uniform")
 SHORTEN = 1e-4
 #: Roulette never lets a path live on for sure: throughput above one would make it immortal.
 SURVIVAL_CAP = 0.95
+
+R = TypeVar("R", PathState, Hit)
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,11 @@ class Shadow:
     radiance: Tensor  # (3, N)
 
 
+def rows(record: R, index: Tensor) -> R:
+    """The lanes ``index`` of a record of tensors."""
+    return type(record)(**{f.name: take(getattr(record, f.name), index) for f in fields(record)})
+
+
 def generate(plan: Plan, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
     """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter."""
     place = filter.offset(Draws(plan.sampler, key, salts).two(Dimension.PIXEL)).to(plan.dtype)
@@ -74,13 +82,15 @@ def generate(plan: Plan, camera: Perspective, filter: Filter, x: Tensor, y: Tens
     ones = torch.ones_like(d)
     everywhere = torch.full((n,), math.inf, dtype=plan.dtype, device=d.device)
     lane = torch.arange(n, device=d.device)
-    return PathState(o.expand(3, n).contiguous(), d, everywhere, ones, torch.zeros_like(d), everywhere, lane, key)
+    # No two tensors of a state share memory: a compiled stage would take that for a fact.
+    return PathState(o.expand(3, n).clone(), d, everywhere, ones, torch.zeros_like(d), everywhere.clone(), lane, key)
 
 
-def emit(plan: Plan, world: World, state: PathState, at: Interaction, index: Tensor) -> Tensor:
+def emit(plan: Plan, world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
     """Radiance ``(3, n)`` that the paths at ``index`` gather from the emitters they hit, weighted by MIS."""
     assert world.lights is not None
     o, d = take(state.o, index), take(state.d, index)
+    at = interact(world, o, d, rows(hit, index), slide)
     radiance, pdf = lights.emitted(world.lights, o, at, d)
     return _weighted(take(state.throughput, index), radiance, take(state.pdf, index), pdf)
 
@@ -97,6 +107,43 @@ def _weighted(throughput: Tensor, radiance: Tensor, pdf: Tensor, light_pdf: Tens
     whole = torch.isinf(pdf)
     weight = torch.where(whole, 1.0, power_heuristic(torch.where(whole, 1.0, pdf), light_pdf))
     return throughput * radiance * weight.detach()
+
+
+def bounce(
+    plan: Plan,
+    world: World,
+    model: int,
+    roulette: bool,
+    slide: bool,
+    search: Callable[[PathState], Hit],
+    state: PathState,
+    hit: Hit,
+    index: Tensor,
+    salts: Tensor,
+) -> tuple[PathState, Hit | None, Shadow | None]:
+    """One vertex of the paths at ``index``, all of which hit surfaces of one BSDF model.
+
+    Args:
+        plan: static needs.
+        world: the scene's tensors.
+        model: number of the BSDF model.
+        roulette: whether roulette plays at this depth.
+        slide: see :func:`torchpt.shapes.interact`.
+        search: finds hits; called only where ``plan.attached``.
+        state: of the whole wave.
+        hit: of the whole wave.
+        index: lanes concerned ``(n,)``.
+        salts: names of this depth's dimensions.
+
+    Returns:
+        The state of the ``n`` paths with their next rays, the next hits where they had to be found already, and the shadow
+        rays whose light is still to be added (None where no light is sampled).
+    """
+    here = rows(state, index)
+    at = interact(world, here.o, here.d, rows(hit, index), slide)
+    surface, shadow = shade(plan, world, model, here, at, salts)
+    after, found = scatter(plan, world, model, here, at, surface, salts, roulette, search)
+    return after, found, shadow
 
 
 def shade(

@@ -11,9 +11,9 @@ from torchpt.accel import Accel
 from torchpt.cameras import Perspective
 from torchpt.film import Filter
 from torchpt.integrators import aov
+from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import Limits, Tally, trace
-from torchpt.integrators.stages import Plan, generate
-from torchpt.records import PathState, World
+from torchpt.records import PathState
 from torchpt.samplers import Sampler, salts
 
 __all__ = ["Wave"]
@@ -24,9 +24,8 @@ class Wave:
     """What a render fixes for all of its waves.
 
     Attributes:
-        plan: static needs.
+        stages: the stages bound to the scene, eager or compiled.
         limits: where paths end; None where no light is carried.
-        world: tensors of the scene.
         accel: the search.
         camera: on the whole film.
         filter: reconstruction filter.
@@ -35,9 +34,8 @@ class Wave:
         centre: ``(3,)`` float64, see Scene.centre.
     """
 
-    plan: Plan
+    stages: Stages
     limits: Limits | None
-    world: World
     accel: Accel
     camera: Perspective
     filter: Filter
@@ -55,14 +53,14 @@ class Wave:
         pixel = (y * self.camera.width + x).repeat(samples)
         sample = torch.arange(first_sample, first_sample + samples, device=device).repeat_interleave(pixels)
         key = self.sampler.key(pixel, sample)
-        x, y = (a.to(self.plan.dtype).repeat(samples) for a in (x, y))
-        return generate(self.plan, self.camera, self.filter, x, y, key, salts(0, device))
+        x, y = (a.to(self.stages.plan.dtype).repeat(samples) for a in (x, y))
+        return self.stages.generate(self.camera, self.filter, x, y, key, salts(0, device))
 
     def radiance(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> tuple[Tensor, Tally]:
         """Radiance ``(3, samples, pixels)`` and what it took."""
         assert self.limits is not None
         state = self.rays(first_pixel, pixels, first_sample, samples)
-        radiance, tally = trace(self.plan, self.limits, self.world, self.accel, state)
+        radiance, tally = trace(self.stages, self.limits, self.accel, state)
         return radiance.view(3, samples, pixels), tally
 
     def layers(
@@ -70,5 +68,5 @@ class Wave:
     ) -> dict[str, Tensor]:
         """The layers ``names``, each ``(C, samples, pixels)``."""
         state = self.rays(first_pixel, pixels, first_sample, samples)
-        found = aov.first_hit(names, self.world, self.accel, state, self.centre, self.plan.dtype)
+        found = aov.first_hit(names, self.stages.world, self.accel, state, self.centre, self.stages.plan.dtype)
         return {name: value.view(len(value), samples, pixels) for name, value in found.items()}

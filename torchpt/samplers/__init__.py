@@ -61,15 +61,25 @@ class Draws:
     """
 
     def __init__(self, kind: str, key: Tensor, salts: Tensor) -> None:
-        self._module, self._key, self._salts = KINDS[kind], key, salts
+        self._kind, self._key, self._salts = kind, key, salts
+        # Eager on a CPU the kernels take over: the same bits, see torchpt.samplers.kernels.
+        self._kernels = key.device.type == "cpu" and not torch.compiler.is_compiling()
 
     def one(self, dimension: Dimension) -> Tensor:
         """``(N,)`` float32 in ``[0, 1)``."""
-        return self._module.draw_1d(self._key, self._salts[int(dimension)])
+        if self._kernels:
+            from torchpt.samplers import kernels
+
+            return kernels.draw_1d(self._kind, self._key, int(self._salts[int(dimension)]))
+        return KINDS[self._kind].draw_1d(self._key, self._salts[int(dimension)])
 
     def two(self, dimension: Dimension) -> Tensor:
         """``(2, N)`` float32 in ``[0, 1)``."""
-        return self._module.draw_2d(self._key, self._salts[int(dimension)])
+        if self._kernels:
+            from torchpt.samplers import kernels
+
+            return kernels.draw_2d(self._kind, self._key, int(self._salts[int(dimension)]))
+        return KINDS[self._kind].draw_2d(self._key, self._salts[int(dimension)])
 
 
 @lru_cache(maxsize=4096)

@@ -94,7 +94,7 @@ def _shape_parts(
         pieces, source, flat = [piece], "", shape.face_normals
     else:
         path = description.resolve(shape.path, f"{prefix}.path")
-        pieces, source, flat = load_mesh(path), str(path), shape.face_normals
+        pieces, source, flat = load_mesh(path, materials=shape.material is None), str(path), shape.face_normals
     labels = _labels([piece.name for piece in pieces])
     parts = []
     for piece, label in zip(pieces, labels, strict=True):
@@ -169,7 +169,7 @@ def _part(
         smooth=not flat,
         dropped=dropped,
         source=source,
-        ignored=tuple(own.ignored) if own is not None else (),
+        ignored=tuple(piece.ignored) + (tuple(own.ignored) if own is not None else ()) if piece is not None else (),
     )
 
 

@@ -1,0 +1,141 @@
+"""The stages bound to one scene and plan, run eagerly or compiled.
+
+Compiled, a stage is one graph for any number of lanes: whole-state tensors, the gather inside, the index padded to a
+multiple of 16 by repeating its last lane. The extra lanes are exact duplicates of a path: they carry the same numbers and
+write the same result twice, so nothing needs to know of them. (Under gradients they would count twice: eager only.)
+"""
+
+from __future__ import annotations
+
+import shutil
+import types
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.cameras import Perspective
+from torchpt.errors import RenderError
+from torchpt.film import Filter
+from torchpt.integrators import stages
+from torchpt.integrators.stages import Plan, Shadow
+from torchpt.records import Hit, PathState, World
+
+__all__ = ["CompiledStages", "Stages", "can_compile"]
+
+Search = Callable[[PathState], Hit]
+
+
+def can_compile(device: torch.device) -> bool:
+    """Whether what ``torch.compile`` needs is on this machine."""
+    return device.type != "cpu" or any(shutil.which(name) for name in ("g++", "clang++", "c++"))
+
+
+class Stages:
+    """The stages, eager: always complete and correct."""
+
+    compiled = False
+
+    def __init__(self, plan: Plan, world: World) -> None:
+        self.plan, self.world = plan, world
+
+    def generate(self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+        """See :func:`torchpt.integrators.stages.generate`."""
+        return stages.generate(self.plan, camera, filter, x, y, key, salts)
+
+    def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
+        """See :func:`torchpt.integrators.stages.emit`."""
+        return stages.emit(self.plan, self.world, state, hit, index, slide)
+
+    def escape(self, state: PathState, index: Tensor) -> Tensor:
+        """See :func:`torchpt.integrators.stages.escape`."""
+        return stages.escape(self.plan, self.world, state, index)
+
+    def bounce(
+        self, model: int, roulette: bool, slide: bool, search: Search, state: PathState, hit: Hit, index: Tensor, salts: Tensor
+    ) -> tuple[PathState, Hit | None, Shadow | None]:
+        """See :func:`torchpt.integrators.stages.bounce`."""
+        return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
+
+
+class CompiledStages(Stages):
+    """The same stages through ``torch.compile``; forward only.
+
+    Attributes:
+        graphs: how many graphs each stage was compiled to so far.
+    """
+
+    compiled = True
+
+    def __init__(self, plan: Plan, world: World) -> None:
+        super().__init__(plan, world)
+        if not can_compile(world.p0.device):
+            raise RenderError("render.compile: on needs a C++ compiler (g++ or clang++) for the CPU; none was found")
+        self.graphs: dict[str, int] = {}
+        self._made: dict[tuple[Any, ...], Callable[..., Any]] = {}
+
+    def generate(self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+        if len(x) % 16:  # the last chunk of a film: once a pass, not worth a graph
+            return super().generate(camera, filter, x, y, key, salts)
+
+        def stage(camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+            return stages.generate(self.plan, camera, filter, x, y, key, salts)
+
+        variant = (camera.width, camera.height, camera.fov_axis, filter.kind, filter.radius)
+        return self._get("generate", variant, stage)(camera, filter, x, y, key, salts)
+
+    def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
+        def stage(state: PathState, hit: Hit, index: Tensor) -> Tensor:
+            return stages.emit(self.plan, self.world, state, hit, index, slide)
+
+        return self._get("emit", (slide,), stage)(state, hit, _padded(index))[:, : len(index)]
+
+    def bounce(
+        self, model: int, roulette: bool, slide: bool, search: Search, state: PathState, hit: Hit, index: Tensor, salts: Tensor
+    ) -> tuple[PathState, Hit | None, Shadow | None]:
+        def stage(
+            state: PathState, hit: Hit, index: Tensor, salts: Tensor
+        ) -> tuple[PathState, Hit | None, Shadow | None]:
+            return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
+
+        name = f"bounce {self.world.models[model]}"
+        return self._get(name, (roulette, slide), stage)(state, hit, _padded(index), salts)
+
+    def _get(self, name: str, variant: tuple[Any, ...], stage: Callable[..., Any]) -> Callable[..., Any]:
+        """The compiled form of ``stage``, made once for each variant."""
+        made = self._made.get((name, *variant))
+        if made is None:
+            made = self._made[name, *variant] = self._compile(name, stage)
+        return made
+
+    def _compile(self, name: str, stage: Callable[..., Any]) -> Callable[..., Any]:
+        import torch._dynamo.config
+        import torch.fx.experimental._config
+        from torch._inductor.compile_fx import compile_fx
+
+        def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Callable[..., Any]:
+            self.graphs[name] = self.graphs.get(name, 0) + 1
+            return compile_fx(graph, inputs)
+
+        # A code object of its own: dynamo counts graphs by code, and those of another scene are no business of this one.
+        assert isinstance(stage, types.FunctionType)
+        own = types.FunctionType(stage.__code__.replace(), stage.__globals__, stage.__name__, stage.__defaults__, stage.__closure__)
+        run = torch.compile(own, dynamic=True, fullgraph=True, backend=backend)
+
+        def call(*args: Any) -> Any:
+            # Equal sizes are a coincidence, not a fact to compile in; and more than two graphs are an error, where the
+            # default would fall back to eager with a line in a log.
+            with (
+                torch._dynamo.config.patch(recompile_limit=2, fail_on_recompile_limit_hit=True),
+                torch.fx.experimental._config.patch(use_duck_shape=False),
+            ):
+                return run(*args)
+
+        return call
+
+
+def _padded(index: Tensor) -> Tensor:
+    """The lanes with the last one repeated up to a multiple of 16, in fresh memory."""
+    extra = -len(index) % 16
+    return torch.cat((index, index[-1:].expand(extra))) if extra else index.clone()
