@@ -150,7 +150,7 @@ def collapse(nodes, spans, boxes, child, first):
     Args:
         nodes: boxes of the binary tree.
         spans: its topology.
-        boxes: ``(M * 48,)`` float32, filled: per node low x, y, z, high x, y, z of eight children; empty ones inverted.
+        boxes: ``(M * 48,)`` float32, filled: per node low x, y, z, high x, y, z of 8 children; empty ones at infinity.
         child: ``(M * 8,)`` int32, filled: a node, or ``~leaf``.
         first: ``(K, 2)`` int32, filled: the primitives of each leaf.
 
@@ -180,8 +180,7 @@ def collapse(nodes, spans, boxes, child, first):
             n += 1
         for k in range(WIDTH):
             for c in range(6):
-                empty = _INF if c < 3 else -_INF
-                boxes[wide * 6 * WIDTH + c * WIDTH + k] = nodes[slots[k], c] if k < n else empty
+                boxes[wide * 6 * WIDTH + c * WIDTH + k] = nodes[slots[k], c] if k < n else _INF
             code = np.int32(0)
             if k < n and spans[slots[k], 2] > 0:
                 code = np.int32(used)

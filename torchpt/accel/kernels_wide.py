@@ -18,21 +18,32 @@ _ONE = np.float32(1.0)
 
 
 @jit(forceinline=True)
-def _children(boxes, node, o, inverse, best, near):
+def _at(i):
+    """An index that is never negative: numba's test for that would keep LLVM from using vectors."""
+    return np.uint64(i)
+
+
+@jit(forceinline=True)
+def _smaller(a, b):
+    return a if a < b else b
+
+
+@jit(forceinline=True)
+def _larger(a, b):
+    return a if a > b else b
+
+
+@jit(forceinline=True)
+def _children(boxes, node, o, inverse, best, near, unit):
     """Entry distances of a node's eight boxes, infinite for those not met before ``best``."""
     base = node * 6 * WIDTH
-    x0 = base + (3 * WIDTH if inverse[0] < _ZERO else 0)
-    y0 = base + (4 * WIDTH if inverse[1] < _ZERO else WIDTH)
-    z0 = base + (5 * WIDTH if inverse[2] < _ZERO else 2 * WIDTH)
-    x1 = base + (0 if inverse[0] < _ZERO else 3 * WIDTH)
-    y1 = base + (WIDTH if inverse[1] < _ZERO else 4 * WIDTH)
-    z1 = base + (2 * WIDTH if inverse[2] < _ZERO else 5 * WIDTH)
-    for k in range(WIDTH):
-        ax, bx = (boxes[x0 + k] - o[0]) * inverse[0], (boxes[x1 + k] - o[0]) * inverse[0]
-        ay, by = (boxes[y0 + k] - o[1]) * inverse[1], (boxes[y1 + k] - o[1]) * inverse[1]
-        az, bz = (boxes[z0 + k] - o[2]) * inverse[2], (boxes[z1 + k] - o[2]) * inverse[2]
-        a = max(max(ax, ay), max(az, _ZERO))
-        b = min(min(bx, by), min(bz, best)) * _SLACK
+    for k in range(unit * WIDTH):
+        i = base + k
+        ax, bx = (boxes[_at(i)] - o[0]) * inverse[0], (boxes[_at(i + 3 * WIDTH)] - o[0]) * inverse[0]
+        ay, by = (boxes[_at(i + WIDTH)] - o[1]) * inverse[1], (boxes[_at(i + 4 * WIDTH)] - o[1]) * inverse[1]
+        az, bz = (boxes[_at(i + 2 * WIDTH)] - o[2]) * inverse[2], (boxes[_at(i + 5 * WIDTH)] - o[2]) * inverse[2]
+        a = _larger(_larger(_smaller(ax, bx), _smaller(ay, by)), _larger(_smaller(az, bz), _ZERO))
+        b = _smaller(_smaller(_larger(ax, bx), _larger(ay, by)), _smaller(_larger(az, bz), best)) * _SLACK
         near[k] = a if a <= b else _INF
 
 
@@ -53,24 +64,22 @@ def _push(child, node, near, stack, entry, top):
 
 
 @jit(forceinline=True)
-def _inside(corners, leaf, px, py, pz, kx, ky, kz, sx, sy, inside):
-    """Marks which of a leaf's eight triangles the ray's line crosses; returns whether any."""
+def _inside(corners, leaf, px, py, pz, kx, ky, kz, sx, sy, inside, unit):
+    """Marks which of a leaf's eight triangles the ray's line crosses."""
     base = leaf * 9 * WIDTH
     x, y, z = base + kx * WIDTH, base + ky * WIDTH, base + kz * WIDTH
-    found = _ZERO
-    for k in range(WIDTH):
-        za, zb, zc = corners[z + k] - pz, corners[z + 3 * WIDTH + k] - pz, corners[z + 6 * WIDTH + k] - pz
-        ax, ay = (corners[x + k] - px) - sx * za, (corners[y + k] - py) - sy * za
-        bx, by = (corners[x + 3 * WIDTH + k] - px) - sx * zb, (corners[y + 3 * WIDTH + k] - py) - sy * zb
-        cx, cy = (corners[x + 6 * WIDTH + k] - px) - sx * zc, (corners[y + 6 * WIDTH + k] - py) - sy * zc
+    for k in range(unit * WIDTH):
+        i, j = 3 * WIDTH + k, 6 * WIDTH + k
+        za, zb, zc = corners[_at(z + k)] - pz, corners[_at(z + i)] - pz, corners[_at(z + j)] - pz
+        ax, ay = (corners[_at(x + k)] - px) - sx * za, (corners[_at(y + k)] - py) - sy * za
+        bx, by = (corners[_at(x + i)] - px) - sx * zb, (corners[_at(y + i)] - py) - sy * zb
+        cx, cy = (corners[_at(x + j)] - px) - sx * zc, (corners[_at(y + j)] - py) - sy * zc
         e = cx * by - cy * bx
         f = ax * cy - ay * cx
         g = bx * ay - by * ax
-        both = ((e >= _ZERO) & (f >= _ZERO) & (g >= _ZERO)) | ((e <= _ZERO) & (f <= _ZERO) & (g <= _ZERO))
-        mark = _ONE if both else _ZERO
-        inside[k] = mark
-        found = max(found, mark)
-    return found > _ZERO
+        low, high = _smaller(_smaller(e, f), g), _larger(_larger(e, f), g)
+        # a missing triangle is NaN in all corners, and NaN is neither
+        inside[k] = _ONE if (low >= _ZERO) | (high <= _ZERO) else _ZERO
 
 
 @jit(forceinline=True)
@@ -79,80 +88,77 @@ def _finite(a, b, c):
 
 
 @jit()
-def _trace(i, o, d, t_max, tree, kinds, work, any_hit):
-    """The nearest hit of ray i (or any): ``t, prim, u, v``."""
+def _trace(first, last, o, d, t_max, tree, kinds, room, unit, any_hit, out_t, out_prim, out_u, out_v):
+    """The nearest hits of a range of rays, or for each any hit's primitive alone."""
     boxes, child, leaves, ids, simple, corner, rows = tree
-    stack, entry, near, inside = work
     n1, n2, n3 = kinds
-    p, r, best = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i]), t_max[i]
-    prim, best_u, best_v = np.int32(-1), _ZERO, _ZERO
-    if not (best > _ZERO and _finite(p[0], p[1], p[2]) and _finite(r[0], r[1], r[2])):
-        return _INF, prim, _ZERO, _ZERO
-    kx, ky, kz, sx, sy, sz, ix, iy, iz = setup(r[0], r[1], r[2])
-    px, py, pz = o[kx, i], o[ky, i], o[kz, i]
-    stack[0], entry[0] = 0, _ZERO
-    top = 1
-    while top > 0:
-        top -= 1
-        node = stack[top]
-        if entry[top] > best * _SLACK:
-            continue
-        if node >= 0:
-            _children(boxes, node, p, (ix, iy, iz), best, near)
-            top = _push(child, node, near, stack, entry, top)
-            continue
-        leaf = ~node
-        if simple[leaf] and not _inside(leaves, leaf, px, py, pz, kx, ky, kz, sx, sy, inside):
-            continue
-        for k in range(WIDTH):
-            q = ids[leaf * WIDTH + k]
-            if q < 0 or (simple[leaf] and inside[k] == _ZERO):
+    stack, entry = np.empty(room, np.int32), np.empty(room, np.float32)
+    near, inside = np.empty(WIDTH, np.float32), np.empty(WIDTH, np.float32)
+    for i in range(first, last):
+        p, r, best = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i]), t_max[i]
+        prim, best_u, best_v = np.int32(-1), _ZERO, _ZERO
+        top = 0
+        if best > _ZERO and _finite(p[0], p[1], p[2]) and _finite(r[0], r[1], r[2]):
+            stack[0], entry[0] = 0, _ZERO
+            top = 1
+        kx, ky, kz, sx, sy, sz, ix, iy, iz = setup(r[0], r[1], r[2])
+        px, py, pz = o[kx, i], o[ky, i], o[kz, i]
+        while top > 0:
+            top -= 1
+            node = stack[top]
+            if entry[top] > best * _SLACK:
                 continue
-            t, u, v = distance(q, corner, rows, n1, n2, n3, p, r, kx, ky, kz, sx, sy, sz)
-            if t > _ZERO and (t < best or (t == best and q < prim)):
-                best, prim, best_u, best_v = t, q, u, v
-                if any_hit:
-                    return best, prim, best_u, best_v
-    return (best if prim >= 0 else _INF), prim, best_u, best_v
+            if node >= 0:
+                _children(boxes, node, p, (ix, iy, iz), best, near, unit)
+                top = _push(child, node, near, stack, entry, top)
+                continue
+            leaf = ~node
+            if simple[leaf]:
+                _inside(leaves, leaf, px, py, pz, kx, ky, kz, sx, sy, inside, unit)
+            for k in range(WIDTH):
+                if simple[leaf] and inside[k] == _ZERO:
+                    continue
+                q = ids[leaf * WIDTH + k]
+                if q < 0:
+                    continue
+                t, u, v = distance(q, corner, rows, n1, n2, n3, p, r, kx, ky, kz, sx, sy, sz)
+                if t > _ZERO and (t < best or (t == best and q < prim)):
+                    best, prim, best_u, best_v = t, q, u, v
+                    if any_hit:
+                        top = 0
+                        break
+        out_prim[i] = prim
+        if not any_hit:
+            out_t[i] = best if prim >= 0 else _INF
+            out_u[i], out_v[i] = best_u, best_v
 
 
 @jit()
-def intersect(first, last, o, d, t_max, tree, kinds, room, t, prim, u, v):
-    """Nearest hits of the rays ``first <= i < last``; ``room`` is the size of the stack."""
-    work = (
-        np.empty(room, np.int32),
-        np.empty(room, np.float32),
-        np.empty(WIDTH, np.float32),
-        np.empty(WIDTH, np.float32),
-    )
-    for i in range(first, last):
-        t[i], prim[i], u[i], v[i] = _trace(i, o, d, t_max, tree, kinds, work, False)
+def intersect(first, last, o, d, t_max, tree, kinds, room, unit, t, prim, u, v):
+    """Nearest hits of the rays ``first <= i < last``; ``room`` is the size of the stack, ``unit`` is 1.
+
+    The loops over eight run to ``8 * unit``: LLVM would unroll a loop of eight before it looks for vectors.
+    """
+    _trace(first, last, o, d, t_max, tree, kinds, room, unit, False, t, prim, u, v)
 
 
 @jit(parallel=True)
-def intersect_parallel(chunks, items, o, d, t_max, tree, kinds, room, t, prim, u, v):
+def intersect_parallel(chunks, items, o, d, t_max, tree, kinds, room, unit, t, prim, u, v):
     """:func:`intersect` over equal chunks of the rays, one a thread."""
     for c in prange(chunks):
         a, b = c * items // chunks, (c + 1) * items // chunks
-        intersect(a, b, o, d, t_max, tree, kinds, room, t, prim, u, v)
+        intersect(a, b, o, d, t_max, tree, kinds, room, unit, t, prim, u, v)
 
 
 @jit()
-def occluded(first, last, o, d, t_max, tree, kinds, room, blocked):
-    """Whether the rays ``first <= i < last`` hit anything."""
-    work = (
-        np.empty(room, np.int32),
-        np.empty(room, np.float32),
-        np.empty(WIDTH, np.float32),
-        np.empty(WIDTH, np.float32),
-    )
-    for i in range(first, last):
-        blocked[i] = _trace(i, o, d, t_max, tree, kinds, work, True)[1] >= 0
+def occluded(first, last, o, d, t_max, tree, kinds, room, unit, prim):
+    """Some primitive that each of the rays ``first <= i < last`` hits, or -1."""
+    _trace(first, last, o, d, t_max, tree, kinds, room, unit, True, t_max, prim, t_max, t_max)
 
 
 @jit(parallel=True)
-def occluded_parallel(chunks, items, o, d, t_max, tree, kinds, room, blocked):
+def occluded_parallel(chunks, items, o, d, t_max, tree, kinds, room, unit, prim):
     """:func:`occluded` over equal chunks of the rays, one a thread."""
     for c in prange(chunks):
         a, b = c * items // chunks, (c + 1) * items // chunks
-        occluded(a, b, o, d, t_max, tree, kinds, room, blocked)
+        occluded(a, b, o, d, t_max, tree, kinds, room, unit, prim)

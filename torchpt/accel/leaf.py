@@ -3,7 +3,7 @@
 Triangles and parallelograms are watertight after Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection", JCGT
 2013: corners are sheared into the ray's frame, where an edge function's sign depends on the edge alone, not on the
 primitive. Products round monotonically, so a computed edge function is of the right sign or zero; zero counts as
-inside. That holds without fused operations only. The distance comes from the plane and stays within the corners' depths.
+inside. That holds without fused operations only. The distance comes from the plane, within the corners' depths.
 The numba kernels (kernels_leaf.py) do the same operations in the same order.
 """
 

@@ -79,7 +79,7 @@ def _wide_tree(boxes: np.ndarray, ids: np.ndarray) -> _Built:
     """Builds over boxes ``(L, 6)``; ids come back as ``(leaves * 8,)``, padded with -1."""
     n = len(ids)
     if n == 0:
-        empty = np.repeat(np.array([np.inf] * 3 + [-np.inf] * 3, np.float32), WIDTH)
+        empty = np.full(6 * WIDTH, np.inf, np.float32)
         return _Built(empty, np.zeros(WIDTH, np.int32), np.zeros(0, np.int32), 1, 0.0)
     nodes, spans = np.empty((2 * n, 6), np.float32), np.empty((2 * n, 3), np.int32)
     used = build_binary(boxes, ids, nodes, spans, WIDTH)
@@ -139,10 +139,10 @@ def _(o, d, t_max, tensors, counts, depth, threads):
 def _occluded(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int, threads: int
 ) -> Tensor:
-    blocked = torch.empty_like(t_max, dtype=torch.bool)
-    args = (*_arguments(o, d, t_max, tensors, counts, depth), blocked.numpy())
+    prim = torch.empty_like(t_max, dtype=torch.int32)
+    args = (*_arguments(o, d, t_max, tensors, counts, depth), prim.numpy())
     launch(kernels.occluded, kernels.occluded_parallel, t_max.shape[0], threads, _GRAIN, args)
-    return blocked
+    return prim >= 0
 
 
 @_occluded.register_fake
@@ -153,4 +153,4 @@ def _(o, d, t_max, tensors, counts, depth, threads):
 def _arguments(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> tuple:
     rays = tuple(x.contiguous().numpy() for x in (o, d, t_max))
     first = (counts[0], counts[0] + counts[1], counts[0] + counts[1] + counts[2])
-    return (*rays, tuple(x.numpy() for x in tensors), first, depth * (WIDTH - 1) + WIDTH + 1)
+    return (*rays, tuple(x.numpy() for x in tensors), first, depth * (WIDTH - 1) + WIDTH + 1, 1)
