@@ -2,8 +2,8 @@
 
     python scripts/make_references.py [cornell_box] [cornell_bunny]
 
-Needs the extra ``bench``; ``cornell_bunny`` needs ``$TORCHPT_ASSETS/bunny.ply``. Writes ``tests/references/NAME.exr`` with the
-picture and the layer ``variance``: box filter, max_depth 8, rr_depth 5, 64 x 64 pixels.
+Needs the extra ``bench``; ``cornell_bunny`` needs ``$TORCHPT_ASSETS/bunny.ply``. Writes ``tests/references/NAME.exr``
+with the picture and the layer ``variance``: box filter, max_depth 8, rr_depth 5, 64 x 64 pixels.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ __all__ = ["convert", "find_llvm", "load_mitsuba"]
 
 
 def find_llvm() -> str | None:
-    """The LLVM library for ``llvm_ad_rgb``: ``$DRJIT_LIBLLVM_PATH``, else the system's newest of version 16 or later."""
+    """The LLVM library for ``llvm_ad_rgb``: ``$DRJIT_LIBLLVM_PATH``, else the system's newest, 16 or later."""
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         return given

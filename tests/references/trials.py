@@ -1,7 +1,7 @@
 """Statistics and short renders that the tests of the physics share.
 
-Significance: a test that makes ``n`` comparisons takes each at ``SIGNIFICANCE / n`` (Bonferroni), so that a right renderer
-fails it with at most this probability; seeds are fixed, so it does not fail by turns.
+Significance: a test that makes ``n`` comparisons takes each at ``SIGNIFICANCE / n`` (Bonferroni), so that a right
+renderer fails it with at most this probability; seeds are fixed, so it does not fail by turns.
 """
 
 from __future__ import annotations

@@ -1,0 +1,206 @@
+"""The same bits whatever the chunk, the place in it and the number of threads (eager, CPU)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from trials import film_of, shoot
+
+import torchpt
+from torchpt.integrators.wave import Wave
+from torchpt.math.distributions import Discrete
+from torchpt.math.frames import Frame
+from torchpt.math.mis import power_heuristic
+from torchpt.math.vectors import normalize
+from torchpt.math.warps import concentric_disk, one_minus_cos, uniform_cone, uniform_sphere
+from torchpt.render import BYTES_PER_LANE as PER_LANE
+from torchpt.samplers import KINDS as SAMPLERS
+from torchpt.samplers import Sampler, salts
+
+N = 70_003  # above torch's grain of 32,768: two threads share it, and the last vector is not full
+
+MIXED: dict[str, Any] = {
+    "camera": {"origin": [0, 0, 0.9], "target": [0, 0.1, -1], "fov": 80},
+    "lights": {"sky": {"type": "constant", "radiance": [0.2, 0.3, 0.4]}},
+    "shapes": {
+        "floor": {"type": "cube", "transform": [{"scale": [1, 0.1, 1]}, {"translate": [0, -1, 0]}]},
+        "lamp": {"type": "sphere", "center": [0, 0.5, 0], "radius": 0.2, "emission": [4, 5, 6]},
+        "disc": {"type": "disk", "transform": [{"scale": 0.3}, {"translate": [0.5, 0, -1]}], "emission": [1, 2, 3]},
+        "pyramid": {
+            "type": "mesh",
+            "vertices": [[-1, -0.9, -1], [0, -0.9, -1], [-0.5, 0, -0.7], [-0.5, -0.9, -0.2]],
+            "faces": [[0, 1, 2], [1, 3, 2], [3, 0, 2]],
+        },
+    },
+}
+
+
+@pytest.fixture(scope="module", params=["cornell_box", "mixed"])
+def scene(request):
+    return torchpt.load(MIXED if request.param == "mixed" else "cornell_box", device="cpu")
+
+
+@pytest.mark.parametrize("sampler", ["sobol", "independent"])
+def test_the_picture_does_not_depend_on_chunks_or_threads(scene, sampler):
+    # 64 x 64 x 15 spp in passes of 4, 4, 7: up to 28,672 lanes a wave; 96 x 96 would cross the grain, see below.
+    def image(lanes: int | None, threads: int) -> torch.Tensor:
+        memory = None if lanes is None else lanes * PER_LANE
+        keys = {"max_memory": memory, "threads": threads}
+        return shoot(scene, 15, 11, sampler, {"max_depth": 8, "rr_depth": 3}, film_of(64), **keys).image
+
+    whole = image(None, 1)
+    assert whole.amax() > 0
+    for lanes, threads in ((1003, 1), (4801, 2), (20_011, 1), (20_011, 2), (None, 2)):
+        assert torch.equal(image(lanes, threads), whole), (lanes, threads)
+
+
+def test_waves_that_threads_divide(scene):
+    def image(threads: int, memory: int | None = None) -> torch.Tensor:
+        keys = {"max_memory": memory, "threads": threads}
+        return shoot(scene, 12, 5, "sobol", {"max_depth": 4}, film_of(112), **keys).image
+
+    one = image(1)
+    assert torch.equal(image(2), one)
+    assert torch.equal(image(2, 40_009 * PER_LANE), one)
+
+
+@pytest.mark.parametrize("lanes", [1, 3, 7])
+def test_waves_of_a_few_lanes(scene, lanes):
+    def image(memory: int | None) -> torch.Tensor:
+        return shoot(scene, 5, 2, "sobol", {"max_depth": 3}, film_of(4, 3), max_memory=memory).image
+
+    assert torch.equal(image(lanes * PER_LANE), image(None))
+
+
+def test_the_same_seed_again_and_another(scene):
+    def image(seed: int) -> torch.Tensor:
+        return shoot(scene, 4, seed, "sobol", {"max_depth": 4}, film_of(16)).image
+
+    assert torch.equal(image(1), image(1))
+    assert not torch.equal(image(1), image(2))
+    assert not torch.equal(image(1), image(1 + 2**32))
+    image(2**63 - 1)
+
+
+def _real(seed: int, *shape: int) -> torch.Tensor:
+    """Numbers of many magnitudes and both signs, zeros among them."""
+    g = torch.Generator().manual_seed(seed)
+    x = torch.randn(*shape, generator=g) * 10.0 ** torch.randint(-6, 7, shape, generator=g)
+    return torch.where(torch.rand(*shape, generator=g) < 0.01, torch.zeros(()), x)
+
+
+A, B, U = _real(1, 3, N), _real(2, 3, N), torch.rand(3, N, generator=torch.Generator().manual_seed(3))
+KEYS = Sampler("sobol", 5, 4).key(torch.arange(N), torch.arange(N) % 97)
+CHOICE = Discrete.of(U[0, :999], torch.float32)
+
+#: Arithmetic done on lanes: (name of the operation, function of columns of A, B, U).
+OPERATIONS: list[tuple[str, Callable[..., torch.Tensor]]] = [
+    ("add", lambda a, b, u: a + b),
+    ("sub", lambda a, b, u: a - b),
+    ("rsub", lambda a, b, u: 1.0 - u),
+    ("mul", lambda a, b, u: a * b),
+    ("mul", lambda a, b, u: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]),
+    ("div", lambda a, b, u: a / b),
+    ("reciprocal", lambda a, b, u: 1.0 / a),
+    ("neg", lambda a, b, u: -a),
+    ("abs", lambda a, b, u: a.abs()),
+    ("sqrt", lambda a, b, u: a.abs().sqrt()),
+    ("sin", lambda a, b, u: torch.sin(2.0 * math.pi * u)),
+    ("cos", lambda a, b, u: torch.cos(2.0 * math.pi * u)),
+    ("sin", lambda a, b, u: torch.sin((math.pi / 4) * (2.0 * u - 1.0))),
+    ("cos", lambda a, b, u: torch.cos((math.pi / 4) * (2.0 * u - 1.0))),
+    ("sign", lambda a, b, u: torch.sign(a)),
+    ("copysign", lambda a, b, u: torch.copysign(a, b)),
+    ("clamp_min", lambda a, b, u: a.clamp_min(0.0)),
+    ("clamp_max", lambda a, b, u: a.clamp_max(0.95)),
+    ("minimum", lambda a, b, u: torch.minimum(a, b)),
+    ("amax", lambda a, b, u: a.amax(0)),
+    ("where", lambda a, b, u: torch.where(a > b, a, 1.0)),
+    ("isinf", lambda a, b, u: torch.isinf(a).float()),
+    ("_to_copy", lambda a, b, u: (a.clamp(-1e6, 1e6)).to(torch.int64).to(torch.float32)),
+    ("", lambda a, b, u: normalize(a)),
+    ("", lambda a, b, u: torch.stack((*Frame.about(normalize(a)).to_local(b), *Frame.about(normalize(b)).to_world(a)))),
+    ("", lambda a, b, u: power_heuristic(a[0].abs(), b[0].abs())),
+    ("", lambda a, b, u: torch.cat((concentric_disk(u), uniform_sphere(u), uniform_cone(u, u[2])))),
+    ("", lambda a, b, u: one_minus_cos(u)),
+    ("", lambda a, b, u: CHOICE.sample(u[0]).float()),
+]
+#: What moves numbers or makes constants, without arithmetic. Scatters here have distinct indices.
+EXACT = {
+    "alias", "arange", "cat", "clone", "copy_", "detach", "empty", "empty_like", "expand", "full", "full_like", "gather",
+    "index", "index_select", "lift_fresh", "new_zeros", "ones", "ones_like", "permute", "repeat", "repeat_interleave",
+    "scalar_tensor", "scatter_", "scatter_add_", "select", "slice", "stack", "take", "unsqueeze", "view", "zeros",
+    "zeros_like", "_unsafe_view", "split", "squeeze", "sort", "brute_intersect", "brute_occluded",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(len(OPERATIONS)))
+def test_a_lanes_value_does_not_depend_on_its_place(number):
+    operation = OPERATIONS[number][1]
+
+    def at(first: int, last: int, view: bool) -> torch.Tensor:
+        columns = (x[:, first:last] for x in (A, B, U))
+        return operation(*(c if view else c.contiguous() for c in columns))
+
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        whole = at(0, N, True)
+        torch.set_num_threads(2)
+        assert _same(at(0, N, True), whole)
+        for first, size in ((0, 1), (5, 1), (1, 3), (7, 13), (3, 1001), (11, 32_769), (1, N - 1), (N - 37, 37)):
+            for view in (False, True):
+                assert _same(at(first, first + size, view), whole[..., first : first + size]), (first, size, view)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _same(a: torch.Tensor, b: torch.Tensor) -> bool:
+    return torch.equal(a.contiguous().view(torch.int32), b.contiguous().view(torch.int32))
+
+
+@pytest.mark.parametrize("sampler", list(SAMPLERS))
+def test_numbers_drawn_do_not_depend_on_their_place(sampler):
+    module, salt = SAMPLERS[sampler], salts(3, torch.device("cpu"))[4]
+    for draw in (module.draw_1d, module.draw_2d):
+        whole = draw(KEYS, salt)
+        for first, size in ((0, 1), (1, 3), (3, 1001), (11, 32_769)):
+            assert torch.equal(draw(KEYS[:, first : first + size], salt), whole[..., first : first + size])
+
+
+class _Recorder(TorchDispatchMode):
+    """Names of the operations that gave floating tensors."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = func(*args, **(kwargs or {}))
+        if any(isinstance(x, torch.Tensor) and x.is_floating_point() and x.dim() for x in tree_leaves(out)):
+            self.seen.add(func._schema.name.split("::")[1])
+        return out
+
+
+def test_the_audit_covers_what_waves_use(monkeypatch):
+    recorder, radiance = _Recorder(), Wave.radiance
+
+    def recorded(self: Wave, *span: int) -> Any:
+        with recorder:
+            return radiance(self, *span)
+
+    monkeypatch.setattr(Wave, "radiance", recorded)
+    scene = torchpt.load(MIXED, device="cpu")
+    for sampler in SAMPLERS:
+        for strategy in ("mis", "bsdf", "light", "uniform"):
+            for filter in ("box", "gaussian"):
+                keys = {"strategy": strategy, "max_depth": 5, "rr_depth": 2}
+                shoot(scene, 2, 0, sampler, keys, {**film_of(8), "filter": filter}, accel="brute")
+    assert "mul" in recorder.seen
+    assert recorder.seen - EXACT - {name for name, _ in OPERATIONS} <= {"tan"}  # of the camera's angle: one number
