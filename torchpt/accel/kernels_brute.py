@@ -31,13 +31,17 @@ def _load(block, o, d, t_max, extent, w):
     if count < BLOCK:
         for i in range(_T + BLOCK):
             w[i] = _DEAD
+    # Views of one row each, not indices from `start`: those might be negative for all the compiler knows, and would
+    # stay scalar code.
     for c in range(3):
+        origin, direction = o[c, start : start + count], d[c, start : start + count]
         for i in range(count):
-            w[c * BLOCK + i] = o[c, start + i]
+            w[c * BLOCK + i] = origin[i]
         for i in range(count):
-            w[(3 + c) * BLOCK + i] = d[c, start + i]
+            w[(3 + c) * BLOCK + i] = direction[i]
+    reach = t_max[start : start + count]
     for i in range(count):
-        w[_T + i] = t_max[start + i]
+        w[_T + i] = reach[i]
     for i in range(BLOCK):
         ox, oy, oz, dx, dy, dz = w[_OX + i], w[_OY + i], w[_OZ + i], w[_DX + i], w[_DY + i], w[_DZ + i]
         nothing = (
@@ -163,7 +167,9 @@ def _all_dead(w):
 def _store(block, table, triangles, rectangles, w, t, prim, u, v):
     """Writes a block's hits; parameters in the slack beyond an edge are brought back to the edge."""
     start = block * BLOCK
-    for i in range(min(BLOCK, t.shape[0] - start)):
+    count = min(BLOCK, t.shape[0] - start)
+    t, prim, u, v = t[start : start + count], prim[start : start + count], u[start : start + count], v[start : start + count]
+    for i in range(count):
         p = np.int32(w[_PRIM + i])
         distance, a, b = w[_T + i], _ZERO, _ZERO
         if 0 <= p < table.shape[0]:
@@ -177,10 +183,10 @@ def _store(block, table, triangles, rectangles, w, t, prim, u, v):
             if p < triangles + rectangles:
                 a = min(max(a, _ZERO), _ONE)
                 b = min(max(b, _ZERO), _ONE if p >= triangles else _ONE - a)
-        t[start + i] = distance if p >= 0 else np.float32(math.inf)
-        prim[start + i] = p
-        u[start + i] = a
-        v[start + i] = b
+        t[i] = distance if p >= 0 else np.float32(math.inf)
+        prim[i] = p
+        u[i] = a
+        v[i] = b
 
 
 @jit()

@@ -14,7 +14,8 @@ __all__ = ["intersect", "intersect_parallel", "occluded", "occluded_parallel"]
 _SLACK = np.float32(1.0 + 2.0**-20)  # as in torchpt.accel.traverse
 _INF = np.float32(np.inf)
 _ZERO = np.float32(0.0)
-_ONE = np.float32(1.0)
+#: Place of the lowest set bit of a byte.
+_LOWEST = np.array([0, *((k & -k).bit_length() - 1 for k in range(1, 1 << WIDTH))], np.int32)
 
 
 @jit(forceinline=True)
@@ -35,8 +36,9 @@ def _larger(a, b):
 
 @jit(forceinline=True)
 def _children(boxes, node, o, inverse, best, near, unit):
-    """Entry distances of a node's eight boxes, infinite for those not met before ``best``."""
+    """Entry distances of a node's eight boxes; returns one bit for each that is met before ``best``."""
     base = node * 6 * WIDTH
+    met = np.int32(0)
     for k in range(unit * WIDTH):
         i = base + k
         ax, bx = (boxes[_at(i)] - o[0]) * inverse[0], (boxes[_at(i + 3 * WIDTH)] - o[0]) * inverse[0]
@@ -44,29 +46,33 @@ def _children(boxes, node, o, inverse, best, near, unit):
         az, bz = (boxes[_at(i + 2 * WIDTH)] - o[2]) * inverse[2], (boxes[_at(i + 5 * WIDTH)] - o[2]) * inverse[2]
         a = _larger(_larger(_smaller(ax, bx), _smaller(ay, by)), _larger(_smaller(az, bz), _ZERO))
         b = _smaller(_smaller(_larger(ax, bx), _larger(ay, by)), _smaller(_larger(az, bz), best)) * _SLACK
-        near[k] = a if a <= b else _INF
+        near[k] = a
+        met |= (np.int32(1) << np.int32(k)) if (a <= b) & (a < _INF) else np.int32(0)
+    return met
 
 
 @jit(forceinline=True)
-def _push(child, node, near, stack, entry, top):
+def _push(child, node, met, near, stack, entry, top):
     """Puts the boxes that were met on the stack, the nearest on top."""
     bottom = top
-    for k in range(WIDTH):
+    while met != 0:
+        k = _LOWEST[met]
+        met &= met - np.int32(1)
         a = near[k]
-        if a < _INF:
-            j = top
-            while j > bottom and entry[j - 1] < a:
-                entry[j], stack[j] = entry[j - 1], stack[j - 1]
-                j -= 1
-            entry[j], stack[j] = a, child[node * WIDTH + k]
-            top += 1
+        j = top
+        while j > bottom and entry[j - 1] < a:
+            entry[j], stack[j] = entry[j - 1], stack[j - 1]
+            j -= 1
+        entry[j], stack[j] = a, child[node * WIDTH + k]
+        top += 1
     return top
 
 
 @jit(forceinline=True)
-def _inside(corners, leaf, px, py, pz, kx, ky, kz, sx, sy, inside, unit):
-    """Marks which of a leaf's eight triangles the ray's line crosses."""
+def _inside(corners, leaf, px, py, pz, kx, ky, kz, sx, sy, unit):
+    """One bit for each of a leaf's eight triangles that the ray's line crosses."""
     base = leaf * 9 * WIDTH
+    crossed = np.int32(0)
     x, y, z = base + kx * WIDTH, base + ky * WIDTH, base + kz * WIDTH
     for k in range(unit * WIDTH):
         i, j = 3 * WIDTH + k, 6 * WIDTH + k
@@ -79,7 +85,8 @@ def _inside(corners, leaf, px, py, pz, kx, ky, kz, sx, sy, inside, unit):
         g = bx * ay - by * ax
         low, high = _smaller(_smaller(e, f), g), _larger(_larger(e, f), g)
         # a missing triangle is NaN in all corners, and NaN is neither
-        inside[k] = _ONE if (low >= _ZERO) | (high <= _ZERO) else _ZERO
+        crossed |= (np.int32(1) << np.int32(k)) if (low >= _ZERO) | (high <= _ZERO) else np.int32(0)
+    return crossed
 
 
 @jit(forceinline=True)
@@ -90,10 +97,10 @@ def _finite(a, b, c):
 @jit()
 def _trace(first, last, o, d, t_max, tree, kinds, room, unit, any_hit, out_t, out_prim, out_u, out_v):
     """The nearest hits of a range of rays, or for each any hit's primitive alone."""
-    boxes, child, leaves, ids, simple, corner, rows = tree
+    boxes, child, leaves, ids, full, corner, rows = tree
     n1, n2, n3 = kinds
     stack, entry = np.empty(room, np.int32), np.empty(room, np.float32)
-    near, inside = np.empty(WIDTH, np.float32), np.empty(WIDTH, np.float32)
+    near = np.empty(WIDTH, np.float32)
     for i in range(first, last):
         p, r, best = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i]), t_max[i]
         prim, best_u, best_v = np.int32(-1), _ZERO, _ZERO
@@ -109,18 +116,16 @@ def _trace(first, last, o, d, t_max, tree, kinds, room, unit, any_hit, out_t, ou
             if entry[top] > best * _SLACK:
                 continue
             if node >= 0:
-                _children(boxes, node, p, (ix, iy, iz), best, near, unit)
-                top = _push(child, node, near, stack, entry, top)
+                met = _children(boxes, node, p, (ix, iy, iz), best, near, unit)
+                top = _push(child, node, met, near, stack, entry, top)
                 continue
             leaf = ~node
-            if simple[leaf]:
-                _inside(leaves, leaf, px, py, pz, kx, ky, kz, sx, sy, inside, unit)
-            for k in range(WIDTH):
-                if simple[leaf] and inside[k] == _ZERO:
-                    continue
-                q = ids[leaf * WIDTH + k]
-                if q < 0:
-                    continue
+            left = full[leaf]
+            if left < 0:
+                left = _inside(leaves, leaf, px, py, pz, kx, ky, kz, sx, sy, unit)
+            while left != 0:
+                q = ids[leaf * WIDTH + _LOWEST[left]]
+                left &= left - np.int32(1)
                 t, u, v = distance(q, corner, rows, n1, n2, n3, p, r, kx, ky, kz, sx, sy, sz)
                 if t > _ZERO and (t < best or (t == best and q < prim)):
                     best, prim, best_u, best_v = t, q, u, v

@@ -45,8 +45,8 @@ class Wide(Accel):
         tree = _wide_tree(boxes, ids)
         self.depth, self.nodes, self.sah_cost = tree.depth, len(tree.child) // WIDTH, tree.cost
         self.leaves = len(tree.ids) // WIDTH
-        tris, simple = _leaf_blocks(tree.ids, corner.numpy(), geometry.counts[0])
-        arrays = (tree.boxes, tree.child, tris, tree.ids, simple)
+        tris, full = _leaf_blocks(tree.ids, corner.numpy(), geometry.counts[0])
+        arrays = (tree.boxes, tree.child, tris, tree.ids, full)
         self.tensors = [*(torch.from_numpy(a) for a in arrays), corner, tables.rows]
         self.build_seconds = time.perf_counter() - start
 
@@ -108,14 +108,18 @@ def _binary_cost(nodes: np.ndarray, spans: np.ndarray) -> float:
 
 
 def _leaf_blocks(ids: np.ndarray, corner: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of each leaf's triangles, component first: ``(leaves * 72,)``; and whether it holds only triangles."""
+    """Corners of each leaf's triangles, component first: ``(leaves * 72,)``; and which slots to test one by one.
+
+    That is -1 where all are triangles (a vector test finds the few to look at), else one bit for each used slot.
+    """
     slots = ids.reshape(-1, WIDTH)
     if slots.size == 0:
-        return np.zeros(0, np.float32), np.zeros(0, np.bool_)
+        return np.zeros(0, np.float32), np.zeros(0, np.int32)
     blocks = corner[:, :9][np.maximum(slots, 0)]  # (leaves, 8, 9)
     blocks[slots < 0] = np.nan
-    simple = (slots < triangles).all(1)
-    return np.ascontiguousarray(blocks.transpose(0, 2, 1)).reshape(-1), simple
+    used = ((slots >= 0) << np.arange(WIDTH)).sum(1)
+    full = np.where((slots < triangles).all(1), -1, used).astype(np.int32)
+    return np.ascontiguousarray(blocks.transpose(0, 2, 1)).reshape(-1), full
 
 
 @torch.library.custom_op("torchpt::wide_intersect", mutates_args=())
