@@ -44,7 +44,9 @@ class Perspective:
         w, h = self.width, self.height
         if self.fov_axis == "diagonal":
             return half * (w / math.hypot(w, h))
-        vertical = self.fov_axis == "y" or (self.fov_axis == "smaller" and h < w) or (self.fov_axis == "larger" and h > w)
+        vertical = (
+            self.fov_axis == "y" or (self.fov_axis == "smaller" and h < w) or (self.fov_axis == "larger" and h > w)
+        )
         return half * (w / h) if vertical else half
 
     def rays(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:

@@ -106,7 +106,8 @@ class Film:
             return None
         sums, counts = self._sums[filled], self._counts[filled]
         means = sums / counts[:, None]
-        return self._picture(means.var(0) / len(means))
+        spread = (means - means.mean(0)).square().sum(0) / (len(means) - 1)
+        return self._picture(spread / len(means))
 
     def relmse(self) -> float | None:
         """The picture's estimate of its own relMSE."""

@@ -132,7 +132,7 @@ class PathState:
 
     o: Tensor  # (3, N) ray origin
     d: Tensor  # (3, N) ray direction, unit
-    t_max: Tensor  # (N,) inf; 0 once the path has ended
+    t_max: Tensor  # (N,) the largest float; 0 once the path has ended
     throughput: Tensor  # (3, N)
     radiance: Tensor  # (3, N) gathered so far
     pdf: Tensor  # (N,) with which d was drawn: inf where emission counts whole, 0 where it does not count

@@ -190,7 +190,9 @@ def render(
     backward_seed = settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad
     fixed = {name: value for name, value in (params or {}).items() if name not in wanted}
     again = settings.model_copy(
-        update={"render": settings.render.model_copy(update={"seed": backward_seed, "spp": spp_grad or settings.render.spp})}
+        update={
+            "render": settings.render.model_copy(update={"seed": backward_seed, "spp": spp_grad or settings.render.spp})
+        }
     )
     names = tuple(wanted)
 
@@ -315,7 +317,9 @@ def _lanes(settings: Settings, device: torch.device, per_lane: int = BYTES_PER_L
     return lanes
 
 
-def _chunks(settings: Settings, lanes: int, randomizations: int, pixels: int) -> Iterator[tuple[int, int, int, int, bool]]:
+def _chunks(
+    settings: Settings, lanes: int, randomizations: int, pixels: int
+) -> Iterator[tuple[int, int, int, int, bool]]:
     """Ranges ``(first_pixel, pixels, first_sample, samples, ends_pass)``. Chunks split pixels, never samples' order."""
     for first_sample, samples in _passes(settings.render.spp, randomizations):
         batch = max(min(samples, lanes), 1)
@@ -357,7 +361,10 @@ class _Run:
             self.done += count * samples
             if on_progress is not None:
                 seconds = time.perf_counter() - self.start
-                if on_progress(Progress(self.done, total, self.tally.rays, seconds, ends, self.result)) and self.done < total:
+                if (
+                    on_progress(Progress(self.done, total, self.tally.rays, seconds, ends, self.result))
+                    and self.done < total
+                ):
                     break
         return self.result()
 

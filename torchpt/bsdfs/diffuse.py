@@ -38,12 +38,11 @@ def pdf(parameters: Parameters, wo: Tensor, wi: Tensor) -> Tensor:
 
 def sample(parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
     """Cosine-weighted direction on the side of ``wo``."""
-    wi = cosine_hemisphere(u)
-    wi = torch.stack((wi[0], wi[1], torch.copysign(wi[2], wo[2])))
+    wi = cosine_hemisphere(u, wo[2])
     density = pdf(parameters, wo, wi)
     reflectance = parameters["reflectance"]
     assert reflectance is not None
-    return BsdfSample(wi, density, reflectance * (density > 0))
+    return BsdfSample(wi, density, reflectance)
 
 
 def albedo(parameters: Parameters) -> Tensor:

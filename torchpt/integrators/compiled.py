@@ -40,7 +40,9 @@ class Stages:
     def __init__(self, plan: Plan, world: World) -> None:
         self.plan, self.world = plan, world
 
-    def generate(self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+    def generate(
+        self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
+    ) -> PathState:
         """See :func:`torchpt.integrators.stages.generate`."""
         return stages.generate(self.plan, camera, filter, x, y, key, salts)
 
@@ -53,7 +55,15 @@ class Stages:
         return stages.escape(self.plan, self.world, state, index)
 
     def bounce(
-        self, model: int, roulette: bool, slide: bool, search: Search, state: PathState, hit: Hit, index: Tensor, salts: Tensor
+        self,
+        model: int,
+        roulette: bool,
+        slide: bool,
+        search: Search,
+        state: PathState,
+        hit: Hit,
+        index: Tensor,
+        salts: Tensor,
     ) -> tuple[PathState, Hit | None, Shadow | None]:
         """See :func:`torchpt.integrators.stages.bounce`."""
         return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
@@ -75,7 +85,10 @@ class CompiledStages(Stages):
         self.graphs: dict[str, int] = {}
         self._made: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
-    def generate(self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+    def generate(
+        self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
+    ) -> PathState:
+        """See :func:`torchpt.integrators.stages.generate`."""
         if len(x) % 16:  # the last chunk of a film: once a pass, not worth a graph
             return super().generate(camera, filter, x, y, key, salts)
 
@@ -86,14 +99,26 @@ class CompiledStages(Stages):
         return self._get("generate", variant, stage)(camera, filter, x, y, key, salts)
 
     def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
+        """See :func:`torchpt.integrators.stages.emit`."""
+
         def stage(state: PathState, hit: Hit, index: Tensor) -> Tensor:
             return stages.emit(self.plan, self.world, state, hit, index, slide)
 
         return self._get("emit", (slide,), stage)(state, hit, _padded(index))[:, : len(index)]
 
     def bounce(
-        self, model: int, roulette: bool, slide: bool, search: Search, state: PathState, hit: Hit, index: Tensor, salts: Tensor
+        self,
+        model: int,
+        roulette: bool,
+        slide: bool,
+        search: Search,
+        state: PathState,
+        hit: Hit,
+        index: Tensor,
+        salts: Tensor,
     ) -> tuple[PathState, Hit | None, Shadow | None]:
+        """See :func:`torchpt.integrators.stages.bounce`."""
+
         def stage(
             state: PathState, hit: Hit, index: Tensor, salts: Tensor
         ) -> tuple[PathState, Hit | None, Shadow | None]:
@@ -111,16 +136,19 @@ class CompiledStages(Stages):
 
     def _compile(self, name: str, stage: Callable[..., Any]) -> Callable[..., Any]:
         import torch._dynamo.config
-        import torch.fx.experimental._config
+        from torch.fx.experimental import _config
         from torch._inductor.compile_fx import compile_fx
 
-        def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Callable[..., Any]:
+        def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Any:
             self.graphs[name] = self.graphs.get(name, 0) + 1
             return compile_fx(graph, inputs)
 
+        config: Any = _config  # its `patch` is put there at run time
         # A code object of its own: dynamo counts graphs by code, and those of another scene are no business of this one.
         assert isinstance(stage, types.FunctionType)
-        own = types.FunctionType(stage.__code__.replace(), stage.__globals__, stage.__name__, stage.__defaults__, stage.__closure__)
+        own = types.FunctionType(
+            stage.__code__.replace(), stage.__globals__, stage.__name__, stage.__defaults__, stage.__closure__
+        )
         run = torch.compile(own, dynamic=True, fullgraph=True, backend=backend)
 
         def call(*args: Any) -> Any:
@@ -128,7 +156,7 @@ class CompiledStages(Stages):
             # default would fall back to eager with a line in a log.
             with (
                 torch._dynamo.config.patch(recompile_limit=2, fail_on_recompile_limit_hit=True),
-                torch.fx.experimental._config.patch(use_duck_shape=False),
+                config.patch(use_duck_shape=False),
             ):
                 return run(*args)
 

@@ -23,7 +23,7 @@ __all__ = ["ENDLESS", "Limits", "Tally", "trace"]
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted.
 ENDLESS = 4096
 
-R = TypeVar("R")
+R = TypeVar("R", PathState, Hit)
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,13 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
         salt = salts(depth, state.lane.device)
         parts = []
         for model, index in groups:
-            after, found, shadow = stages.bounce(model, depth >= limits.rr_depth, slide, search, state, hit, index, salt)
+            after, found, shadow = stages.bounce(
+                model, depth >= limits.rr_depth, slide, search, state, hit, index, salt
+            )
             if shadow is not None:
                 tally.rays += len(shadow.t_max)
-                clear = ~accel.occluded(shadow.o, shadow.d, shadow.t_max)
-                after = replace(after, radiance=after.radiance + shadow.radiance * clear)
+                clear = (~accel.occluded(shadow.o, shadow.d, shadow.t_max)).to(plan.dtype)
+                after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
             parts.append((after, found))
         state = _join([after for after, _ in parts])
         hit = _join([found for _, found in parts if found is not None]) if plan.attached else None

@@ -19,14 +19,26 @@ from torchpt.cameras import Perspective
 from torchpt.film import Filter
 from torchpt.math.frames import Frame
 from torchpt.math.mis import power_heuristic
-from torchpt.math.vectors import dot, take
+from torchpt.math.vectors import dot, largest, take
 from torchpt.math.warps import uniform_hemisphere
 from torchpt.records import Hit, Interaction, PathState, World
 from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import interact, offset_origin, reattach
 from torchpt.shapes.interaction import OFFSET
 
-__all__ = ["STRATEGIES", "Plan", "Shadow", "Surface", "bounce", "emit", "escape", "generate", "rows", "scatter", "shade"]
+__all__ = [
+    "STRATEGIES",
+    "Plan",
+    "Shadow",
+    "Surface",
+    "bounce",
+    "emit",
+    "escape",
+    "generate",
+    "rows",
+    "scatter",
+    "shade",
+]
 
 #: mis: light and BSDF sampling combined; bsdf, light: one of them; uniform: directions uniform over the hemisphere.
 STRATEGIES = ("mis", "bsdf", "light", "uniform")
@@ -74,7 +86,9 @@ def rows(record: R, index: Tensor) -> R:
     return type(record)(**{f.name: take(getattr(record, f.name), index) for f in fields(record)})
 
 
-def generate(plan: Plan, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+def generate(
+    plan: Plan, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
+) -> PathState:
     """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter."""
     place = filter.offset(Draws(plan.sampler, key, salts).two(Dimension.PIXEL)).to(plan.dtype)
     o, d = camera.rays(x + 0.5 + place[0], y + 0.5 + place[1])
@@ -104,9 +118,7 @@ def escape(plan: Plan, world: World, state: PathState, index: Tensor) -> Tensor:
 
 def _weighted(throughput: Tensor, radiance: Tensor, pdf: Tensor, light_pdf: Tensor) -> Tensor:
     # PathState.pdf is inf where emission counts whole and 0 where it does not count: the heuristic's own limits.
-    whole = torch.isinf(pdf)
-    weight = torch.where(whole, 1.0, power_heuristic(torch.where(whole, 1.0, pdf), light_pdf))
-    return throughput * radiance * weight.detach()
+    return throughput * radiance * power_heuristic(pdf, light_pdf).detach()
 
 
 def bounce(
@@ -177,7 +189,7 @@ def shade(
     radiance = state.throughput * reflected * light.radiance * weight
     o = offset_origin(world, at, light.wi)
     d = light.target - o
-    lit = radiance.detach().amax(0) > 0
+    lit = largest(radiance.detach()) > 0
     t_max = lit.to(plan.dtype) * (1.0 - SHORTEN)
     if light.distant is not None:
         d = torch.where(light.distant, light.wi, d)
@@ -217,34 +229,41 @@ def scatter(
         wi, pdf, weight = drawn.wi, drawn.pdf, drawn.weight
     d = frame.to_world(wi).detach()
     o = offset_origin(world, at, d)
-    alive = pdf > 0
+    # Least of what must be positive for the path to go on: comparisons cost more than minima.
+    least = pdf.detach()
     if world.normals is not None:
-        alive = alive & (dot(d, at.ng) * wi[2] > 0)
-    forever = torch.full_like(pdf, math.inf)
-    hit = None
+        least = torch.minimum(least, dot(d, at.ng) * wi[2])
+    hit, forever = None, torch.finfo(torch.float32).max
     if plan.attached:
         # Detached sampling: direction and density are constants, the integrand follows the geometry.
         pdf = pdf.detach()
-        hit = search(replace(state, o=o, d=d, t_max=torch.where(alive, forever, 0.0)))
+        alive = least > 0
+        hit = search(replace(state, o=o, d=d, t_max=alive.to(plan.dtype) * forever))
         d, measure = reattach(world, at.p, hit, d)
         weight = kind.eval(parameters, wo, frame.to_local(d)) * (measure / torch.where(alive, pdf, 1.0))
     throughput = state.throughput * weight
-    brightest = throughput.detach().amax(0)
-    alive = alive & (brightest > 0)
+    brightest = largest(throughput.detach())
+    alive = torch.minimum(least, brightest) > 0
     if roulette:
-        survival = brightest.clamp_max(SURVIVAL_CAP) if plan.rr_prob is None else torch.full_like(brightest, plan.rr_prob)
+        survival = (
+            brightest.clamp_max(SURVIVAL_CAP) if plan.rr_prob is None else torch.full_like(brightest, plan.rr_prob)
+        )
         alive = alive & (draws.one(Dimension.ROULETTE) < survival)
         throughput = throughput / torch.where(alive, survival, 1.0)
     if hit is not None:
         hit = replace(hit, prim=torch.where(alive, hit.prim, -1))
-    counts = {"mis": pdf, "light": torch.zeros_like(pdf)}.get(plan.strategy, forever)
+    on = alive.to(plan.dtype)
+    if plan.strategy == "mis" and world.lights is not None:
+        counts = pdf.detach()
+    else:
+        counts = torch.full_like(pdf, 0.0 if plan.strategy == "light" and world.lights is not None else math.inf)
     after = PathState(
         o=o,
         d=d,
-        t_max=torch.where(alive, forever, 0.0),
-        throughput=throughput * alive,
+        t_max=on * forever,
+        throughput=throughput * on,
         radiance=state.radiance,
-        pdf=(counts if world.lights is not None else forever).detach(),
+        pdf=counts,
         lane=state.lane,
         key=state.key,
     )

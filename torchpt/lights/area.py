@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from torchpt.math.vectors import dot
+from torchpt.math.vectors import affine, dot, safe_reciprocal
 from torchpt.math.warps import concentric_disk, uniform_triangle
 
 __all__ = ["WARPS", "inverse_pdf", "point"]
@@ -21,7 +20,7 @@ WARPS = {"triangle": uniform_triangle, "rectangle": _identity, "disk": concentri
 
 def point(p0: Tensor, e1: Tensor, e2: Tensor, uv: Tensor) -> Tensor:
     """The point ``(3, N)`` at ``(u, v)`` of affine primitives."""
-    return p0 + e1 * uv[0] + e2 * uv[1]
+    return affine(p0, e1, uv[0], e2, uv[1])
 
 
 def inverse_pdf(normal: Tensor, area: Tensor, wi: Tensor, square: Tensor) -> Tensor:
@@ -34,4 +33,4 @@ def inverse_pdf(normal: Tensor, area: Tensor, wi: Tensor, square: Tensor) -> Ten
         square: squared distance ``(N,)``.
     """
     cosine = (-dot(wi, normal)).clamp_min(0.0)
-    return area * cosine / torch.where(square > 0, square, torch.inf)
+    return area * cosine * safe_reciprocal(square)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.frames import Frame
-from torchpt.math.vectors import dot, normalize
+from torchpt.math.vectors import dot, normalize, safe_reciprocal
 from torchpt.math.warps import one_minus_cos, uniform_cone, uniform_sphere
 
 __all__ = ["inverse_pdf", "sample"]
@@ -43,5 +43,5 @@ def inverse_pdf(x: Tensor, centre: Tensor, radius: Tensor, normal: Tensor, wi: T
     """``1 / pdf`` in solid angle of :func:`sample`, given what was hit; 0 behind the emitting side."""
     _, _, outside, width = _cone(x, centre, radius)
     cosine = -dot(wi, normal)
-    whole = (4.0 * math.pi) * radius * radius * cosine / torch.where(square > 0, square, torch.inf)
+    whole = (4.0 * math.pi) * radius * radius * cosine * safe_reciprocal(square)
     return torch.where(cosine > 0, torch.where(outside, (2.0 * math.pi) * width, whole), 0.0)

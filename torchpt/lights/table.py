@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchpt.lights import area, constant, sphere
-from torchpt.math.vectors import dot, take
+from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.records import Interaction, Lights, LightSample
 
 __all__ = ["emitted", "environment", "sample"]
@@ -73,7 +73,7 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
         return _environment_sample(lights, wi, 1.0)
     to = target - x
     square = dot(to, to)
-    wi = to / torch.where(square > 0, square, 1.0).sqrt()
+    wi = to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
     inverse = area.inverse_pdf(normal, at.area, wi, square)
     if "sphere" in lights.kinds:
         ball = sphere.inverse_pdf(x.detach(), at.p0.detach(), at.e1[0].detach(), normal, wi.detach(), square.detach())
@@ -82,10 +82,11 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
         ball = ball * torch.where(value > 0, inverse / torch.where(value > 0, value, 1.0), 1.0)
         inverse = _pick(_is(lights, "sphere", row), ball, inverse)
     probability = _probability(lights, row)
-    inverse = inverse / probability
-    value = inverse.detach()
-    pdf = torch.where(value > 0, 1.0 / torch.where(value > 0, value, 1.0), 0.0)
-    target = target + normal * (at.bound * offset)
+    if lights.choice is not None:
+        inverse = inverse / probability
+    # Where the light is not seen the weight is 0, and the density has no say.
+    pdf = safe_reciprocal(inverse.detach())
+    target = torch.addcmul(target, normal, at.bound * offset)
     here = LightSample(wi, target, None, at.radiance.expand_as(wi), pdf, inverse)
     if "constant" not in lights.kinds:
         return here
@@ -93,9 +94,12 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
     assert distant is not None
     there = _environment_sample(lights, constant.sample(u), probability)
     return LightSample(
-        *(torch.where(distant, getattr(there, n), getattr(here, n)) for n in ("wi", "target")),
-        distant,
-        *(torch.where(distant, getattr(there, n), getattr(here, n)) for n in ("radiance", "pdf", "weight")),
+        wi=torch.where(distant, there.wi, here.wi),
+        target=torch.where(distant, there.target, here.target),
+        distant=distant,
+        radiance=torch.where(distant, there.radiance, here.radiance),
+        pdf=torch.where(distant, there.pdf, here.pdf),
+        weight=torch.where(distant, there.weight, here.weight),
     )
 
 
@@ -127,8 +131,7 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Ten
         if "sphere" in lights.kinds:
             ball = sphere.inverse_pdf(x, table.p0, table.e1[0], at.ng, wi, dot(to, to))
             inverse = _pick(_is(lights, "sphere", row), ball, inverse)
-        inverse = inverse / _probability(lights, row)
-        pdf = torch.where(inverse > 0, 1.0 / torch.where(inverse > 0, inverse, 1.0), 0.0)
+        pdf = safe_reciprocal(inverse / _probability(lights, row))
         facing = dot(wi, at.ng) < 0
     return torch.where(facing, table.radiance, 0.0), pdf
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import dot
+from torchpt.math.vectors import affine, dot
 
 __all__ = ["Frame"]
 
@@ -39,4 +39,4 @@ class Frame:
 
     def to_world(self, w: Tensor) -> Tensor:
         """Local ``(3, N)`` to world."""
-        return self.s * w[0] + self.t * w[1] + self.n * w[2]
+        return affine(self.s * w[0], self.t, w[1], self.n, w[2])

@@ -39,15 +39,15 @@ def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dty
     if part.kind == "sphere":
         radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)
         zero = torch.zeros_like(radius)
-        return Corners(
-            *(x.to(dtype) for x in (move, torch.stack((radius, zero, zero))[:, None], torch.zeros_like(move))), None
-        )
+        p1 = torch.stack((radius, zero, zero))[:, None]
+        return Corners(move.to(dtype), p1.to(dtype), torch.zeros_like(move).to(dtype), None)
     if part.kind == "rectangle":  # Mitsuba's unit shape [-1, 1]^2 from its lower corner
         x, y = 2.0 * linear[:, 0:1], 2.0 * linear[:, 1:2]
         p0 = move - 0.5 * (x + y)
-        return Corners(*(p.to(dtype) for p in (p0, p0 + x, p0 + y)), None)
+        return Corners(p0.to(dtype), (p0 + x).to(dtype), (p0 + y).to(dtype), None)
     if part.kind == "disk":
-        return Corners(*(p.to(dtype) for p in (move, move + linear[:, 0:1], move + linear[:, 1:2])), None)
+        p1, p2 = move + linear[:, 0:1], move + linear[:, 1:2]
+        return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), None)
     vertices = linear @ parameters[f"{part.name}.vertices"].T.double() + move
     device = vertices.device
     assert part.faces is not None
@@ -129,7 +129,7 @@ def assemble(
     key = torch.cat((torch.full((1,), 2 * len(models), device=device), keys)).to(torch.uint8)
     lights = _lights(parts, sizes, parameters, environment, p0, e1, e2, normal, bound, sign, face, emissive, dtype)
     # The search gets the corners themselves: rebuilt from edges, neighbours would no longer share them to the bit.
-    search = (x.detach().to(torch.float32).contiguous() for x in (p0, p1, p2))
+    q0, q1, q2 = (x.detach().to(torch.float32).contiguous() for x in (p0, p1, p2))
     size = (counts[0], counts[1], counts[2], counts[3])
     world = World(
         counts=size,
@@ -147,7 +147,7 @@ def assemble(
         object_id=spread([part.object_id for part in parts]),
         lights=lights,
     )
-    return world, Geometry(*search, size)
+    return world, Geometry(q0, q1, q2, size)
 
 
 def _largest(p0: Tensor, e1: Tensor, e2: Tensor) -> Tensor:

@@ -51,7 +51,9 @@ def build_parts(description: Description) -> Built:
         parts += _shape_parts(description, name, shape, number, parameters)
     for name, material in description.materials.items():
         for slot in (_slot(f"materials.{name}", material),):
-            parameters.update({f"{slot.name}.{key}": np.asarray(value, np.float64) for key, value in slot.values.items()})
+            parameters.update(
+                {f"{slot.name}.{key}": np.asarray(value, np.float64) for key, value in slot.values.items()}
+            )
     if len(description.lights) > 1:
         first, second = list(description.lights)[:2]
         raise SceneError(f"lights.{second}", "constant", f"one environment only ({first} is one)", description.file)
@@ -101,7 +103,9 @@ def _shape_parts(
         stem = prefix if len(pieces) == 1 else f"{prefix}.{label}"
         parameters[f"{stem}.vertices"] = np.asarray(piece.vertices, np.float64)
         parameters[f"{stem}.to_world"] = pose
-        part = _part(description, shape, stem, name, number, "triangle", pose, piece, parameters, flat=flat, source=source)
+        part = _part(
+            description, shape, stem, name, number, "triangle", pose, piece, parameters, flat=flat, source=source
+        )
         parts.append(part)
     if all(len(part.faces) == 0 for part in parts if part.faces is not None):
         problem = "every face is degenerate (without area)"
@@ -140,13 +144,19 @@ def _part(
     elif shape.material is not None:
         slot = _slot(f"{prefix}.material", shape.material)
     else:
-        colour = own.reflectance if own is not None and own.reflectance is not None else _GREY
-        slot = MaterialSlot("diffuse", f"{prefix}.material", {"reflectance": tuple(colour)}, True)
+        colour = _GREY if own is None or own.reflectance is None else own.reflectance
+        slot = MaterialSlot("diffuse", f"{prefix}.material", {"reflectance": colour}, True)
     for key, value in slot.values.items():
         parameters[f"{slot.name}.{key}"] = np.asarray(value, np.float64)
     emission = shape.emission
-    if emission is None and shape.material is None and own is not None and own.emission is not None and any(own.emission):
-        emission = tuple(own.emission)
+    if (
+        emission is None
+        and shape.material is None
+        and own is not None
+        and own.emission is not None
+        and any(own.emission)
+    ):
+        emission = own.emission
     if emission is not None and not any(emission):
         emission = None
     emission_name = f"shapes.{name}.emission" if shape.emission is not None else f"{prefix}.emission"
@@ -188,7 +198,11 @@ def _centre(parts: list[Part], parameters: dict[str, np.ndarray]) -> np.ndarray:
     """Where the origin goes: the middle of a scene that lies far off, else where it is."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for part in parts:
-        points = part.vertices if part.vertices is not None else np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        points = (
+            part.vertices
+            if part.vertices is not None
+            else np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        )
         world = points @ part.to_world[:3, :3].T + part.to_world[:3, 3]
         low, high = np.minimum(low, world.min(0)), np.maximum(high, world.max(0))
     if not parts:

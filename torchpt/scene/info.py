@@ -32,12 +32,14 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         if part.ignored:
             row["ignored_in_file"] = list(part.ignored)
         if part.kind == "triangle":
-            row["normals"] = "face" if not part.smooth else "computed, smooth" if part.normals is None else "from the file"
+            row["normals"] = (
+                "face" if not part.smooth else "computed, smooth" if part.normals is None else "from the file"
+            )
         shapes[part.name.removeprefix("shapes.")] = row
     memory = sum(x.numel() * x.element_size() for x in _tensors(world))
     made: dict[str, Any] = {
         "accel": accel.describe(),
-        "bsdfs": {model: len(next(iter(t.values()))[0]) for model, t in zip(world.models, world.bsdfs, strict=True) if t},  # type: ignore[index]
+        "bsdfs": dict(zip(world.models, (_rows(table) for table in world.bsdfs), strict=True)),
         "lights": {} if lights is None else {"rows": len(lights.area), "kinds": list(lights.kinds)},
         "scene_bytes": memory,
     }
@@ -52,7 +54,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "shapes": shapes,
         "built": made,
         "left_out": _left_out(world, settings),
-        "settings": settings.model_dump(mode="json"),
+        "settings": settings.model_dump(mode="json", warnings=False),
     }
 
 
@@ -88,6 +90,11 @@ def _left_out(world: World, settings: Settings) -> list[str]:
         absent.append("aov layers")
     absent += ["textures", "volumes", "derivative tape (until a parameter requires gradients)"]
     return absent
+
+
+def _rows(table: dict[str, Any]) -> int:
+    """How many materials share a model's stacked parameters."""
+    return max((value.shape[-1] for value in table.values() if value is not None), default=0)
 
 
 def _tensors(record: object) -> list[Any]:

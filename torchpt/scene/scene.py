@@ -135,7 +135,11 @@ class Scene:
         shift = torch.zeros(4, 4, dtype=torch.float64, device=self.device)
         shift[:3, 3] = self._centre
         return Perspective(
-            (pose - shift).to(dtype), params["camera.fov"].to(dtype), self.description.camera.fov_axis, film.width, film.height
+            (pose - shift).to(dtype),
+            params["camera.fov"].to(dtype),
+            self.description.camera.fov_axis,
+            film.width,
+            film.height,
         )
 
     def info(self, settings: Settings) -> dict[str, Any]:

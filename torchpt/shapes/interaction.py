@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import cross, dot, normalize, take
+from torchpt.math.vectors import affine, cross, dot, normalize, take
 from torchpt.records import Hit, Interaction, World
 
 __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
@@ -34,7 +34,7 @@ def _slide(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple[Te
 
 def _blend(corners: tuple[Tensor, Tensor, Tensor], prim: Tensor, u: Tensor, v: Tensor) -> Tensor:
     n0, n1, n2 = (take(n, prim) for n in corners)
-    return n0 * (1.0 - u - v) + n1 * u + n2 * v
+    return affine(n0 * (1.0 - u - v), n1, u, n2, v)
 
 
 def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) -> Interaction:
@@ -56,7 +56,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         u, v = _slide(o, d, p0, e1, e2)
         if ball is not None:
             u, v = torch.where(ball, 0.0, u), torch.where(ball, 0.0, v)
-    p = p0 + e1 * u + e2 * v
+    p = affine(p0, e1, u, e2, v)
     ng = take(world.normal, prim)
     if ball is not None:
         assert world.flip is not None
@@ -99,7 +99,7 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
     missed = hit.prim < 0
     prim = hit.prim.clamp_min(0)
     p0, e1, e2 = take(world.p0, prim), take(world.e1, prim), take(world.e2, prim)
-    y = p0 + e1 * hit.u + e2 * hit.v
+    y = affine(p0, e1, hit.u, e2, hit.v)
     area = cross(e1, e2)
     spheres = world.counts[3]
     if spheres:
@@ -125,4 +125,4 @@ def offset_origin(world: World, at: Interaction, w: Tensor) -> Tensor:
     Waechter and Binder (*A Fast and Robust Method for Avoiding Self-Intersection*, Ray Tracing Gems, 2019) for the idea.
     """
     step = take(world.bound, at.prim) * OFFSET
-    return at.p + at.ng * torch.copysign(step, dot(w, at.ng))
+    return torch.addcmul(at.p, at.ng, torch.copysign(step, dot(w, at.ng)))
