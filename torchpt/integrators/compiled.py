@@ -136,8 +136,8 @@ class CompiledStages(Stages):
 
     def _compile(self, name: str, stage: Callable[..., Any]) -> Callable[..., Any]:
         import torch._dynamo.config
-        from torch.fx.experimental import _config
         from torch._inductor.compile_fx import compile_fx
+        from torch.fx.experimental import _config
 
         def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Any:
             self.graphs[name] = self.graphs.get(name, 0) + 1
