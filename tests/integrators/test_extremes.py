@@ -1,4 +1,4 @@
-"""Scenes at the edge: nothing in them, nothing that shines, cameras inside solids, radiance and albedo at their limits."""
+"""Scenes at the edge: empty, dark, cameras inside solids, radiance and albedo at their limits."""
 
 from __future__ import annotations
 

@@ -133,9 +133,9 @@ OPERATIONS: list[tuple[str, Callable[..., torch.Tensor]]] = [
 ]
 #: What moves numbers or makes constants, without arithmetic. Scatters here have distinct indices.
 EXACT = {
-    "alias", "arange", "cat", "clone", "copy_", "detach", "empty", "empty_like", "expand", "full", "full_like", "gather",
-    "index", "index_select", "lift_fresh", "new_zeros", "ones", "ones_like", "permute", "repeat", "repeat_interleave",
-    "scalar_tensor", "scatter_", "scatter_add_", "select", "slice", "stack", "take", "unsqueeze", "view", "zeros",
+    "alias", "arange", "cat", "clone", "copy_", "detach", "empty", "empty_like", "expand", "full", "full_like",
+    "gather", "index", "index_select", "lift_fresh", "new_zeros", "ones", "ones_like", "permute", "repeat",
+    "repeat_interleave", "scalar_tensor", "scatter_", "scatter_add_", "select", "slice", "stack", "take", "unsqueeze", "view", "zeros",
     "zeros_like", "_unsafe_view", "split", "squeeze", "sort", "brute_intersect", "brute_occluded",
 }  # fmt: skip
 

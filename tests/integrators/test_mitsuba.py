@@ -1,0 +1,137 @@
+"""Against Mitsuba 3: per-pixel z-tests of whole pictures, with stored references and live ones.
+
+``tests/references/NAME.exr`` holds Mitsuba's mean over independent seeds and the variance of that mean, made by
+``scripts/make_references.py``. The deviate of a pixel is ``z = (ours - theirs) / sqrt(var_ours + var_theirs)``, where our
+variance comes from ``SEEDS`` independent pictures. As it is estimated from few of them, z follows Student's t about: mean
+square ``n / (n - 2) = 1.07``, and since radiance is skewed (a large mean comes with a large variance) its mean lies a little
+below zero. The tolerances are stated for that; block means, where both effects average out, are tested at ``SIGNIFICANCE``.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from trials import SIGNIFICANCE, chi_square_p, film_of, shoot, spread, z_limit
+
+import torchpt
+from torchpt.scene.description import settings
+
+ROOT = Path(__file__).parent.parent.parent
+SEEDS = 32
+KEYS = {"max_depth": 8, "rr_depth": 5}
+
+
+def turn(angle: float) -> dict[str, Any]:
+    return {"rotate": {"axis": [0, 1, 0], "angle": angle}}
+
+
+# Every analytic shape, several lights of different kinds, and the environment.
+ZOO: dict[str, Any] = {
+    "camera": {"origin": [0.5, 2.2, 6], "target": [0, 0.7, 0], "fov": 38, "fov_axis": "y"},
+    "lights": {"sky": {"type": "constant", "radiance": [0.02, 0.025, 0.04]}},
+    "materials": {"clay": {"type": "diffuse", "reflectance": [0.7, 0.45, 0.3]}},
+    "shapes": {
+        "floor": {
+            "type": "rectangle",
+            "material": "clay",
+            "transform": [{"scale": 4}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}],
+        },
+        "ball": {"type": "sphere", "center": [-1, 0.6, 0], "radius": 0.6, "material": "clay"},
+        "block": {
+            "type": "cube",
+            "transform": [{"scale": [0.4, 0.5, 0.3]}, turn(30), {"translate": [1.2, 0.5, 0.4]}],
+        },
+        "bulb": {"type": "sphere", "center": [0.3, 2, 0.6], "radius": 0.1, "emission": [30, 25, 20]},
+        "panel": {
+            "type": "disk",
+            "emission": [3, 4, 5],
+            "transform": [{"scale": [0.6, 0.4, 1]}, turn(90), {"translate": [-2, 1, 0]}],
+        },
+        "gem": {
+            "type": "mesh",
+            "material": "clay",
+            "vertices": [[0, 0.1, 1], [0.6, 0.1, 0.9], [0.3, 0.1, 1.5], [0.3, 0.8, 1.1]],
+            "faces": [[0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 2, 1]],
+            "face_normals": True,  # so coarse a mesh with smooth normals leaks light in Mitsuba; torchpt lets none through
+        },
+        "glow": {
+            "type": "mesh",
+            "emission": [1, 2, 1],
+            "vertices": [[1, 0.5, -1], [2, 0.5, -1], [1.5, 1.5, -1]],
+            "faces": [[0, 1, 2]],
+            "face_normals": True,
+        },
+    },
+}  # fmt: skip
+
+
+def ours(scene: Any, size: int) -> tuple[Tensor, Tensor]:
+    return spread([shoot(scene, 16, 100 + k, "sobol", KEYS, film_of(size)).image for k in range(SEEDS)])
+
+
+def assert_equal_pictures(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> None:
+    """Two pictures ``(mean, variance of the mean)`` estimate the same."""
+    difference, variance = a[0] - b[0], a[1] + b[1]
+    lit = variance.sqrt() > 1e-5 * b[0]
+    assert not difference[~lit].abs().gt(1e-4 * b[0][~lit]).any()  # pixels without noise: the lamp, black
+    z = difference[lit] / variance[lit].sqrt()
+    assert 0.9 < float((z**2).mean()) < 1.2
+    assert float((z.abs() > 3).double().mean()) < 0.015  # t of 31 degrees: 0.0053; skewed radiance: up to 0.01
+    assert float(z.abs().max()) < 8
+    assert abs(float(z.mean())) < 0.15
+    side = len(difference) // 8
+    blocks, noise = pooled(difference, side), pooled(variance * lit, side).sqrt() / side
+    deviate = torch.where(noise > 1e-5 * pooled(b[0], side), blocks / noise.clamp_min(1e-30), 0.0)
+    assert float(deviate.abs().max()) < 1.1 * z_limit(deviate.numel())
+    for channel in deviate:  # channels share their paths: each is a test of its own
+        assert chi_square_p(float((channel**2).sum()), channel.numel()) > SIGNIFICANCE / 3
+    whole, error = difference.mean((0, 1)), variance.sum((0, 1)).sqrt() / difference[..., 0].numel()
+    reference = b[0].mean((0, 1))
+    assert (error / reference).max() < 0.004  # the test can see a bias of 1 %
+    assert (whole.abs() < z_limit(3) * error).all()
+
+
+def pooled(picture: Tensor, side: int) -> Tensor:
+    return torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], side)[0]
+
+
+@pytest.mark.parametrize("name", ["cornell_box", "cornell_bunny"])
+def test_stored_references(name):
+    assets = os.environ.get("TORCHPT_ASSETS")
+    if name == "cornell_bunny" and not (assets and (Path(assets) / "bunny.ply").is_file()):
+        pytest.skip("$TORCHPT_ASSETS/bunny.ply is not there")
+    layers = torchpt.read_layers(ROOT / "tests" / "references" / f"{name}.exr")
+    reference = layers["image"].double(), layers["variance"].double()
+    assert_equal_pictures(ours(torchpt.load(name, device="cpu"), 64), reference)
+
+
+def test_the_test_notices_a_bias_of_one_percent():
+    layers = torchpt.read_layers(ROOT / "tests" / "references" / "cornell_box.exr")
+    reference = layers["image"].double(), layers["variance"].double()
+    g = torch.Generator().manual_seed(0)
+    right = reference[0] + 4 * reference[1].sqrt() * torch.randn(reference[0].shape, generator=g)
+    assert_equal_pictures((right, 16 * reference[1]), reference)
+    with pytest.raises(AssertionError):
+        assert_equal_pictures((1.01 * right, 16 * reference[1]), reference)
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize("scene", ["zoo", "cornell_spheres"])
+def test_live(scene, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    sys.modules.pop("mitsuba_scene", None)
+    from mitsuba_scene import convert, load_mitsuba
+
+    mitsuba = load_mitsuba("scalar_rgb")
+    loaded = torchpt.load(ZOO if scene == "zoo" else scene, device="cpu")
+    film = {**film_of(48), "filter": "box"}
+    wishes = settings(loaded.description, {"film": film, "integrator": {"type": "path", **KEYS}, "render": {"spp": 32}})
+    theirs = mitsuba.load_dict(convert(mitsuba, loaded, wishes, tmp_path))
+    pictures = [torch.tensor(mitsuba.render(theirs, spp=32, seed=seed).numpy()) for seed in range(SEEDS)]
+    assert_equal_pictures(ours(loaded, 48), spread(pictures))

@@ -1,0 +1,129 @@
+"""Vectors, frames, the power heuristic and discrete choice at their extremes."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from trials import SIGNIFICANCE, chi_square_p
+
+from torchpt.math.distributions import Discrete
+from torchpt.math.frames import Frame
+from torchpt.math.mis import power_heuristic
+from torchpt.math.vectors import cross, dot, luminance, normalize, take
+from torchpt.math.warps import uniform_sphere
+
+G = torch.Generator().manual_seed(4)
+AXES = torch.cat((torch.eye(3), -torch.eye(3)), 1)
+
+
+def directions(n: int) -> torch.Tensor:
+    d = uniform_sphere(torch.rand(2, n, generator=G))
+    near = normalize(torch.tensor([[1e-4, 1e-20, 0.0], [0.0, 1e-4, 1e-30], [-1.0, 1.0, -1.0]]))
+    below = torch.tensor([[1.0, 0.6], [0.0, 0.8], [-0.0, -0.0]])  # n.z = -0
+    return torch.cat((d, AXES, near, -near, below), 1)
+
+
+def test_frames_are_orthonormal_right_handed_and_invert():
+    n = directions(20_000)
+    frame = Frame.about(n)
+    s, t = frame.s, frame.t
+    for a, b, expected in ((s, s, 1), (t, t, 1), (s, t, 0), (s, n, 0), (t, n, 0)):
+        assert (dot(a.double(), b.double()) - expected).abs().max() < 1e-6
+    assert (cross(s, t) - n).abs().max() < 1e-6
+    w = directions(20_000)
+    assert (frame.to_world(frame.to_local(w)) - w).abs().max() < 1e-6
+    assert torch.equal(Frame.about(AXES).to_local(AXES)[2], torch.ones(6))
+
+
+def test_dot_and_cross_are_torchs():
+    a, b = torch.randn(2, 3, 1000, generator=G, dtype=torch.float64)
+    torch.testing.assert_close(dot(a, b), (a * b).sum(0))
+    torch.testing.assert_close(cross(a, b), torch.linalg.cross(a, b, dim=0))
+
+
+@pytest.mark.parametrize("size", [1e-38, 1e-30, 1e-10, 1.0, 1e10, 1e30, 1e38])
+def test_normalize_over_the_whole_range(size):
+    d = directions(1000)
+    out = normalize(d * size)
+    assert (out.double().norm(dim=0) - 1).abs().max() < 5e-7
+    if size > 1e-37:
+        assert (out - d).abs().max() < 1e-5
+
+
+def test_normalize_of_zero_is_zero_with_zero_gradient():
+    a = torch.zeros(3, 2, requires_grad=True)
+    out = normalize(a)
+    out.sum().backward()
+    assert not out.detach().any()
+    assert a.grad is not None and not a.grad.any()
+
+
+def test_luminance_and_take():
+    assert float(luminance(torch.ones(3))) == pytest.approx(1, abs=1e-6)
+    table = torch.arange(12.0).view(3, 4)
+    index = torch.tensor([3, 0, 3])
+    assert torch.equal(take(table, index), table[:, index])
+    assert torch.equal(take(table[0], index), table[0, index])
+
+
+SCALES = torch.tensor([0.0, 1e-36, 1e-30, 1e-19, 1e-10, 1.0, 1e10, 1.8e19, 1e30, 3e38])
+
+
+def test_power_heuristic_at_its_extremes():
+    a, b = torch.cartesian_prod(SCALES, SCALES).T
+    w, v = power_heuristic(a, b), power_heuristic(b, a)
+    assert torch.isfinite(w).all()
+    assert ((w >= 0) & (w <= 1)).all()
+    some = (a > 0) | (b > 0)
+    assert (w + v - 1)[some].abs().max() < 1e-6  # also where squares would overflow or vanish
+    assert not w[a == 0].any()
+    assert (w[(a > 0) & (b == 0)] == 1).all()
+    exact = a.double() ** 2 / (a.double() ** 2 + b.double() ** 2)
+    torch.testing.assert_close(w[some], exact[some].float(), rtol=1e-5, atol=1e-7)
+    assert float(power_heuristic(torch.tensor(1e30), torch.tensor(1e-30))) == 1
+    assert float(power_heuristic(torch.tensor(1e-30), torch.tensor(1e30))) == 0
+
+
+def test_discrete_choice_follows_its_weights():
+    weights = torch.tensor([0.0, 1.0, 0.0, 3.0, 2.0, 0.0])
+    choice = Discrete.of(weights, torch.float32)
+    drawn = choice.sample(torch.rand(120_000, generator=G))
+    counts = torch.bincount(drawn, minlength=6).double()
+    assert not counts[weights == 0].any()
+    expected = 120_000 * (weights / 6).double()
+    some = weights > 0
+    assert chi_square_p(float(((counts - expected)[some] ** 2 / expected[some]).sum()), 2) > SIGNIFICANCE
+    torch.testing.assert_close(choice.pmf, weights / 6)
+
+
+def test_a_million_tiny_weights_do_not_collapse():
+    n = 1_000_000
+    weights = torch.full((n,), 1e-12)
+    choice = Discrete.of(weights, torch.float32)
+    u = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+    drawn = torch.searchsorted(choice.cdf, u, right=True)  # float64 u: each outcome exactly once
+    assert (drawn - torch.arange(n)).abs().max() <= 1
+    assert float(choice.pmf.double().sum()) == pytest.approx(1, abs=1e-6)
+    assert int(choice.sample(torch.tensor([1 - 2**-24]))) >= n - 2
+    # One a million times brighter takes its share beside 1e5 dim ones (STIFF_CASES 62).
+    weights = torch.ones(100_001)
+    weights[50_000] = 1e6
+    drawn = Discrete.of(weights, torch.float32).sample(torch.rand(100_000, generator=G))
+    share = float((drawn == 50_000).double().mean())
+    assert abs(share - 1e6 / 1.1e6) < 4 * math.sqrt(1e6 / 1.1e6 / 11 / 1e5)
+
+
+@pytest.mark.parametrize("weights", [[0.0, 0.0, 0.0], [5.0], [0.0, 1e-30, 0.0], [1e30, 1e30], [1.0, 0.0]])
+def test_extreme_weights(weights):
+    w = torch.tensor(weights)
+    choice = Discrete.of(w, torch.float32)
+    u = torch.tensor([0.0, 2**-24, 0.5, 1 - 2**-24])
+    drawn = choice.sample(u)
+    assert ((drawn >= 0) & (drawn < len(w))).all()
+    if w.any():
+        assert (w[drawn] > 0).all()
+        assert (choice.pmf[drawn] > 0).all()
+    else:
+        torch.testing.assert_close(choice.pmf, torch.full((3,), 1 / 3))

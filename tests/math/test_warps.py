@@ -1,0 +1,94 @@
+"""Warps have the densities that they state."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from trials import SIGNIFICANCE, grid_cells, uniform_p
+
+from torchpt.math import warps
+
+TESTS = 12  # chi-square tests in this file
+U = torch.rand(2, 1 << 18, generator=torch.Generator().manual_seed(8))
+EDGES = torch.cartesian_prod(*(torch.tensor([0.0, 2**-24, 0.5, 1 - 2**-24]),) * 2).T
+SIDE = 24
+
+
+def assert_uniform(*coordinates: torch.Tensor) -> None:
+    """Coordinates in [0, 1] that uniform points of the domain would spread evenly."""
+    cells = grid_cells(torch.stack(coordinates).double().clamp(0, 1), SIDE)
+    assert uniform_p(cells, SIDE ** len(coordinates)) > SIGNIFICANCE / TESTS
+
+
+def azimuth(d: torch.Tensor) -> torch.Tensor:
+    return torch.atan2(d[1].double(), d[0].double()) / (2 * math.pi) + 0.5
+
+
+def assert_unit(d: torch.Tensor) -> None:
+    assert (d.double().norm(dim=0) - 1).abs().max() < 5e-7
+
+
+def test_concentric_disk():
+    p = warps.concentric_disk(U)
+    square = (p.double() ** 2).sum(0)
+    assert square.max() <= 1 + 1e-6
+    assert_uniform(square, azimuth(p))
+    assert torch.isfinite(warps.concentric_disk(EDGES)).all()
+    assert torch.equal(warps.concentric_disk(torch.full((2, 1), 0.5)), torch.zeros(2, 1))
+
+
+def test_cosine_hemisphere():
+    d = warps.cosine_hemisphere(U, torch.ones(U.shape[1]))
+    assert_unit(d)
+    assert d[2].min() >= 0
+    assert_uniform(d[2].double() ** 2, azimuth(d))
+    below = warps.cosine_hemisphere(U, torch.tensor(-0.3))
+    assert torch.equal(below, d * torch.tensor([[1.0], [1.0], [-1.0]]))
+    assert torch.isfinite(warps.cosine_hemisphere(EDGES, torch.ones(EDGES.shape[1]))).all()
+
+
+def test_uniform_hemisphere_and_sphere():
+    d = warps.uniform_hemisphere(U)
+    assert_unit(d)
+    assert_uniform(d[2], azimuth(d))
+    d = warps.uniform_sphere(U)
+    assert_unit(d)
+    assert_uniform((d[2].double() + 1) / 2, azimuth(d))
+    for warp in (warps.uniform_hemisphere, warps.uniform_sphere):
+        assert torch.isfinite(warp(EDGES)).all()
+
+
+@pytest.mark.parametrize("width", [1e-12, 1e-7, 1e-3, 0.5, 1.0, 2.0])
+def test_uniform_cone(width):
+    d = warps.uniform_cone(U, torch.full((U.shape[1],), width))
+    assert_unit(d)
+    # From the sine, since 1 - cos of a narrow cone is lost in float32.
+    sin2 = (d[:2].double() ** 2).sum(0)
+    drop = torch.where(d[2] > 0.5, sin2 / (1 + (1 - sin2).clamp_min(0).sqrt()), 1 - d[2].double())
+    assert drop.max() <= width * (1 + 1e-5)
+    assert_uniform(drop / width, azimuth(d))
+
+
+def test_uniform_triangle():
+    b = warps.uniform_triangle(U)
+    assert b.min() >= 0
+    assert b.sum(0).max() <= 1
+    # Fold (u, v) onto the unit square: sqrt(1 - u') and v / (1 - u) are uniform for uniform (u, v).
+    u, v = b.double()
+    assert_uniform((1 - u) ** 2, v / (1 - u))
+    edges = warps.uniform_triangle(EDGES)
+    assert edges.min() >= 0
+    assert edges.sum(0).max() <= 1
+
+
+def test_one_minus_cos_has_no_cancellation():
+    sin2 = torch.logspace(-38, 0, 2000, dtype=torch.float64)
+    exact = sin2 / (1 + (1 - sin2).sqrt())
+    found = warps.one_minus_cos(sin2.float()).double()
+    relative = (found / exact - 1).abs()
+    assert relative[sin2 < 6e-4].max() < 1e-6
+    assert relative[sin2 < 1 - 1e-6].max() < 2e-4  # above the series: half an ulp of 1 over 3.4e-4
+    assert float(warps.one_minus_cos(torch.tensor(1.0))) == 1.0
+    assert float(warps.one_minus_cos(torch.tensor(0.0))) == 0.0
