@@ -6,7 +6,7 @@ Directions (pbrt): ``wo`` points toward the previous vertex, ``wi`` toward the n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from torchpt.math.distributions import Discrete
 
-__all__ = ["KINDS", "BsdfSample", "Geometry", "Hit", "Interaction", "LightSample", "Lights", "PathState", "World"]
+__all__ = ["KINDS", "BsdfSample", "Geometry", "Hit", "Interaction", "LightSample", "Lights", "PathState", "World", "tensors_of"]
 
 #: Primitive kinds in the order in which a :class:`Geometry` stores them.
 KINDS = ("triangle", "rectangle", "disk", "sphere")
@@ -138,3 +138,18 @@ class PathState:
     pdf: Tensor  # (N,) with which d was drawn: inf where emission counts whole, 0 where it does not count
     lane: Tensor  # (N,) int64 place in the wave
     key: Tensor  # (2, N) int32 of the sampler
+
+
+def tensors_of(record: object) -> list[Tensor]:
+    """All tensors of a record, its dicts, tuples and inner records."""
+    import torch
+
+    if isinstance(record, torch.Tensor):
+        return [record]
+    if isinstance(record, dict):
+        return [t for value in record.values() for t in tensors_of(value)]
+    if isinstance(record, tuple | list):
+        return [t for value in record for t in tensors_of(value)]
+    if is_dataclass(record):
+        return [t for f in fields(record) for t in tensors_of(getattr(record, f.name))]
+    return []

@@ -20,7 +20,7 @@ from torchpt.errors import RenderError
 from torchpt.film import Filter
 from torchpt.integrators import stages
 from torchpt.integrators.stages import Plan, Shadow
-from torchpt.records import Hit, PathState, World
+from torchpt.records import Hit, PathState, World, tensors_of
 
 __all__ = ["CompiledStages", "Stages", "can_compile"]
 
@@ -73,7 +73,7 @@ class CompiledStages(Stages):
     """The same stages through ``torch.compile``; forward only.
 
     Attributes:
-        graphs: how many graphs each stage was compiled to so far.
+        graphs: how many graphs each variant of a stage was compiled to so far; two at most.
     """
 
     compiled = True
@@ -82,6 +82,9 @@ class CompiledStages(Stages):
         super().__init__(plan, world)
         if not can_compile(world.p0.device):
             raise RenderError("render.compile: on needs a C++ compiler (g++ or clang++) for the CPU; none was found")
+        # Only lanes vary in number; a scene's tables do not.
+        for table in tensors_of(world):
+            torch._dynamo.mark_static(table)
         self.graphs: dict[str, int] = {}
         self._made: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
@@ -131,7 +134,7 @@ class CompiledStages(Stages):
         """The compiled form of ``stage``, made once for each variant."""
         made = self._made.get((name, *variant))
         if made is None:
-            made = self._made[name, *variant] = self._compile(name, stage)
+            made = self._made[name, *variant] = self._compile(" ".join((name, *map(str, variant))), stage)
         return made
 
     def _compile(self, name: str, stage: Callable[..., Any]) -> Callable[..., Any]:
@@ -141,7 +144,7 @@ class CompiledStages(Stages):
 
         def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Any:
             self.graphs[name] = self.graphs.get(name, 0) + 1
-            return compile_fx(graph, inputs)
+            return compile_fx(graph, inputs, config_patches={"assert_indirect_indexing": False})
 
         config: Any = _config  # its `patch` is put there at run time
         # A code object of its own: dynamo counts graphs by code, and those of another scene are no business of this one.

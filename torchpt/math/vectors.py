@@ -62,4 +62,7 @@ def luminance(rgb: Tensor) -> Tensor:
 
 def take(table: Tensor, index: Tensor) -> Tensor:
     """Columns of a table: ``(C, M), (N,) -> (C, N)`` or ``(M,), (N,) -> (N,)``. Several times faster than ``[:, index]``."""
+    if torch.compiler.is_compiling():
+        # Known not to be negative, an index needs no code for counting from the end.
+        index = index.clamp_min(0)
     return torch.index_select(table, table.dim() - 1, index)

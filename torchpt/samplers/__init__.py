@@ -62,24 +62,31 @@ class Draws:
 
     def __init__(self, kind: str, key: Tensor, salts: Tensor) -> None:
         self._kind, self._key, self._salts = kind, key, salts
-        # Eager on a CPU the kernels take over: the same bits, see torchpt.samplers.kernels.
-        self._kernels = key.device.type == "cpu" and not torch.compiler.is_compiling()
 
     def one(self, dimension: Dimension) -> Tensor:
         """``(N,)`` float32 in ``[0, 1)``."""
-        if self._kernels:
-            from torchpt.samplers import kernels
-
-            return kernels.draw_1d(self._kind, self._key, int(self._salts[int(dimension)]))
+        if self._key.device.type == "cpu":
+            return _draw_on_cpu(self._kind, 1, self._key, self._salts, int(dimension))[0]
         return KINDS[self._kind].draw_1d(self._key, self._salts[int(dimension)])
 
     def two(self, dimension: Dimension) -> Tensor:
         """``(2, N)`` float32 in ``[0, 1)``."""
-        if self._kernels:
-            from torchpt.samplers import kernels
-
-            return kernels.draw_2d(self._kind, self._key, int(self._salts[int(dimension)]))
+        if self._key.device.type == "cpu":
+            return _draw_on_cpu(self._kind, 2, self._key, self._salts, int(dimension))
         return KINDS[self._kind].draw_2d(self._key, self._salts[int(dimension)])
+
+
+@torch.library.custom_op("torchpt::draw", mutates_args=())
+def _draw_on_cpu(kind: str, rows: int, key: Tensor, salts: Tensor, dimension: int) -> Tensor:
+    """``(rows, N)`` numbers from the kernels; an operator, so that compiled stages call it instead of tracing into it."""
+    from torchpt.samplers import kernels
+
+    return kernels.draw(kind, rows, key, int(salts[dimension]))
+
+
+@_draw_on_cpu.register_fake
+def _(kind: str, rows: int, key: Tensor, salts: Tensor, dimension: int) -> Tensor:
+    return torch.empty(rows, key.shape[1], dtype=torch.float32, device=key.device)
 
 
 @lru_cache(maxsize=4096)

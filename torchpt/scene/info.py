@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchpt import bsdfs
 from torchpt.accel import Accel
-from torchpt.records import KINDS, World
+from torchpt.records import KINDS, World, tensors_of
 from torchpt.scene.settings import Settings
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
                 "face" if not part.smooth else "computed, smooth" if part.normals is None else "from the file"
             )
         shapes[part.name.removeprefix("shapes.")] = row
-    memory = sum(x.numel() * x.element_size() for x in _tensors(world))
+    memory = sum(x.numel() * x.element_size() for x in tensors_of(world))
     made: dict[str, Any] = {
         "accel": accel.describe(),
         "bsdfs": dict(zip(world.models, (_rows(table) for table in world.bsdfs), strict=True)),
@@ -95,18 +95,3 @@ def _left_out(world: World, settings: Settings) -> list[str]:
 def _rows(table: dict[str, Any]) -> int:
     """How many materials share a model's stacked parameters."""
     return max((value.shape[-1] for value in table.values() if value is not None), default=0)
-
-
-def _tensors(record: object) -> list[Any]:
-    """All tensors of a record, its dicts, tuples and inner records."""
-    from torch import Tensor
-
-    if isinstance(record, Tensor):
-        return [record]
-    if isinstance(record, dict):
-        return [t for value in record.values() for t in _tensors(value)]
-    if isinstance(record, tuple | list):
-        return [t for value in record for t in _tensors(value)]
-    if hasattr(record, "__dataclass_fields__"):
-        return [t for name in record.__dataclass_fields__ for t in _tensors(getattr(record, name))]  # type: ignore[attr-defined]
-    return []
