@@ -31,7 +31,7 @@ from torchpt.scene.settings import AovIntegrator, DirectIntegrator, GaussianFilt
 __all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene"]
 
 #: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
-LANES = {"cpu": 1 << 17, "cuda": 1 << 22}
+LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
 #: Peak bytes a lane takes in a wave, measured on the Cornell box; under a tape each vertex keeps about this much.
 BYTES_PER_LANE = 640
 #: Independent randomizations that share a pixel's samples, see torchpt.samplers.

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import kernels_brute as kernels
-from torchpt.accel.base import Accel, Hits
+from torchpt.accel.base import Accel, Hits, choose, operator
 from torchpt.accel.jit import launch, thread_count
 from torchpt.accel.tables import extent, prepare, tolerances
 from torchpt.errors import SceneError
@@ -65,10 +65,14 @@ class Brute(Accel):
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(o, d, t_max, self.table, self.spheres, self.counts, self.extent, self.threads)
+        return choose(_intersect, _intersect_operator)(
+            o, d, t_max, self.table, self.spheres, self.counts, self.extent, self.threads
+        )
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(o, d, t_max, self.table, self.spheres, self.counts, self.extent, self.threads)
+        return choose(_occluded, _occluded_operator)(
+            o, d, t_max, self.table, self.spheres, self.counts, self.extent, self.threads
+        )
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; there are no nodes, and the cost is one test a primitive."""
@@ -85,7 +89,6 @@ class Brute(Accel):
         }
 
 
-@torch.library.custom_op("torchpt::brute_intersect", mutates_args=())
 def _intersect(
     o: Tensor, d: Tensor, t_max: Tensor, table: Tensor, spheres: Tensor, counts: list[int], extent: float, threads: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -104,13 +107,15 @@ def _intersect(
     return t, prim, u, v
 
 
-@_intersect.register_fake
+_intersect_operator = operator("torchpt::brute_intersect", _intersect)
+
+
+@_intersect_operator.register_fake
 def _(o, d, t_max, table, spheres, counts, extent, threads):
     like = torch.empty_like
     return like(t_max), like(t_max, dtype=torch.int32), like(t_max), like(t_max)
 
 
-@torch.library.custom_op("torchpt::brute_occluded", mutates_args=())
 def _occluded(
     o: Tensor, d: Tensor, t_max: Tensor, table: Tensor, spheres: Tensor, counts: list[int], extent: float, threads: int
 ) -> Tensor:
@@ -121,7 +126,10 @@ def _occluded(
     return blocked
 
 
-@_occluded.register_fake
+_occluded_operator = operator("torchpt::brute_occluded", _occluded)
+
+
+@_occluded_operator.register_fake
 def _(o, d, t_max, table, spheres, counts, extent, threads):
     return torch.empty_like(t_max, dtype=torch.bool)
 

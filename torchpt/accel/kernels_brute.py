@@ -168,7 +168,12 @@ def _store(block, table, triangles, rectangles, w, t, prim, u, v):
     """Writes a block's hits; parameters in the slack beyond an edge are brought back to the edge."""
     start = block * BLOCK
     count = min(BLOCK, t.shape[0] - start)
-    t, prim, u, v = t[start : start + count], prim[start : start + count], u[start : start + count], v[start : start + count]
+    t, prim, u, v = (
+        t[start : start + count],
+        prim[start : start + count],
+        u[start : start + count],
+        v[start : start + count],
+    )
     for i in range(count):
         p = np.int32(w[_PRIM + i])
         distance, a, b = w[_T + i], _ZERO, _ZERO

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import traverse
-from torchpt.accel.base import Accel, Hits
+from torchpt.accel.base import Accel, Hits, choose, operator
 from torchpt.accel.bounds import primitive_bounds, surface
 from torchpt.accel.radix import Tree, build_tree
 from torchpt.accel.tables import prepare
@@ -42,10 +42,10 @@ class Lbvh(Accel):
         return [self.corners, self.rows, self.tree.children, self.tree.boxes, self.tree.order]
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
+        return choose(_intersect, _intersect_operator)(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
+        return choose(_occluded, _occluded_operator)(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`."""
@@ -71,24 +71,28 @@ def sah_cost(tree: Tree) -> float:
     return float(1 + area.sum() / surface(low, high).clamp(min=torch.finfo(torch.float64).tiny))
 
 
-@torch.library.custom_op("torchpt::lbvh_intersect", mutates_args=())
 def _intersect(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return traverse.intersect(o, d, t_max, tensors, counts, depth)
 
 
-@_intersect.register_fake
+_intersect_operator = operator("torchpt::lbvh_intersect", _intersect)
+
+
+@_intersect_operator.register_fake
 def _(o, d, t_max, tensors, counts, depth):
     like = torch.empty_like
     return like(t_max), like(t_max, dtype=torch.int32), like(t_max), like(t_max)
 
 
-@torch.library.custom_op("torchpt::lbvh_occluded", mutates_args=())
 def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> Tensor:
     return traverse.occluded(o, d, t_max, tensors, counts, depth)
 
 
-@_occluded.register_fake
+_occluded_operator = operator("torchpt::lbvh_occluded", _occluded)
+
+
+@_occluded_operator.register_fake
 def _(o, d, t_max, tensors, counts, depth):
     return torch.empty_like(t_max, dtype=torch.bool)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import kernels_wide as kernels
-from torchpt.accel.base import Accel, Hits
+from torchpt.accel.base import Accel, Hits, choose, operator
 from torchpt.accel.bounds import primitive_bounds
 from torchpt.accel.jit import launch, thread_count
 from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
@@ -51,10 +51,10 @@ class Wide(Accel):
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(o, d, t_max, self.tensors, self.counts, self.depth, self.threads)
+        return choose(_intersect, _intersect_operator)(o, d, t_max, self.tensors, self.counts, self.depth, self.threads)
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(o, d, t_max, self.tensors, self.counts, self.depth, self.threads)
+        return choose(_occluded, _occluded_operator)(o, d, t_max, self.tensors, self.counts, self.depth, self.threads)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; the cost is that of the binary tree before it was widened."""
@@ -122,7 +122,6 @@ def _leaf_blocks(ids: np.ndarray, corner: np.ndarray, triangles: int) -> tuple[n
     return np.ascontiguousarray(blocks.transpose(0, 2, 1)).reshape(-1), full
 
 
-@torch.library.custom_op("torchpt::wide_intersect", mutates_args=())
 def _intersect(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int, threads: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -133,13 +132,15 @@ def _intersect(
     return t, prim, u, v
 
 
-@_intersect.register_fake
+_intersect_operator = operator("torchpt::wide_intersect", _intersect)
+
+
+@_intersect_operator.register_fake
 def _(o, d, t_max, tensors, counts, depth, threads):
     like = torch.empty_like
     return like(t_max), like(t_max, dtype=torch.int32), like(t_max), like(t_max)
 
 
-@torch.library.custom_op("torchpt::wide_occluded", mutates_args=())
 def _occluded(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int, threads: int
 ) -> Tensor:
@@ -149,7 +150,10 @@ def _occluded(
     return prim >= 0
 
 
-@_occluded.register_fake
+_occluded_operator = operator("torchpt::wide_occluded", _occluded)
+
+
+@_occluded_operator.register_fake
 def _(o, d, t_max, tensors, counts, depth, threads):
     return torch.empty_like(t_max, dtype=torch.bool)
 

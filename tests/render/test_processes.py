@@ -1,0 +1,88 @@
+"""Renders from threads, forked and spawned workers, under numba's workqueue layer, and without a writable cache: each runs
+in an interpreter of its own, and must give the picture that a plain render gives."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchpt
+
+PREFACE = """
+import hashlib, multiprocessing, os, threading
+import torch, torchpt
+
+def digest(spp=4):
+    scene = torchpt.load(NAME, "cpu")
+    image = torchpt.render(scene, spp=spp, film={"width": 40, "height": 40, "filter": "box"}, compile="off")
+    return hashlib.sha256(image.numpy().tobytes()).hexdigest()
+
+def work(queue):
+    queue.put(digest())
+
+def worker(method):
+    context = multiprocessing.get_context(method)
+    queue = context.Queue()
+    process = context.Process(target=work, args=(queue,))
+    process.start()
+    print(queue.get(timeout=100))
+    process.join()
+"""
+SCRIPTS = {
+    "threads": """
+found = []
+threads = [threading.Thread(target=lambda: found.append(digest())) for _ in range(2)]
+[t.start() for t in threads]; [t.join() for t in threads]
+print(*found, sep="\\n")
+""",
+    "fork": "print(digest())\nworker('fork')",
+    "spawn": "print(digest())\nworker('spawn')",
+}
+
+
+def expected(name: str) -> str:
+    scene = torchpt.load(name, "cpu")
+    image = torchpt.render(scene, spp=4, film={"width": 40, "height": 40, "filter": "box"}, compile="off")
+    return hashlib.sha256(image.numpy().tobytes()).hexdigest()
+
+
+def run(tmp_path: Path, body: str, name: str, environment: dict[str, str]) -> list[str]:
+    script = tmp_path / "script.py"
+    indented = "\n".join("    " + line for line in body.strip().splitlines())
+    script.write_text(f"NAME = {name!r}\n{PREFACE}\nif __name__ == '__main__':\n    torch.set_num_threads(2)\n{indented}\n")
+    root = str(Path(torchpt.__file__).parents[1])
+    found = subprocess.run(
+        [sys.executable, str(script)],
+        env={**os.environ, "PYTHONPATH": root, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr[-2000:]
+    return found.stdout.split()
+
+
+@pytest.mark.parametrize("name", ["cornell_box", "cornell_bunny"])  # both CPU searches: packets and the wide tree
+@pytest.mark.parametrize("way", SCRIPTS)
+def test_threads_and_workers_give_the_same_picture(tmp_path, way, name):
+    assert set(run(tmp_path, SCRIPTS[way], name, {})) == {expected(name)}
+
+
+@pytest.mark.parametrize("way", SCRIPTS)
+def test_under_the_workqueue_layer(tmp_path, way):
+    found = run(tmp_path, SCRIPTS[way], "cornell_box", {"NUMBA_THREADING_LAYER": "workqueue"})
+    assert set(found) == {expected("cornell_box")}
+
+
+def test_without_a_writable_cache_folder(tmp_path):
+    # A copy of the package beside which nothing can be written, and no home to fall back to.
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    found = run(tmp_path, "print(digest())", "cornell_box", {"NUMBA_CACHE_DIR": str(blocked / "cache")})
+    assert set(found) == {expected("cornell_box")}
