@@ -10,7 +10,7 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from torchpt.errors import AssetError, NotBuiltError, OutputError, RenderError, SceneError, TorchptError
+from torchpt.errors import AssetError, EdgeWarning, NotBuiltError, OutputError, RenderError, SceneError, TorchptError
 
 if TYPE_CHECKING:
     from torchpt.images import read_image, read_layers, write_image
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "AssetError",
+    "EdgeWarning",
     "NotBuiltError",
     "OutputError",
     "RenderError",

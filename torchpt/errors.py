@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["AssetError", "NotBuiltError", "OutputError", "RenderError", "SceneError", "TorchptError"]
+__all__ = ["AssetError", "EdgeWarning", "NotBuiltError", "OutputError", "RenderError", "SceneError", "TorchptError"]
 
 
 def _shown(value: object, limit: int = 80) -> str:
@@ -70,3 +70,7 @@ class OutputError(TorchptError):
 
 class RenderError(TorchptError):
     """A render that could not be carried out as asked (device, compiler, strict mode)."""
+
+
+class EdgeWarning(UserWarning):
+    """A gradient with respect to geometry leaves out visibility edges: silhouettes and shadow edges that move."""

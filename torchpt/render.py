@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchpt import adjoint as adjoints
-from torchpt.errors import RenderError, SceneError
+from torchpt.errors import EdgeWarning, RenderError, SceneError
 from torchpt.film import Film, Filter
 from torchpt.integrators import Wave
 from torchpt.integrators.aov import CHANNELS
@@ -195,6 +196,13 @@ def render(
         }
     )
     names = tuple(wanted)
+    if _moves(names):
+        warnings.warn(
+            "the gradient with respect to geometry leaves out visibility edges (silhouettes and shadow edges that move); "
+            "see docs/gradients.md",
+            EdgeWarning,
+            stacklevel=2,
+        )
 
     def forward(*tensors: Tensor) -> Tensor:
         given = {**fixed, **dict(zip(names, tensors, strict=True))}
@@ -205,6 +213,11 @@ def render(
         return _differentiable_chunks(scene, again, given, names, dtype)
 
     return adjoints.KINDS[adjoint or "autograd"](forward, chunks, tuple(wanted.values()))
+
+
+def _moves(names: Iterable[str]) -> bool:
+    """Whether any of the parameters moves the geometry or the camera."""
+    return any(name.endswith((".vertices", ".to_world")) or name.startswith("camera.") for name in names)
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:
@@ -436,7 +449,7 @@ def _differentiable_chunks(
     """Chunks of pixels as differentiable functions of the tensors ``wanted``, for the backward pass."""
     if isinstance(settings.integrator, AovIntegrator):
         raise SceneError("integrator.type", "aov", "path or direct where gradients are wanted")
-    attached = any(name.endswith((".vertices", ".to_world")) or name.startswith("camera.") for name in wanted)
+    attached = _moves(wanted)
     plain = {name: value.detach() for name, value in params.items()}
     with torch.no_grad():
         still = make_wave(scene, settings, plain, dtype, attached)

@@ -9,6 +9,7 @@ import torch
 import torchpt
 from torchpt.errors import SceneError
 
+pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 ROOM = {
     "camera": {"type": "perspective", "origin": [0, 2, 0.5], "target": [0, 0, 0.5], "up": [0, 0, 1], "fov": 30},
     "film": {"width": 4, "height": 4, "filter": "box"},
@@ -76,7 +77,11 @@ def test_gradcheck_geometry(name):
 
 
 def test_gradcheck_smooth_normals():
-    bent = {**ROOM["shapes"]["floor"], "face_normals": False, "vertices": [[-2, 0, -2], [2, 0.2, -2], [2, 0, 2], [-2, 0.1, 2]]}
+    bent = {
+        **ROOM["shapes"]["floor"],
+        "face_normals": False,
+        "vertices": [[-2, 0, -2], [2, 0.2, -2], [2, 0, 2], [-2, 0.1, 2]],
+    }
     scene = torchpt.load({**ROOM, "shapes": {"floor": bent, "panel": ROOM["shapes"]["panel"]}}, "cpu")
     assert checked(scene, ("shapes.floor.vertices",), integrator={"type": "direct", "strategy": "light"})
 
@@ -113,6 +118,13 @@ def test_geometry_agrees_with_finite_differences_in_the_mean(name, entry, step):
     a, b = torch.stack(exact), torch.stack(difference)
     error = float((a.var() / 4 + b.var() / 4).sqrt())
     assert abs(float(a.mean() - b.mean())) < 4.5 * error + 5e-3 * abs(float(b.mean()))  # six draws, 4.5 SE of few seeds
+
+
+def test_geometry_gradients_warn_of_edges():
+    scene = torchpt.load(only("floor", "panel"), "cpu")
+    leaf = scene.params["shapes.floor.vertices"].clone().requires_grad_()
+    with pytest.warns(torchpt.EdgeWarning, match="silhouettes"):
+        torchpt.render(scene, params={"shapes.floor.vertices": leaf}, spp=1)
 
 
 def test_backward_draws_its_own_samples():

@@ -54,7 +54,9 @@ def expected(name: str) -> str:
 def run(tmp_path: Path, body: str, name: str, environment: dict[str, str]) -> list[str]:
     script = tmp_path / "script.py"
     indented = "\n".join("    " + line for line in body.strip().splitlines())
-    script.write_text(f"NAME = {name!r}\n{PREFACE}\nif __name__ == '__main__':\n    torch.set_num_threads(2)\n{indented}\n")
+    script.write_text(
+        f"NAME = {name!r}\n{PREFACE}\nif __name__ == '__main__':\n    torch.set_num_threads(2)\n{indented}\n"
+    )
     root = str(Path(torchpt.__file__).parents[1])
     found = subprocess.run(
         [sys.executable, str(script)],
