@@ -147,7 +147,8 @@ def test_disc_light(radius, distance, strategy):
 
 @pytest.mark.parametrize("strategy", ["mis", "light"])
 @pytest.mark.parametrize(
-    ("radius", "distance"), [(0.5, 1.0), (1.0, 1.01), (1.0, 1.00001), (1e-3, 1.0), (1e-4, 10.0), (0.5, 1000.0)]
+    ("radius", "distance"),
+    [(0.5, 1.0), (1.0, 1.01), (1.0, 1.00001), (1e-3, 1.0), (1e-4, 10.0), (0.5, 1000.0), (1e-3, 3000.0)],
 )
 def test_sphere_light(radius, distance, strategy):
     lamp = {"type": "sphere", "radius": radius, "center": [0, distance, 0], "emission": [1, 1, 1]}

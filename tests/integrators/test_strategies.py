@@ -112,10 +112,13 @@ def moved(scale: float, offset: float) -> dict[str, Any]:
 def test_place_and_size_do_not_matter(by_mis, cornell, scale, offset):
     scene = torchpt.load(moved(scale, offset), device="cpu")
     assert_same_mean(pictures(scene, 8, 32, 3000), by_mis)
-    # With the same numbers the paths are the same but for rounding: far stricter than noise allows.
-    one, other = (shoot(s, 64, 7, "sobol", {"max_depth": 6}, SMALL).image.double() for s in (cornell, scene))
-    assert abs(float(other.mean() / one.mean()) - 1) < 2e-3
-    assert float(((other - one).abs() <= 1e-3 * one).double().mean()) > 0.9
+    # With the same numbers direct light is the same but for rounding: far stricter than noise allows. (Not so further
+    # on: frames turn where a normal's z changes sign, and on axis-parallel walls that sign is rounding.)
+    one, other = (
+        shoot(s, 64, 7, "sobol", {"max_depth": 2, "strategy": "light"}, SMALL).image.double() for s in (cornell, scene)
+    )
+    assert abs(float(other.mean() / one.mean()) - 1) < 1e-3
+    assert float(((other - one).abs() <= 1e-3 * one).double().mean()) > 0.95
 
 
 @pytest.mark.parametrize("sampler", ["sobol", "independent"])

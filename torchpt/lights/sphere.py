@@ -31,10 +31,12 @@ def sample(x: Tensor, centre: Tensor, radius: Tensor, flip: Tensor, u: Tensor) -
     """Points ``(3, N)`` on the spheres seen from ``x (3, N)``, and the emitting side's unit normals there."""
     axis, distance, outside, width = _cone(x, centre, radius)
     local = uniform_cone(u, width)
-    towards = Frame.about(normalize(axis)).to_world(local)
-    sin2 = (local[0] * local[0] + local[1] * local[1]) * distance * distance
-    depth = distance * local[2] - (radius * radius - sin2).clamp_min(0.0).sqrt()
-    seen = normalize(towards * depth - axis)
+    sin2 = local[0] * local[0] + local[1] * local[1]
+    half = (radius * radius - sin2 * distance * distance).clamp_min(0.0).sqrt()
+    depth = distance * local[2] - half
+    # From the centre to the point, in the cone's frame: its z is depth cos - distance, without that cancellation.
+    seen = torch.stack((local[0] * depth, local[1] * depth, -(sin2 * distance + local[2] * half)))
+    seen = Frame.about(normalize(axis)).to_world(normalize(seen))
     normal = torch.where(outside, seen, uniform_sphere(u))
     return centre + normal * radius, normal * flip
 
