@@ -11,7 +11,10 @@ __all__ = ["primitive_bounds", "surface"]
 
 
 def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
-    """Boxes of all primitives, rounded outward: ``low, high``, each ``(3, P)`` float32.
+    """Boxes of all primitives, a few ulps larger than they are: ``low, high``, each ``(3, P)`` float32.
+
+    The margin (relative to coordinates and size) keeps rays that run exactly within a face of a box, and hits that a
+    leaf test accepts by rounding, inside it.
 
     A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse reaches ``sqrt(e1^2 + e2^2)`` from
     its centre on each axis.
@@ -26,6 +29,8 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     reach = ((p1 - p0)[:, b:c].square() + (p2 - p0)[:, b:c].square()).sqrt()
     reach = torch.cat([reach, p1[:1, c:].abs().expand(3, -1)], 1)
     low[:, b:], high[:, b:] = p0[:, b:] - reach, p0[:, b:] + reach
+    margin = 2.0**-22 * (torch.maximum(low.abs(), high.abs()) + (high - low).amax(0))
+    low, high = low - margin, high + margin
     down, up = low.float(), high.float()
     down = torch.where(down.double() > low, torch.nextafter(down, torch.full_like(down, -torch.inf)), down)
     up = torch.where(up.double() < high, torch.nextafter(up, torch.full_like(up, torch.inf)), up)

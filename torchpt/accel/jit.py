@@ -14,6 +14,7 @@ from typing import Any
 
 import numba
 import torch
+from numba.core import config as numba_config
 
 __all__ = ["jit", "launch", "parallel_allowed", "thread_count"]
 
@@ -22,8 +23,12 @@ _state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "poo
 
 
 def _after_fork() -> None:
-    """A child starts without its parent's OpenMP team, lock and pool threads."""
+    """A child starts without its parent's OpenMP team, lock and pool threads.
+
+    Torch's own parallel operations would wait for that team for ever: in the child they run serially.
+    """
     global _lock
+    torch.set_num_threads(1)
     _lock = threading.Lock()
     _state.update(forked=True, parallel=False, pools={})
 
@@ -53,15 +58,20 @@ def thread_count(threads: int | None) -> int:
     return max(1, int(threads)) if threads else max(1, torch.get_num_threads())
 
 
+def _most_threads() -> int:
+    """Threads that numba was started with."""
+    return int(getattr(numba_config, "NUMBA_NUM_THREADS", 1))
+
+
 def _probe() -> bool:
     """Whether numba's threading layer lets several Python threads call parallel kernels (starts the layer)."""
-    if numba.config.THREADING_LAYER == "workqueue" or numba.config.NUMBA_NUM_THREADS < 2:
+    if _most_threads() < 2 or getattr(numba_config, "THREADING_LAYER", "") == "workqueue":
         return False
     try:
-        from numba.np.ufunc.parallel import _launch_threads
+        from numba.np.ufunc.parallel import _launch_threads, threading_layer
 
         _launch_threads()
-        return numba.threading_layer() in ("omp", "tbb")
+        return threading_layer() in ("omp", "tbb")
     except (ImportError, ValueError, RuntimeError):
         return False
 
@@ -77,7 +87,7 @@ def parallel_allowed() -> bool:
     with _lock:
         if _state["parallel"] is None:
             _state.update(owner=os.getpid(), parallel=_probe())
-        return _state["parallel"] and _state["owner"] == os.getpid()
+        return bool(_state["parallel"]) and _state["owner"] == os.getpid()
 
 
 def _pool(workers: int) -> ThreadPoolExecutor:
@@ -103,7 +113,7 @@ def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, arg
     if threads == 1:
         serial(0, items, *args)
     elif parallel_allowed():
-        threads = min(threads, numba.config.NUMBA_NUM_THREADS)
+        threads = min(threads, _most_threads())
         before = numba.get_num_threads()
         numba.set_num_threads(threads)
         try:
