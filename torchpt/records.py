@@ -14,7 +14,18 @@ if TYPE_CHECKING:
 
     from torchpt.math.distributions import Discrete
 
-__all__ = ["KINDS", "BsdfSample", "Geometry", "Hit", "Interaction", "LightSample", "Lights", "PathState", "World", "tensors_of"]
+__all__ = [
+    "KINDS",
+    "BsdfSample",
+    "Geometry",
+    "Hit",
+    "Interaction",
+    "LightSample",
+    "Lights",
+    "PathState",
+    "World",
+    "tensors_of",
+]
 
 #: Primitive kinds in the order in which a :class:`Geometry` stores them.
 KINDS = ("triangle", "rectangle", "disk", "sphere")

@@ -13,13 +13,13 @@ from torch.utils._pytree import tree_leaves
 from trials import film_of, shoot
 
 import torchpt
+from torchpt.forward import BYTES_PER_LANE as PER_LANE
 from torchpt.integrators.wave import Wave
 from torchpt.math.distributions import Discrete
 from torchpt.math.frames import Frame
 from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import normalize
 from torchpt.math.warps import concentric_disk, one_minus_cos, uniform_cone, uniform_sphere
-from torchpt.render import BYTES_PER_LANE as PER_LANE
 from torchpt.samplers import KINDS as SAMPLERS
 from torchpt.samplers import Sampler, salts
 

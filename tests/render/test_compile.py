@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 import torch
 
 import torchpt
+from torchpt import forward
 from torchpt.errors import RenderError
 from torchpt.integrators import compiled
 from torchpt.render import render_scene
 from torchpt.scene.description import settings
 
-RENDER = sys.modules["torchpt.render"]
 FILM = {"width": 48, "height": 48, "filter": "box"}
 
 pytestmark = pytest.mark.skipif(not compiled.can_compile(torch.device("cpu")), reason="needs a C++ compiler")
@@ -26,7 +24,7 @@ def run(scene, spp: int, mode: str, seed: int = 1):
 
 def graphs(scene) -> dict[str, int]:
     counts: dict[str, int] = {}
-    for stages in RENDER._compiled[scene].values():
+    for stages in forward._compiled[scene].values():
         counts |= stages.graphs
     return counts
 
@@ -68,9 +66,9 @@ def test_more_graphs_than_two_are_an_error_not_a_fall_back():
 
 def test_without_a_compiler_on_is_an_error_and_auto_stays_eager(monkeypatch):
     monkeypatch.setattr(compiled.shutil, "which", lambda name: None)
-    monkeypatch.setattr(RENDER, "COMPILE_REPAYS", 1)
+    monkeypatch.setattr(forward, "COMPILE_REPAYS", 1)
     scene = torchpt.load("cornell_box")
     with pytest.raises(RenderError, match="C\\+\\+ compiler"):
         run(scene, 1, "on")
     assert run(scene, 1, "auto").complete
-    assert scene not in RENDER._compiled or not RENDER._compiled[scene]
+    assert scene not in forward._compiled or not forward._compiled[scene]

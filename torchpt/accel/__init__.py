@@ -20,7 +20,7 @@ __all__ = ["BRUTE_LIMIT", "KINDS", "Accel", "Hits", "build"]
 #: What ``kind`` accepts.
 KINDS = ("auto", "torch", "numba", "brute")
 #: Up to this many primitives ``auto`` takes the packet search on a CPU (measured crossover, scripts/bench_accel.py).
-BRUTE_LIMIT = 64
+BRUTE_LIMIT = 128
 
 
 def build(geometry: Geometry, kind: str = "auto", threads: int | None = None) -> Accel:

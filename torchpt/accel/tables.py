@@ -54,11 +54,11 @@ def prepare(geometry: Geometry) -> Tables:
     n = cross / length
     a = torch.linalg.cross(e2, n, dim=0) / length
     b = torch.linalg.cross(n, e1, dim=0) / length
-    rows = torch.stack([r for x in (n, a, b) for r in (*x.unbind(0), -(x * p0).sum(0))], 1)
-    good = planar & (length > 0) & torch.isfinite(rows.float()).all(1)
-    rows = torch.where(good[:, None], rows, 0.0)
+    rows = torch.cat([r for x in (n, a, b) for r in (x, -(x * p0).sum(0, keepdim=True))])
+    good = planar & (length > 0) & torch.isfinite(rows.float()).all(0)
+    rows = torch.where(good, rows, 0.0)
     round_ = ~planar & torch.isfinite(p0).all(0) & (p1[0].abs() > 0) & torch.isfinite(p1[0])
-    return Tables(rows.float().contiguous(), rows, good | round_)
+    return Tables(rows.float().T.contiguous(), rows.T, good | round_)
 
 
 def extent(geometry: Geometry) -> float:

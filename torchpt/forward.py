@@ -1,0 +1,316 @@
+"""One forward render: chunks of pixels, each a wave, accumulate in films."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from torchpt.errors import RenderError
+from torchpt.film import Film, Filter
+from torchpt.integrators import Wave
+from torchpt.integrators.aov import CHANNELS
+from torchpt.integrators.compiled import CompiledStages, Stages, can_compile
+from torchpt.integrators.path import Limits, Tally
+from torchpt.integrators.stages import Plan
+from torchpt.records import World
+from torchpt.samplers import Sampler
+from torchpt.scene import Scene
+from torchpt.scene.settings import AovIntegrator, DirectIntegrator, GaussianFilter, PathIntegrator, Settings
+
+__all__ = ["BYTES_PER_LANE", "Progress", "Rendering", "Run", "chunks_of", "lanes_for", "limited_threads", "make_wave"]
+
+#: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
+LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
+#: Peak bytes a lane takes in a wave, measured on the Cornell box; under a tape each vertex keeps about this much.
+BYTES_PER_LANE = 640
+#: Independent randomizations that share a pixel's samples, see torchpt.samplers.
+RANDOMIZATIONS = 4
+#: A pass never holds more samples a pixel than this.
+LARGEST_PASS = 64
+
+#: From this many camera paths on ``compile: auto`` compiles: a cold start takes about a minute, and saves a quarter of the rest.
+COMPILE_REPAYS = 200_000_000
+
+_compiled: WeakKeyDictionary[Scene, dict[Plan, CompiledStages]] = WeakKeyDictionary()
+_forked = False
+
+
+def _after_fork() -> None:
+    global _forked
+    _forked = True
+
+
+os.register_at_fork(after_in_child=_after_fork)
+
+
+@dataclass
+class Rendering:
+    """A picture and how it came about.
+
+    Attributes:
+        image: ``(H, W, 3)`` linear RGB.
+        layers: what ``film.aovs`` asked for, each ``(H, W, C)``.
+        spp: samples a pixel that the picture holds.
+        seconds: wall time.
+        paths: camera samples traced.
+        rays: rays traced, shadow rays included.
+        nonfinite_samples: samples that were NaN or infinite, and counted as black.
+        truncated_paths: paths ended by the cap on endless depth.
+        clamped: fraction of the light that ``integrator.clamp`` took away; None where it is off.
+        relmse: the picture's estimate of its own relMSE; None for a single randomization.
+        complete: whether all samples asked for were taken.
+    """
+
+    image: Tensor
+    layers: dict[str, Tensor] = field(default_factory=dict)
+    spp: int = 0
+    seconds: float = 0.0
+    paths: int = 0
+    rays: int = 0
+    nonfinite_samples: int = 0
+    truncated_paths: int = 0
+    clamped: float | None = None
+    relmse: float | None = None
+    complete: bool = True
+
+    def summary(self) -> dict[str, Any]:
+        """The facts as plain values, ready for JSON."""
+        facts: dict[str, Any] = {
+            "spp": self.spp,
+            "seconds": round(self.seconds, 4),
+            "paths_per_second": round(self.paths / max(self.seconds, 1e-9)),
+            "rays": self.rays,
+            "nonfinite_samples": self.nonfinite_samples,
+            "mean": [float(x) for x in self.image.double().mean((0, 1))],
+            "relmse": self.relmse,
+        }
+        if self.truncated_paths:
+            facts["truncated_paths"] = self.truncated_paths
+        if self.clamped is not None:
+            facts["clamped"] = self.clamped
+        if not self.complete:
+            facts["complete"] = False
+        return facts
+
+
+@dataclass
+class Progress:
+    """The state of a render between two chunks.
+
+    Attributes:
+        done: camera samples taken.
+        total: camera samples asked for.
+        rays: rays traced.
+        seconds: since the start.
+        pass_finished: whether every pixel now has the same number of samples.
+        snapshot: makes the picture so far.
+    """
+
+    done: int
+    total: int
+    rays: int
+    seconds: float
+    pass_finished: bool
+    snapshot: Callable[[], Rendering]
+
+
+@contextmanager
+def limited_threads(wish: int | str) -> Iterator[None]:
+    """Let torch use ``wish`` threads for a while."""
+    before = torch.get_num_threads()
+    # The thread pool of the parent does not survive a fork: waiting for it would never end.
+    now = 1 if _forked else before if wish == "auto" else int(wish)
+    if now == before:
+        yield
+        return
+    torch.set_num_threads(now)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def make_wave(
+    scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype, attached: bool
+) -> Wave:
+    """Everything that the waves of a render share."""
+    world, geometry = scene.world(dtype, params)
+    threads = None if settings.render.threads == "auto" else int(settings.render.threads)
+    moved = any(name.startswith("shapes.") and name.endswith((".vertices", ".to_world")) for name in params or {})
+    accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
+    film, integrator = settings.film, settings.integrator
+    stddev = film.filter.stddev if isinstance(film.filter, GaussianFilter) else 0.5
+    limits, plan = None, Plan(settings.sampler.type, "mis", None, dtype, attached)
+    if isinstance(integrator, PathIntegrator):
+        limits = Limits(integrator.max_depth, integrator.rr_depth)
+        plan = Plan(settings.sampler.type, integrator.strategy, integrator.rr_prob, dtype, attached)
+    elif isinstance(integrator, DirectIntegrator):
+        limits = Limits(2, 3)
+        plan = Plan(settings.sampler.type, integrator.strategy, None, dtype, attached)
+    spp = settings.render.spp
+    return Wave(
+        stages=_stages(scene, settings, plan, world),
+        limits=limits,
+        accel=accel,
+        camera=scene.camera(film, scene.merged(params), dtype),
+        filter=Filter(film.filter.type, film.filter.radius, stddev, scene.device),
+        sampler=Sampler(settings.sampler.type, settings.render.seed, min(spp, RANDOMIZATIONS)),
+        crop=film.crop or (0, 0, film.width, film.height),
+        centre=scene.centre,
+    )
+
+
+def _stages(scene: Scene, settings: Settings, plan: Plan, world: World) -> Stages:
+    """Eager or compiled stages; compiled ones are kept with the scene."""
+    mode = settings.render.compile
+    if mode == "auto":
+        film = settings.film
+        work = film.width * film.height * settings.render.spp
+        mode = "on" if work >= COMPILE_REPAYS and plan.dtype == torch.float32 and can_compile(scene.device) else "off"
+    if mode == "off" or plan.attached or torch.is_grad_enabled():
+        return Stages(plan, world)
+    kept = _compiled.setdefault(scene, {})
+    if plan not in kept or kept[plan].world is not world:
+        kept[plan] = CompiledStages(plan, world)
+    return kept[plan]
+
+
+def _passes(spp: int, randomizations: int) -> Iterator[tuple[int, int]]:
+    """First sample and number of samples of each pass; sizes double and depend on ``spp`` alone."""
+    first, size = 0, randomizations
+    while first < spp:
+        count = min(size, spp - first)
+        yield first, count
+        first += count
+        size = min(2 * size, LARGEST_PASS) if first > randomizations else size
+
+
+def lanes_for(settings: Settings, device: torch.device, per_lane: int = BYTES_PER_LANE) -> int:
+    """Lanes of a wave, under ``render.max_memory``."""
+    lanes = LANES.get(device.type, LANES["cpu"])
+    if settings.render.max_memory is not None:
+        lanes = min(lanes, max(settings.render.max_memory // per_lane, 1))
+    return lanes
+
+
+def chunks_of(
+    settings: Settings, lanes: int, randomizations: int, pixels: int
+) -> Iterator[tuple[int, int, int, int, bool]]:
+    """Ranges ``(first_pixel, pixels, first_sample, samples, ends_pass)``. Chunks split pixels, never samples' order."""
+    for first_sample, samples in _passes(settings.render.spp, randomizations):
+        batch = max(min(samples, lanes), 1)
+        for start in range(first_sample, first_sample + samples, batch):
+            count = min(batch, first_sample + samples - start)
+            step = max(lanes // count, 1)
+            for first in range(0, pixels, step):
+                last = first + step >= pixels and start + count == first_sample + samples
+                yield first, min(step, pixels - first), start, count, last
+
+
+class Run:
+    """One forward render: accumulates chunks into films."""
+
+    def __init__(
+        self, scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
+    ) -> None:
+        self.start = time.perf_counter()
+        self.settings, self.device = settings, scene.device
+        self.wave = make_wave(scene, settings, params, dtype, attached=False)
+        _, _, self.width, self.height = self.wave.crop
+        self.dtype = dtype
+        groups = self.wave.sampler.randomizations
+        self.film = Film(self.width, self.height, groups, self.device)
+        self.names = tuple(name for name in settings.film.aovs if name in CHANNELS)
+        if isinstance(settings.integrator, AovIntegrator) and not settings.film.aovs:
+            self.names = ("albedo",)
+        self.layers = {name: Film(self.width, self.height, 1, self.device, CHANNELS[name]) for name in self.names}
+        self.tally, self.done = Tally(), 0
+        self.bad = torch.zeros((), dtype=torch.int64, device=self.device)
+        self.light = torch.zeros(2, dtype=torch.float64, device=self.device)  # before and after the clamp
+
+    def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
+        """Take all samples, or as many as ``on_progress`` lets."""
+        pixels = self.width * self.height
+        total = pixels * self.settings.render.spp
+        lanes = lanes_for(self.settings, self.device)
+        for first, count, sample, samples, ends in chunks_of(self.settings, lanes, self.film.randomizations, pixels):
+            self._chunk(first, count, sample, samples)
+            self.done += count * samples
+            if on_progress is not None:
+                seconds = time.perf_counter() - self.start
+                if (
+                    on_progress(Progress(self.done, total, self.tally.rays, seconds, ends, self.result))
+                    and self.done < total
+                ):
+                    break
+        return self.result()
+
+    def _chunk(self, first: int, count: int, sample: int, samples: int) -> None:
+        if self.wave.limits is not None:
+            radiance, tally = self.wave.radiance(first, count, sample, samples)
+            self.tally.rays += tally.rays
+            self.tally.truncated += tally.truncated
+            self.film.add(self._checked(radiance, first, sample), first, sample)
+        if self.names:
+            found = self.wave.layers(self.names, first, count, sample, samples)
+            self.tally.rays += count * samples
+            for name, values in found.items():
+                self.layers[name].add(values, first, sample)
+
+    def _checked(self, radiance: Tensor, first: int, sample: int) -> Tensor:
+        """Count what is not finite and take it as black; apply the clamp."""
+        settings = self.settings.integrator
+        assert not isinstance(settings, AovIntegrator)
+        finite = torch.isfinite(radiance).all(0)
+        self.bad += (~finite).sum()
+        if settings.strict and not bool(finite.all()):
+            s, p = (int(i) for i in (~finite).nonzero()[0])
+            x, y = (first + p) % self.width + self.wave.crop[0], (first + p) // self.width + self.wave.crop[1]
+            raise RenderError(f"integrator.strict: sample {sample + s} of pixel ({x}, {y}) is not finite")
+        radiance = torch.where(finite, radiance, 0.0)
+        if settings.clamp is None:
+            return radiance
+        scale = (settings.clamp / radiance.amax(0).clamp_min(settings.clamp)).clamp_max(1.0)
+        clamped = radiance * scale
+        self.light += torch.stack((radiance.double().sum(), clamped.double().sum()))
+        return clamped
+
+    def result(self) -> Rendering:
+        """The picture so far."""
+        layers = {name: film.mean().to(self.dtype) for name, film in self.layers.items()}
+        aov = isinstance(self.settings.integrator, AovIntegrator)
+        if "object_id" in layers:  # an identity has no average: that of the first sample
+            layers["object_id"] = self.layers["object_id"].first().to(self.dtype)
+        image = self.film.mean().to(self.dtype)
+        variance = None if aov else self.film.variance()
+        if aov and self.names:
+            shown = layers[self.names[0]]
+            image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else shown
+        if "variance" in self.settings.film.aovs:
+            layers["variance"] = torch.full_like(image, torch.inf) if variance is None else variance.to(self.dtype)
+        clamped = None
+        if not aov and self.settings.integrator.clamp is not None:  # type: ignore[union-attr]
+            before, after = self.light.tolist()
+            clamped = 1.0 - after / before if before > 0 else 0.0
+        pixels = self.width * self.height
+        return Rendering(
+            image=image,
+            layers=layers,
+            spp=self.done // pixels,
+            seconds=time.perf_counter() - self.start,
+            paths=self.done,
+            rays=self.tally.rays,
+            nonfinite_samples=int(self.bad),
+            truncated_paths=self.tally.truncated,
+            clamped=clamped,
+            relmse=None if aov else self.film.relmse(),
+            complete=self.done == pixels * self.settings.render.spp,
+        )
