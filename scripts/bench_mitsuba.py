@@ -33,6 +33,7 @@ BARS = (
 def main() -> None:
     """Run all contenders in turn and print rates and ratios."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", default=SCENES, help=f"of {', '.join(SCENES)}")
     parser.add_argument("--compile", action="store_true", help="compiled stages too (half a minute to warm up)")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--size", type=int, default=256)
@@ -48,7 +49,7 @@ def main() -> None:
         return
     modes = ("eager", "compiled") if arguments.compile else ("eager",)
     contenders = [*MITSUBA, *(f"{mode} {sampler}" for mode in modes for sampler in ("sobol", "independent"))]
-    for scene in SCENES:
+    for scene in arguments.scenes:
         report(scene, compete(scene, contenders, arguments))
         searcher = start(scene, "traversal", arguments)
         for kind, rate in ask(searcher).items():
@@ -123,9 +124,9 @@ def serve(scene: str, contender: str, size: int, spp: int) -> None:
     else:
         turn = partial(timed, torchpt(scene, contender, size, spp), size * size * spp)
     turn()
-    print(json.dumps({"ready": 1}), flush=True)
+    print("\n" + json.dumps({"ready": 1}), flush=True)
     for _ in sys.stdin:
-        print(json.dumps(turn()), flush=True)
+        print("\n" + json.dumps(turn()), flush=True)
 
 
 def timed(shoot: Callable[[], Any], paths: int) -> dict[str, float]:

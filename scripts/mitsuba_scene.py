@@ -43,6 +43,7 @@ def load_mitsuba(variant: str) -> Any:
         os.environ["DRJIT_LIBLLVM_PATH"] = library
     mitsuba: Any = importlib.import_module("mitsuba")
     mitsuba.set_variant(variant)
+    mitsuba.set_log_level(mitsuba.LogLevel.Error)  # its warnings about meshes go to stdout
     return mitsuba
 
 
