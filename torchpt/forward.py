@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -36,16 +37,18 @@ RANDOMIZATIONS = 4
 #: A pass never holds more samples a pixel than this.
 LARGEST_PASS = 64
 
-#: From this many camera paths on ``compile: auto`` compiles: a cold start takes about a minute, and saves a quarter of the rest.
+#: From this many camera paths on ``compile: auto`` compiles: a cold start takes a minute, and saves a quarter of the rest.
 COMPILE_REPAYS = 200_000_000
 
 _compiled: WeakKeyDictionary[Scene, dict[Plan, CompiledStages]] = WeakKeyDictionary()
 _forked = False
+_threads_lock = threading.Lock()
+_threads_before, _renders = 0, 0
 
 
 def _after_fork() -> None:
-    global _forked
-    _forked = True
+    global _forked, _renders, _threads_lock
+    _forked, _renders, _threads_lock = True, 0, threading.Lock()
 
 
 os.register_at_fork(after_in_child=_after_fork)
@@ -125,17 +128,23 @@ class Progress:
 @contextmanager
 def limited_threads(wish: int | str) -> Iterator[None]:
     """Let torch use ``wish`` threads for a while."""
-    before = torch.get_num_threads()
-    # The thread pool of the parent does not survive a fork: waiting for it would never end.
-    now = 1 if _forked else before if wish == "auto" else int(wish)
-    if now == before:
-        yield
-        return
-    torch.set_num_threads(now)
+    global _renders, _threads_before
+    with _threads_lock:
+        if _renders == 0:
+            _threads_before = torch.get_num_threads()
+        _renders += 1
+        # The thread pool of the parent does not survive a fork: waiting for it would never end.
+        now = 1 if _forked else _threads_before if wish == "auto" else int(wish)
+        if now != torch.get_num_threads():
+            torch.set_num_threads(now)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        with _threads_lock:
+            _renders -= 1
+            # Of renders that overlap, the last one puts back what the first one found.
+            if _renders == 0 and torch.get_num_threads() != _threads_before and not _forked:
+                torch.set_num_threads(_threads_before)
 
 
 def make_wave(
@@ -157,7 +166,7 @@ def make_wave(
         plan = Plan(settings.sampler.type, integrator.strategy, None, dtype, attached)
     spp = settings.render.spp
     return Wave(
-        stages=_stages(scene, settings, plan, world),
+        stages=_stages(scene, settings, plan, world, own=not params),
         limits=limits,
         accel=accel,
         camera=scene.camera(film, scene.merged(params), dtype),
@@ -168,15 +177,21 @@ def make_wave(
     )
 
 
-def _stages(scene: Scene, settings: Settings, plan: Plan, world: World) -> Stages:
-    """Eager or compiled stages; compiled ones are kept with the scene."""
+def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, own: bool) -> Stages:
+    """Eager or compiled stages; compiled ones are kept with the scene, unless the world is not the scene's ``own``."""
     mode = settings.render.compile
     if mode == "auto":
-        film = settings.film
-        work = film.width * film.height * settings.render.spp
-        mode = "on" if work >= COMPILE_REPAYS and plan.dtype == torch.float32 and can_compile(scene.device) else "off"
+        _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+        work = width * height * settings.render.spp
+        mode = (
+            "on"
+            if own and work >= COMPILE_REPAYS and plan.dtype == torch.float32 and can_compile(scene.device)
+            else "off"
+        )
     if mode == "off" or plan.attached or torch.is_grad_enabled():
         return Stages(plan, world)
+    if not own:
+        return CompiledStages(plan, world)
     kept = _compiled.setdefault(scene, {})
     if plan not in kept or kept[plan].world is not world:
         kept[plan] = CompiledStages(plan, world)

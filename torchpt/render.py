@@ -65,7 +65,7 @@ def render(
         SceneError: a setting or parameter that is not accepted.
         RenderError: a device or compiler that is not there.
     """
-    if device is not None and torch.device(device if device != "auto" else scene.device).type != scene.device.type:
+    if device not in (None, "auto") and not _same(device, scene.device):
         raise SceneError("device", str(device), f"the scene's own device {scene.device}; load the scene on the other")
     if dtype not in (torch.float32, torch.float64):
         raise SceneError("dtype", dtype, "torch.float32 or torch.float64")
@@ -80,17 +80,20 @@ def render(
     settings = complete(scene.description, wishes)
     if adjoint not in (None, *adjoints.KINDS):
         raise SceneError("adjoint", adjoint, " or ".join(adjoints.KINDS))
+    for key, value, low in (("seed_grad", seed_grad, 0), ("spp_grad", spp_grad, 1)):
+        if value is not None and (type(value) is not int or value < low):
+            raise SceneError(key, value, f"a whole number >= {low}")
     scene.merged(params)
     wanted = {name: value for name, value in (params or {}).items() if value.requires_grad}
     if not wanted or not torch.is_grad_enabled():
         return render_scene(scene, settings, params=params, dtype=dtype).image
     backward_seed = settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad
     fixed = {name: value for name, value in (params or {}).items() if name not in wanted}
-    again = settings.model_copy(
-        update={
-            "render": settings.render.model_copy(update={"seed": backward_seed, "spp": spp_grad or settings.render.spp})
-        }
-    )
+    backward_spp = settings.render.spp if spp_grad is None else spp_grad
+    drawn_anew = settings.render.model_copy(update={"seed": backward_seed, "spp": backward_spp})
+    again = settings.model_copy(update={"render": drawn_anew})
+    if isinstance(settings.integrator, AovIntegrator):
+        raise SceneError("integrator.type", "aov", "path or direct where gradients are wanted")
     names = tuple(wanted)
     if _moves(names):
         warnings.warn(
@@ -109,6 +112,15 @@ def render(
         return _differentiable_chunks(scene, again, given, names, dtype)
 
     return adjoints.KINDS[adjoint or "autograd"](forward, chunks, tuple(wanted.values()))
+
+
+def _same(wish: str | torch.device, own: torch.device) -> bool:
+    """Whether a wish for a device names the one that a scene is on."""
+    try:
+        device = torch.device(wish)
+    except RuntimeError:
+        return False
+    return device.type == own.type and device.index in (None, own.index or 0)
 
 
 def _moves(names: Iterable[str]) -> bool:
@@ -152,8 +164,7 @@ def _differentiable_chunks(
     scene: Scene, settings: Settings, params: Mapping[str, Tensor], wanted: tuple[str, ...], dtype: torch.dtype
 ) -> Iterator[adjoints.Chunk]:
     """Chunks of pixels as differentiable functions of the tensors ``wanted``, for the backward pass."""
-    if isinstance(settings.integrator, AovIntegrator):
-        raise SceneError("integrator.type", "aov", "path or direct where gradients are wanted")
+    assert not isinstance(settings.integrator, AovIntegrator)
     attached = _moves(wanted)
     plain = {name: value.detach() for name, value in params.items()}
     with torch.no_grad():

@@ -142,10 +142,11 @@ def test_lights_are_chosen_by_power():
     assert table is not None and table.choice is not None
     areas = table.area
     power = areas * table.radiance[0]
-    torch.testing.assert_close(table.choice.pmf, power / power.sum())
+    expected = 0.99 * power / power.sum() + 0.01 / 3  # a hundredth is even, see Discrete
+    torch.testing.assert_close(table.choice.pmf, expected)
     row = table.choice.sample(torch.rand(N, generator=G))
     counts = torch.bincount(row, minlength=3).double()
-    expected = N * power / power.sum()
+    expected = N * expected
     assert chi_square_p(float(((counts - expected) ** 2 / expected).sum()), 2) > SIGNIFICANCE
 
 

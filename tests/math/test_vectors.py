@@ -86,16 +86,22 @@ def test_power_heuristic_at_its_extremes():
     assert float(power_heuristic(torch.tensor(1e-30), torch.tensor(1e30))) == 0
 
 
+def shares(weights: torch.Tensor) -> torch.Tensor:
+    """Probabilities in float64: by weight, but for a hundredth that is even among what has weight."""
+    w = weights.double()
+    return 0.99 * w / w.sum() + 0.01 * (w > 0) / (w > 0).sum()
+
+
 def test_discrete_choice_follows_its_weights():
     weights = torch.tensor([0.0, 1.0, 0.0, 3.0, 2.0, 0.0])
     choice = Discrete.of(weights, torch.float32)
     drawn = choice.sample(torch.rand(120_000, generator=G))
     counts = torch.bincount(drawn, minlength=6).double()
     assert not counts[weights == 0].any()
-    expected = 120_000 * (weights / 6).double()
+    expected = 120_000 * shares(weights)
     some = weights > 0
     assert chi_square_p(float(((counts - expected)[some] ** 2 / expected[some]).sum()), 2) > SIGNIFICANCE
-    torch.testing.assert_close(choice.pmf, weights / 6)
+    torch.testing.assert_close(choice.pmf, shares(weights).float())
 
 
 def test_a_million_tiny_weights_do_not_collapse():
@@ -111,8 +117,20 @@ def test_a_million_tiny_weights_do_not_collapse():
     weights = torch.ones(100_001)
     weights[50_000] = 1e6
     drawn = Discrete.of(weights, torch.float32).sample(torch.rand(100_000, generator=G))
-    share = float((drawn == 50_000).double().mean())
-    assert abs(share - 1e6 / 1.1e6) < 4 * math.sqrt(1e6 / 1.1e6 / 11 / 1e5)
+    share, expected = float((drawn == 50_000).double().mean()), float(shares(weights)[50_000])
+    assert abs(share - expected) < 4 * math.sqrt(expected * (1 - expected) / 1e5)
+
+
+def test_no_outcome_is_too_rare_for_a_draw_of_24_bits():
+    """1,000 lights, one 1e12 times brighter: the others' own share would lie below 2^-24, and their light be lost."""
+    weights = torch.ones(1000, dtype=torch.float64)
+    weights[500] = 1e12
+    choice = Discrete.of(weights, torch.float32)
+    u = torch.arange(1 << 16).float() / (1 << 16) + 2.0**-20
+    drawn = torch.bincount(choice.sample(u), minlength=1000).double() / (1 << 16)
+    # One over the probability is what a sampled light weighs: what is never drawn must have none.
+    assert (drawn > 0).sum() > 400
+    assert float(choice.pmf.min()) > 2.0**-24 * 100
 
 
 @pytest.mark.parametrize("weights", [[0.0, 0.0, 0.0], [5.0], [0.0, 1e-30, 0.0], [1e30, 1e30], [1.0, 0.0]])

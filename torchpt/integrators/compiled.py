@@ -48,11 +48,11 @@ class Stages:
 
     def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
         """See :func:`torchpt.integrators.stages.emit`."""
-        return stages.emit(self.plan, self.world, state, hit, index, slide)
+        return stages.emit(self.world, state, hit, index, slide)
 
     def escape(self, state: PathState, index: Tensor) -> Tensor:
         """See :func:`torchpt.integrators.stages.escape`."""
-        return stages.escape(self.plan, self.world, state, index)
+        return stages.escape(self.world, state, index)
 
     def bounce(
         self,
@@ -105,7 +105,7 @@ class CompiledStages(Stages):
         """See :func:`torchpt.integrators.stages.emit`."""
 
         def stage(state: PathState, hit: Hit, index: Tensor) -> Tensor:
-            return stages.emit(self.plan, self.world, state, hit, index, slide)
+            return stages.emit(self.world, state, hit, index, slide)
 
         return self._get("emit", (slide,), stage)(state, hit, _padded(index))[:, : len(index)]
 

@@ -100,7 +100,7 @@ def generate(
     return PathState(o.expand(3, n).clone(), d, everywhere, ones, torch.zeros_like(d), everywhere.clone(), lane, key)
 
 
-def emit(plan: Plan, world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
+def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
     """Radiance ``(3, n)`` that the paths at ``index`` gather from the emitters they hit, weighted by MIS."""
     assert world.lights is not None
     o, d = take(state.o, index), take(state.d, index)
@@ -109,7 +109,7 @@ def emit(plan: Plan, world: World, state: PathState, hit: Hit, index: Tensor, sl
     return _weighted(take(state.throughput, index), radiance, take(state.pdf, index), pdf)
 
 
-def escape(plan: Plan, world: World, state: PathState, index: Tensor) -> Tensor:
+def escape(world: World, state: PathState, index: Tensor) -> Tensor:
     """Radiance ``(3, n)`` that the paths at ``index`` gather from the environment they escape to."""
     assert world.lights is not None
     radiance, pdf = lights.environment(world.lights, take(state.d, index))
@@ -178,7 +178,7 @@ def shade(
     choice = None if table.choice is None else draws.one(Dimension.LIGHT_CHOICE)
     light = lights.sample(table, at.p, choice, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET)
     wi = frame.to_local(light.wi)
-    # A shading normal must not let light through the surface: both directions on the sides that geometry says.
+    # A shading normal must not let light through the surface: wi on the same side of both normals.
     through = dot(light.wi, at.ng) * wi[2]
     reflected = kind.eval(parameters, wo, wi)
     weight = light.weight
@@ -189,7 +189,7 @@ def shade(
     radiance = state.throughput * reflected * light.radiance * weight
     o = offset_origin(world, at, light.wi)
     d = light.target - o
-    lit = largest(radiance.detach()) > 0
+    lit = largest(radiance.detach().abs()) > 0
     t_max = lit.to(plan.dtype) * (1.0 - SHORTEN)
     if light.distant is not None:
         d = torch.where(light.distant, light.wi, d)

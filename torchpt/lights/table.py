@@ -131,8 +131,8 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Ten
         if "sphere" in lights.kinds:
             ball = sphere.inverse_pdf(x, table.p0, table.e1[0], at.ng, wi, dot(to, to))
             inverse = _pick(_is(lights, "sphere", row), ball, inverse)
-        pdf = safe_reciprocal(inverse / _probability(lights, row))
         facing = dot(wi, at.ng) < 0
+        pdf = torch.where(facing, safe_reciprocal(inverse) * _probability(lights, row), 0.0)
     return torch.where(facing, table.radiance, 0.0), pdf
 
 

@@ -23,11 +23,21 @@ class Discrete:
     pmf: Tensor
 
     @staticmethod
-    def of(weights: Tensor, dtype: torch.dtype) -> Discrete:
-        """From non-negative weights ``(K,)``; all zero gives the uniform choice."""
+    def of(weights: Tensor, dtype: torch.dtype, even: float = 0.01) -> Discrete:
+        """From non-negative weights ``(K,)``; all zero gives the uniform choice.
+
+        Args:
+            weights: ``(K,)``.
+            dtype: of ``pmf``.
+            even: share of the draws that is even among the outcomes with any weight. A draw has 24 bits: an outcome rarer
+                than that would never come up, or too often.
+        """
         w = weights.detach().double()
         total = w.sum()
-        w = torch.where(total > 0, w / torch.where(total > 0, total, 1.0), torch.full_like(w, 1.0 / max(len(w), 1)))
+        even = torch.full_like(w, 1.0 / max(len(w), 1))
+        possible = (w > 0).double()
+        floor = possible / possible.sum().clamp_min(1.0)
+        w = torch.where(total > 0, (1.0 - even) * w / torch.where(total > 0, total, 1.0) + even * floor, even)
         cdf = torch.cumsum(w, 0)
         # From the last possible outcome on the sum is 1, so that rounding never lets a draw fall on an impossible one.
         last = int((w > 0).nonzero().max())

@@ -55,7 +55,7 @@ class Draws:
     """The numbers of one path vertex for a batch of lanes: ``draws.one(Dimension.ROULETTE)``, ``draws.two(...)``.
 
     Args:
-        sampler: whose numbers.
+        kind: type of the sampler.
         key: ``(2, N)`` int32 as given by :meth:`Sampler.key`.
         salts: ``(STREAMS,)`` int32, the dimensions' names at this depth; a tensor, so that a compiled stage does not
             specialize on the depth.

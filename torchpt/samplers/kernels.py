@@ -71,7 +71,9 @@ def _unit(x: Any) -> Any:
 @jit()
 def _sobol_1d(k0: Any, k1: Any, salt: Any, o0: Any, o1: Any) -> None:
     for i in range(len(k0)):
-        o0[i] = _unit(_reverse(_scramble(k1[i], _mix(U(k0[i] ^ salt)))))
+        seed = _mix(U(k0[i] ^ salt))
+        index = _reverse(_scramble(_reverse(k1[i]), seed))
+        o0[i] = _unit(_reverse(_scramble(index, _mix(U(seed ^ _X)))))
 
 
 @jit()

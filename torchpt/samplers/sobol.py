@@ -47,7 +47,10 @@ def second_dimension(index: Tensor) -> Tensor:
 
 def draw_1d(key: Tensor, salt: Tensor | int) -> Tensor:
     """``(N,)`` float32 in ``[0, 1)``. ``key (2, N)`` int32 holds the pixel's seed and the sample's index."""
-    return to_unit(reverse_bits(scramble(key[1], mix(key[0] ^ salt))))
+    # Shuffled before it is scrambled: scrambled alone, all 1D sets would share their order and move together.
+    seed = mix(key[0] ^ salt)
+    index = reverse_bits(scramble(reverse_bits(key[1]), seed))
+    return to_unit(reverse_bits(scramble(index, mix(seed ^ _X))))
 
 
 def draw_2d(key: Tensor, salt: Tensor | int) -> Tensor:

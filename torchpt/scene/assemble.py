@@ -41,12 +41,15 @@ def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dty
         zero = torch.zeros_like(radius)
         p1 = torch.stack((radius, zero, zero))[:, None]
         return Corners(move.to(dtype), p1.to(dtype), torch.zeros_like(move).to(dtype), None)
+    x, y = linear[:, 0:1], linear[:, 1:2]
+    if bool(torch.linalg.det(linear.detach()) < 0):
+        x, y = y, x  # mirrored, a flat shape still faces where its own +z goes, as in Mitsuba
     if part.kind == "rectangle":  # Mitsuba's unit shape [-1, 1]^2 from its lower corner
-        x, y = 2.0 * linear[:, 0:1], 2.0 * linear[:, 1:2]
+        x, y = 2.0 * x, 2.0 * y
         p0 = move - 0.5 * (x + y)
         return Corners(p0.to(dtype), (p0 + x).to(dtype), (p0 + y).to(dtype), None)
     if part.kind == "disk":
-        p1, p2 = move + linear[:, 0:1], move + linear[:, 1:2]
+        p1, p2 = move + x, move + y
         return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), None)
     vertices = linear @ parameters[f"{part.name}.vertices"].T.double() + move
     device = vertices.device
@@ -211,14 +214,14 @@ def _lights(
     area = torch.where(of_kind == KINDS.index("sphere"), (4.0 * math.pi) * q1[0] * q1[0], area)
     radiance = [parameters[part.emission_name].to(dtype)[:, None].expand(3, n) for part, n in glowing]
     radiance = torch.cat(radiance, 1) if radiance else torch.zeros(3, 0, dtype=dtype, device=device)
-    power = (luminance(radiance.detach().double()) * area.detach().double()) * math.pi
+    power = (luminance(radiance.detach().double().abs()) * area.detach().double()) * math.pi
     kind = torch.tensor([kinds.index(k) if k in kinds else 0 for k in KINDS], device=device)[of_kind]
     extra = [bound.index_select(0, rows), sign.index_select(0, rows)]
     if environment is not None:
         # A row of its own, whose surface is never read; its flux through the sphere about the scene, 4 pi^2 R^2 L.
         low, high = (p0 - e1.abs() - e2.abs()).double(), (p0 + e1.abs() + e2.abs()).double()
         reach = (high.amax(1) - low.amin(1)).norm() * 0.5 if p0.shape[1] else torch.ones((), device=device)
-        flux = 4.0 * math.pi**2 * reach.detach() ** 2 * luminance(environment.detach().double())
+        flux = 4.0 * math.pi**2 * reach.detach() ** 2 * luminance(environment.detach().double().abs())
         power = torch.cat((power, flux.reshape(1)))
         kinds = (*kinds, "constant")
         kind = torch.cat((kind, torch.tensor([len(kinds) - 1], device=device)))

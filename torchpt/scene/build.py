@@ -50,10 +50,8 @@ def build_parts(description: Description) -> Built:
     for number, (name, shape) in enumerate(description.shapes.items(), 1):
         parts += _shape_parts(description, name, shape, number, parameters)
     for name, material in description.materials.items():
-        for slot in (_slot(f"materials.{name}", material),):
-            parameters.update(
-                {f"{slot.name}.{key}": np.asarray(value, np.float64) for key, value in slot.values.items()}
-            )
+        slot = _slot(f"materials.{name}", material)
+        parameters.update({f"{slot.name}.{key}": np.asarray(value, np.float64) for key, value in slot.values.items()})
     if len(description.lights) > 1:
         first, second = list(description.lights)[:2]
         raise SceneError(f"lights.{second}", "constant", f"one environment only ({first} is one)", description.file)
@@ -64,7 +62,7 @@ def build_parts(description: Description) -> Built:
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
     parameters["camera.fov"] = np.asarray(description.camera.fov, np.float64)
     parts.sort(key=lambda part: KINDS.index(part.kind))
-    return Built(tuple(parts), parameters, _centre(parts, parameters), environment)
+    return Built(tuple(parts), parameters, _centre(parts), environment)
 
 
 def _slot(prefix: str, material: Material) -> MaterialSlot:
@@ -119,8 +117,11 @@ def _labels(names: list[str]) -> list[str]:
     """Distinct labels without dots for the pieces of a mesh."""
     labels: list[str] = []
     for number, name in enumerate(names):
-        label = name.replace(".", "_") or f"part{number}"
-        labels.append(label if label not in labels else f"{label}_{number}")
+        base = name.replace(".", "_") or f"part{number}"
+        label, again = base, number
+        while label in labels:
+            label, again = f"{base}_{again}", again + 1
+        labels.append(label)
     return labels
 
 
@@ -157,7 +158,7 @@ def _part(
         and any(own.emission)
     ):
         emission = own.emission
-    if emission is not None and not any(emission):
+    if emission is not None and not any(emission) and shape.emission is None:
         emission = None
     emission_name = f"shapes.{name}.emission" if shape.emission is not None else f"{prefix}.emission"
     if emission is not None:
@@ -184,7 +185,7 @@ def _part(
 
 
 def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
-    """Faces that have an area once they are float32 numbers, and how many do not."""
+    """Faces that have an area, and how many do not."""
     corners = (piece.vertices @ pose[:3, :3].T)[piece.faces]
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     # Relative to the longest edge, so that neither tiny nor huge meshes are mistaken for degenerate ones.
@@ -194,18 +195,18 @@ def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
     return np.ascontiguousarray(piece.faces[solid]), int((~solid).sum())
 
 
-def _centre(parts: list[Part], parameters: dict[str, np.ndarray]) -> np.ndarray:
+def _centre(parts: list[Part]) -> np.ndarray:
     """Where the origin goes: the middle of a scene that lies far off, else where it is."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for part in parts:
-        points = (
-            part.vertices
-            if part.vertices is not None
-            else np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        )
+        if part.vertices is not None and part.faces is not None:
+            points = part.vertices[part.faces.reshape(-1)]  # vertices of no face have no say
+        else:
+            points = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         world = points @ part.to_world[:3, :3].T + part.to_world[:3, 3]
-        low, high = np.minimum(low, world.min(0)), np.maximum(high, world.max(0))
-    if not parts:
+        if len(world):
+            low, high = np.minimum(low, world.min(0)), np.maximum(high, world.max(0))
+    if not np.isfinite(low).all():
         return np.zeros(3)
     middle = 0.5 * (low + high)
     return middle if np.abs(middle).max() > RECENTRE * (high - low).max() else np.zeros(3)

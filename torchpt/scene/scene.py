@@ -15,29 +15,32 @@ from torchpt import accel as search
 from torchpt.accel import Accel
 from torchpt.cameras import Perspective
 from torchpt.errors import RenderError, SceneError
+from torchpt.math.transforms import is_singular, similarity_scale
 from torchpt.records import Geometry, World
 from torchpt.scene.assemble import assemble
 from torchpt.scene.build import Built, build_parts
-from torchpt.scene.description import Description, read_description
+from torchpt.scene.description import Description, read_description, settings
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
 
 __all__ = ["Scene", "device_of", "load"]
 
 
-def load(source: str | os.PathLike[str] | Mapping[str, Any], device: str | torch.device = "auto") -> Scene:
+def load(source: str | os.PathLike[str] | Mapping[str, Any], device: str | torch.device | None = None) -> Scene:
     """Load a scene.
 
     Args:
         source: the name of a scene that ships, a path ending in ``.yaml``, or a dict of the same schema.
-        device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``.
+        device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
+            ``render.device``, which is ``auto`` where it does not say.
 
     Raises:
         SceneError: the description is wrong; says where and what is accepted.
         AssetError: a file that it names is missing or malformed.
         RenderError: the device is not there.
     """
-    return Scene(read_description(source), device_of(device))
+    description = read_description(source)
+    return Scene(description, device_of(settings(description).render.device if device is None else device))
 
 
 def device_of(name: str | torch.device) -> torch.device:
@@ -76,10 +79,10 @@ class Scene:
             for name, value in self._built.parameters.items()
         }
         self._centre = torch.from_numpy(self._built.centre).to(device)
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._worlds: dict[torch.dtype, tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
-        self._state: tuple[Any, ...] = ()
+        self._state: dict[str, tuple[Tensor, int]] = {}
 
     @property
     def parts(self) -> Built:
@@ -106,7 +109,24 @@ class Scene:
                 found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
                 raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(merged[name].shape)}")
             merged[name] = value.to(self.device)
+            self._check(name, value.detach())
         return merged
+
+    def _check(self, name: str, value: Tensor) -> None:
+        """Refuse numbers that no scene file could hold."""
+        if not bool(torch.isfinite(value).all()):
+            raise SceneError(f"params.{name}", "a value that is not finite", "finite numbers")
+        if name.endswith((".emission", ".radiance", ".reflectance")) and bool((value < 0).any()):
+            raise SceneError(f"params.{name}", value.tolist(), "no negative numbers (clamp before rendering)")
+        if name.endswith(".to_world"):
+            matrix = value.double().cpu().numpy()
+            if is_singular(matrix):
+                raise SceneError(f"params.{name}", matrix.tolist(), "a matrix that can be inverted")
+            if any(part.kind == "sphere" and name == f"{part.name}.to_world" for part in self._built.parts):
+                if similarity_scale(matrix, 1e-4) is None:
+                    raise SceneError(
+                        f"params.{name}", matrix.tolist(), "a transform that keeps a sphere round (uniform scale)"
+                    )
 
     def world(self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None) -> tuple[World, Geometry]:
         """The tensors that lanes gather from, and what the search sees; made once for the scene's own parameters."""
@@ -123,8 +143,8 @@ class Scene:
         """A search structure: built for ``geometry``, or kept for the scene's own."""
         if geometry is not None:
             return search.build(geometry, kind, threads)
-        _, own = self.world(torch.float32)
         with self._lock:
+            _, own = self.world(torch.float32)
             if (kind, threads) not in self._accels:
                 self._accels[kind, threads] = search.build(own, kind, threads)
             return self._accels[kind, threads]
@@ -154,8 +174,13 @@ class Scene:
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""
-        state = tuple((name, id(value), value._version) for name, value in self.params.items())
-        if state != self._state:
+        state = {name: (value, value._version) for name, value in self.params.items()}
+        # The tensors themselves are kept and compared: an id may be another tensor's by now.
+        same = state.keys() == self._state.keys() and all(
+            value is self._state[name][0] and version == self._state[name][1]
+            for name, (value, version) in state.items()
+        )
+        if not same:
             self._state = state
             self._worlds.clear()
             self._accels.clear()

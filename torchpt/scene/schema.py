@@ -56,8 +56,9 @@ class Perspective(Model):
             for name in ("origin", "target", "up"):
                 if getattr(self, name) is not None:
                     raise wrong("either to_world or origin, target and up, not both", getattr(self, name), (name,))
-            if np.abs((self.to_world[:3, :3] ** 2).sum(axis=1) - 1.0).max() > 1e-3:
-                raise wrong("a pose without scale", self.to_world.tolist(), ("to_world",))
+            turn = self.to_world[:3, :3]
+            if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3:
+                raise wrong("a pose without scale or shear", self.to_world.tolist(), ("to_world",))
             return self
         for name in ("origin", "target"):
             if getattr(self, name) is None:

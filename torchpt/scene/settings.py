@@ -279,6 +279,10 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
         except SceneError as error:
             blame = None if _given(overrides, error.key) else file
             raise type(error)(error.key, error.value, error.expected, blame) from None
+    if isinstance(blocks["integrator"], AovIntegrator) and "variance" in blocks["film"].aovs:
+        raise SceneError(
+            "film.aovs", list(blocks["film"].aovs), "no variance where integrator is aov (it carries no light)", file
+        )
     return Settings.model_construct(**blocks)
 
 
