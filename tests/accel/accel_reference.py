@@ -8,7 +8,8 @@ from torchpt.records import Geometry
 
 def geometry(p0, p1, p2, counts):
     """A Geometry from (P, 3) arrays."""
-    return Geometry(*(torch.tensor(np.asarray(p, np.float32).reshape(-1, 3).T.copy()) for p in (p0, p1, p2)), counts)
+    a, b, c = (torch.tensor(np.asarray(p, np.float32).reshape(-1, 3).T.copy()) for p in (p0, p1, p2))
+    return Geometry(a, b, c, counts)
 
 
 def triangles(vertices, faces):

@@ -74,7 +74,8 @@ def test_dead_rays_and_open_interval(kind):
 def test_ties_go_to_the_lowest_primitive(kind):
     g = soup(3, (9, 3, 2, 2))
     order = [*[*range(9)] * 2, *[*range(9, 12)] * 2, *[12, 13] * 2, *[14, 15] * 2]
-    twice = geometry(*(p.numpy().T[order] for p in (g.p0, g.p1, g.p2)), (18, 6, 4, 4))
+    a, b, c = (p.numpy().T[order] for p in (g.p0, g.p1, g.p2))
+    twice = geometry(a, b, c, (18, 6, 4, 4))
     _, prim, _, _ = build(twice, kind).intersect(*rays(1, 3000))
     first = [*range(9), *range(18, 21), *range(24, 26), *range(28, 30)]
     assert set(prim.tolist()) - {-1} <= set(first)

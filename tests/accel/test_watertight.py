@@ -131,7 +131,7 @@ def test_coincident_centroids(kind, n):
     k = (np.arange(n) / n + 0.5).astype(np.float32)
     zero = np.zeros_like(k)
     corners = [np.stack(p, 1) for p in ((k, k, zero), (-k, k, zero), (zero, -k, zero))]
-    accel = build(geometry(*corners, (n, 0, 0, 0)), kind)
+    accel = build(geometry(corners[0], corners[1], corners[2], (n, 0, 0, 0)), kind)
     assert accel.describe()["depth"] <= 21
     o, d = torch.tensor([[0.01, 9.0], [0.02, 9.0], [1.0, 1.0]]), torch.tensor([[0.0] * 2, [0.0] * 2, [-1.0] * 2])
     t, prim, _, _ = accel.intersect(o[:, -rays_of[kind] :], d[:, -rays_of[kind] :], torch.tensor([INF] * rays_of[kind]))

@@ -3,6 +3,8 @@ in the mean where it is not (directions are sampled detached)."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -131,7 +133,8 @@ def test_backward_draws_its_own_samples():
     scene = torchpt.load(only("floor", "lamp"), "cpu")
     rgb = scene.params["materials.grey.reflectance"].clone().requires_grad_()
     grads = []
-    for wish in ({}, {}, {"seed_grad": 77}, {"seed_grad": 0}, {"spp_grad": 64}):
+    wishes: list[dict[str, Any]] = [{}, {}, {"seed_grad": 77}, {"seed_grad": 0}, {"spp_grad": 64}]
+    for wish in wishes:
         image = torchpt.render(scene, params={"materials.grey.reflectance": rgb}, spp=4, seed=0, **wish)
         grads.append(torch.autograd.grad(image.sum(), rgb)[0])
     assert torch.equal(grads[0], grads[1])

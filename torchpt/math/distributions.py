@@ -34,10 +34,10 @@ class Discrete:
         """
         w = weights.detach().double()
         total = w.sum()
-        even = torch.full_like(w, 1.0 / max(len(w), 1))
+        uniform = torch.full_like(w, 1.0 / max(len(w), 1))
         possible = (w > 0).double()
         floor = possible / possible.sum().clamp_min(1.0)
-        w = torch.where(total > 0, (1.0 - even) * w / torch.where(total > 0, total, 1.0) + even * floor, even)
+        w = torch.where(total > 0, (1.0 - even) * w / torch.where(total > 0, total, 1.0) + even * floor, uniform)
         cdf = torch.cumsum(w, 0)
         # From the last possible outcome on the sum is 1, so that rounding never lets a draw fall on an impossible one.
         last = int((w > 0).nonzero().max())
