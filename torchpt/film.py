@@ -15,7 +15,7 @@ __all__ = ["RELMSE_FLOOR", "Film", "Filter"]
 
 #: relMSE is the mean of ``(x - ref)^2 / (ref^2 + RELMSE_FLOOR)`` over pixels and channels.
 RELMSE_FLOOR = 1e-2
-_CELLS = 1024
+_CELLS = 4096
 
 
 def _profile(kind: str, radius: float, stddev: float, x: np.ndarray) -> np.ndarray:

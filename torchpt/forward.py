@@ -32,8 +32,10 @@ __all__ = ["BYTES_PER_LANE", "Progress", "Rendering", "Run", "chunks_of", "lanes
 LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
 #: Peak bytes a lane takes in a wave, measured on the Cornell box; under a tape each vertex keeps about this much.
 BYTES_PER_LANE = 640
-#: Independent randomizations that share a pixel's samples, see torchpt.samplers.
-RANDOMIZATIONS = 4
+#: From this many samples a pixel on they are shared by four independent randomizations, below by two. Each takes something
+#: from Sobol' points (Cornell box, 64 spp: relMSE 0.38, 0.50, 0.58 of independent sampling for one, two, four), and two
+#: already tell the picture's error; four make the variance of a single pixel less of a guess.
+MANY_SAMPLES = 256
 #: A pass never holds more samples a pixel than this.
 LARGEST_PASS = 64
 
@@ -171,7 +173,7 @@ def make_wave(
         accel=accel,
         camera=scene.camera(film, scene.merged(params), dtype),
         filter=Filter(film.filter.type, film.filter.radius, stddev, scene.device),
-        sampler=Sampler(settings.sampler.type, settings.render.seed, min(spp, RANDOMIZATIONS)),
+        sampler=Sampler(settings.sampler.type, settings.render.seed, min(spp, 4 if spp >= MANY_SAMPLES else 2)),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.centre,
     )
