@@ -207,7 +207,7 @@ def test_arrays_are_accepted() -> None:
 
 @pytest.mark.mitsuba
 def test_pose_is_mitsubas_look_at() -> None:
-    import mitsuba as mi
+    import mitsuba as mi  # pyright: ignore[reportMissingImports]
 
     mi.set_variant("scalar_rgb")
     pose = Perspective(origin=(1, 2, 3), target=(4, 5, 7), up=(0, 1, 0)).pose()

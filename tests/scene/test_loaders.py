@@ -228,7 +228,7 @@ def test_a_large_obj_is_quick(tmp_path: Path) -> None:
 
 @pytest.mark.mitsuba
 def test_smooth_normals_are_mitsubas() -> None:
-    import mitsuba as mi
+    import mitsuba as mi  # pyright: ignore[reportMissingImports]
 
     mi.set_variant("scalar_rgb")
     mi.set_log_level(mi.LogLevel.Error)
@@ -242,7 +242,7 @@ def test_smooth_normals_are_mitsubas() -> None:
 
 @pytest.mark.mitsuba
 def test_cube_is_mitsubas() -> None:
-    import mitsuba as mi
+    import mitsuba as mi  # pyright: ignore[reportMissingImports]
 
     mi.set_variant("scalar_rgb")
     params, cube = mi.traverse(mi.load_dict({"type": "cube"})), unit_cube()
