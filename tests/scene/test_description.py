@@ -166,7 +166,10 @@ def test_what_is_not_built_says_so(name: str) -> None:
 
 def test_values_that_ask_for_nothing_are_no_error() -> None:
     nothing = {"adaptive": False}, {"resume": False, "time_limit": None}
-    read_description(material(opacity=1, emission=0, normal_map=None) | {"sampler": nothing[0], "render": nothing[1]})
+    found = read_description(
+        material(opacity=1, emission=0, normal_map=None) | {"sampler": nothing[0], "render": nothing[1]}
+    )
+    assert len(found.materials) == 1
 
 
 def test_a_whole_scene() -> None:
