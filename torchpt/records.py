@@ -118,11 +118,12 @@ class Interaction:
 
 @dataclass(frozen=True)
 class BsdfSample:
-    """A direction drawn from a BSDF; ``pdf = 0`` says that the draw failed."""
+    """A direction drawn from a BSDF."""
 
     wi: Tensor  # (3, N) local
-    pdf: Tensor  # (N,) in solid angle
+    pdf: Tensor  # (N,) in solid angle; 0 where the draw failed, inf where the lobe is a delta
     weight: Tensor  # (3, N) = eval / pdf
+    eta: Tensor | None = None  # (N,) index of the side of wi over that of wo, 1 for reflection; None: never refracts
 
 
 @dataclass(frozen=True)

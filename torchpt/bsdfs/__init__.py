@@ -2,23 +2,10 @@
 
 from __future__ import annotations
 
-from types import ModuleType
+from torchpt.bsdfs.base import Bsdf, Parameters, Table, gather, stacked
+from torchpt.bsdfs.diffuse import Diffuse
 
-from torch import Tensor
+__all__ = ["MODELS", "Bsdf", "Diffuse", "Parameters", "Table", "gather", "stacked"]
 
-from torchpt.bsdfs import diffuse
-from torchpt.bsdfs.base import Parameters
-from torchpt.math.vectors import take
-
-__all__ = ["KINDS", "Parameters", "gather"]
-
-#: Models by name.
-KINDS: dict[str, ModuleType] = {"diffuse": diffuse}
-
-#: Models that draw a number to choose among their lobes; the others are spared it.
-LOBED: frozenset[str] = frozenset()
-
-
-def gather(stacked: Parameters, row: Tensor) -> Parameters:
-    """Lane values of a model's stacked parameters at rows ``(N,)``: the one place where parameters are resolved."""
-    return {name: None if value is None else take(value, row) for name, value in stacked.items()}
+#: Every model in every variant that scenes can ask for; tests run over it.
+MODELS: tuple[Bsdf, ...] = (Diffuse(),)

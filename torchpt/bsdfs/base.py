@@ -1,23 +1,160 @@
-"""Conventions of every BSDF, stated once.
+"""What a BSDF is, stated once: the conventions, the base class, and tables that a model may look up.
 
 Directions are local: ``+z`` is the shading normal; ``wo`` points toward the previous vertex, ``wi`` is sampled. Both leave
 the surface. ``eval`` includes ``|cos(theta_i)|``, ``pdf`` is in solid angle, ``weight = eval / pdf``, and ``pdf = 0`` says
-that the sample failed. A model is a module with
+that the sample failed. A lobe that is a delta is not seen by ``eval`` and ``pdf``; ``sample`` gives it ``pdf = inf``.
 
-    PARAMETERS: names of its stacked parameters
-    sample(parameters, wo, lobe, u) -> BsdfSample   # lobe (N,), u (2, N)
-    eval(parameters, wo, wi) -> (3, N)
-    pdf(parameters, wo, wi) -> (N,)
-    albedo(parameters) -> (3, N)                    # colour for the albedo layer
-
-where each parameter is already a lane value, ``(3, N)`` or ``(N,)``, or ``None`` where the scene leaves it at what costs
-nothing. The functions are pure.
+Radiance is carried, so what is refracted scales by ``1 / eta^2`` (Veach, *Robust Monte Carlo Methods*, 1997, section 5.2).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import torch
 from torch import Tensor
 
-__all__ = ["Parameters"]
+from torchpt.math.vectors import take
+from torchpt.records import BsdfSample
 
-Parameters = dict[str, Tensor | None]
+__all__ = ["Bsdf", "Parameters", "Table", "gather", "stacked"]
+
+#: By name: a tensor, ``(3, N)`` or ``(N,)``; a :class:`Table`; such a mapping again; None where it asks for nothing.
+Parameters = dict[str, Any]
+
+Default = float | tuple[float, float, float]
+
+
+class Bsdf:
+    """A material model: pure tensor functions on plain values. One instance is one group of lanes.
+
+    A subclass defines :meth:`sample` and either :meth:`eval_pdf`, or :meth:`eval` and :meth:`pdf`.
+
+    Attributes:
+        name: its ``type`` in a scene file.
+        parameters: names and defaults of what a material of this type is given: a number, or three for a colour.
+        lobed: whether ``sample`` reads ``lobe``; the others are spared that number.
+        delta: whether ``sample`` may give ``pdf = inf``.
+        smooth: whether it gives nothing else: then no light is sampled for it.
+        transmits: whether light passes through. Other models meet ``wo.z >= 0`` only: callers turn the frame around on the
+            back, or see to it that the back is black (``two_sided``).
+        refracts: whether ``sample`` returns ``eta``.
+        anisotropic: whether the tangent matters.
+        conserves: whether it reflects no more than it receives, for parameters in their ranges.
+        reciprocal: whether ``f(wo, wi) = f(wi, wo)`` (for refraction: divided by the squared indices).
+    """
+
+    name: ClassVar[str] = ""
+    parameters: ClassVar[Mapping[str, Default]] = {}
+    lobed: ClassVar[bool] = False
+    conserves: ClassVar[bool] = True
+    reciprocal: ClassVar[bool] = True
+    delta: bool = False
+    smooth: bool = False
+    transmits: bool = False
+    refracts: bool = False
+    anisotropic: bool = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if cls.eval_pdf is Bsdf.eval_pdf and (cls.eval is Bsdf.eval or cls.pdf is Bsdf.pdf):
+            raise TypeError(f"{cls.__name__} has to define eval_pdf, or eval and pdf")
+
+    def prepare(self, values: Parameters) -> Parameters:
+        """Lane parameters from those a material was given (``(3, 1)`` or ``(1,)``); differentiable, once a material."""
+        return dict(values)
+
+    def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        """Draw ``wi``.
+
+        Args:
+            parameters: lane values.
+            wo: ``(3, N)``.
+            lobe: ``(N,)`` in [0, 1), given where ``lobed``.
+            u: ``(2, N)`` in [0, 1).
+        """
+        raise NotImplementedError
+
+    def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+        """``f |cos(theta_i)|`` ``(3, N)`` and the density ``(N,)`` with which :meth:`sample` draws ``wi``."""
+        return self.eval(parameters, wo, wi), self.pdf(parameters, wo, wi)
+
+    def eval(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> Tensor:
+        """``f |cos(theta_i)|``: ``(3, N), (3, N) -> (3, N)``."""
+        return self.eval_pdf(parameters, wo, wi)[0]
+
+    def pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> Tensor:
+        """Density of :meth:`sample` in solid angle ``(N,)``."""
+        return self.eval_pdf(parameters, wo, wi)[1]
+
+    def albedo(self, parameters: Parameters) -> Tensor:
+        """Colour ``(3, N)`` for the albedo layer."""
+        raise NotImplementedError
+
+    def weights(self) -> Iterator[Tensor]:
+        """Trainable tensors of its own, those of modules it holds: gradients flow to them."""
+        own = self if isinstance(self, torch.nn.Module) else None
+        held = [value for value in vars(self).values() if isinstance(value, torch.nn.Module)]
+        for module in [own] if own is not None else held:
+            yield from module.parameters()
+
+    def __str__(self) -> str:
+        variants = [key.replace("_", " ") for key, value in vars(self).items() if value is True]
+        return f"{self.name} ({', '.join(variants)})" if variants else self.name
+
+
+@dataclass(frozen=True)
+class Table:
+    """Functions on [0, 1], one a material, each by ``K`` values at equal distances; linear between them.
+
+    Attributes:
+        values: ``(M, K)``.
+        row: ``(N,)`` which of them a lane reads; None before lanes are known.
+    """
+
+    values: Tensor
+    row: Tensor | None = None
+
+    def at(self, x: Tensor) -> Tensor:
+        """Values ``(N,)`` at ``x (N,)``, clamped to [0, 1]."""
+        last = self.values.shape[1] - 1
+        place = x.clamp(0.0, 1.0) * last
+        below = place.detach().to(torch.int64).clamp_max(last - 1)
+        start = below if self.row is None else self.row * (last + 1) + below
+        flat = self.values.reshape(-1)
+        low = take(flat, start)
+        return low + (take(flat, start + 1) - low) * (place - below)
+
+
+def gather(rows: Parameters, row: Tensor) -> Parameters:
+    """Lane values of a model's stacked parameters at rows ``(N,)``: the one place where parameters are resolved."""
+
+    def at(value: Any) -> Any:
+        if value is None:
+            return None
+        if isinstance(value, dict):
+            return gather(value, row)
+        if isinstance(value, Table):
+            return replace(value, row=row)
+        return take(value, row)
+
+    return {name: at(value) for name, value in rows.items()}
+
+
+def stacked(prepared: Sequence[Parameters]) -> Parameters:
+    """One mapping of rows from those of several materials of one model. What is None in some is zero (false) there."""
+    out: Parameters = {}
+    for name in dict.fromkeys(name for values in prepared for name in values):
+        column = [values.get(name) for values in prepared]
+        like = next((value for value in column if value is not None), None)
+        if like is None:
+            out[name] = None
+        elif isinstance(like, dict):
+            out[name] = stacked([value or {} for value in column])
+        elif isinstance(like, Table):
+            out[name] = Table(torch.cat([torch.zeros_like(like.values) if t is None else t.values for t in column]))
+        else:
+            out[name] = torch.cat([torch.zeros_like(like) if t is None else t for t in column], -1)
+    return out

@@ -30,11 +30,11 @@ def concentric_disk(u: Tensor) -> Tensor:
     return r * torch.stack((torch.where(wide, c, s), torch.where(wide, s, c)))
 
 
-def cosine_hemisphere(u: Tensor, side: Tensor) -> Tensor:
-    """Directions ``(3, N)`` with density ``|cos(theta)| / pi`` (Malley's method), ``z`` of the sign of ``side (N,)``."""
+def cosine_hemisphere(u: Tensor) -> Tensor:
+    """Directions ``(3, N)`` about ``+z`` with density ``cos(theta) / pi`` (Malley's method)."""
     d = concentric_disk(u)
     z = torch.addcmul(torch.addcmul(torch.ones_like(d[0]), d[0], d[0], value=-1), d[1], d[1], value=-1)
-    return torch.stack((d[0], d[1], torch.copysign(z.clamp_min(0.0).sqrt(), side)))
+    return torch.stack((d[0], d[1], z.clamp_min(0.0).sqrt()))
 
 
 def uniform_hemisphere(u: Tensor) -> Tensor:
