@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from torchpt.errors import AssetError, EdgeWarning, NotBuiltError, OutputError, RenderError, SceneError, TorchptError
 
 if TYPE_CHECKING:
+    from torchpt.bsdfs import Bsdf
     from torchpt.images import read_image, read_layers, write_image
     from torchpt.render import render
     from torchpt.scene import Scene, load
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "AssetError",
+    "Bsdf",
     "EdgeWarning",
     "NotBuiltError",
     "OutputError",
@@ -36,6 +38,7 @@ __all__ = [
 
 # public name -> the module that has it
 _LAZY = {
+    "Bsdf": "torchpt.bsdfs",
     "Scene": "torchpt.scene",
     "load": "torchpt.scene",
     "read_image": "torchpt.images",

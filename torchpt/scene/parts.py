@@ -6,24 +6,48 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from torchpt.bsdfs import Bsdf
+
 __all__ = ["MaterialSlot", "Part"]
 
 
 @dataclass(frozen=True)
 class MaterialSlot:
-    """One row of one BSDF model.
+    """One material: one row of one BSDF model.
 
     Attributes:
-        model: name of the model, from ``bsdfs.KINDS``.
+        model: its model, in the variant that it needs.
         name: dotted prefix of its parameters, e.g. ``materials.red``.
-        values: colours as three floats, by parameter name.
-        two_sided: whether the back reflects as the front does.
+        values: what the model is given, by parameter name: colours as three floats, numbers as one.
+        two_sided: whether the back of an opaque model reflects as the front does.
+        opacity: fraction of the light that meets the surface at all.
+        alpha_cutoff: where set, opacity below it counts as 0, else as 1.
+        emission: radiance, or None where it does not emit.
+        emission_strength: factor of it.
+        inner: the two materials of a blend, whose own ``values`` hold but the weight.
     """
 
-    model: str
+    model: Bsdf
     name: str
-    values: dict[str, tuple[float, float, float]]
-    two_sided: bool
+    values: dict[str, float | tuple[float, float, float]]
+    two_sided: bool = True
+    opacity: float = 1.0
+    alpha_cutoff: float | None = None
+    emission: tuple[float, float, float] | None = None
+    emission_strength: float = 1.0
+    inner: tuple[MaterialSlot, ...] = ()
+
+    def numbers(self) -> dict[str, float | tuple[float, float, float]]:
+        """Its parameters by dotted name, those of inner materials included."""
+        found = {f"{self.name}.{key}": value for key, value in self.values.items()}
+        if self.opacity != 1.0:
+            found[f"{self.name}.opacity"] = self.opacity
+        if self.emission is not None:
+            found[f"{self.name}.emission"] = self.emission
+            found[f"{self.name}.emission_strength"] = self.emission_strength
+        for slot in self.inner:
+            found |= slot.numbers()
+        return found
 
 
 @dataclass(frozen=True)
@@ -37,7 +61,7 @@ class Part:
         kind: one of ``records.KINDS``.
         material: its material.
         emission: radiance, or None where it does not emit.
-        emission_name: dotted name of that radiance.
+        emission_names: dotted names of that radiance and, where it has one, of its strength.
         flip: whether the normals are turned around.
         to_world: ``(4, 4)`` float64.
         vertices: ``(V, 3)`` float64 in the file's own space; None for analytic shapes.
@@ -55,7 +79,7 @@ class Part:
     kind: str
     material: MaterialSlot
     emission: tuple[float, float, float] | None
-    emission_name: str
+    emission_names: tuple[str, ...]
     flip: bool
     to_world: np.ndarray
     vertices: np.ndarray | None = None
