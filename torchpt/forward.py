@@ -150,22 +150,27 @@ def limited_threads(wish: int | str) -> Iterator[None]:
 
 
 def make_wave(
-    scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype, attached: bool
+    scene: Scene,
+    settings: Settings,
+    params: Mapping[str, Tensor] | None,
+    dtype: torch.dtype,
+    tape: bool = False,
+    attached: bool = False,
 ) -> Wave:
-    """Everything that the waves of a render share."""
+    """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``."""
     world, geometry = scene.world(dtype, params)
     threads = None if settings.render.threads == "auto" else int(settings.render.threads)
     moved = any(name.startswith("shapes.") and name.endswith((".vertices", ".to_world")) for name in params or {})
     accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
     film, integrator = settings.film, settings.integrator
     stddev = film.filter.stddev if isinstance(film.filter, GaussianFilter) else 0.5
-    limits, plan = None, Plan(settings.sampler.type, "mis", None, dtype, attached)
+    limits, plan = None, Plan(settings.sampler.type, "mis", None, dtype, tape, attached)
     if isinstance(integrator, PathIntegrator):
         limits = Limits(integrator.max_depth, integrator.rr_depth)
-        plan = Plan(settings.sampler.type, integrator.strategy, integrator.rr_prob, dtype, attached)
+        plan = Plan(settings.sampler.type, integrator.strategy, integrator.rr_prob, dtype, tape, attached)
     elif isinstance(integrator, DirectIntegrator):
         limits = Limits(2, 3)
-        plan = Plan(settings.sampler.type, integrator.strategy, None, dtype, attached)
+        plan = Plan(settings.sampler.type, integrator.strategy, None, dtype, tape, attached)
     spp = settings.render.spp
     return Wave(
         stages=_stages(scene, settings, plan, world, own=not params),
@@ -187,10 +192,14 @@ def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, own: boo
         work = width * height * settings.render.spp
         mode = (
             "on"
-            if own and work >= COMPILE_REPAYS and plan.dtype == torch.float32 and can_compile(scene.device)
+            if own
+            and work >= COMPILE_REPAYS
+            and plan.dtype == torch.float32
+            and not scene.description.bsdfs  # code of the user's own may hold what cannot be compiled
+            and can_compile(scene.device)
             else "off"
         )
-    if mode == "off" or plan.attached or torch.is_grad_enabled():
+    if mode == "off" or plan.tape or torch.is_grad_enabled():
         return Stages(plan, world)
     if not own:
         return CompiledStages(plan, world)
@@ -240,7 +249,7 @@ class Run:
     ) -> None:
         self.start = time.perf_counter()
         self.settings, self.device = settings, scene.device
-        self.wave = make_wave(scene, settings, params, dtype, attached=False)
+        self.wave = make_wave(scene, settings, params, dtype)
         _, _, self.width, self.height = self.wave.crop
         self.dtype = dtype
         groups = self.wave.sampler.randomizations

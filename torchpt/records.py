@@ -7,11 +7,14 @@ Directions (pbrt): ``wo`` points toward the previous vertex, ``wi`` toward the n
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
+
+from torchpt.math.vectors import take
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from torchpt.bsdfs import Bsdf, Parameters
     from torchpt.math.distributions import Discrete
 
 __all__ = [
@@ -23,7 +26,10 @@ __all__ = [
     "LightSample",
     "Lights",
     "PathState",
+    "Shadow",
     "World",
+    "joined",
+    "rows",
     "tensors_of",
 ]
 
@@ -72,6 +78,7 @@ class Lights:
     area: Tensor  # (K,)
     bound: Tensor  # (K,) see World.bound
     radiance: Tensor  # (3, K)
+    opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
     environment: Tensor | None  # (3,) radiance that comes from outside
     row_of_prim: Tensor | None  # (P,) int64, -1 where a primitive does not emit; None where none does
 
@@ -88,10 +95,13 @@ class World:
     bound: Tensor  # (P,) sum |n_i| max |p_i| over the primitive: scales the rounding of its plane
     flip: Tensor | None  # (P,) orientation of spheres
     normals: tuple[Tensor, Tensor, Tensor] | None  # (3, P) shading normals at the corners, where any are smooth
+    tangents: Tensor | None  # (3, P) along u where any material is anisotropic; of a sphere its axis, zero: any will do
+    opacity: Tensor | None  # (P,) chance that a ray meets the surface; None where it always does
     material: Tensor  # (P,) int64 row in the parameters of its model
     key: Tensor  # (P + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
-    models: tuple[str, ...]  # names of the BSDFs present
-    bsdfs: tuple[dict[str, Tensor | None], ...]  # stacked parameters of each model
+    models: tuple[Bsdf, ...]  # the BSDFs present
+    bsdfs: tuple[Parameters, ...]  # stacked parameters of each model
+    two_sided: tuple[Tensor | None, ...]  # (M,) bool for the rows of each model; None where all are
     object_id: Tensor  # (P,) int64, order of the shape in the scene
     lights: Lights | None  # None where nothing emits
 
@@ -104,6 +114,7 @@ class Hit:
     prim: Tensor  # (N,) int64, -1 for a miss
     u: Tensor  # (N,)
     v: Tensor  # (N,)
+    chance: Tensor | None = None  # (N,) 1, with the derivative of the chance to get here; None: no derivative, or no chance
 
 
 @dataclass(frozen=True)
@@ -113,6 +124,7 @@ class Interaction:
     p: Tensor  # (3, N)
     ng: Tensor  # (3, N) unit geometric normal, on the shape's own outside
     ns: Tensor  # (3, N) unit shading normal
+    tangent: Tensor | None  # (3, N) along u, neither unit nor orthogonal; None where nothing is anisotropic
     prim: Tensor  # (N,)
 
 
@@ -139,6 +151,16 @@ class LightSample:
 
 
 @dataclass(frozen=True)
+class Shadow:
+    """Shadow rays and what the light brings where they pass."""
+
+    o: Tensor  # (3, N)
+    d: Tensor  # (3, N)
+    t_max: Tensor  # (N,) in units of |d|; 0 where the light brings nothing
+    radiance: Tensor  # (3, N)
+
+
+@dataclass(frozen=True)
 class PathState:
     """One path a lane."""
 
@@ -150,6 +172,26 @@ class PathState:
     pdf: Tensor  # (N,) with which d was drawn: inf where emission counts whole, 0 where it does not count
     lane: Tensor  # (N,) int64 place in the wave
     key: Tensor  # (2, N) int32 of the sampler
+    eta: Tensor | None = None  # (N,) index of refraction here over that at the camera; None where nothing refracts
+
+
+R = TypeVar("R", PathState, Hit)
+
+
+def rows(record: R, index: Tensor) -> R:
+    """The lanes ``index`` of a record of tensors."""
+    values = {f.name: getattr(record, f.name) for f in fields(record)}
+    return type(record)(**{name: None if value is None else take(value, index) for name, value in values.items()})
+
+
+def joined(records: list[R]) -> R:
+    """Records joined along the lane axis."""
+    import torch
+
+    if len(records) == 1:
+        return records[0]
+    columns = {f.name: [getattr(r, f.name) for r in records] for f in fields(records[0])}
+    return type(records[0])(**{name: None if c[0] is None else torch.cat(c, -1) for name, c in columns.items()})
 
 
 def tensors_of(record: object) -> list[Tensor]:

@@ -17,6 +17,7 @@ from torchpt.forward import BYTES_PER_LANE, Progress, Rendering, Run, chunks_of,
 from torchpt.integrators.compiled import Stages
 from torchpt.scene import Scene
 from torchpt.scene.description import settings as complete
+from torchpt.scene.scene import INDICES
 from torchpt.scene.settings import AovIntegrator, Settings
 
 __all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene"]
@@ -83,9 +84,10 @@ def render(
     for key, value, low in (("seed_grad", seed_grad, 0), ("spp_grad", spp_grad, 1)):
         if value is not None and (type(value) is not int or value < low):
             raise SceneError(key, value, f"a whole number >= {low}")
-    scene.merged(params)
+    scene.check(params)
     wanted = {name: value for name, value in (params or {}).items() if value.requires_grad}
-    if not wanted or not torch.is_grad_enabled():
+    weights = scene.weights()
+    if not (wanted or weights) or not torch.is_grad_enabled():
         return render_scene(scene, settings, params=params, dtype=dtype).image
     backward_seed = settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad
     fixed = {name: value for name, value in (params or {}).items() if name not in wanted}
@@ -95,9 +97,10 @@ def render(
     if isinstance(settings.integrator, AovIntegrator):
         raise SceneError("integrator.type", "aov", "path or direct where gradients are wanted")
     names = tuple(wanted)
-    if _moves(names):
+    attached = _moves(scene, names)
+    if attached:
         warnings.warn(
-            "the gradient with respect to geometry leaves out visibility edges (silhouettes and shadow edges that move); "
+            "the gradient with respect to what moves or bends rays leaves out visibility edges (silhouettes and shadow edges that move); "
             "see docs/gradients.md",
             EdgeWarning,
             stacklevel=2,
@@ -109,9 +112,9 @@ def render(
 
     def chunks(*tensors: Tensor) -> Iterator[adjoints.Chunk]:
         given = {**fixed, **dict(zip(names, tensors, strict=True))}
-        return _differentiable_chunks(scene, again, given, names, dtype)
+        return _differentiable_chunks(scene, again, given, names, dtype, attached)
 
-    return adjoints.KINDS[adjoint or "autograd"](forward, chunks, tuple(wanted.values()))
+    return adjoints.KINDS[adjoint or "autograd"](forward, chunks, tuple(wanted.values()), weights)
 
 
 def _same(wish: str | torch.device, own: torch.device) -> bool:
@@ -123,9 +126,17 @@ def _same(wish: str | torch.device, own: torch.device) -> bool:
     return device.type == own.type and device.index in (None, own.index or 0)
 
 
-def _moves(names: Iterable[str]) -> bool:
-    """Whether any of the parameters moves the geometry or the camera."""
-    return any(name.endswith((".vertices", ".to_world")) or name.startswith("camera.") for name in names)
+def _moves(scene: Scene, names: Iterable[str]) -> bool:
+    """Whether any of the parameters moves the geometry or the camera, or bends rays."""
+    slots = [slot for part in scene.parts.parts for slot in part.material.all()]
+    bending = {slot.name for slot in slots if slot.model.refracts and slot.model.delta}
+
+    def moves(name: str) -> bool:
+        if name.endswith((".vertices", ".to_world")) or name.startswith("camera."):
+            return True
+        return name.endswith(INDICES) and name.rpartition(".")[0] in bending
+
+    return any(map(moves, names))
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:
@@ -161,14 +172,18 @@ def render_scene(
 
 
 def _differentiable_chunks(
-    scene: Scene, settings: Settings, params: Mapping[str, Tensor], wanted: tuple[str, ...], dtype: torch.dtype
+    scene: Scene,
+    settings: Settings,
+    params: Mapping[str, Tensor],
+    wanted: tuple[str, ...],
+    dtype: torch.dtype,
+    attached: bool,
 ) -> Iterator[adjoints.Chunk]:
     """Chunks of pixels as differentiable functions of the tensors ``wanted``, for the backward pass."""
     assert not isinstance(settings.integrator, AovIntegrator)
-    attached = _moves(wanted)
     plain = {name: value.detach() for name, value in params.items()}
     with torch.no_grad():
-        still = make_wave(scene, settings, plain, dtype, attached)
+        still = make_wave(scene, settings, plain, dtype, True, attached)
     assert still.limits is not None
     depth = still.limits.max_depth if 0 <= still.limits.max_depth < 64 else 64
     lanes = lanes_for(settings, scene.device, BYTES_PER_LANE * max(depth, 1))

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from torchpt import bsdfs
-from torchpt.accel import Accel
 from torchpt.integrators.path import partition
+from torchpt.integrators.search import Search
 from torchpt.math.vectors import take
-from torchpt.records import Hit, PathState, World
+from torchpt.records import PathState, World, rows
 from torchpt.shapes import interact
 
 __all__ = ["CHANNELS", "first_hit"]
@@ -19,24 +19,23 @@ CHANNELS = {"albedo": 3, "normal": 3, "depth": 1, "position": 3, "object_id": 1}
 
 
 def first_hit(
-    names: tuple[str, ...], world: World, accel: Accel, state: PathState, centre: Tensor, dtype: torch.dtype
+    names: tuple[str, ...], world: World, search: Search, state: PathState, centre: Tensor, dtype: torch.dtype
 ) -> dict[str, Tensor]:
     """The layers ``names``, each ``(C, N)``, for camera rays ``state``.
 
     ``albedo`` is the material's reflectance, ``normal`` the shading normal in the world, ``depth`` the distance from the
     camera, ``object_id`` the order of the shape in the scene, from 1.
     """
-    t, prim, u, v = accel.intersect(state.o, state.d, state.t_max)
-    hit = Hit(t.to(dtype), prim.to(torch.int64), u.to(dtype), v.to(dtype))
-    layers = {name: torch.zeros(CHANNELS[name], len(t), dtype=dtype, device=t.device) for name in names}
+    hit = search.nearest(state, 1)
+    layers = {name: torch.zeros(CHANNELS[name], len(hit.t), dtype=dtype, device=centre.device) for name in names}
     _, groups = partition(world, hit)
     for model, index in groups:
-        found = Hit(*(take(x, index) for x in (hit.t, hit.prim, hit.u, hit.v)))
+        found = rows(hit, index)
         at = interact(world, take(state.o, index), take(state.d, index), found)
         values: dict[str, Tensor] = {}
         if "albedo" in names:
             parameters = bsdfs.gather(world.bsdfs[model], take(world.material, at.prim))
-            values["albedo"] = bsdfs.KINDS[world.models[model]].albedo(parameters)
+            values["albedo"] = world.models[model].albedo(parameters)
         if "normal" in names:
             values["normal"] = at.ns
         if "depth" in names:

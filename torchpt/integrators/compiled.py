@@ -19,8 +19,8 @@ from torchpt.cameras import Perspective
 from torchpt.errors import RenderError
 from torchpt.film import Filter
 from torchpt.integrators import stages
-from torchpt.integrators.stages import Plan, Shadow
-from torchpt.records import Hit, PathState, World, tensors_of
+from torchpt.integrators.stages import Plan
+from torchpt.records import Hit, PathState, Shadow, World, tensors_of
 
 __all__ = ["CompiledStages", "Stages", "can_compile"]
 
@@ -50,9 +50,9 @@ class Stages:
         """See :func:`torchpt.integrators.stages.emit`."""
         return stages.emit(self.world, state, hit, index, slide)
 
-    def escape(self, state: PathState, index: Tensor) -> Tensor:
+    def escape(self, state: PathState, hit: Hit, index: Tensor) -> Tensor:
         """See :func:`torchpt.integrators.stages.escape`."""
-        return stages.escape(self.world, state, index)
+        return stages.escape(self.world, state, hit, index)
 
     def bounce(
         self,
@@ -128,7 +128,7 @@ class CompiledStages(Stages):
             return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
 
         name = f"bounce {self.world.models[model]}"
-        return self._get(name, (roulette, slide), stage)(state, hit, _padded(index), salts)
+        return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts)
 
     def _get(self, name: str, variant: tuple[Any, ...], stage: Callable[..., Any]) -> Callable[..., Any]:
         """The compiled form of ``stage``, made once for each variant."""

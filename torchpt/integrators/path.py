@@ -6,25 +6,23 @@ camera rays -> intersect -> emission with MIS -> sort by BSDF and compact -> lig
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
 from torchpt.integrators.compiled import Stages
+from torchpt.integrators.search import Search
 from torchpt.math.vectors import take
-from torchpt.records import Hit, PathState, World
+from torchpt.records import Hit, PathState, World, joined
 from torchpt.samplers import salts
 
 __all__ = ["ENDLESS", "Limits", "Tally", "trace"]
 
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted.
 ENDLESS = 4096
-
-R = TypeVar("R", PathState, Hit)
-
 
 @dataclass(frozen=True)
 class Limits:
@@ -49,9 +47,11 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
     n = len(state.lane)
     gathered = torch.zeros_like(state.radiance)
 
-    def search(state: PathState) -> Hit:
-        t, prim, u, v = accel.intersect(state.o, state.d, state.t_max)
-        return Hit(t.to(plan.dtype), prim.to(torch.int64), u.to(plan.dtype), v.to(plan.dtype))
+    search = Search(accel, world, plan.sampler, plan.dtype)
+    if any(model.refracts for model in world.models):
+        state = replace(state, eta=torch.ones_like(state.t_max))
+    # Where a delta sends a ray on, its next point slides along it as the camera's does.
+    sliding = plan.attached and any(model.delta for model in world.models)
 
     def retire(index: Tensor) -> None:
         if len(index):
@@ -63,10 +63,10 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
     while n and depth <= last:
         tally.rays += len(state.lane)
         if hit is None:
-            hit = search(state)
+            hit = search.nearest(state, depth)
         # Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64
         # the camera's point is found anew, since the search rounds it to float32.
-        slide = depth == 1 and (plan.attached or plan.dtype == torch.float64)
+        slide = sliding or (depth == 1 and (plan.attached or plan.dtype == torch.float64))
         ends, groups = partition(world, hit)
         _gather_light(stages, state, hit, ends, slide)
         retire(ends.missed)
@@ -77,18 +77,19 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
         if depth == last or not groups:
             break
         salt = salts(depth, state.lane.device)
+        following = partial(search.nearest, depth=depth + 1)
         parts = []
         for model, index in groups:
             after, found, shadow = stages.bounce(
-                model, depth >= limits.rr_depth, slide, search, state, hit, index, salt
+                model, depth >= limits.rr_depth, slide, following, state, hit, index, salt
             )
             if shadow is not None:
                 tally.rays += len(shadow.t_max)
-                clear = (~accel.occluded(shadow.o, shadow.d, shadow.t_max)).to(plan.dtype)
+                clear = search.clear(shadow)
                 after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
             parts.append((after, found))
-        state = _join([after for after, _ in parts])
-        hit = _join([found for _, found in parts if found is not None]) if plan.attached else None
+        state = joined([after for after, _ in parts])
+        hit = joined([found for _, found in parts if found is not None]) if plan.attached else None
         depth += 1
     return gathered, tally
 
@@ -127,12 +128,4 @@ def _gather_light(stages: Stages, state: PathState, hit: Hit, ends: Ends, slide:
     if len(ends.emissive):
         state.radiance.scatter_add_(1, ends.emissive.expand(3, -1), stages.emit(state, hit, ends.emissive, slide))
     if lights.environment is not None and len(ends.missed):
-        state.radiance.scatter_add_(1, ends.missed.expand(3, -1), stages.escape(state, ends.missed))
-
-
-def _join(records: list[R]) -> R:
-    """Records joined along the lane axis."""
-    if len(records) == 1:
-        return records[0]
-    names = [f.name for f in fields(records[0])]
-    return type(records[0])(**{name: torch.cat([getattr(r, name) for r in records], -1) for name in names})
+        state.radiance.scatter_add_(1, ends.missed.expand(3, -1), stages.escape(state, hit, ends.missed))

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,8 +19,8 @@ from torchpt.film import Filter
 from torchpt.math.frames import Frame
 from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import dot, largest, take
-from torchpt.math.warps import uniform_hemisphere
-from torchpt.records import Hit, Interaction, PathState, World
+from torchpt.math.warps import uniform_hemisphere, uniform_sphere
+from torchpt.records import BsdfSample, Hit, Interaction, PathState, Shadow, World, rows
 from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import interact, offset_origin, reattach
 from torchpt.shapes.interaction import OFFSET
@@ -29,13 +28,11 @@ from torchpt.shapes.interaction import OFFSET
 __all__ = [
     "STRATEGIES",
     "Plan",
-    "Shadow",
     "Surface",
     "bounce",
     "emit",
     "escape",
     "generate",
-    "rows",
     "scatter",
     "shade",
 ]
@@ -48,9 +45,6 @@ SHORTEN = 1e-4
 #: Roulette never lets a path live on for sure: throughput above one would make it immortal.
 SURVIVAL_CAP = 0.95
 
-R = TypeVar("R", PathState, Hit)
-
-
 @dataclass(frozen=True)
 class Plan:
     """What a render asks of the stages; static."""
@@ -59,31 +53,19 @@ class Plan:
     strategy: str
     rr_prob: float | None
     dtype: torch.dtype
-    attached: bool  # whether derivatives with respect to geometry are wanted
+    tape: bool  # whether derivatives are wanted
+    attached: bool  # whether they are wanted with respect to geometry
 
 
 @dataclass(frozen=True)
 class Surface:
     """A surface point with its material resolved."""
 
-    frame: Frame  # about the shading normal
+    frame: Frame  # about the shading normal, turned to the side of wo where light does not pass through
+    side: Tensor | None  # (N,) -1 where it was turned around; None where light passes through
+    shown: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
     parameters: bsdfs.Parameters  # lane values of the BSDF
     wo: Tensor  # (3, N) local
-
-
-@dataclass(frozen=True)
-class Shadow:
-    """Shadow rays and what the light brings where they pass."""
-
-    o: Tensor  # (3, N)
-    d: Tensor  # (3, N)
-    t_max: Tensor  # (N,) 0 where the light brings nothing
-    radiance: Tensor  # (3, N)
-
-
-def rows(record: R, index: Tensor) -> R:
-    """The lanes ``index`` of a record of tensors."""
-    return type(record)(**{f.name: take(getattr(record, f.name), index) for f in fields(record)})
 
 
 def generate(
@@ -106,14 +88,19 @@ def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -
     o, d = take(state.o, index), take(state.d, index)
     at = interact(world, o, d, rows(hit, index), slide)
     radiance, pdf = lights.emitted(world.lights, o, at, d)
-    return _weighted(take(state.throughput, index), radiance, take(state.pdf, index), pdf)
+    return _weighted(_arrived(rows(state, index), rows(hit, index)), radiance, take(state.pdf, index), pdf)
 
 
-def escape(world: World, state: PathState, index: Tensor) -> Tensor:
+def escape(world: World, state: PathState, hit: Hit, index: Tensor) -> Tensor:
     """Radiance ``(3, n)`` that the paths at ``index`` gather from the environment they escape to."""
     assert world.lights is not None
     radiance, pdf = lights.environment(world.lights, take(state.d, index))
-    return _weighted(take(state.throughput, index), radiance, take(state.pdf, index), pdf)
+    return _weighted(_arrived(rows(state, index), rows(hit, index)), radiance, take(state.pdf, index), pdf)
+
+
+def _arrived(state: PathState, hit: Hit) -> Tensor:
+    """Throughput ``(3, n)`` with the derivative of the chance that the rays came here."""
+    return state.throughput if hit.chance is None else state.throughput * hit.chance
 
 
 def _weighted(throughput: Tensor, radiance: Tensor, pdf: Tensor, light_pdf: Tensor) -> Tensor:
@@ -151,11 +138,26 @@ def bounce(
         The state of the ``n`` paths with their next rays, the next hits where they had to be found already, and the shadow
         rays whose light is still to be added (None where no light is sampled).
     """
-    here = rows(state, index)
-    at = interact(world, here.o, here.d, rows(hit, index), slide)
+    here, met = rows(state, index), rows(hit, index)
+    at = interact(world, here.o, here.d, met, slide)
+    here = replace(here, throughput=_arrived(here, met))
     surface, shadow = shade(plan, world, model, here, at, salts)
     after, found = scatter(plan, world, model, here, at, surface, salts, roulette, search)
     return after, found, shadow
+
+
+def _surface(world: World, number: int, state: PathState, at: Interaction) -> Surface:
+    """Resolve the material at the surface points."""
+    model, row = world.models[number], take(world.material, at.prim)
+    ns, side, shown = at.ns, None, None
+    if not model.transmits:
+        side = torch.copysign(torch.ones_like(ns[0]), -dot(state.d, ns).detach())
+        ns = ns * side
+        both = world.two_sided[number]
+        if both is not None:
+            shown = ((side > 0) | take(both, row)).to(side.dtype)
+    frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
+    return Surface(frame, side, shown, bsdfs.gather(world.bsdfs[number], row), frame.to_local(-state.d))
 
 
 def shade(
@@ -166,26 +168,24 @@ def shade(
     Returns:
         The surface, and the shadow rays (None where no light is sampled).
     """
-    frame = Frame.about(at.ns)
-    wo = frame.to_local(-state.d)
-    parameters = bsdfs.gather(world.bsdfs[model], take(world.material, at.prim))
-    surface = Surface(frame, parameters, wo)
-    if world.lights is None or plan.strategy in ("bsdf", "uniform"):
+    surface, kind = _surface(world, model, state, at), world.models[model]
+    if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
         return surface, None
     table = world.lights
-    kind = bsdfs.KINDS[world.models[model]]
     draws = Draws(plan.sampler, state.key, salts)
     choice = None if table.choice is None else draws.one(Dimension.LIGHT_CHOICE)
     light = lights.sample(table, at.p, choice, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET)
-    wi = frame.to_local(light.wi)
-    # A shading normal must not let light through the surface: wi on the same side of both normals.
-    through = dot(light.wi, at.ng) * wi[2]
-    reflected = kind.eval(parameters, wo, wi)
+    wi = surface.frame.to_local(light.wi)
     weight = light.weight
     if plan.strategy == "mis":
-        weight = weight * power_heuristic(light.pdf, kind.pdf(parameters, wo, wi)).detach()
+        reflected, pdf = kind.eval_pdf(surface.parameters, surface.wo, wi)
+        weight = weight * power_heuristic(light.pdf, pdf).detach()
+    else:
+        reflected = kind.eval(surface.parameters, surface.wo, wi)
     if world.normals is not None:
-        weight = weight * (through > 0)
+        weight = weight * (_through(at, surface, light.wi, wi) > 0)
+    if surface.shown is not None:
+        weight = weight * surface.shown
     radiance = state.throughput * reflected * light.radiance * weight
     o = offset_origin(world, at, light.wi)
     d = light.target - o
@@ -195,6 +195,12 @@ def shade(
         d = torch.where(light.distant, light.wi, d)
         t_max = torch.where(light.distant & lit, math.inf, t_max)
     return surface, Shadow(o, d, t_max, radiance)
+
+
+def _through(at: Interaction, surface: Surface, world_wi: Tensor, wi: Tensor) -> Tensor:
+    """Positive where a direction lies on the same side of both normals: a shading normal must not let light through."""
+    same = dot(world_wi, at.ng) * wi[2]
+    return same if surface.side is None else same * surface.side
 
 
 def scatter(
@@ -213,50 +219,66 @@ def scatter(
     Where derivatives with respect to geometry are wanted, the next hit is found here already, since the throughput must
     follow both ends of the ray; it is returned beside the state.
     """
-    name = world.models[model]
-    kind = bsdfs.KINDS[name]
-    frame, parameters, wo = surface.frame, surface.parameters, surface.wo
+    kind, frame, parameters, wo = world.models[model], surface.frame, surface.parameters, surface.wo
     draws = Draws(plan.sampler, state.key, salts)
     u = draws.two(Dimension.BSDF).to(plan.dtype)
-    if plan.strategy == "uniform":
-        wi = uniform_hemisphere(u)
-        wi = torch.stack((wi[0], wi[1], torch.copysign(wi[2], wo[2])))
-        pdf = torch.full_like(wi[2], 0.5 / math.pi)
-        weight = kind.eval(parameters, wo, wi) / pdf
+    if plan.strategy == "uniform" and not kind.delta:
+        wi = uniform_sphere(u) if kind.transmits else uniform_hemisphere(u)
+        pdf = torch.full_like(wi[2], (0.25 if kind.transmits else 0.5) / math.pi)
+        drawn = BsdfSample(wi, pdf, kind.eval(parameters, wo, wi) / pdf)
     else:
-        lobe = draws.one(Dimension.LOBE) if name in bsdfs.LOBED else None
+        lobe = draws.one(Dimension.LOBE).to(plan.dtype) if kind.lobed else None
         drawn = kind.sample(parameters, wo, lobe, u)
-        wi, pdf, weight = drawn.wi, drawn.pdf, drawn.weight
+    wi, pdf, weight = drawn.wi, drawn.pdf.detach(), drawn.weight
+    sharp = torch.isinf(pdf) if kind.delta else None
     d = frame.to_world(wi).detach()
     o = offset_origin(world, at, d)
     # Least of what must be positive for the path to go on: comparisons cost more than minima.
-    least = pdf.detach()
+    least = pdf
     if world.normals is not None:
-        least = torch.minimum(least, dot(d, at.ng) * wi[2])
+        least = torch.minimum(least, _through(at, surface, d, wi.detach()))
+    if surface.shown is not None:
+        least = torch.minimum(least, surface.shown)
     hit, forever = None, torch.finfo(torch.float32).max
-    if plan.attached:
-        # Detached sampling: direction and density are constants, the integrand follows the geometry.
-        pdf = pdf.detach()
-        alive = least > 0
-        hit = search(replace(state, o=o, d=d, t_max=alive.to(plan.dtype) * forever))
-        d, measure = reattach(world, at.p, hit, d)
-        weight = kind.eval(parameters, wo, frame.to_local(d)) * (measure / torch.where(alive, pdf, 1.0))
+    if plan.tape:
+        # Detached sampling: direction and density are constants, the integrand follows the parameters.
+        measure, alive = 1.0, least > 0
+        follow = d
+        if plan.attached:
+            hit = search(replace(state, o=o, d=d, t_max=alive.to(plan.dtype) * forever))
+            follow, measure = reattach(world, at.p, hit, d)
+        if not kind.smooth:
+            value = kind.eval(parameters, wo, frame.to_local(follow))
+            again = value * (measure / torch.where(alive & ~torch.isinf(pdf), pdf, 1.0))
+            weight = again if sharp is None else torch.where(sharp, weight, again)
+        if plan.attached:
+            # The direction of a delta follows the surface that it leaves; the next point slides along it.
+            d = follow if sharp is None else torch.where(sharp, frame.to_world(wi), follow)
     throughput = state.throughput * weight
     brightest = largest(throughput.detach())
     alive = torch.minimum(least, brightest) > 0
+    eta = state.eta
+    if eta is not None and drawn.eta is not None:
+        eta = eta * drawn.eta.detach()
     if roulette:
-        survival = (
-            brightest.clamp_max(SURVIVAL_CAP) if plan.rr_prob is None else torch.full_like(brightest, plan.rr_prob)
-        )
+        if plan.rr_prob is None:
+            # Radiance is scaled at refraction; what a path can still bring is not.
+            expected = brightest if eta is None else brightest * eta * eta
+            survival = expected.clamp_max(SURVIVAL_CAP)
+        else:
+            survival = torch.full_like(brightest, plan.rr_prob)
         alive = alive & (draws.one(Dimension.ROULETTE) < survival)
         throughput = throughput / torch.where(alive, survival, 1.0)
     if hit is not None:
         hit = replace(hit, prim=torch.where(alive, hit.prim, -1))
     on = alive.to(plan.dtype)
     if plan.strategy == "mis" and world.lights is not None:
-        counts = pdf.detach()
+        counts = pdf
     else:
-        counts = torch.full_like(pdf, 0.0 if plan.strategy == "light" and world.lights is not None else math.inf)
+        alone = plan.strategy == "light" and world.lights is not None  # lights are not to be counted twice
+        counts = torch.full_like(pdf, 0.0 if alone else math.inf)
+        if alone and sharp is not None:
+            counts = torch.where(sharp, pdf, counts)
     after = PathState(
         o=o,
         d=d,
@@ -266,5 +288,6 @@ def scatter(
         pdf=counts,
         lane=state.lane,
         key=state.key,
+        eta=eta,
     )
     return after, hit

@@ -13,6 +13,7 @@ from torchpt.film import Filter
 from torchpt.integrators import aov
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import Limits, Tally, trace
+from torchpt.integrators.search import Search
 from torchpt.records import PathState
 from torchpt.samplers import Sampler, salts
 
@@ -68,5 +69,7 @@ class Wave:
     ) -> dict[str, Tensor]:
         """The layers ``names``, each ``(C, samples, pixels)``."""
         state = self.rays(first_pixel, pixels, first_sample, samples)
-        found = aov.first_hit(names, self.stages.world, self.accel, state, self.centre, self.stages.plan.dtype)
+        plan, world = self.stages.plan, self.stages.world
+        search = Search(self.accel, world, plan.sampler, plan.dtype)
+        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype)
         return {name: value.view(len(value), samples, pixels) for name, value in found.items()}

@@ -23,7 +23,8 @@ def _rows(lights: Lights, row: Tensor | None) -> Lights:
     if row is None:
         return lights
     names = ("p0", "e1", "e2", "normal", "flip", "area", "bound", "radiance")
-    return replace(lights, **{name: take(getattr(lights, name), row) for name in names})
+    covered = None if lights.opacity is None else take(lights.opacity, row)
+    return replace(lights, opacity=covered, **{name: take(getattr(lights, name), row) for name in names})
 
 
 def _is(lights: Lights, kind: str, row: Tensor | None) -> Tensor | None:
@@ -87,7 +88,8 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
     # Where the light is not seen the weight is 0, and the density has no say.
     pdf = safe_reciprocal(inverse.detach())
     target = torch.addcmul(target, normal, at.bound * offset)
-    here = LightSample(wi, target, None, at.radiance.expand_as(wi), pdf, inverse)
+    radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
+    here = LightSample(wi, target, None, radiance.expand_as(wi), pdf, inverse)
     if "constant" not in lights.kinds:
         return here
     distant = _is(lights, "constant", row)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import affine, dot
+from torchpt.math.vectors import affine, cross, dot
 
 __all__ = ["Frame"]
 
@@ -32,6 +32,15 @@ class Frame:
         s = torch.stack((1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]))
         t = torch.stack((b, sign + n[1] * n[1] * a, -n[1]))
         return Frame(s, t, n)
+
+    @staticmethod
+    def along(n: Tensor, tangent: Tensor) -> Frame:
+        """The frame about unit normals ``n (3, N)`` whose ``s`` is next to ``tangent (3, N)``; any where that is along n."""
+        s = torch.addcmul(tangent, n, dot(n, tangent), value=-1)
+        square, whole = dot(s, s), dot(tangent, tangent)
+        usable = square > 1e-12 * whole
+        s = torch.where(usable, s / torch.where(usable, square, 1.0).sqrt(), Frame.about(n).s)
+        return Frame(s, cross(n, s), n)
 
     def to_local(self, w: Tensor) -> Tensor:
         """World ``(3, N)`` to local."""

@@ -19,6 +19,7 @@ class Dimension(IntEnum):
     LOBE = 4  # 1D, which part of the BSDF
     BSDF = 5  # 2D, direction
     ROULETTE = 6  # 1D
+    OPACITY = 7  # 1D, whether a surface is met
 
 
 STREAMS = len(Dimension)

@@ -12,10 +12,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.bsdfs import Bsdf, Diffuse, Parameters, stacked
+from torchpt.errors import SceneError
 from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import cross, dot, luminance, normalize
 from torchpt.records import KINDS, Geometry, Lights, World
 from torchpt.scene.parts import Part
+from torchpt.scene.surfaces import Surface, surface_of
 from torchpt.shapes.normals import smooth_normals
 
 __all__ = ["Corners", "assemble", "corners_of"]
@@ -126,11 +129,17 @@ def assemble(
     if planar is not None:
         bound = torch.where(planar, bound, (p0.abs().sum(0) + 2.0 * e1[0].abs()).detach())
 
-    models, rows, stacked = _materials(parts, parameters, dtype, device)
+    surfaces = {
+        slot.name: surface_of(slot, parameters, dtype) for slot in {part.material.name: part.material for part in parts}.values()
+    }
+    models, rows, tables, two_sided = _materials(parts, surfaces, device)
+    opacity = _opacity(parts, surfaces, sizes, dtype, device)
     emissive = spread([int(part.emission is None) for part in parts])  # 0 where it emits
-    keys = emissive * len(models) + spread([models.index(part.material.model) for part in parts])
+    keys = emissive * len(models) + spread([models.index(surfaces[part.material.name].model) for part in parts])
     key = torch.cat((torch.full((1,), 2 * len(models), device=device), keys)).to(torch.uint8)
-    lights = _lights(parts, sizes, parameters, environment, p0, e1, e2, normal, bound, sign, face, emissive, dtype)
+    lights = _lights(
+        parts, sizes, parameters, environment, p0, e1, e2, normal, bound, sign, face, opacity, emissive, dtype
+    )
     # The search gets the corners themselves: rebuilt from edges, neighbours would no longer share them to the bit.
     q0, q1, q2 = (x.detach().to(torch.float32).contiguous() for x in (p0, p1, p2))
     size = (counts[0], counts[1], counts[2], counts[3])
@@ -143,10 +152,13 @@ def assemble(
         bound=bound,
         flip=sign if ball else None,
         normals=normals,
+        tangents=_tangents(parts, corners, parameters) if any(model.anisotropic for model in models) else None,
+        opacity=opacity,
         material=spread(rows),
         key=key,
         models=models,
-        bsdfs=stacked,
+        bsdfs=tables,
+        two_sided=two_sided,
         object_id=spread([part.object_id for part in parts]),
         lights=lights,
     )
@@ -158,28 +170,67 @@ def _largest(p0: Tensor, e1: Tensor, e2: Tensor) -> Tensor:
     return p0.abs() + e1.abs() + e2.abs()
 
 
+#: Lanes are sorted by keys of 8 bits, two for each model.
+MOST_MODELS = 120
+
+
 def _materials(
-    parts: Sequence[Part], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
-) -> tuple[tuple[str, ...], list[int], tuple[dict[str, Tensor | None], ...]]:
-    """Models present, the row of each part in its model, and the stacked parameters."""
-    models = tuple(dict.fromkeys(part.material.model for part in parts)) or ("diffuse",)
-    rows: list[int] = []
-    slots: dict[str, dict[str, int]] = {model: {} for model in models}
-    used = {}
+    parts: Sequence[Part], surfaces: Mapping[str, Surface], device: torch.device
+) -> tuple[tuple[Bsdf, ...], list[int], tuple[Parameters, ...], tuple[Tensor | None, ...]]:
+    """Models present, the row of each part in its model, the stacked parameters, and which rows are two-sided."""
+    models = tuple(dict.fromkeys(surfaces[part.material.name].model for part in parts)) or (Diffuse(),)
+    if len(models) > MOST_MODELS:
+        raise SceneError("materials", len(models), f"at most {MOST_MODELS} models, blends of different models included")
+    slots: list[dict[str, int]] = [{} for _ in models]
+    rows = []
     for part in parts:
-        names = slots[part.material.model]
+        names = slots[models.index(surfaces[part.material.name].model)]
         rows.append(names.setdefault(part.material.name, len(names)))
-        used[part.material.name] = part.material
-    stacked = []
-    for model in models:
-        names = list(slots[model])
-        table: dict[str, Tensor | None] = {}
-        for key in used[names[0]].values if names else ():
-            table[key] = torch.stack([parameters[f"{name}.{key}"].to(dtype) for name in names], -1)
+    used = {part.material.name: part.material for part in parts}
+    tables, sides = [], []
+    for model, names in zip(models, slots, strict=True):
+        tables.append(stacked([model.prepare(surfaces[name].values) for name in names]))
         both = [used[name].two_sided for name in names]
-        table["two_sided"] = None if all(both) else torch.tensor(both, device=device)
-        stacked.append(table)
-    return models, rows, tuple(stacked)
+        sides.append(None if all(both) else torch.tensor(both, device=device))
+    return models, rows, tuple(tables), tuple(sides)
+
+
+def _opacity(
+    parts: Sequence[Part], surfaces: Mapping[str, Surface], sizes: list[int], dtype: torch.dtype, device: torch.device
+) -> Tensor | None:
+    """The chance ``(P,)`` that a ray meets a primitive; None where it always does."""
+    if all(surface.opacity is None for surface in surfaces.values()):
+        return None
+    whole = torch.ones(1, dtype=dtype, device=device)
+    found = [surfaces[part.material.name].opacity for part in parts]
+    return torch.cat([(whole if x is None else x).expand(n) for x, n in zip(found, sizes, strict=True)])
+
+
+def _tangents(parts: Sequence[Part], corners: Sequence[Corners], parameters: Mapping[str, Tensor]) -> Tensor:
+    """Directions ``(3, P)`` along the first surface parameter; of a sphere the axis about which it runs."""
+    found = []
+    for part, c in zip(parts, corners, strict=True):
+        if part.kind == "sphere":
+            linear = parameters[f"{part.name}.to_world"][:3, :3].to(c.p0)
+            found.append(normalize(linear[:, 2:3]))
+        elif part.kind != "triangle":
+            found.append(c.p1 - c.p0)
+        elif part.uvs is None:
+            found.append(torch.zeros_like(c.p0))
+        else:
+            assert part.faces is not None
+            uv = torch.from_numpy(part.uvs[part.faces]).to(c.p0)  # (P, 3, 2)
+            a, b = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
+            det = a[0] * b[1] - a[1] * b[0]
+            along = (c.p1 - c.p0) * b[1] - (c.p2 - c.p0) * a[1]
+            found.append(torch.where(det == 0, 0.0, along * torch.sign(det)))
+    return torch.cat(found, 1)
+
+
+def _emission(part: Part, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> Tensor:
+    """Radiance ``(3,)`` of a part that emits."""
+    radiance, *strength = (parameters[name].to(dtype) for name in part.emission_names)
+    return radiance if not strength else radiance * strength[0]
 
 
 def _lights(
@@ -194,6 +245,7 @@ def _lights(
     bound: Tensor,
     sign: Tensor,
     face: Tensor,
+    opacity: Tensor | None,
     emissive: Tensor,
     dtype: torch.dtype,
 ) -> Lights | None:
@@ -212,9 +264,12 @@ def _lights(
     area = dot(raw, raw).clamp_min(torch.finfo(dtype).tiny).sqrt() * share
     q0, q1, q2, qn = (x.index_select(1, rows) for x in (p0, e1, e2, normal))
     area = torch.where(of_kind == KINDS.index("sphere"), (4.0 * math.pi) * q1[0] * q1[0], area)
-    radiance = [parameters[part.emission_name].to(dtype)[:, None].expand(3, n) for part, n in glowing]
+    radiance = [_emission(part, parameters, dtype)[:, None].expand(3, n) for part, n in glowing]
     radiance = torch.cat(radiance, 1) if radiance else torch.zeros(3, 0, dtype=dtype, device=device)
+    seen = None if opacity is None else opacity.index_select(0, rows)
     power = (luminance(radiance.detach().double().abs()) * area.detach().double()) * math.pi
+    if seen is not None:
+        power = power * seen.detach().double()
     kind = torch.tensor([kinds.index(k) if k in kinds else 0 for k in KINDS], device=device)[of_kind]
     extra = [bound.index_select(0, rows), sign.index_select(0, rows)]
     if environment is not None:
@@ -229,6 +284,7 @@ def _lights(
         q0, q1, q2, qn = (torch.cat((x, blank), 1) for x in (q0, q1, q2, qn))
         area, *extra = (torch.cat((x, torch.ones(1, dtype=dtype, device=device))) for x in (area, *extra))
         radiance = torch.cat((radiance, environment.to(dtype)[:, None]), 1)
+        seen = None if seen is None else torch.cat((seen, torch.ones_like(area[:1])))
     index = None
     if len(rows):
         index = torch.full((len(emissive),), -1, dtype=torch.int64, device=device)
@@ -246,6 +302,7 @@ def _lights(
         area=area,
         bound=extra[0],
         radiance=radiance,
+        opacity=seen,
         environment=None if environment is None else environment.to(dtype),
         row_of_prim=index,
     )

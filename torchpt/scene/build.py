@@ -6,13 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchpt.bsdfs import Diffuse
 from torchpt.errors import AssetError, SceneError
 from torchpt.math.transforms import similarity_scale
 from torchpt.records import KINDS
 from torchpt.scene.description import Description
 from torchpt.scene.loaders import MeshPart, load_mesh, unit_cube
+from torchpt.scene.materials import slot_of
 from torchpt.scene.parts import MaterialSlot, Part
-from torchpt.scene.schema import Cube, Diffuse, Disk, Material, Mesh, Rectangle, Shape, Sphere
+from torchpt.scene.schema import Cube, Disk, Mesh, Rectangle, Shape, Sphere
 
 __all__ = ["Built", "build_parts"]
 
@@ -50,8 +52,7 @@ def build_parts(description: Description) -> Built:
     for number, (name, shape) in enumerate(description.shapes.items(), 1):
         parts += _shape_parts(description, name, shape, number, parameters)
     for name, material in description.materials.items():
-        slot = _slot(f"materials.{name}", material)
-        parameters.update({f"{slot.name}.{key}": np.asarray(value, np.float64) for key, value in slot.values.items()})
+        _declare(slot_of(material, f"materials.{name}", description.materials), parameters)
     if len(description.lights) > 1:
         first, second = list(description.lights)[:2]
         raise SceneError(f"lights.{second}", "constant", f"one environment only ({first} is one)", description.file)
@@ -65,9 +66,8 @@ def build_parts(description: Description) -> Built:
     return Built(tuple(parts), parameters, _centre(parts), environment)
 
 
-def _slot(prefix: str, material: Material) -> MaterialSlot:
-    assert isinstance(material, Diffuse)
-    return MaterialSlot("diffuse", prefix, {"reflectance": material.reflectance}, material.two_sided)
+def _declare(slot: MaterialSlot, parameters: dict[str, np.ndarray]) -> None:
+    parameters.update({name: np.asarray(value, np.float64) for name, value in slot.numbers().items()})
 
 
 def _shape_parts(
@@ -141,15 +141,16 @@ def _part(
 ) -> Part:
     own = piece.material if piece is not None else None
     if isinstance(shape.material, str):
-        slot = _slot(f"materials.{shape.material}", description.materials[shape.material])
+        slot = slot_of(description.materials[shape.material], f"materials.{shape.material}", description.materials)
     elif shape.material is not None:
-        slot = _slot(f"{prefix}.material", shape.material)
+        slot = slot_of(shape.material, f"{prefix}.material", description.materials)
     else:
         colour = _GREY if own is None or own.reflectance is None else own.reflectance
-        slot = MaterialSlot("diffuse", f"{prefix}.material", {"reflectance": colour}, True)
-    for key, value in slot.values.items():
-        parameters[f"{slot.name}.{key}"] = np.asarray(value, np.float64)
-    emission = shape.emission
+        slot = MaterialSlot(Diffuse(), f"{prefix}.material", {"reflectance": colour})
+    _declare(slot, parameters)
+    emission, names = shape.emission, (f"shapes.{name}.emission",)
+    if emission is None and slot.emission is not None:
+        emission, names = slot.emission, (f"{slot.name}.emission", f"{slot.name}.emission_strength")
     if (
         emission is None
         and shape.material is None
@@ -157,12 +158,9 @@ def _part(
         and own.emission is not None
         and any(own.emission)
     ):
-        emission = own.emission
-    if emission is not None and not any(emission) and shape.emission is None:
-        emission = None
-    emission_name = f"shapes.{name}.emission" if shape.emission is not None else f"{prefix}.emission"
-    if emission is not None:
-        parameters[emission_name] = np.asarray(emission, np.float64)
+        emission, names = own.emission, (f"{prefix}.emission",)
+    if emission is not None and names[0] not in parameters:
+        parameters[names[0]] = np.asarray(emission, np.float64)
     faces, dropped = _solid(piece, pose) if piece is not None else (None, 0)
     return Part(
         name=prefix,
@@ -171,12 +169,13 @@ def _part(
         kind=kind,
         material=slot,
         emission=emission,
-        emission_name=emission_name if emission is not None else "",
+        emission_names=names if emission is not None else (),
         flip=shape.flip_normals,
         to_world=pose,
         vertices=None if piece is None else piece.vertices,
         faces=faces,
         normals=None if piece is None or flat else piece.normals,
+        uvs=None if piece is None else piece.uvs,
         smooth=not flat,
         dropped=dropped,
         source=source,

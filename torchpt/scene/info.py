@@ -39,7 +39,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     memory = sum(x.numel() * x.element_size() for x in tensors_of(world))
     made: dict[str, Any] = {
         "accel": accel.describe(),
-        "bsdfs": dict(zip(world.models, (_rows(table) for table in world.bsdfs), strict=True)),
+        "bsdfs": dict(zip(map(str, world.models), map(_rows, world.bsdfs), strict=True)),
         "lights": {} if lights is None else {"rows": len(lights.area), "kinds": list(lights.kinds)},
         "scene_bytes": memory,
     }
@@ -62,13 +62,22 @@ def _left_out(world: World, settings: Settings) -> list[str]:
     """Features this scene does not need, for which there is no object, no tensor and no instruction."""
     lights = world.lights
     absent = [f"{kind} primitives" for kind, n in zip(KINDS, world.counts, strict=True) if not n]
-    absent += [f"{name} bsdf" for name in bsdfs.KINDS if name not in world.models]
+    present = {model.name for model in world.models}
+    absent += [f"{name} bsdf" for name in dict.fromkeys(model.name for model in bsdfs.MODELS) if name not in present]
     if len(world.models) == 1:
         absent.append("sorting by bsdf (one model)")
     if world.normals is None:
         absent.append("shading normals (all flat)")
-    if all(table.get("two_sided") is None for table in world.bsdfs):
+    if all(both is None for both in world.two_sided):
         absent.append("one-sided materials")
+    if world.opacity is None:
+        absent.append("opacity (every surface is met)")
+    if world.tangents is None:
+        absent.append("tangents (nothing is anisotropic)")
+    if not any(model.refracts for model in world.models):
+        absent.append("refraction (no index along paths)")
+    if not any(model.lobed for model in world.models):
+        absent.append("choice among lobes")
     if lights is None:
         absent.append("light sampling and MIS (nothing emits)")
     else:
@@ -92,6 +101,7 @@ def _left_out(world: World, settings: Settings) -> list[str]:
     return absent
 
 
-def _rows(table: dict[str, Any]) -> int:
+def _rows(table: bsdfs.Parameters) -> int:
     """How many materials share a model's stacked parameters."""
-    return max((value.shape[-1] for value in table.values() if value is not None), default=0)
+    found = tensors_of(table)
+    return max((value.shape[-1] if value.dim() < 2 or len(value) == 3 else len(value) for value in found), default=1)

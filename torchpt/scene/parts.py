@@ -37,6 +37,10 @@ class MaterialSlot:
     emission_strength: float = 1.0
     inner: tuple[MaterialSlot, ...] = ()
 
+    def all(self) -> list[MaterialSlot]:
+        """Itself and the materials that it blends."""
+        return [self, *(slot for inner in self.inner for slot in inner.all())]
+
     def numbers(self) -> dict[str, float | tuple[float, float, float]]:
         """Its parameters by dotted name, those of inner materials included."""
         found = {f"{self.name}.{key}": value for key, value in self.values.items()}
@@ -45,8 +49,8 @@ class MaterialSlot:
         if self.emission is not None:
             found[f"{self.name}.emission"] = self.emission
             found[f"{self.name}.emission_strength"] = self.emission_strength
-        for slot in self.inner:
-            found |= slot.numbers()
+        for inner in self.inner:
+            found |= inner.numbers()
         return found
 
 
@@ -67,6 +71,7 @@ class Part:
         vertices: ``(V, 3)`` float64 in the file's own space; None for analytic shapes.
         faces: ``(F, 3)`` int64.
         normals: ``(V, 3)`` from the file, or None.
+        uvs: ``(V, 2)``, or None.
         smooth: whether shading normals are interpolated.
         dropped: faces without area, left out.
         source: the file it was read from, or "".
@@ -85,6 +90,7 @@ class Part:
     vertices: np.ndarray | None = None
     faces: np.ndarray | None = None
     normals: np.ndarray | None = None
+    uvs: np.ndarray | None = None
     smooth: bool = False
     dropped: int = 0
     source: str = ""

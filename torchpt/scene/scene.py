@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpt import accel as search
 from torchpt.accel import Accel
+from torchpt.bsdfs import Bsdf
 from torchpt.cameras import Perspective
 from torchpt.errors import RenderError, SceneError
 from torchpt.math.transforms import is_singular, similarity_scale
@@ -23,23 +24,31 @@ from torchpt.scene.description import Description, read_description, settings
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
 
-__all__ = ["Scene", "device_of", "load"]
+__all__ = ["INDICES", "Scene", "device_of", "load"]
+
+#: Parameters of materials that are indices of refraction.
+INDICES = (".int_ior", ".ext_ior", ".ior")
 
 
-def load(source: str | os.PathLike[str] | Mapping[str, Any], device: str | torch.device | None = None) -> Scene:
+def load(
+    source: str | os.PathLike[str] | Mapping[str, Any],
+    device: str | torch.device | None = None,
+    bsdfs: Mapping[str, Bsdf] | None = None,
+) -> Scene:
     """Load a scene.
 
     Args:
         source: the name of a scene that ships, a path ending in ``.yaml``, or a dict of the same schema.
         device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
             ``render.device``, which is ``auto`` where it does not say.
+        bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
 
     Raises:
         SceneError: the description is wrong; says where and what is accepted.
         AssetError: a file that it names is missing or malformed.
         RenderError: the device is not there.
     """
-    description = read_description(source)
+    description = read_description(source, bsdfs)
     return Scene(description, device_of(settings(description).render.device if device is None else device))
 
 
@@ -84,6 +93,12 @@ class Scene:
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._state: dict[str, tuple[Tensor, int]] = {}
 
+    def weights(self) -> tuple[Tensor, ...]:
+        """Tensors of models of the user's own that want gradients."""
+        models = self.description.bsdfs.values()
+        found = {id(weight): weight for model in models for weight in model.weights() if weight.requires_grad}
+        return tuple(found.values())
+
     @property
     def parts(self) -> Built:
         """The resolved parts, static."""
@@ -94,30 +109,36 @@ class Scene:
         """``(3,)`` float64: where the lanes' origin lies in the scene's own coordinates."""
         return self._centre
 
-    def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
-        """All parameters, those of ``params`` in place of the scene's.
+    def check(self, params: Mapping[str, Tensor] | None) -> None:
+        """Refuse parameters that this scene cannot be rendered with.
 
         Raises:
-            SceneError: an unknown name, or a tensor of another shape.
+            SceneError: an unknown name, a tensor of another shape, numbers that no scene file could hold.
         """
-        merged = dict(self.params)
         for name, value in (params or {}).items():
-            if name not in merged:
-                close = difflib.get_close_matches(name, merged, 3) or list(merged)[:8]
+            if name not in self.params:
+                close = difflib.get_close_matches(name, self.params, 3) or list(self.params)[:8]
                 raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {', '.join(close)}")
-            if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != merged[name].shape:
+            shape = self.params[name].shape
+            if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
                 found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
-                raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(merged[name].shape)}")
-            merged[name] = value.to(self.device)
+                raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}")
             self._check(name, value.detach())
-        return merged
+
+    def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
+        """All parameters, those of ``params`` (once checked) in place of the scene's."""
+        return {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
 
     def _check(self, name: str, value: Tensor) -> None:
         """Refuse numbers that no scene file could hold."""
         if not bool(torch.isfinite(value).all()):
             raise SceneError(f"params.{name}", "a value that is not finite", "finite numbers")
-        if name.endswith((".emission", ".radiance", ".reflectance")) and bool((value < 0).any()):
-            raise SceneError(f"params.{name}", value.tolist(), "no negative numbers (clamp before rendering)")
+        low = 0.0
+        if ".material." in name or name.startswith("materials.") or name.endswith((".emission", ".radiance")):
+            if name.endswith(INDICES):
+                low = 1e-3
+            if bool((value < low).any()):
+                raise SceneError(f"params.{name}", value.tolist(), f"no number below {low:g} (clamp before rendering)")
         if name.endswith(".to_world"):
             matrix = value.double().cpu().numpy()
             if is_singular(matrix):

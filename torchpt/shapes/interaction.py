@@ -71,7 +71,24 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         ns = normalize(_blend(world.normals, prim, u, v))
         if triangles < len(world.bound):
             ns = torch.where(prim < triangles, ns, ng)
-    return Interaction(p, ng, ns, prim)
+    return Interaction(p, ng, ns, _tangent(world, prim, u, v, e1, e2, ng), prim)
+
+
+def _tangent(
+    world: World, prim: Tensor, u: Tensor, v: Tensor, e1: Tensor, e2: Tensor, ng: Tensor
+) -> Tensor | None:
+    """Derivative of the point along the shape's first parameter, as Mitsuba has it: radial on a disk, around a sphere."""
+    if world.tangents is None:
+        return None
+    tangent = take(world.tangents, prim)
+    triangles, rectangles, disks, spheres = world.counts
+    if spheres:
+        first = len(world.bound) - spheres
+        tangent = torch.where(prim >= first, cross(tangent, ng), tangent)
+    if disks:
+        first = triangles + rectangles
+        tangent = torch.where((prim >= first) & (prim < first + disks), e1 * u + e2 * v, tangent)
+    return tangent
 
 
 def _sphere_distance(o: Tensor, d: Tensor, centre: Tensor, radius: Tensor, near: Tensor) -> Tensor:

@@ -1,0 +1,103 @@
+"""What the next ray meets. Surfaces that are not opaque let a ray through by chance, and shadow rays in part.
+
+Passing is no vertex of a path: the direction, the place it was drawn from and the depth stay. Scenes without opacity go
+straight to the search.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchpt.accel import Accel
+from torchpt.math.vectors import take
+from torchpt.records import Hit, PathState, Shadow, World, rows
+from torchpt.samplers import Dimension, Draws, salts
+from torchpt.shapes import interact, offset_origin
+
+__all__ = ["Search"]
+
+#: Beyond the depth of any path: names the numbers for the second, third, ... surface that a ray passes.
+PASSES = 1 << 13
+
+
+class Search:
+    """The search of one wave.
+
+    Args:
+        accel: finds the nearest hit.
+        world: the scene's tensors.
+        sampler: type of the sampler.
+        dtype: of the lanes.
+    """
+
+    def __init__(self, accel: Accel, world: World, sampler: str, dtype: torch.dtype) -> None:
+        self._accel, self._world, self._sampler, self._dtype = accel, world, sampler, dtype
+
+    def nearest(self, state: PathState, depth: int) -> Hit:
+        """Where the rays of ``state`` meet a surface, at path vertex ``depth``."""
+        hit = self._trace(state.o, state.d, state.t_max)
+        return hit if self._world.opacity is None else self._met(state, hit, depth)
+
+    def clear(self, shadow: Shadow) -> Tensor:
+        """How much of the light gets through ``(N,)``: 0 or 1 where all surfaces are opaque."""
+        if self._world.opacity is None:
+            return (~self._accel.occluded(shadow.o, shadow.d, shadow.t_max)).to(self._dtype)
+        return self._filtered(shadow)
+
+    def _trace(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
+        t, prim, u, v = self._accel.intersect(o, d, t_max)
+        return Hit(t.to(self._dtype), prim.to(torch.int64), u.to(self._dtype), v.to(self._dtype))
+
+    def _opacity(self, hit: Hit, miss: float) -> Tensor:
+        """Opacity ``(N,)`` of what was hit; ``miss`` where nothing was."""
+        assert self._world.opacity is not None
+        return torch.where(hit.prim < 0, miss, take(self._world.opacity, hit.prim.clamp_min(0)))
+
+    @torch.no_grad()
+    def _beyond(self, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
+        """Origins behind the surfaces that were hit ``(3, N)``."""
+        return offset_origin(self._world, interact(self._world, o, d, hit), d)
+
+    def _met(self, state: PathState, hit: Hit, depth: int) -> Hit:
+        """The hits that hold: a surface is met with the chance of its opacity, else the ray goes on behind it."""
+        opacity = self._opacity(hit, 1.0)
+        chance = torch.ones_like(hit.t) if opacity.requires_grad else None
+        t, prim, u, v = hit.t, hit.prim, hit.u, hit.v
+        step, lanes = 0, (opacity.detach() < 1).nonzero().squeeze(1)
+        opacity = take(opacity, lanes)
+        while len(lanes):
+            draws = Draws(self._sampler, take(state.key, lanes), salts(depth + step * PASSES, lanes.device))
+            met = draws.one(Dimension.OPACITY) < opacity.detach()
+            if chance is not None:
+                share = torch.where(met, opacity, 1.0 - opacity)
+                chance = chance.index_copy(0, lanes, take(chance, lanes) * (share / share.detach()))
+            lanes = take(lanes, (~met).nonzero().squeeze(1))
+            at = Hit(take(t, lanes), take(prim, lanes), take(u, lanes), take(v, lanes))
+            o, d = take(state.o.detach(), lanes), take(state.d.detach(), lanes)
+            behind = self._trace(self._beyond(o, d, at), d, take(state.t_max, lanes))
+            # Distances are counted from where the ray began; the step over the surface is below their rounding.
+            t, prim = t.index_copy(0, lanes, behind.t + at.t), prim.index_copy(0, lanes, behind.prim)
+            u, v = u.index_copy(0, lanes, behind.u), v.index_copy(0, lanes, behind.v)
+            opacity = self._opacity(behind, 1.0)
+            again = (opacity.detach() < 1).nonzero().squeeze(1)
+            lanes, opacity, step = take(lanes, again), take(opacity, again), step + 1
+        return Hit(t, prim, u, v, chance)
+
+    def _filtered(self, shadow: Shadow) -> Tensor:
+        """The product of ``1 - opacity`` over all surfaces between the ends of the rays."""
+        clear = torch.ones_like(shadow.t_max)
+        o, d, t_max = shadow.o.detach(), shadow.d.detach(), shadow.t_max
+        lanes = torch.arange(len(t_max), device=t_max.device)
+        while len(lanes):
+            hit = self._trace(o, d, t_max)
+            opacity = self._opacity(hit, 0.0)
+            clear = clear.index_copy(0, lanes, take(clear, lanes) * (1.0 - opacity))
+            on = ((hit.prim >= 0) & (opacity.detach() < 1)).nonzero().squeeze(1)
+            at, o, d = rows(hit, on), take(o, on), take(d, on)
+            lanes, t_max = take(lanes, on), (take(t_max, on) - at.t).clamp_min(0.0)
+            if len(lanes):
+                o = self._beyond(o, d, at)
+        return clear
