@@ -10,7 +10,16 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from torchpt.errors import AssetError, EdgeWarning, NotBuiltError, OutputError, RenderError, SceneError, TorchptError
+from torchpt.errors import (
+    AssetError,
+    EdgeWarning,
+    EnergyWarning,
+    NotBuiltError,
+    OutputError,
+    RenderError,
+    SceneError,
+    TorchptError,
+)
 
 if TYPE_CHECKING:
     from torchpt.bsdfs import Bsdf
@@ -23,6 +32,7 @@ __all__ = [
     "AssetError",
     "Bsdf",
     "EdgeWarning",
+    "EnergyWarning",
     "NotBuiltError",
     "OutputError",
     "RenderError",

@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
-__all__ = ["AssetError", "EdgeWarning", "NotBuiltError", "OutputError", "RenderError", "SceneError", "TorchptError"]
+__all__ = [
+    "AssetError",
+    "EdgeWarning",
+    "EnergyWarning",
+    "NotBuiltError",
+    "OutputError",
+    "RenderError",
+    "SceneError",
+    "TorchptError",
+]
 
 
 def _shown(value: object, limit: int = 80) -> str:
@@ -74,3 +83,7 @@ class RenderError(TorchptError):
 
 class EdgeWarning(UserWarning):
     """A gradient with respect to geometry leaves out visibility edges: silhouettes and shadow edges that move."""
+
+
+class EnergyWarning(UserWarning):
+    """A material may reflect more light than it receives."""

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from torchpt import paths
+from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, NotBuiltError, SceneError
 from torchpt.scene import schema
 from torchpt.scene import settings as run_settings
-from torchpt.scene.schema import ConstantLight, Material, Perspective, Shape
+from torchpt.scene.materials import MATERIALS, Material, check_material, custom_types, read_material
+from torchpt.scene.schema import ConstantLight, Perspective, Shape
 from torchpt.scene.settings import BLOCKS, Settings
 from torchpt.scene.validate import check_keys, select
 from torchpt.scene.yaml_file import plain, read_yaml
@@ -102,19 +104,26 @@ def scene_names() -> list[str]:
     return sorted(path.stem for path in (paths.configs() / "scene").glob("*.yaml"))
 
 
-def read_description(source: str | os.PathLike[str] | Mapping[str, Any]) -> Description:
+def read_description(
+    source: str | os.PathLike[str] | Mapping[str, Any], bsdfs: Mapping[str, Bsdf] | None = None
+) -> Description:
     """A checked scene description.
 
     Args:
         source: the name of a scene in ``configs/scene/``, a path ending in ``.yaml``, or a mapping of the same schema
             (its relative paths start at the current folder).
+        bsdfs: material types of the caller's own: type name to model instance.
 
     Raises:
         SceneError: what is wrong first, with file, dotted key, value and what is accepted.
         NotBuiltError: something that the format knows and this version does not build.
+
+    Warns:
+        EnergyWarning: a material may reflect more light than it receives.
     """
+    types = {**MATERIALS, **custom_types(bsdfs)}
     if isinstance(source, Mapping):
-        return _describe(plain(source), None, Path.cwd())
+        return _describe(plain(source), types, None, Path.cwd())
     if not isinstance(source, str | os.PathLike):
         raise SceneError("scene", source, "a scene's name, a path ending in .yaml, or a mapping")
     file = os.fspath(source)
@@ -125,7 +134,7 @@ def read_description(source: str | os.PathLike[str] | Mapping[str, Any]) -> Desc
         file = str(path)
     else:
         raise SceneError("scene", file, f"one of {', '.join(scene_names())}, or a path ending in .yaml")
-    return _describe(plain(read_yaml(path, file), file), file, path.resolve().parent)
+    return _describe(plain(read_yaml(path, file), file), types, file, path.resolve().parent)
 
 
 def settings(description: Description, overrides: Mapping[str, Any] | None = None) -> Settings:
@@ -142,7 +151,7 @@ def settings(description: Description, overrides: Mapping[str, Any] | None = Non
     return run_settings.merge(blocks, overrides or {}, description.file)
 
 
-def _describe(raw: dict[str, Any], file: str | None, base: Path) -> Description:
+def _describe(raw: dict[str, Any], types: Mapping[str, type[Material]], file: str | None, base: Path) -> Description:
     check_keys(raw, _KEYS, "", "a scene", file)
     version = raw.get("version")
     if version is not None and (isinstance(version, bool) or version != 1):
@@ -153,8 +162,10 @@ def _describe(raw: dict[str, Any], file: str | None, base: Path) -> Description:
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
     run_settings.merge(blocks, {}, file)
     _named(raw, "textures", file, lambda item, key: _texture(item, key, file))
-    materials = _named(raw, "materials", file, lambda item, key: select("material", schema.MATERIALS, item, key, file))
-    shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, file))
+    materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
+    for name, material in materials.items():
+        check_material(material, f"materials.{name}", materials, file)
+    shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, types, file))
     lights = _named(raw, "lights", file, lambda item, key: select("light", schema.LIGHTS, item, key, file))
     return Description(file, base, camera, version, **blocks, materials=materials, shapes=shapes, lights=lights)
 
@@ -182,12 +193,21 @@ def _texture(item: Any, key: str, file: str | None) -> None:
     raise NotBuiltError(key, item, "numbers and colours", file)
 
 
-def _shape(item: Any, key: str, materials: Mapping[str, Material], file: str | None) -> Shape:
+def _shape(
+    item: Any, key: str, materials: Mapping[str, Material], types: Mapping[str, type[Material]], file: str | None
+) -> Shape:
     if isinstance(item, dict) and isinstance(item.get("material"), dict):
-        inline = select("material", schema.MATERIALS, item["material"], f"{key}.material", file)
+        inline = read_material(item["material"], f"{key}.material", types, file)
+        check_material(inline, f"{key}.material", materials, file)
         item = {**item, "material": inline}
     shape = select("shape", schema.SHAPES, item, key, file)
-    if isinstance(shape.material, str) and shape.material not in materials:
-        known = ", ".join(materials) or "none is defined"
-        raise SceneError(f"{key}.material", shape.material, f"the name of a material ({known}) or a material", file)
+    material, where = shape.material, f"{key}.material"
+    if isinstance(material, str):
+        if material not in materials:
+            known = ", ".join(materials) or "none is defined"
+            raise SceneError(where, material, f"the name of a material ({known}) or a material", file)
+        material, where = materials[material], f"materials.{material}"
+    if shape.emission is not None and material is not None and material.emission is not None:
+        expected = f"no emission where the material emits as well ({where}.emission)"
+        raise SceneError(f"{key}.emission", shape.emission, expected, file)
     return shape

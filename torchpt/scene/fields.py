@@ -20,7 +20,8 @@ from torchpt.math import transforms
 
 __all__ = [
     "Affine", "Color", "FaceArray", "Flag", "Rows2", "Rows3", "Text", "Transform", "Vec3",
-    "choice", "color", "integer", "memory_size", "number", "number_field", "vector", "wrong",
+    "bounded", "choice", "color", "integer", "memory_size", "number", "number_field", "refuse_texture", "scalar", "vector",
+    "wrong",
 ]  # fmt: skip
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -101,26 +102,54 @@ def vector(value: Any, expected: str = "three finite numbers [x, y, z]") -> tupl
     return x, y, z
 
 
-def color(low: float = 0.0, high: float = _LARGEST, *, optional: bool = False) -> PlainValidator:
-    """A validator for a linear RGB colour: three numbers or one for all, each in ``low..high``."""
-    bound = f"in {low:g}..{high:g}" if high < _LARGEST else f">= {low:g}"
-    expected = f"[r, g, b] or one number, each finite and {bound}"
+def bounded(value: Any, low: float, high: float, expected: str) -> float:
+    """A finite float in ``low..high``, where a texture may stand one day."""
+    refuse_texture(value, expected)
+    result = number(value, expected)
+    if not low <= result <= high:
+        raise wrong(expected)
+    return result
+
+
+def scalar(low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False) -> PlainValidator:
+    """A validator for a material's number in ``low..high`` (any, where ``low`` is None)."""
+    floor = -_LARGEST if low is None else low
+    expected = f"a finite number{_bound(low, high)}"
+    return PlainValidator(lambda value: None if value is None and optional else bounded(value, floor, high, expected))
+
+
+def color(low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False) -> PlainValidator:
+    """A validator for a linear RGB colour: three numbers or one for all, each in ``low..high`` (any, if low is None)."""
+    floor = -_LARGEST if low is None else low
+    bound = _bound(low, high)
+    expected = f"[r, g, b] or one number, each finite{' and' if bound else ''}{bound}"
 
     def check(value: Any) -> tuple[float, float, float] | None:
         if value is None and optional:
             return None
-        if isinstance(value, Mapping):
-            raise _texture(value, expected)
+        refuse_texture(value, expected)
         if isinstance(value, list | tuple | np.ndarray):
             rgb = vector(value, expected)
         else:
             gray = number(value, expected)
             rgb = (gray, gray, gray)
-        if not all(low <= channel <= high for channel in rgb):
+        if not all(floor <= channel <= high for channel in rgb):
             raise wrong(expected)
         return rgb
 
     return PlainValidator(check)
+
+
+def _bound(low: float | None, high: float) -> str:
+    if low is None:
+        return ""
+    return f" in {low:g}..{high:g}" if high < _LARGEST else f" >= {low:g}"
+
+
+def refuse_texture(value: Any, expected: str) -> None:
+    """Raises the error for a texture where a number or colour stands; anything else passes."""
+    if isinstance(value, Mapping):
+        raise _texture(value, expected)
 
 
 def _texture(value: Mapping[str, Any], expected: str) -> PydanticCustomError:

@@ -1,4 +1,4 @@
-"""The blocks of a scene file as models: camera, materials, shapes, lights. One table of types for each."""
+"""The blocks of a scene file as models: camera, shapes, lights (materials have a file of their own). One table each."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ from torchpt.scene.fields import (
     number_field,
     wrong,
 )  # fmt: skip
+from torchpt.scene.materials import Material
 from torchpt.scene.validate import Model
 
 __all__ = [
-    "CAMERAS", "FOV_AXES", "LIGHTS", "MATERIALS", "SHAPES",
-    "ConstantLight", "Cube", "Diffuse", "Disk", "Material", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
+    "CAMERAS", "FOV_AXES", "LIGHTS", "SHAPES",
+    "ConstantLight", "Cube", "Disk", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
 ]  # fmt: skip
 
 FOV_AXES = ("x", "y", "diagonal", "smaller", "larger")
@@ -74,23 +75,6 @@ class Perspective(Model):
         if self.to_world is not None:
             return self.to_world
         return transforms.look_at(self.origin, self.target, self.up or _UP, key="")
-
-
-class Material(Model):
-    """What every material has.
-
-    Attributes:
-        two_sided: whether the back reflects as the front does; else it is black.
-    """
-
-    two_sided: Flag = True
-
-
-class Diffuse(Material):
-    """A Lambertian reflector; ``reflectance`` is linear RGB in 0..1."""
-
-    type: Literal["diffuse"] = "diffuse"
-    reflectance: Annotated[tuple[float, float, float], color(0.0, 1.0)] = (0.5, 0.5, 0.5)
 
 
 def _material(value: Any) -> Any:
@@ -221,7 +205,6 @@ class ConstantLight(Model):
 
 
 CAMERAS: dict[str, type[Perspective]] = {"perspective": Perspective}
-MATERIALS: dict[str, type[Material]] = {"diffuse": Diffuse}
 SHAPES: dict[str, type[Shape]] = {
     "mesh": Mesh,
     "sphere": Sphere,
