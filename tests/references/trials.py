@@ -1,8 +1,4 @@
-"""Statistics and short renders that the tests of the physics share.
-
-Significance: a test that makes ``n`` comparisons takes each at ``SIGNIFICANCE / n`` (Bonferroni), so that a right
-renderer fails it with at most this probability; seeds are fixed, so it does not fail by turns.
-"""
+"""Statistics and short renders that the tests of the physics share."""
 
 from __future__ import annotations
 
@@ -11,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from significance import SIGNIFICANCE, chi_square_p, z_limit
 from torch import Tensor
 
 import torchpt
@@ -18,7 +15,17 @@ from torchpt.render import Rendering, render_scene
 from torchpt.scene import Scene
 from torchpt.scene.description import settings
 
-SIGNIFICANCE = 1e-3
+__all__ = [
+    "SIGNIFICANCE",
+    "chi_square_p",
+    "estimate",
+    "film_of",
+    "grid_cells",
+    "shoot",
+    "spread",
+    "uniform_p",
+    "z_limit",
+]
 
 
 def shoot(
@@ -57,18 +64,6 @@ def spread(images: list[Tensor]) -> tuple[Tensor, Tensor]:
     """Mean of independent pictures and the variance of that mean."""
     stack = torch.stack([image.double() for image in images])
     return stack.mean(0), stack.var(0) / len(stack)
-
-
-def z_limit(comparisons: int, significance: float = SIGNIFICANCE) -> float:
-    """Two-sided bound on the largest of ``comparisons`` standard normal deviates."""
-    share = torch.tensor(1.0 - 0.5 * significance / comparisons, dtype=torch.float64)
-    return float(torch.special.ndtri(share))
-
-
-def chi_square_p(statistic: float, freedom: int) -> float:
-    """Probability that chi-square with ``freedom`` degrees exceeds ``statistic``."""
-    half = torch.tensor([0.5 * freedom, 0.5 * statistic], dtype=torch.float64)
-    return float(torch.special.gammaincc(half[0], half[1]))
 
 
 def uniform_p(cells: Tensor, number: int) -> float:

@@ -1,0 +1,574 @@
+"""What every BSDF promises, over the table of models: a new one is tested the moment it is listed.
+
+Each promise is tested as if the model broke it. Statistics are judged at one significance over the whole file (Šidák),
+against float64 cubature of the model's own ``eval`` and ``pdf``, on float32 lanes as a render runs them.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import pytest
+import torch
+from cases import BUILDERS, Case, cases_of, edges_of, lanes, leaves, tensors
+from chi_square import Integral, Tree, chart, counts_p, integrate
+from significance import SIGNIFICANCE, z_limit
+from torch import Tensor
+
+from torchpt import bsdfs
+from torchpt.math.vectors import normalize
+from torchpt.math.warps import uniform_sphere
+from torchpt.records import BsdfSample
+
+ANGLES = (0.0, 30.0, 60.0, 85.0, 89.9)
+AZIMUTH = 0.7  # of wo: on no axis, so that no anisotropy is hidden
+FAST, FULL = 1 << 18, 1_000_000
+LANES = 1 << 16
+
+CASES = [case for model in bsdfs.MODELS for case in cases_of(model)]
+EDGES = [case for model in bsdfs.MODELS for case in (*edges_of(model), *cases_of(model))]
+
+
+def towards(angle: float, below: bool = False, azimuth: float = AZIMUTH) -> Tensor:
+    """Unit direction ``(3, 1)`` float32 at ``angle`` degrees from the normal."""
+    a = math.radians(angle)
+    z = -math.cos(a) if below else math.cos(a)
+    return torch.tensor([[math.sin(a) * math.cos(azimuth)], [math.sin(a) * math.sin(azimuth)], [z]])
+
+
+def refracted(wo: Tensor, eta: float) -> Tensor | None:
+    """Where Snell sends a ray that comes from ``wo (3, 1)``; None where all is reflected."""
+    ratio = 1 / eta if float(wo[2]) > 0 else eta
+    cos2 = 1 - ratio**2 * (1 - float(wo[2]) ** 2)
+    if cos2 <= 0:
+        return None
+    out = -ratio * wo
+    out[2] = -math.copysign(math.sqrt(cos2), float(wo[2]))
+    return out
+
+
+def mirrored(w: Tensor) -> Tensor:
+    return torch.stack((-w[0], -w[1], w[2]))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One material seen from one direction."""
+
+    case: Case
+    angle: float
+    below: bool
+    full: bool
+
+    def __str__(self) -> str:
+        return f"{self.case} at {self.angle:g}{' below' if self.below else ''}{' full' if self.full else ''}"
+
+
+def settings() -> Iterator[Setting]:
+    """All of them are slow; of each material two directions are fast (and one from below), another two for the next."""
+    for i, case in enumerate(CASES):
+        for below in (False, True) if case.model.transmits else (False,):
+            chosen = {ANGLES[(i + 3) % 5]} if below else {ANGLES[i % 5], ANGLES[(i + 2) % 5]}
+            for angle in ANGLES:
+                if angle in chosen:
+                    yield Setting(case, angle, below, False)
+                yield Setting(case, angle, below, True)
+
+
+SETTINGS = list(settings())
+EACH = 1.0 - (1.0 - SIGNIFICANCE) ** (1.0 / max(len(SETTINGS), 1))  # Šidák
+Z = z_limit(3 * max(len(SETTINGS), 1))
+
+
+class Experiment:
+    """Draws of a material from one direction, and the integrals that they estimate."""
+
+    def __init__(self, setting: Setting, number: int | None = None, rows: bsdfs.Parameters | None = None) -> None:
+        self.setting, self.case, self.model = setting, setting.case, setting.case.model
+        self.wo = towards(setting.angle, setting.below)
+        self.number = number or (FULL if setting.full else FAST)
+        self.seed = torch.seed() if setting.full else zlib.crc32(str(setting).encode())
+        self.generator = torch.Generator().manual_seed(self.seed)
+        self.azimuth = AZIMUTH + math.pi  # of the mirror direction
+        self.sampled_rows = rows or self.case.rows()
+        self.rows = self.case.rows(torch.float64)
+        self.draws = self.drawn(self.number)
+
+    def drawn(self, number: int) -> BsdfSample:
+        """``number`` draws, wave by wave."""
+        out = []
+        for start in range(0, number, LANES):
+            n = min(LANES, number - start)
+            u = torch.rand(3, n, generator=self.generator)
+            lobe = u[2] if self.model.lobed else None
+            out.append(self.model.sample(lanes(self.sampled_rows, n), self.wo.expand(3, n), lobe, u[:2]))
+        eta = [one.eta for one in out if one.eta is not None]
+        return BsdfSample(
+            torch.cat([one.wi for one in out], 1),
+            torch.cat([one.pdf for one in out]),
+            torch.cat([one.weight.expand(3, one.pdf.shape[0]) for one in out], 1),
+            torch.cat(eta) if eta else None,
+        )
+
+    @cached_property
+    def spread(self) -> Tensor:
+        """Lanes that a lobe with a density has drawn."""
+        return (self.draws.pdf > 0) & torch.isfinite(self.draws.pdf)
+
+    @cached_property
+    def delta(self) -> Tensor:
+        """Lanes that a delta has drawn."""
+        return torch.isinf(self.draws.pdf)
+
+    def values(self, wi: Tensor) -> Tensor:
+        """``pdf`` and ``eval`` ``(4, n)`` in float64."""
+        n = wi.shape[1]
+        value, pdf = self.model.eval_pdf(lanes(self.rows, n), self.wo.double().expand(3, n), wi)
+        return torch.cat((pdf[None], value.expand(3, n)))
+
+    def guides(self, below: bool, n: int) -> Tensor:
+        """Directions ``(3, n)`` in one half that owe nothing to the sampler: uniform, and close about where lobes may be."""
+        wo = self.wo.double()
+        up = wo if self.setting.below == below else -wo
+        centres = [mirrored(up), up]
+        bent = refracted(wo, self.case.eta)
+        if bent is not None and self.setting.below != below:
+            centres.append(bent)
+        u = torch.rand(4, n, generator=self.generator).double()
+        centre = torch.cat(centres, 1)[:, (u[2] * len(centres)).long()]
+        near = normalize(centre + 10 ** (-6 * u[3]) * uniform_sphere(u[:2]))
+        w = torch.where(torch.arange(n) % 2 == 0, near, uniform_sphere(u[:2]))
+        return torch.stack((w[0], w[1], w[2].abs() * (-1 if below else 1)))
+
+    @cached_property
+    def cells(self) -> tuple[list[Tree], list[bool], Integral]:
+        """Trees of both halves (of one where light cannot pass), and the integrals over their leaves."""
+        depth = 7 if self.setting.full else 6
+        scout = self.drawn(1 << 15)
+        known = scout.wi[:, (scout.pdf > 0) & torch.isfinite(scout.pdf)].double()
+        trees, sides = [], [False, True] if self.model.transmits else [False]
+        for below in sides:
+            here = known[:, (known[2] < 0) == below]
+            points = self.guides(below, 1 << 13)
+            if here.shape[1] > 100:
+                pick = torch.randint(here.shape[1], (3 << 11,), generator=self.generator)
+                points = torch.cat((here[:, pick], points[:, : 1 << 11]), 1)
+            trees.append(Tree.over(chart(points, self.azimuth), depth, below))
+        rects = torch.cat([tree.rects for tree in trees], 1)
+        tolerance = 0.02 / math.sqrt(self.number * rects.shape[1])
+        return trees, sides, integrate(self.values, rects, self.azimuth, tolerance)
+
+    def counts(self) -> Tensor:
+        """Draws in each leaf."""
+        trees, sides, _ = self.cells
+        wi = self.draws.wi[:, self.spread]
+        out = []
+        for tree, below in zip(trees, sides, strict=True):
+            here = wi[:, (wi[2] < 0) == below]
+            out.append(torch.bincount(tree.leaf(chart(here, self.azimuth)), minlength=tree.rects.shape[1]))
+        return torch.cat(out)
+
+    def p_value(self) -> float:
+        """Of the hypothesis that the draws follow the density."""
+        trees, _, integral = self.cells
+        y0, y1, p0, p1 = torch.cat([tree.rects for tree in trees], 1)
+        area = (torch.tanh(y1) - torch.tanh(y0)) * (p1 - p0)
+        n = self.number
+        return counts_p(self.counts(), n * integral.value[0], area, n, n * integral.error[0])
+
+    def mean(self, where: Tensor, radiance: bool = False) -> tuple[Tensor, Tensor]:
+        """Mean weight ``(3,)`` over all draws of those ``where``, and its standard error.
+
+        With ``radiance``, in units of what the far side holds in a furnace: there it is ``eta^2`` times this side's.
+        """
+        weight = torch.where(where, self.draws.weight, 0.0).double()
+        if radiance and self.draws.eta is not None:
+            weight = weight * self.draws.eta.double() ** 2
+        return weight.mean(1), weight.std(1) / math.sqrt(self.number)
+
+
+def identify(x: object) -> str:
+    return str(x)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(s, marks=[pytest.mark.slow] if s.full else [], id=str(s)) for s in SETTINGS],
+)
+def experiment(request) -> Experiment:
+    return Experiment(request.param)
+
+
+def test_every_model_has_cases_and_edges():
+    missing = [str(model) for model in bsdfs.MODELS if not cases_of(model) or not edges_of(model)]
+    assert not missing, f"no case in cases.py for {missing}"
+    assert len({str(model) for model in bsdfs.MODELS}) == len(bsdfs.MODELS)
+    assert {model.name for model in bsdfs.MODELS} <= set(BUILDERS)
+
+
+# --- Draws against the density
+
+
+def test_draws_follow_the_density(experiment):
+    if experiment.case.smooth:
+        assert not experiment.spread.any()
+        assert experiment.cells[2].value.abs().max() == 0
+        return
+    p = experiment.p_value()
+    assert p > EACH, f"p = {p:.3g} (seed {experiment.seed}), limit {EACH:.2g}"
+
+
+def test_the_density_holds_at_most_one(experiment):
+    integral = experiment.cells[2]
+    mass, error = float(integral.value[0].sum()), float(integral.error[0].sum())
+    assert error < 2e-3, f"the cubature is known to {error:.2g} only"
+    share = float((~experiment.spread).double().mean())
+    assert mass <= 1 + error + 1e-5
+    assert abs(mass - (1 - share)) < error + 1e-5 + 5 * math.sqrt(max(share * (1 - share), 1e-9) / experiment.number)
+
+
+def test_the_mean_weight_is_the_integral_of_eval(experiment):
+    integral = experiment.cells[2]
+    mean, error = experiment.mean(experiment.spread)
+    expected, doubt = integral.value[1:].sum(1), integral.error[1:].sum(1)
+    assert (doubt < 2e-3 * (1 + expected)).all(), f"the cubature is known to {doubt.tolist()} only"
+    limit = Z * error + doubt + 1e-4 * expected + 1e-6
+    assert ((mean - expected).abs() <= limit).all(), f"{mean.tolist()} against {expected.tolist()} +- {limit.tolist()}"
+
+
+def test_no_energy_is_created(experiment):
+    if not (experiment.model.conserves and experiment.case.conserves):
+        pytest.skip("this material may reflect more than it receives")
+    mean, error = experiment.mean(experiment.draws.pdf > 0, radiance=True)
+    assert (mean <= 1 + Z * error + 2e-5).all(), f"albedo {mean.tolist()} +- {error.tolist()}"
+
+
+def test_white_furnace(experiment):
+    case = experiment.case
+    if not case.lossless:
+        pytest.skip("this material absorbs, or loses light between its facets")
+    mean, error = experiment.mean(experiment.draws.pdf > 0, radiance=True)
+    assert ((mean - 1).abs() <= case.furnace + Z * error + 2e-5).all(), f"{mean.tolist()} +- {error.tolist()}"
+
+
+def test_weight_is_eval_over_pdf(experiment):
+    wi, pdf, weight = (x[..., :LANES] for x in (experiment.draws.wi, experiment.draws.pdf, experiment.draws.weight))
+    spread = experiment.spread[:LANES]
+    wo = experiment.wo.expand(3, wi.shape[1])
+    p = lanes(experiment.sampled_rows, wi.shape[1])
+    value, density = experiment.model.eval_pdf(p, wo, wi)
+    assert torch.equal(experiment.model.eval(p, wo, wi), value)
+    assert torch.equal(experiment.model.pdf(p, wo, wi), density)
+    value = value.expand(3, wi.shape[1])
+    torch.testing.assert_close(density[spread], pdf[spread], rtol=1e-3, atol=1e-7)
+    torch.testing.assert_close(value[:, spread], (weight * pdf)[:, spread], rtol=1e-3, atol=1e-7)
+    failed = pdf == 0
+    assert not weight[:, failed].any()
+    live = pdf > 0
+    assert ((wi[:, live].double() ** 2).sum(0) - 1).abs().max() < 2e-6 if live.any() else True
+
+
+def test_deltas_go_where_they_may(experiment):
+    """A delta reflects by the mirror's law, refracts by Snell's or passes straight; ``eta`` says which."""
+    case, wi = experiment.case, experiment.draws.wi[:, experiment.delta].double()
+    sides = experiment.draws.eta
+    assert experiment.delta.any() <= experiment.model.delta
+    if experiment.model.smooth:
+        assert case.smooth and not experiment.spread.any()
+    assert (sides is not None) == experiment.model.refracts
+    wo = experiment.wo.double()
+    off = torch.full((wi.shape[1],), 9.0, dtype=torch.float64)
+    for aim in (mirrored(wo), -wo, refracted(wo, case.eta)):
+        if aim is not None:
+            off = torch.minimum(off, (wi - aim).abs().amax(0))
+    assert not (off > 2e-6).any(), f"a delta leaves by {off.max():.3g}"
+    if sides is not None and "b" not in case.values:
+        live = experiment.draws.pdf > 0
+        through = experiment.draws.wi[2] * wo[2] < 0
+        index = 1 / case.eta if experiment.setting.below else case.eta
+        torch.testing.assert_close(
+            sides[live].double(), torch.where(through, index, 1.0)[live].double(), rtol=1e-6, atol=0
+        )
+
+
+# --- Delta lobes against closed forms
+
+
+def fresnel(cos: Tensor, eta: Tensor) -> Tensor:
+    """Unpolarized reflectance from the side of index 1 into the side of index ``eta``; 1 beyond the critical angle."""
+    cos2 = 1 - (1 - cos * cos) / (eta * eta)
+    inside = torch.where(cos2 > 0, cos2, 1.0).sqrt()
+    s = (cos - eta * inside) / (cos + eta * inside)
+    p = (eta * cos - inside) / (eta * cos + inside)
+    return torch.where(cos2 > 0, 0.5 * (s * s + p * p), 1.0)
+
+
+def delta_amounts(case: Case, values: bsdfs.Parameters, wo: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Reflected and transmitted shares ``(3,)`` of the deltas of simple models; None for the others."""
+    name, one = case.model.name, torch.ones(3, dtype=torch.float64)
+    if name == "null":
+        return 0 * one, one
+    if name not in ("dielectric", "thindielectric", "plastic"):
+        return None
+    ratio = values["int_ior"] / values["ext_ior"]
+    f = fresnel(wo[2].abs(), ratio if name != "dielectric" or float(wo[2]) > 0 else 1 / ratio)
+    reflectance = values["specular_reflectance"][:, 0] if "specular_reflectance" in values else one
+    transmittance = values["specular_transmittance"][:, 0] if "specular_transmittance" in values else one
+    if name == "plastic":
+        return f * reflectance, 0 * one
+    if name == "thindielectric":  # the series of reflections between both faces
+        f = 2 * f / (1 + f)
+    return f * reflectance, (1 - f) * transmittance
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("case", [case for case in CASES if case.model.delta], ids=identify)
+def test_deltas_carry_what_fresnel_gives_them(case, angle):
+    """In the mean over ``lobe``, with its gradient: a probability is detached, an amount is not."""
+    for below in (False, True) if case.model.transmits else (False,):
+        wo = towards(angle, below).double()
+        values = tensors(case.values, torch.float64)
+        inputs = [t.requires_grad_() for t in leaves(values)]
+        expected = delta_amounts(case, values, wo)
+        if expected is None:
+            pytest.skip("no closed form here")
+        n = 1 << 12
+        rows = bsdfs.stacked([case.model.prepare(values)])
+        u = torch.full((2, n), 0.3, dtype=torch.float64)
+        # An even lattice rounds each probability to 1/n, so the shares are weighted by how often they came up.
+        lobe = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+        out = case.model.sample(lanes(rows, n), wo.expand(3, n), lobe if case.model.lobed else None, u)
+        weight = out.weight if out.eta is None else out.weight * out.eta.detach() ** 2
+        up = torch.isinf(out.pdf) & (out.wi[2] * wo[2] > 0)
+        down = torch.isinf(out.pdf) & (out.wi[2] * wo[2] < 0)
+        for lanes_of, amount in ((up, expected[0]), (down, expected[1])):
+            mean = torch.where(lanes_of, weight, 0.0).mean(1)
+            most = float(weight.detach().abs().max()) / n
+            assert ((mean - amount).abs() < 1e-6 + 1.1 * most).all(), f"{mean.tolist()} against {amount.tolist()}"
+            if not inputs or not (mean.requires_grad and amount.requires_grad):
+                continue
+            ours = torch.autograd.grad(mean.sum(), inputs, retain_graph=True, allow_unused=True)
+            theirs = torch.autograd.grad(amount.sum(), inputs, retain_graph=True, allow_unused=True)
+            for a, b, x in zip(ours, theirs, inputs, strict=True):
+                a, b = (torch.zeros_like(x) if g is None else g for g in (a, b))
+                if case.eta != 1 and case.model.name == "dielectric":
+                    continue  # eta^2 above hides a part of the gradient
+                if case.eta != 1:
+                    torch.testing.assert_close(
+                        a, b, rtol=2e-3 + 5 / n / max(float(amount.detach().min()), 1e-3), atol=2e-3
+                    )
+
+
+# --- Values
+
+
+def pairs(case: Case, n: int, dtype: torch.dtype, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Half of the pairs at random, half drawn by the model, so that narrow lobes are met."""
+    wo = uniform_sphere(torch.rand(2, n, generator=generator))
+    wi = uniform_sphere(torch.rand(2, n, generator=generator))
+    if not case.model.transmits:
+        wo, wi = (torch.stack((w[0], w[1], w[2].abs())) for w in (wo, wi))
+    u = torch.rand(3, n, generator=generator)
+    out = case.model.sample(lanes(case.rows(), n), wo, u[2] if case.model.lobed else None, u[:2])
+    drawn = (out.pdf > 0) & torch.isfinite(out.pdf) & (torch.arange(n) % 2 == 0)
+    wi = torch.where(drawn, out.wi, wi)
+    return normalize(wo.to(dtype)), normalize(wi.to(dtype))
+
+
+@pytest.mark.parametrize("case", CASES, ids=identify)
+def test_reciprocity(case):
+    """``f(wo, wi) = f(wi, wo)`` on one side; across, the radiance of either is divided by its squared index."""
+    if not case.model.reciprocal:
+        pytest.skip("not reciprocal by its definition")
+    wo, wi = pairs(case, 4096, torch.float64, torch.Generator().manual_seed(3))
+    p = lanes(case.rows(torch.float64), wo.shape[1])
+    there = case.model.eval(p, wo, wi) * wo[2].abs()
+    back = case.model.eval(p, wi, wo) * wi[2].abs()
+    if case.model.refracts:
+        there = there * torch.where(wo[2] < 0, case.eta**-2, 1.0)
+        back = back * torch.where(wi[2] < 0, case.eta**-2, 1.0)
+    assert (there > 0).any() or case.smooth
+    torch.testing.assert_close(there, back, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("case", CASES, ids=identify)
+def test_opaque_models_are_black_from_behind(case):
+    if case.model.transmits:
+        pytest.skip("light passes")
+    wo, wi = pairs(case, 512, torch.float32, torch.Generator().manual_seed(4))
+    p = lanes(case.rows(), wo.shape[1])
+    down = torch.tensor([1.0, 1.0, -1.0])[:, None]
+    for a, b in ((wo, wi * down), (wo * down, wi), (wo * down, wi * down)):
+        value, pdf = case.model.eval_pdf(p, a, b)
+        if bool((a[2] > 0).all()):
+            assert not value.any() and not pdf.any()
+        else:
+            assert not (value * (a[2] <= 0)).any() or case.model.name == "diffuse"
+
+
+@pytest.mark.parametrize("model", bsdfs.MODELS, ids=identify)
+def test_rows_of_one_model_do_not_meet(model):
+    """Two materials in one group of lanes give what each gives alone, whatever one has and the other has not."""
+    cases = cases_of(model)
+    generator = torch.Generator().manual_seed(5)
+    n = 512
+    for a, b in zip(cases, [*cases[1:], cases[0]], strict=True):
+        rows = bsdfs.stacked([case.model.prepare(tensors(case.values, torch.float32)) for case in (a, b)])
+        u = torch.rand(3, n, generator=generator)
+        wo = uniform_sphere(torch.rand(2, n, generator=generator))
+        wi = uniform_sphere(torch.rand(2, n, generator=generator))
+        if not model.transmits:
+            wo = torch.stack((wo[0], wo[1], wo[2].abs()))
+        row = torch.arange(n) % 2
+        both = _everything(model, bsdfs.gather(rows, row), wo, wi, u)
+        for i, case in enumerate((a, b)):
+            alone = _everything(model, lanes(case.rows(), n), wo, wi, u)
+            for x, y in zip(both, alone, strict=True):
+                assert torch.equal(x[..., row == i], y[..., row == i]), f"{a} beside {b}"
+
+
+def _everything(model: bsdfs.Bsdf, p: bsdfs.Parameters, wo: Tensor, wi: Tensor, u: Tensor) -> list[Tensor]:
+    n = wo.shape[1]
+    out = model.sample(p, wo, u[2] if model.lobed else None, u[:2])
+    value, pdf = model.eval_pdf(p, wo, wi)
+    parts = [out.wi, out.pdf, out.weight, value, model.albedo(p)]
+    return [
+        x.expand(3, n) if x.dim() == 2 else x.expand(n) for x in (*parts, pdf, *([] if out.eta is None else [out.eta]))
+    ]
+
+
+# --- Edges of the numbers
+
+
+def edge_directions(both_sides: bool) -> Tensor:
+    """Outgoing ``(3, n)``: along the normal, slanted, and ever closer to the horizon."""
+    columns = [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (-0.48, 0.64, 0.6)]
+    for z in (0.0, -0.0, 1e-7, 1e-4):
+        for angle in (0.0, 2.2):
+            r = math.sqrt(1 - z * z)
+            columns.append((r * math.cos(angle), r * math.sin(angle), z))
+    up = torch.tensor(columns).T
+    return torch.cat((up, up * torch.tensor([1.0, 1.0, -1.0])[:, None]), 1) if both_sides else up
+
+
+_EDGE_U = torch.cartesian_prod(*(torch.tensor([0.0, 2**-24, 0.5, 1 - 2**-24]),) * 3).T
+
+
+def edge_lanes(case: Case) -> tuple[Tensor, Tensor, Tensor]:
+    """All combinations of outgoing directions, degenerate and random incoming ones, and numbers at their ends."""
+    wo = edge_directions(case.model.transmits)
+    k, m = wo.shape[1], _EDGE_U.shape[1]
+    u = _EDGE_U.repeat(1, k)
+    wo = wo.repeat_interleave(m, 1)
+    generator = torch.Generator().manual_seed(8)
+    wi = uniform_sphere(torch.rand(2, k * m, generator=generator))
+    kind = torch.arange(k * m) % m
+    flat = torch.stack((torch.cos(kind * 1.0), torch.sin(kind * 1.0), torch.zeros(k * m)))
+    for i, special in enumerate(
+        (wo, -wo, mirrored(wo), -mirrored(wo), flat, edge_directions(True).repeat(1, m)[:, : k * m])
+    ):
+        wi = torch.where((kind >= 4 * i) & (kind < 4 * i + 4), special, wi)
+    return wo, wi, u
+
+
+@pytest.mark.parametrize("case", EDGES, ids=identify)
+def test_edge_numbers_stay_finite(case):
+    model = case.model
+    wo, wi, u = edge_lanes(case)
+    p = lanes(case.rows(), wo.shape[1])
+    out = model.sample(p, wo, u[2] if model.lobed else None, u[:2])
+
+    def lane(bad: Tensor) -> str:
+        i = int(bad.reshape(-1, bad.shape[-1]).any(0).nonzero()[0])
+        return (
+            f"wo {wo[:, i].tolist()} u {u[:, i].tolist()} sampled {out.wi[:, i].tolist()} pdf {float(out.pdf[i])} "
+            f"weight {out.weight.expand(3, wo.shape[1])[:, i].tolist()}; given wi {wi[:, i].tolist()}"
+        )
+
+    def no(bad: Tensor, what: str) -> None:
+        assert not bad.any(), f"{what}: {lane(bad)}"
+
+    no(~torch.isfinite(out.wi), "wi is not finite")
+    no(~torch.isfinite(out.weight.expand(3, wo.shape[1])), "weight is not finite")
+    no(torch.isnan(out.pdf) | (out.pdf < 0), "pdf of the draw")
+    no(torch.isinf(out.pdf) & torch.tensor(not model.delta), "a delta of a model that says it has none")
+    no(out.weight.expand(3, wo.shape[1]) < 0, "weight below 0")
+    live = out.pdf > 0
+    no(live & (((out.wi.double() ** 2).sum(0) - 1).abs() > 4e-6), "wi is no unit vector")
+    no(~live & (out.weight.expand(3, wo.shape[1]) != 0).any(0), "a failed draw has weight")
+    if out.eta is not None:
+        no(~torch.isfinite(out.eta) | (out.eta <= 0), "eta")
+    if not model.transmits:
+        no(live & (out.wi[2] < 0), "an opaque model draws from below")
+    for other in (wi, out.wi):
+        value, pdf = model.eval_pdf(p, wo, other)
+        no(~torch.isfinite(value) | (value < 0), "eval")
+        no(~torch.isfinite(pdf) | (pdf < 0), "pdf")
+    albedo = model.albedo(p)
+    assert torch.isfinite(albedo).all() and (albedo >= 0).all() and (albedo <= 1 + 1e-6).all()
+
+
+@pytest.mark.parametrize("case", EDGES, ids=identify)
+def test_gradients_stay_finite_at_the_edges(case):
+    """Through ``prepare``: of eval, and of the weights of all draws, deltas and failed ones too."""
+    wo, wi, u = edge_lanes(case)
+    values = tensors(case.values, torch.float32)
+    inputs = [t.requires_grad_() for t in leaves(values)]
+    if not inputs:
+        pytest.skip("no parameters")
+    p = lanes(bsdfs.stacked([case.model.prepare(values)]), wo.shape[1])
+    # Of directions as well: they depend on vertices.
+    wo, wi = wo.clone().requires_grad_(), wi.clone().requires_grad_()
+    out = case.model.sample(p, wo, u[2] if case.model.lobed else None, u[:2])
+    results = {"eval": case.model.eval(p, wo, wi), "weight": out.weight}
+    for name, result in results.items():
+        if not result.requires_grad:
+            continue
+        grads = torch.autograd.grad(result.sum(), [*inputs, wo, wi], retain_graph=True, allow_unused=True)
+        for gradient, x in zip(grads, [*inputs, wo, wi], strict=True):
+            if gradient is None:
+                continue
+            bad = ~torch.isfinite(gradient)
+            where = ""
+            if bad.any() and gradient.shape[-1] == wo.shape[1]:
+                i = int(bad.any(0).nonzero()[0])
+                where = f"wo {wo[:, i].tolist()} wi {wi[:, i].tolist()} u {u[:, i].tolist()}"
+            assert not bad.any(), (
+                f"gradient of {name} in a tensor {tuple(x.shape)}: {gradient[bad][:3].tolist()} {where}"
+            )
+
+
+# --- Gradients
+
+
+def inside(values: bsdfs.Parameters) -> bsdfs.Parameters:
+    """Moved off the ends of [0, 1], where a clamp has no derivative."""
+    out: bsdfs.Parameters = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            out[key] = inside(value)
+        else:
+            out[key] = torch.where(value == 0, 0.03, torch.where(value == 1, 0.97, value))
+    return out
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case.differentiable and not case.smooth], ids=identify)
+def test_gradients_of_eval(case):
+    """Finite differences in every number that a material is given, at directions within its lobes."""
+    values = inside(tensors(case.values, torch.float64))
+    flat = [t.requires_grad_() for t in leaves(values)]
+    wo, wi = pairs(case, 12, torch.float64, torch.Generator().manual_seed(11))
+
+    def refill(like: bsdfs.Parameters, new: list[Tensor]) -> bsdfs.Parameters:
+        return {key: refill(v, new) if isinstance(v, dict) else new.pop(0) for key, v in like.items()}
+
+    def value(*inputs: Tensor) -> Tensor:
+        p = lanes(bsdfs.stacked([case.model.prepare(refill(values, list(inputs)))]), wo.shape[1])
+        return case.model.eval(p, wo, wi)
+
+    assert value(*flat).requires_grad
+    assert torch.autograd.gradcheck(value, flat, eps=1e-6, atol=1e-5, rtol=1e-3)
