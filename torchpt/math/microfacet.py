@@ -1,0 +1,171 @@
+"""The GGX microfacet distribution, anisotropic, with Smith's masking and the sampling of visible normals.
+
+Trowbridge and Reitz 1975; Walter, Marschner, Li, Torrance, *Microfacet Models for Refraction through Rough Surfaces*,
+2007; Heitz, *Understanding the Masking-Shadowing Function*, 2014. Directions ``(3, N)`` are local, normals ``m`` lie in
+the upper hemisphere, and roughnesses ``(N,)`` lie in [:data:`ALPHA_MIN`, 1].
+
+Everything is written with the *stretched length* ``s(w) = sqrt(z^2 + (alpha_u x)^2 + (alpha_v y)^2)``: Smith's
+``G1 = 2 |z| / (|z| + s)`` needs no tangent and no quotient by a cosine.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import dot, normalize
+
+__all__ = [
+    "ALPHA_MIN",
+    "BOUNDED",
+    "Reflection",
+    "correlated_masking",
+    "ggx",
+    "half_vector",
+    "is_smooth",
+    "masking",
+    "reflect",
+    "reflection",
+    "roughness",
+    "sample_normal",
+    "stretched_length",
+]
+
+#: Below this a rough surface is treated as a smooth one: a delta lobe.
+ALPHA_MIN = 1e-4
+#: Whether models that only reflect draw no normal that reflects below the surface (Eto and Tokuyoshi 2023).
+BOUNDED = True
+
+
+def is_smooth(alpha: Tensor) -> Tensor:
+    """Whether a roughness means a delta lobe: below :data:`ALPHA_MIN`, which itself is rough in any dtype."""
+    return alpha < 0.99 * ALPHA_MIN
+
+
+def roughness(alpha: Tensor) -> Tensor:
+    """A roughness that the formulas here can take."""
+    return alpha.clamp_min(ALPHA_MIN)
+
+
+def ggx(m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
+    """Density ``D(m)`` of normals ``(N,)``: ``1 / (pi au av (x^2/au^2 + y^2/av^2 + z^2)^2)``.
+
+    This form of the bracket has no cancellation; ``1 + cos^2 (alpha^2 - 1)`` rounds to 0 below alpha = 1.7e-4.
+    """
+    x, y = m[0] / alpha_u, m[1] / alpha_v
+    # At least 1 for unit normals; a zero vector, which stands for no normal, must not divide by 0.
+    bracket = torch.addcmul(torch.addcmul(m[2] * m[2], x, x), y, y).clamp_min(1e-9)
+    return 1.0 / (math.pi * (alpha_u * alpha_v) * (bracket * bracket))
+
+
+def stretched_length(w: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
+    """``s(w)`` ``(N,)``: the length of ``w`` seen from the configuration in which the normals are uniform."""
+    x, y = w[0] * alpha_u, w[1] * alpha_v
+    return torch.addcmul(torch.addcmul(w[2] * w[2], x, x), y, y).sqrt()
+
+
+def masking(cos: Tensor, length: Tensor) -> Tensor:
+    """Smith's ``G1`` ``(N,)`` from ``|cos|`` and ``s(w)``; 0 at grazing, where ``cos = 0``."""
+    return 2.0 * cos / (cos + length)
+
+
+def correlated_masking(cos_o: Tensor, s_o: Tensor, cos_i: Tensor, s_i: Tensor) -> Tensor:
+    """Height-correlated ``G2 / cos_o = 2 cos_i / (cos_o s_i + cos_i s_o)`` (Heitz 2014, equation 99), finite everywhere."""
+    return 2.0 * cos_i / (cos_o * s_i + cos_i * s_o).clamp_min(torch.finfo(cos_i.dtype).tiny)
+
+
+def half_vector(wo: Tensor, wi: Tensor) -> Tensor:
+    """Unit ``wo + wi``."""
+    return normalize(wo + wi)
+
+
+def reflect(w: Tensor, m: Tensor, cos: Tensor) -> Tensor:
+    """Mirror image of ``w`` about ``m``, their cosine given."""
+    return torch.addcmul(-w, m, 2.0 * cos)
+
+
+class _Bound(NamedTuple):
+    """The lower end ``-k z_std`` of the spherical cap from which stretched directions are drawn."""
+
+    k: Tensor
+    rest: Tensor  # 1 - k, without cancellation
+
+
+def _bound(wo: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> _Bound:
+    """Equations 5 and 6 of Eto and Tokuyoshi (*Bounded VNDF Sampling for Smith-GGX Reflections*, 2023), alpha <= 1."""
+    a2 = torch.minimum(alpha_u, alpha_v).clamp_max(1.0).square()
+    s = 1.0 + torch.addcmul(wo[0] * wo[0], wo[1], wo[1]).clamp_min(torch.finfo(wo.dtype).tiny).sqrt()
+    s2, z2 = s * s, wo[2] * wo[2]
+    inverse = 1.0 / (s2 + a2 * z2)
+    return _Bound((1.0 - a2) * s2 * inverse, a2 * (s2 + z2) * inverse)
+
+
+def sample_normal(wo: Tensor, alpha_u: Tensor, alpha_v: Tensor, u: Tensor, bounded: bool = False) -> Tensor:
+    """Draw a visible normal ``(3, N)`` for ``wo.z >= 0``.
+
+    In the configuration where normals are uniform, directions reflected at visible ones fill a spherical cap (Dupuy and
+    Benyoub, *Sampling Visible GGX Normals with Spherical Caps*, 2023). With ``p = z + 1`` of such a direction, each factor
+    below is a sum of what is positive: nothing cancels, at any roughness and angle.
+
+    Args:
+        wo: ``(3, N)``.
+        alpha_u: ``(N,)``.
+        alpha_v: ``(N,)``.
+        u: ``(2, N)``.
+        bounded: leave out (most of) the normals that reflect ``wo`` below the surface.
+    """
+    x, y = wo[0] * alpha_u, wo[1] * alpha_v
+    l2 = torch.addcmul(x * x, y, y)
+    length = torch.addcmul(l2, wo[2], wo[2]).sqrt().clamp_min(torch.finfo(wo.dtype).tiny)
+    inverse = 1.0 / length
+    z = wo[2] * inverse  # of the stretched direction
+    down = l2 * inverse / (length + wo[2])  # 1 - z
+    low, lift = z, 0.0
+    if bounded:
+        bound = _bound(wo, alpha_u, alpha_v)
+        low, lift = bound.k * z, bound.rest * z
+        down = down + lift
+    height = (1.0 - u[1]) * (1.0 + low)
+    sine = ((height + down) * (u[1] * (1.0 + low))).clamp_min(0.0).sqrt()
+    phi = (2.0 * math.pi) * u[0]
+    nx = torch.addcmul(x * inverse, sine, torch.cos(phi)) * alpha_u
+    ny = torch.addcmul(y * inverse, sine, torch.sin(phi)) * alpha_v
+    return normalize(torch.stack((nx, ny, height + lift)))
+
+
+class Reflection(NamedTuple):
+    """A rough mirror of reflectance 1, each ``(N,)``: 0 where ``wo`` or ``wi`` is not above the surface."""
+
+    m: Tensor  # (3, N) half vector
+    cos_m: Tensor  # of wo and m
+    value: Tensor  # f cos(theta_i)
+    pdf: Tensor  # of reflecting at sample_normal(..., bounded)
+
+
+def reflection(
+    wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, bounded: bool = False, correlated: bool = False
+) -> Reflection:
+    """``D G2 / (4 cos_o)`` and the density of visible normals ``D / (2 (k cos_o + s(wo)))`` carried over to ``wi``.
+
+    Args:
+        wo: ``(3, N)``.
+        wi: ``(3, N)``.
+        alpha_u: ``(N,)``.
+        alpha_v: ``(N,)``.
+        bounded: as the normal was drawn.
+        correlated: masking and shadowing correlated by height, rather than the product ``G1(wo) G1(wi)``.
+    """
+    m = half_vector(wo, wi)
+    above = torch.minimum(wo[2], wi[2]).sign().clamp_min(0.0)
+    cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
+    s_o, s_i = stretched_length(wo, alpha_u, alpha_v), stretched_length(wi, alpha_u, alpha_v)
+    d = ggx(m, alpha_u, alpha_v) * above
+    if correlated:
+        value = 0.25 * d * correlated_masking(cos_o, s_o, cos_i, s_i)
+    else:
+        value = d * cos_i / ((cos_o + s_o) * (cos_i + s_i))
+    scaled = _bound(wo, alpha_u, alpha_v).k * cos_o if bounded else cos_o
+    return Reflection(m, dot(wo, m), value, 0.5 * d / (scaled + s_o))
