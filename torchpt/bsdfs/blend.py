@@ -1,0 +1,118 @@
+"""A blend of two models: ``f = (1 - weight) a + weight b``, each of any kind, blends included."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.bsdfs.base import Bsdf, Parameters
+from torchpt.bsdfs.lobes import weighed
+from torchpt.records import BsdfSample
+
+__all__ = ["Blend"]
+
+
+@dataclass(frozen=True)
+class Blend(Bsdf):
+    """Two models at once. Where one lets light through and the other does not, the opaque one meets both sides alike.
+
+    Attributes:
+        a: the model at weight 0.
+        b: the model at weight 1.
+    """
+
+    a: Bsdf
+    b: Bsdf
+
+    name = "blend"
+    parameters = {"weight": 0.5}  # noqa: RUF012
+    lobed = True
+
+    def __post_init__(self) -> None:
+        a, b = self.a, self.b
+        flags = {
+            "delta": a.delta or b.delta,
+            "smooth": a.smooth and b.smooth,
+            "transmits": a.transmits or b.transmits,
+            "refracts": a.refracts or b.refracts,
+            "anisotropic": a.anisotropic or b.anisotropic,
+            "conserves": a.conserves and b.conserves,
+            "reciprocal": a.reciprocal and b.reciprocal,
+        }
+        for flag, value in flags.items():
+            object.__setattr__(self, flag, value)
+
+    def prepare(self, values: Parameters) -> Parameters:
+        """Both, each by its own."""
+        return {"weight": values["weight"], "a": self.a.prepare(values["a"]), "b": self.b.prepare(values["b"])}
+
+    def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Bsdf`."""
+        weight = parameters["weight"].clamp(0.0, 1.0)
+        value_a, pdf_a = self._facing(self.a).eval_pdf(parameters["a"], wo, wi)
+        value_b, pdf_b = self._facing(self.b).eval_pdf(parameters["b"], wo, wi)
+        return value_a + weight * (value_b - value_a), pdf_a + weight * (pdf_b - pdf_a)
+
+    def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        """One of the two by the weight; the other counts too, but for deltas."""
+        assert lobe is not None
+        weight = parameters["weight"].clamp(0.0, 1.0)
+        often = weight.detach()
+        second = lobe < often
+        # What is left of the number after the choice is uniform again.
+        low, width = torch.where(second, 0.0, often), torch.where(second, often, 1.0 - often)
+        lobe = ((lobe - low) / width).clamp(0.0, 1.0 - 2.0**-24)
+        a = self._facing(self.a).sample(parameters["a"], wo, lobe if self.a.lobed else None, u)
+        b = self._facing(self.b).sample(parameters["b"], wo, lobe if self.b.lobed else None, u)
+        wi, pdf = torch.where(second, b.wi, a.wi), torch.where(second, b.pdf, a.pdf).detach()
+        drawn = weighed(self, parameters, wo, wi, (pdf > 0).to(pdf.dtype))
+        density, value = drawn.pdf, drawn.weight
+        if self.delta:
+            jump = torch.isinf(pdf)
+            amount = torch.where(second, weight, 1.0 - weight) / width
+            value = torch.where(jump, torch.where(second, b.weight, a.weight) * amount, value)
+            density = torch.where(jump, torch.inf, density)
+        eta = None
+        if self.refracts:
+            one = torch.ones_like(lobe)
+            eta = torch.where(second, one if b.eta is None else b.eta, one if a.eta is None else a.eta)
+        return BsdfSample(drawn.wi, density, value, eta)
+
+    def albedo(self, parameters: Parameters) -> Tensor:
+        """Blended likewise."""
+        a, b = self.a.albedo(parameters["a"]), self.b.albedo(parameters["b"])
+        return a + parameters["weight"].clamp(0.0, 1.0) * (b - a)
+
+    def weights(self) -> Iterator[Tensor]:
+        """Those of both."""
+        yield from self.a.weights()
+        yield from self.b.weights()
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.a}, {self.b})"
+
+    def _facing(self, inner: Bsdf) -> Bsdf:
+        return _Mirrored(inner) if self.transmits and not inner.transmits else inner
+
+
+@dataclass(frozen=True)
+class _Mirrored(Bsdf):
+    """An opaque model that meets both sides: what is below is turned up."""
+
+    inner: Bsdf
+
+    def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+        side = torch.copysign(torch.ones_like(wo[2]), wo[2])
+        return self.inner.eval_pdf(parameters, _turned(wo, side), _turned(wi, side))
+
+    def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        side = torch.copysign(torch.ones_like(wo[2]), wo[2])
+        drawn = self.inner.sample(parameters, _turned(wo, side), lobe, u)
+        return BsdfSample(_turned(drawn.wi, side), drawn.pdf, drawn.weight, drawn.eta)
+
+
+def _turned(w: Tensor, side: Tensor) -> Tensor:
+    return torch.stack((w[0], w[1], w[2] * side))
