@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from torchpt.commands.interrupt import Interrupt
+from torchpt.commands.notices import notices
 from torchpt.commands.render import Job, described, plain
 
 __all__ = ["info", "lines"]
@@ -22,8 +23,9 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
     """
     from torchpt.scene.scene import Scene, device_of
 
-    description, wishes = described(job)
-    facts = Scene(description, device_of(wishes.render.device)).info(wishes)
+    with notices():
+        description, wishes = described(job)
+        facts = Scene(description, device_of(wishes.render.device)).info(wishes)
     interrupt.check()
     if as_json:
         print(json.dumps(plain(facts), allow_nan=False))

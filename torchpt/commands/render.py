@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.commands.interrupt import Interrupt, Interrupted
+from torchpt.commands.notices import notices
 from torchpt.commands.progress import Bar
 from torchpt.errors import OutputError, SceneError
 
@@ -51,16 +52,17 @@ def render(job: Job, interrupt: Interrupt) -> int:
     """
     from torchpt.images import check_writable
 
-    description, wishes = described(job)
-    outs = _outputs(job, wishes)
-    preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
-    for path in (*outs, *(_preview_files(preview) if preview else ())):
-        check_writable(path)
+    with notices():
+        description, wishes = described(job)
+        outs = _outputs(job, wishes)
+        preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
+        for path in (*outs, *(_preview_files(preview) if preview else ())):
+            check_writable(path)
 
-    from torchpt.render import first_hit, render_scene
-    from torchpt.scene.scene import Scene, device_of
+        from torchpt.render import first_hit, render_scene
+        from torchpt.scene.scene import Scene, device_of
 
-    scene = Scene(description, device_of(wishes.render.device))
+        scene = Scene(description, device_of(wishes.render.device))
     if preview:
         hits = first_hit(scene, wishes)
         for path, name in zip(_preview_files(preview), ("albedo", "normal"), strict=False):

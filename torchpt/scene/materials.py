@@ -607,20 +607,14 @@ def check_material(material: Material, key: str, materials: Mapping[str, Materia
     """
     if isinstance(material, Blend):
         name = key.removeprefix("materials.")
-        trail = (name,) if materials.get(name) is material else ()
-        _check_blend(material, key, materials, file, trail, 1)
-    if "two_sided" in material.model_fields_set and slot_of(material, key, materials).model.transmits:
-        raise SceneError(f"{key}.two_sided", material.two_sided, "no two_sided where light passes through", file)
-    _warn_of_energy(material, key, file)
-
-
-def _warn_of_energy(material: Material, key: str, file: str | None) -> None:
-    """Warn of a material, and of those inside it that have no name of their own."""
-    if isinstance(material, Blend):
+        _check_blend(material, key, materials, file, (name,) if materials.get(name) is material else (), 1)
         for side, item in _sides(material):
             if isinstance(item, Material):
-                _warn_of_energy(item, f"{key}.{side}", file)
-    elif problem := material.energy():
+                check_material(item, f"{key}.{side}", materials, file)
+    if "two_sided" in material.model_fields_set and slot_of(material, key, materials).model.transmits:
+        expected = "no two_sided, as light passes through this material (it is for opaque ones only)"
+        raise SceneError(f"{key}.two_sided", material.two_sided, expected, file)
+    if problem := material.energy():
         where = f"{file}: {key}" if file else key
         warnings.warn(f"{where}: {problem}", EnergyWarning, stacklevel=2)
 

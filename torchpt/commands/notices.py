@@ -1,0 +1,40 @@
+"""Warnings on the command line: one line each on stderr, once it is certain that no error line takes their place."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+from torchpt.errors import EnergyWarning
+
+__all__ = ["notices"]
+
+
+@contextmanager
+def notices() -> Iterator[None]:
+    """Context whose warnings about the scene are printed where it ends well; other warnings are Python's as before."""
+    lines: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", EnergyWarning)
+        show = warnings.showwarning
+
+        def keep(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, EnergyWarning):
+                lines.append(f"torchpt: warning: {' '.join(str(message).split())}")
+            else:
+                show(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = keep
+        yield
+    for text in dict.fromkeys(lines):
+        print(text, file=sys.stderr)
