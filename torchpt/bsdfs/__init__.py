@@ -6,10 +6,15 @@ from torchpt.bsdfs.base import Bsdf, Parameters, Table, gather, stacked
 from torchpt.bsdfs.blend import Blend
 from torchpt.bsdfs.blinn_phong import BlinnPhong
 from torchpt.bsdfs.conductor import Conductor
+from torchpt.bsdfs.dielectric import Dielectric
 from torchpt.bsdfs.diffuse import Diffuse
 from torchpt.bsdfs.microfacet import Microfacet
 from torchpt.bsdfs.nonmetal import Nonmetal
+from torchpt.bsdfs.null import Null
 from torchpt.bsdfs.phong import Phong
+from torchpt.bsdfs.roughconductor import RoughConductor
+from torchpt.bsdfs.roughdielectric import RoughDielectric
+from torchpt.bsdfs.thindielectric import ThinDielectric
 
 __all__ = [
     "MODELS",
@@ -17,12 +22,17 @@ __all__ = [
     "BlinnPhong",
     "Bsdf",
     "Conductor",
+    "Dielectric",
     "Diffuse",
     "Microfacet",
     "Nonmetal",
+    "Null",
     "Parameters",
     "Phong",
+    "RoughConductor",
+    "RoughDielectric",
     "Table",
+    "ThinDielectric",
     "gather",
     "stacked",
 ]
@@ -37,4 +47,13 @@ MODELS: tuple[Bsdf, ...] = (
     Nonmetal(),
     Microfacet(),
     Blend(Diffuse(), Microfacet()),
+    RoughConductor(),
+    RoughConductor(schlick=True),
+    RoughConductor(anisotropic=True),
+    RoughConductor(schlick=True, anisotropic=True),
+    Dielectric(),
+    ThinDielectric(),
+    RoughDielectric(),
+    RoughDielectric(anisotropic=True),
+    Null(),
 )

@@ -1,0 +1,106 @@
+"""A rough boundary between two clear media: GGX microfacets that reflect and refract.
+
+Walter, Marschner, Li, Torrance, *Microfacet Models for Refraction through Rough Surfaces*, 2007.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.bsdfs.base import Bsdf, Parameters
+from torchpt.bsdfs.dielectric import Dielectric, clear, tinted
+from torchpt.bsdfs.lobes import weighed
+from torchpt.bsdfs.roughconductor import alphas, rough
+from torchpt.math import microfacet
+from torchpt.math.fresnel import INDEX_MATCHED, fresnel_dielectric, refract
+from torchpt.math.vectors import dot, normalize
+from torchpt.records import BsdfSample
+
+__all__ = ["RoughDielectric"]
+
+
+@dataclass(frozen=True)
+class RoughDielectric(Bsdf):
+    """Frosted glass. A row with both roughnesses below ``1e-4`` is polished glass, one with equal indices is nothing.
+
+    Attributes:
+        anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
+    """
+
+    name = "roughdielectric"
+    parameters = {**Dielectric.parameters, "alpha": 0.1, "alpha_u": 0.1, "alpha_v": 0.1}  # noqa: RUF012
+    lobed = True
+    delta = True
+    transmits = True
+    refracts = True
+
+    anisotropic: bool = False
+
+    def prepare(self, values: Parameters) -> Parameters:
+        """See :class:`Bsdf`."""
+        out = {**clear(values), **rough(values, self.anisotropic)}
+        # Facets between equal indices bend nothing, however they lie.
+        out["smooth"] = out["smooth"] | ((out["eta"] - 1.0).abs() < INDEX_MATCHED)
+        return out
+
+    def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+        """Equations 20 and 21 of Walter et al., and the densities of equations 14 and 17 for visible normals."""
+        au, av = alphas(parameters)
+        eta = parameters["eta"]
+        reflects = wo[2] * wi[2] > 0
+        eta_it = torch.where(wo[2] > 0, eta, 1.0 / eta)
+        h = torch.addcmul(wo, wi, torch.where(reflects, 1.0, eta_it))
+        m = normalize(h)
+        m = m * torch.copysign(torch.ones_like(m[2]), m[2])
+        o, i = dot(wo, m), dot(wi, m)
+        cos_o, cos_i = wo[2].abs(), wi[2].abs()
+        # A facet is seen from the side of the surface on which the direction lies, or not at all.
+        seen = torch.minimum(o * wo[2], i * wi[2]) > 0
+        on = seen & ~parameters["smooth"]
+        side = fresnel_dielectric(o, eta)
+        s_o, s_i = microfacet.stretched_length(wo, au, av), microfacet.stretched_length(wi, au, av)
+        h2 = dot(h, h)
+        # Solid angle of normals over that of wi: 1 / (4 i) and eta^2 i / |wo + eta wi|^2.
+        through = (o * i).abs() / torch.where(on, h2, 1.0)
+        spread = torch.where(reflects, 0.25, through)
+        visible = torch.where(on, microfacet.ggx(m, au, av) * 2.0 / (cos_o + s_o).clamp_min(_TINY) * spread, 0.0)
+        r = side.reflectance
+        value = visible * microfacet.masking(cos_i, s_i)
+        colour = torch.where(
+            reflects,
+            tinted(r * value, parameters["specular_reflectance"]),
+            tinted((1.0 - r) * value, parameters["specular_transmittance"]),
+        )
+        return colour, visible * torch.where(reflects, r, (1.0 - r) * (eta_it * eta_it))
+
+    def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        """A visible normal, then reflection or refraction as its reflectance has it."""
+        assert lobe is not None
+        smooth = parameters["smooth"]
+        up = torch.copysign(torch.ones_like(wo[2]), wo[2])
+        m = microfacet.sample_normal(wo * up, *alphas(parameters), u)
+        o = dot(wo, m)
+        side = fresnel_dielectric(o, parameters["eta"])
+        reflects = lobe < side.reflectance
+        wi = torch.where(reflects, microfacet.reflect(wo, m, o), normalize(refract(wo, m, o, side)))
+        # A facet may send the ray to the other side of the surface than is meant: no pair of directions is drawn so.
+        kept = ((wi[2] * wo[2] > 0) == reflects).to(wo.dtype)
+        drawn = weighed(self, parameters, wo, wi, kept)
+        polished = Dielectric().sample(parameters, wo, lobe, u)
+        assert polished.eta is not None
+        return BsdfSample(
+            torch.where(smooth, polished.wi, drawn.wi),
+            torch.where(smooth, polished.pdf, drawn.pdf),
+            torch.where(smooth, polished.weight, drawn.weight),
+            torch.where(smooth, polished.eta, torch.where(reflects, 1.0, side.eta_it)).detach(),
+        )
+
+    def albedo(self, parameters: Parameters) -> Tensor:
+        """White: what it takes is what it gives."""
+        return torch.ones_like(parameters["eta"]).expand(3, -1)
+
+
+_TINY = 1e-30
