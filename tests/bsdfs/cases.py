@@ -48,9 +48,20 @@ class Case:
     def __str__(self) -> str:
         return f"{self.model}: {self.label or brief(self.values)}".replace("[", "(").replace("]", ")")
 
+    @property
+    def narrowest(self) -> float:
+        """The smallest alpha of a lobe that is no delta; 1 where no lobe has one."""
+        return _narrowest(self.values)
+
     def rows(self, dtype: torch.dtype = torch.float32) -> Parameters:
         """The material as stacked rows of its model."""
         return bsdfs.stacked([self.model.prepare(tensors(self.values, dtype))])
+
+
+def _narrowest(values: Values) -> float:
+    inner = [_narrowest(value) for value in values.values() if isinstance(value, dict)]
+    own = _alphas({key: value for key, value in values.items() if key in ("alpha", "alpha_u", "alpha_v", "roughness")})
+    return min([1.0, *inner, *(max(alpha, 1e-4) for alpha in own)])
 
 
 def brief(values: Values) -> str:

@@ -84,19 +84,32 @@ class Tree:
 _NODES, _WEIGHTS = (torch.from_numpy(a) for a in np.polynomial.legendre.leggauss(4))
 
 
-def _gauss(f: Function, rects: Tensor, azimuth: float) -> Tensor:
-    """Integrals ``(C, n)`` over rectangles ``(4, n)`` of the chart by one tensor rule of 16 points, in solid angle."""
+def _gauss(f: Function, rects: Tensor, azimuth: float) -> tuple[Tensor, Tensor]:
+    """Integrals ``(C, n)`` over rectangles ``(4, n)`` by one tensor rule of 16 points, and the largest values met."""
     y0, y1, p0, p1 = rects
     y = 0.5 * (y0 + y1) + 0.5 * (y1 - y0) * _NODES[:, None]  # (4, n)
     p = 0.5 * (p0 + p1) + 0.5 * (p1 - p0) * _NODES[:, None]
     shape = (4, 4, rects.shape[1])
     yy, pp = y[:, None].expand(shape).reshape(-1), p[None].expand(shape).reshape(-1)
-    values = torch.cat(
-        [f(direction(a, b, azimuth)) for a, b in zip(yy.split(1 << 16), pp.split(1 << 16), strict=True)], 1
-    )
+    parts = zip(yy.split(1 << 16), pp.split(1 << 16), strict=True)
+    values = torch.cat([f(direction(a, b, azimuth)) for a, b in parts], 1)
     weight = (_WEIGHTS[:, None, None] * _WEIGHTS[None, :, None]) * (0.25 * (y1 - y0) * (p1 - p0))
     weight = weight.reshape(-1) / torch.cosh(yy) ** 2
-    return (values * weight).reshape(-1, 16, rects.shape[1]).sum(1)
+    shape = (-1, 16, rects.shape[1])
+    return (values * weight).reshape(shape).sum(1), values.reshape(shape).amax(1)
+
+
+def _children(cells: Tensor) -> Tensor:
+    """Four parts ``(4, n, 4)`` of each rectangle: quadrants, or strips across where it is long."""
+    y0, y1, p0, p1 = cells
+    tall, wide = y1 - y0 > 2 * (p1 - p0), p1 - p0 > 2 * (y1 - y0)
+    i = torch.arange(4)[:, None]
+    rows = torch.where(tall, 4, torch.where(wide, 1, 2))
+    columns = 4 // rows
+    row, column = i // columns, i % columns
+    step_y, step_p = (y1 - y0) / rows, (p1 - p0) / columns
+    parts = (y0 + row * step_y, y0 + (row + 1) * step_y, p0 + column * step_p, p0 + (column + 1) * step_p)
+    return torch.stack(parts).transpose(1, 2)
 
 
 @dataclass(frozen=True)
@@ -107,33 +120,56 @@ class Integral:
     error: Tensor  # (C, n)
 
 
-def integrate(f: Function, rects: Tensor, azimuth: float, tolerance: float, rounds: int = 14) -> Integral:
-    """Adaptive cubature over each rectangle: a cell is quartered until that changes its integrals by less than ``tolerance``.
+def integrate(
+    f: Function,
+    rects: Tensor,
+    azimuth: float,
+    tolerance: float,
+    scouts: tuple[Tensor, Tensor] | None = None,
+    rounds: int = 24,
+) -> Integral:
+    """Adaptive cubature over each rectangle: a cell is parted until that changes its integrals by less than ``tolerance``.
 
-    A curve along which the function jumps is followed down to cells whose whole content is below the tolerance. The
-    difference of a cell and its quarters bounds the error of the quarters generously where the function is smooth.
+    Nor is a cell done while a scout in it has seen a far larger value than any node: else a narrow lobe at the end of a
+    long leaf would be passed by. A curve along which the function jumps is followed down to cells whose whole content is
+    below the tolerance. The difference of a cell and its parts bounds the error of the parts generously where it is smooth.
+
+    Args:
+        f: the functions.
+        rects: ``(4, n)`` leaves.
+        azimuth: of longitude 0.
+        tolerance: absolute, for a cell.
+        scouts: places ``(2, m)`` and leaves ``(m,)`` of points where lobes are thought to be.
+        rounds: how often at most.
     """
-    leaf, cells, coarse = torch.arange(rects.shape[1]), rects, _gauss(f, rects, azimuth)
+    leaf, cells, (coarse, _) = torch.arange(rects.shape[1]), rects, _gauss(f, rects, azimuth)
     value = torch.zeros(coarse.shape[0], rects.shape[1], dtype=torch.float64)
     error = torch.zeros_like(value)
+    places, home = (torch.zeros(2, 0).double(), torch.zeros(0).long()) if scouts is None else scouts
+    seen = f(direction(places[0], places[1], azimuth))
     for step in range(rounds):
-        y0, y1, p0, p1 = cells
-        y, p = 0.5 * (y0 + y1), 0.5 * (p0 + p1)
-        quarters = torch.stack(
-            [torch.stack(corner) for corner in ((y0, y, p0, p), (y0, y, p, p1), (y, y1, p0, p), (y, y1, p, p1))],
-            2,
-        )  # (4, n, 4)
-        fine = _gauss(f, quarters.reshape(4, -1), azimuth).reshape(coarse.shape[0], -1, 4)
+        n = cells.shape[1]
+        parts = _children(cells)
+        fine, peak = (x.reshape(len(x), n, 4) for x in _gauss(f, parts.reshape(4, -1), azimuth))
         total = fine.sum(2)
         difference = (total - coarse).abs()
-        again = (difference.amax(0) > tolerance) & (step < rounds - 1)
+        most = torch.zeros_like(total).scatter_reduce_(1, home.expand_as(seen), seen, "amax")
+        y0, y1, p0, p1 = cells
+        area = (torch.tanh(y1) - torch.tanh(y0)) * (p1 - p0)
+        missed = (most > 1.5 * peak.amax(2)) & (most * area > tolerance)
+        again = ((difference > tolerance) | missed).any(0) & (step < rounds - 1)
         value.index_add_(1, leaf[~again], total[:, ~again])
         error.index_add_(1, leaf[~again], difference[:, ~again] * (0.1 if step < rounds - 1 else 1.0))
         if not again.any():
             break
-        cells = quarters[:, again].reshape(4, -1)
-        coarse = fine[:, again].reshape(coarse.shape[0], -1)
+        cells, coarse = parts[:, again].reshape(4, -1), fine[:, again].reshape(fine.shape[0], -1)
         leaf = leaf[again].repeat_interleave(4)
+        stay = again[home]
+        places, seen = places[:, stay], seen[:, stay]
+        home = 4 * (again.cumsum(0) - 1)[home[stay]]
+        # A scout belongs to the last part that begins before it.
+        begins = [(cells[0, home + i] <= places[0]) & (cells[2, home + i] <= places[1]) for i in range(4)]
+        home = home + (torch.stack(begins).long() * torch.arange(4)[:, None]).amax(0)
     return Integral(value, error)
 
 
