@@ -195,7 +195,7 @@ def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, own: boo
             if own
             and work >= COMPILE_REPAYS
             and plan.dtype == torch.float32
-            and not scene.description.bsdfs  # code of the user's own may hold what cannot be compiled
+            and not scene.own_models  # code of the user's own may hold what cannot be compiled
             and can_compile(scene.device)
             else "off"
         )

@@ -51,7 +51,7 @@ def test_two_graphs_a_stage_and_none_later():
 def test_more_graphs_than_two_are_an_error_not_a_fall_back():
     scene = torchpt.load("cornell_box")
     world, _ = scene.world(torch.float32)
-    plan = compiled.Plan("sobol", "mis", None, torch.float32, False)
+    plan = compiled.Plan("sobol", "mis", None, torch.float32, False, False)
     stages = compiled.CompiledStages(plan, world)
 
     def stage(x: torch.Tensor) -> torch.Tensor:

@@ -51,7 +51,8 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
     if any(model.refracts for model in world.models):
         state = replace(state, eta=torch.ones_like(state.t_max))
     # Where a delta sends a ray on, its next point slides along it as the camera's does.
-    sliding = plan.attached and any(model.delta for model in world.models)
+    exact = plan.attached or plan.dtype == torch.float64
+    sliding = exact and any(model.delta for model in world.models)
 
     def retire(index: Tensor) -> None:
         if len(index):
@@ -66,7 +67,7 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
             hit = search.nearest(state, depth)
         # Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64
         # the camera's point is found anew, since the search rounds it to float32.
-        slide = sliding or (depth == 1 and (plan.attached or plan.dtype == torch.float64))
+        slide = sliding or (depth == 1 and exact)
         ends, groups = partition(world, hit)
         _gather_light(stages, state, hit, ends, slide)
         retire(ends.missed)

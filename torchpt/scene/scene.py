@@ -49,7 +49,8 @@ def load(
         RenderError: the device is not there.
     """
     description = read_description(source, bsdfs)
-    return Scene(description, device_of(settings(description).render.device if device is None else device))
+    chosen = device_of(settings(description).render.device if device is None else device)
+    return Scene(description, chosen, tuple((bsdfs or {}).values()))
 
 
 def device_of(name: str | torch.device) -> torch.device:
@@ -71,13 +72,14 @@ class Scene:
     Attributes:
         description: what was read.
         device: where its tensors live.
+        own_models: BSDFs that the caller wrote.
         params: every tensor by dotted name (``materials.*``, ``shapes.*``, ``lights.*``, ``camera.*``): colours ``(3,)``,
             vertices ``(V, 3)`` in the mesh's own space, poses ``(4, 4)``. Changing one in place takes effect at the
             next render; to differentiate, hand replacements to ``torchpt.render(scene, params=...)``.
     """
 
-    def __init__(self, description: Description, device: torch.device) -> None:
-        self.description, self.device = description, device
+    def __init__(self, description: Description, device: torch.device, own_models: tuple[Bsdf, ...] = ()) -> None:
+        self.description, self.device, self.own_models = description, device, own_models
         self._built: Built = build_parts(description)
         # Geometry far from the origin would lose its detail in float32 before it can be moved there.
         far = bool(self._built.centre.any())
@@ -94,9 +96,8 @@ class Scene:
         self._state: dict[str, tuple[Tensor, int]] = {}
 
     def weights(self) -> tuple[Tensor, ...]:
-        """Tensors of models of the user's own that want gradients."""
-        models = self.description.bsdfs.values()
-        found = {id(weight): weight for model in models for weight in model.weights() if weight.requires_grad}
+        """Tensors of the caller's own models that want gradients."""
+        found = {id(weight): weight for model in self.own_models for weight in model.weights() if weight.requires_grad}
         return tuple(found.values())
 
     @property
@@ -138,7 +139,8 @@ class Scene:
             if name.endswith(INDICES):
                 low = 1e-3
             if bool((value < low).any()):
-                raise SceneError(f"params.{name}", value.tolist(), f"no number below {low:g} (clamp before rendering)")
+                bad = f"numbers below {low:g}" if low else "negative numbers"
+                raise SceneError(f"params.{name}", value.tolist(), f"no {bad} (clamp before rendering)")
         if name.endswith(".to_world"):
             matrix = value.double().cpu().numpy()
             if is_singular(matrix):
