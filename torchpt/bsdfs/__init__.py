@@ -12,6 +12,7 @@ from torchpt.bsdfs.microfacet import Microfacet
 from torchpt.bsdfs.nonmetal import Nonmetal
 from torchpt.bsdfs.null import Null
 from torchpt.bsdfs.phong import Phong
+from torchpt.bsdfs.principled import Principled
 from torchpt.bsdfs.roughconductor import RoughConductor
 from torchpt.bsdfs.roughdielectric import RoughDielectric
 from torchpt.bsdfs.thindielectric import ThinDielectric
@@ -29,6 +30,7 @@ __all__ = [
     "Null",
     "Parameters",
     "Phong",
+    "Principled",
     "RoughConductor",
     "RoughDielectric",
     "Table",
@@ -56,4 +58,8 @@ MODELS: tuple[Bsdf, ...] = (
     RoughDielectric(),
     RoughDielectric(anisotropic=True),
     Null(),
+    Principled(),
+    Principled(transmissive=True),
+    Principled(anisotropic=True),
+    Principled(transmissive=True, anisotropic=True),
 )

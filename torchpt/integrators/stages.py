@@ -88,19 +88,20 @@ def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -
     o, d = take(state.o, index), take(state.d, index)
     at = interact(world, o, d, rows(hit, index), slide)
     radiance, pdf = lights.emitted(world.lights, o, at, d)
-    return _weighted(_arrived(rows(state, index), rows(hit, index)), radiance, take(state.pdf, index), pdf)
+    return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
 
 
 def escape(world: World, state: PathState, hit: Hit, index: Tensor) -> Tensor:
     """Radiance ``(3, n)`` that the paths at ``index`` gather from the environment they escape to."""
     assert world.lights is not None
     radiance, pdf = lights.environment(world.lights, take(state.d, index))
-    return _weighted(_arrived(rows(state, index), rows(hit, index)), radiance, take(state.pdf, index), pdf)
+    return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
 
 
-def _arrived(state: PathState, hit: Hit) -> Tensor:
+def _arrived(state: PathState, hit: Hit, index: Tensor) -> Tensor:
     """Throughput ``(3, n)`` with the derivative of the chance that the rays came here."""
-    return state.throughput if hit.chance is None else state.throughput * hit.chance
+    throughput = take(state.throughput, index)
+    return throughput if hit.chance is None else throughput * take(hit.chance, index)
 
 
 def _weighted(throughput: Tensor, radiance: Tensor, pdf: Tensor, light_pdf: Tensor) -> Tensor:
@@ -140,7 +141,8 @@ def bounce(
     """
     here, met = rows(state, index), rows(hit, index)
     at = interact(world, here.o, here.d, met, slide)
-    here = replace(here, throughput=_arrived(here, met))
+    if met.chance is not None:
+        here = replace(here, throughput=here.throughput * met.chance)
     surface, shadow = shade(plan, world, model, here, at, salts)
     after, found = scatter(plan, world, model, here, at, surface, salts, roulette, search)
     return after, found, shadow

@@ -13,15 +13,18 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.math.fresnel import fresnel_dielectric
 from torchpt.math.vectors import dot, normalize
 
 __all__ = [
     "ALPHA_MIN",
     "BOUNDED",
     "Reflection",
+    "coat_reflectance",
     "correlated_masking",
     "ggx",
     "half_vector",
@@ -169,3 +172,33 @@ def reflection(
         value = d * cos_i / ((cos_o + s_o) * (cos_i + s_i))
     scaled = _bound(wo, alpha_u, alpha_v).k * cos_o if bounded else cos_o
     return Reflection(m, dot(wo, m), value, 0.5 * d / (scaled + s_o))
+
+
+def _nodes(azimuths: int, heights: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Points ``(2, Q)`` of [0, 1/2] x [0, 1] and weights ``(Q,)`` for what is symmetric about the plane of ``wo``."""
+    (a, wa), (b, wb) = np.polynomial.legendre.leggauss(azimuths), np.polynomial.legendre.leggauss(heights)
+    u, v = np.meshgrid(0.25 * (a + 1.0), 0.5 * (b + 1.0), indexing="ij")
+    weights = 0.25 * np.outer(wa, wb)
+    return like.new_tensor(np.stack((u.ravel(), v.ravel()))), like.new_tensor(weights.ravel())
+
+
+def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor, azimuths: int = 32, heights: int = 64) -> Tensor:
+    """Directional albedo ``(K,)`` of rough dielectric facets that reflect once: the mean of ``F G1(wi)`` over visible normals.
+
+    Args:
+        cosines: ``(K,)`` of ``wo``, positive.
+        alpha: ``(1,)``.
+        eta: ``(1,)`` index of the far side over that of the side of ``wo``.
+        azimuths: Gauss-Legendre nodes.
+        heights: Gauss-Legendre nodes.
+    """
+    u, weights = _nodes(azimuths, heights, cosines)
+    z = cosines.repeat_interleave(len(weights))
+    wo = torch.stack(((1.0 - z * z).clamp_min(0.0).sqrt(), torch.zeros_like(z), z))
+    alpha = alpha.expand_as(z)
+    m = sample_normal(wo, alpha, alpha, u.repeat(1, len(cosines)))
+    cos = dot(wo, m)
+    wi = reflect(wo, m, cos)
+    up = wi[2].clamp_min(0.0)
+    seen = fresnel_dielectric(cos, eta).reflectance * masking(up, stretched_length(wi, alpha, alpha))
+    return (seen.reshape(len(cosines), -1) * weights).sum(1)

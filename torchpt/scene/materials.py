@@ -159,6 +159,7 @@ class BlinnPhong(Phong):
     """Lambert plus a lobe about the half vector, as published: it gains energy, about fourfold where it is sharp."""
 
     type: Literal["blinn_phong"] = "blinn_phong"
+    specular: Reflectance = (0.1, 0.1, 0.1)
 
     _share: ClassVar[float] = 4.0
 
