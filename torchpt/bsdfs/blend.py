@@ -31,19 +31,40 @@ class Blend(Bsdf):
     parameters = {"weight": 0.5}  # noqa: RUF012
     lobed = True
 
-    def __post_init__(self) -> None:
-        a, b = self.a, self.b
-        flags = {
-            "delta": a.delta or b.delta,
-            "smooth": a.smooth and b.smooth,
-            "transmits": a.transmits or b.transmits,
-            "refracts": a.refracts or b.refracts,
-            "anisotropic": a.anisotropic or b.anisotropic,
-            "conserves": a.conserves and b.conserves,
-            "reciprocal": a.reciprocal and b.reciprocal,
-        }
-        for flag, value in flags.items():
-            object.__setattr__(self, flag, value)
+    @property
+    def delta(self) -> bool:
+        """Where one of them may be."""
+        return self.a.delta or self.b.delta
+
+    @property
+    def smooth(self) -> bool:
+        """Where both are."""
+        return self.a.smooth and self.b.smooth
+
+    @property
+    def transmits(self) -> bool:
+        """Where one does."""
+        return self.a.transmits or self.b.transmits
+
+    @property
+    def refracts(self) -> bool:
+        """Where one does."""
+        return self.a.refracts or self.b.refracts
+
+    @property
+    def anisotropic(self) -> bool:
+        """Where one is."""
+        return self.a.anisotropic or self.b.anisotropic
+
+    @property
+    def conserves(self) -> bool:
+        """Where both do."""
+        return self.a.conserves and self.b.conserves
+
+    @property
+    def reciprocal(self) -> bool:
+        """Where both are."""
+        return self.a.reciprocal and self.b.reciprocal
 
     def prepare(self, values: Parameters) -> Parameters:
         """Both, each by its own."""

@@ -1,0 +1,105 @@
+"""The pieces of the principled model that no other has: Schlick's weight, tints, its diffuse and sheen lobes, its clearcoat.
+
+Burley, *Physically Based Shading at Disney*, 2012 (below: 2012), and *Extending the Disney BRDF to a BSDF with Integrated
+Subsurface Scattering*, 2015 (below: 2015).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchpt.math.microfacet import masking, stretched_length
+from torchpt.math.vectors import luminance
+
+__all__ = [
+    "clearcoat_alpha",
+    "clearcoat_masking",
+    "fake_subsurface",
+    "gtr1",
+    "lerp",
+    "reflectance_at_normal",
+    "retro_diffuse",
+    "sample_gtr1",
+    "schlick_weight",
+    "tint",
+]
+
+
+def lerp(a: Tensor | float, b: Tensor | float, t: Tensor) -> Tensor:
+    """``a`` at 0, ``b`` at 1."""
+    return a + t * (b - a)
+
+
+def schlick_weight(cos: Tensor) -> Tensor:
+    """``(1 - cos)^5`` (Schlick 1994)."""
+    x = (1.0 - cos).clamp(0.0, 1.0)
+    x2 = x * x
+    return x2 * x2 * x
+
+
+def reflectance_at_normal(eta: Tensor) -> Tensor:
+    """Of a dielectric of relative index ``eta``."""
+    root = (eta - 1.0) / (eta + 1.0)
+    return root * root
+
+
+def tint(base_color: Tensor) -> Tensor:
+    """The colour at luminance 1, white where it is black: ``(3, N) -> (3, N)``."""
+    y = luminance(base_color)
+    lit = y > 0
+    return torch.where(lit, base_color / torch.where(lit, y, 1.0), 1.0)
+
+
+def retro_diffuse(roughness: Tensor, fresnel_o: Tensor, fresnel_i: Tensor, cos_d: Tensor) -> Tensor:
+    """Diffuse with retro-reflection, times pi, in the form of 2015, section 3: ``(N,)``.
+
+    Args:
+        roughness: ``(N,)``.
+        fresnel_o: Schlick's weight at ``wo``.
+        fresnel_i: the same at ``wi``.
+        cos_d: of the angle between either and the half vector.
+    """
+    retro = 2.0 * roughness * cos_d * cos_d
+    both = fresnel_o * fresnel_i
+    return (1.0 - 0.5 * fresnel_o) * (1.0 - 0.5 * fresnel_i) + retro * (fresnel_o + fresnel_i + both * (retro - 1.0))
+
+
+def fake_subsurface(
+    roughness: Tensor, fresnel_o: Tensor, fresnel_i: Tensor, cos_d: Tensor, cos_o: Tensor, cos_i: Tensor
+) -> Tensor:
+    """The lobe that stands in for scattering below the surface, times pi (2012, section 5.3, after Hanrahan and Krueger)."""
+    grazing = roughness * cos_d * cos_d
+    both = lerp(1.0, grazing, fresnel_o) * lerp(1.0, grazing, fresnel_i)
+    sum_ = cos_o + cos_i
+    apart = sum_ > 0
+    return 1.25 * (both * (1.0 / torch.where(apart, sum_, 1.0) - 0.5) + 0.5)
+
+
+def clearcoat_alpha(gloss: Tensor) -> Tensor:
+    """Roughness of the coat: 0.1 at gloss 0, 0.001 at gloss 1."""
+    return lerp(0.1, 0.001, gloss)
+
+
+def gtr1(m: Tensor, alpha: Tensor) -> Tensor:
+    """Density of normals, with a longer tail than GGX: 2012, appendix B.2, equation 4; the bracket has no cancellation."""
+    a2 = alpha * alpha
+    bracket = torch.addcmul(torch.addcmul(m[0] * m[0], m[1], m[1]), a2 * m[2], m[2])
+    return (a2 - 1.0) / (math.pi * torch.log(a2) * bracket)
+
+
+def sample_gtr1(alpha: Tensor, u: Tensor) -> Tensor:
+    """Normals ``(3, N)`` with density ``D cos`` (2012, appendix B.2, equation 2)."""
+    a2 = alpha * alpha
+    sin2 = a2 * torch.expm1(-u[1] * torch.log(a2)) / (1.0 - a2)
+    sin2 = sin2.clamp(0.0, 1.0)
+    r, phi = sin2.sqrt(), (2.0 * math.pi) * u[0]
+    return torch.stack((r * torch.cos(phi), r * torch.sin(phi), (1.0 - sin2).sqrt()))
+
+
+def clearcoat_masking(wo: Tensor, wi: Tensor, cos_o: Tensor, cos_i: Tensor) -> Tensor:
+    """Smith's product for a fixed roughness of 0.25 (2012, section 5.6); positive cosines ``(N,)``."""
+    alpha = torch.full_like(cos_o, 0.25)
+    return masking(cos_o, stretched_length(wo, alpha, alpha)) * masking(cos_i, stretched_length(wi, alpha, alpha))
