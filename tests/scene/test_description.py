@@ -12,7 +12,8 @@ import pytest
 from torchpt import paths
 from torchpt.errors import AssetError, NotBuiltError, SceneError
 from torchpt.scene.description import read_description, scene_names, settings
-from torchpt.scene.schema import Diffuse, Mesh, Perspective, Sphere
+from torchpt.scene.materials import Diffuse
+from torchpt.scene.schema import Mesh, Perspective, Sphere
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
 TRIANGLE = {"type": "mesh", "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "faces": [[0, 1, 2]]}
@@ -138,8 +139,7 @@ def test_bad_input_is_one_line_that_names_the_key(name: str) -> None:
 LATER: dict[str, tuple[dict[str, Any], str]] = {
     "camera": ({"camera": {**CAMERA, "type": "thinlens", "aperture_radius": 1}}, "camera.type"),
     "camera key": (camera(blades=5), "camera.blades"),
-    "material": (scene(materials={"m": {"type": "principled", "base_color": 1}}), "materials.m.type"),
-    "material key": (material(opacity=0.5), "materials.m.opacity"),
+    "material key": (material(bump_map={"type": "image", "path": "a.png"}), "materials.m.bump_map"),
     "texture by name": (material(reflectance={"texture": "wood"}), "materials.m.reflectance"),
     "texture inline": (material(reflectance={"type": "image", "path": "a.png"}), "materials.m.reflectance"),
     "textures block": (scene(textures={"t": {"type": "checkerboard"}}), "textures.t.type"),
@@ -167,7 +167,7 @@ def test_what_is_not_built_says_so(name: str) -> None:
 def test_values_that_ask_for_nothing_are_no_error() -> None:
     nothing = {"adaptive": False}, {"resume": False, "time_limit": None}
     found = read_description(
-        material(opacity=1, emission=0, normal_map=None) | {"sampler": nothing[0], "render": nothing[1]}
+        material(opacity=1, emission=0, normal_map=None, bump_map=None) | {"sampler": nothing[0], "render": nothing[1]}
     )
     assert len(found.materials) == 1
 

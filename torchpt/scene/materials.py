@@ -629,7 +629,7 @@ def _check_blend(
         at, beyond = f"{key}.{side}", trail
         if isinstance(item, str):
             if item not in materials:
-                known = ", ".join(materials)
+                known = ", ".join(materials) or "none is defined"
                 raise SceneError(at, item, f"the name of a material ({known}) or a material", file)
             if item in trail:
                 circle = " -> ".join((*trail[trail.index(item) :], item))
