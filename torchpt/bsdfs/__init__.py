@@ -12,9 +12,11 @@ from torchpt.bsdfs.microfacet import Microfacet
 from torchpt.bsdfs.nonmetal import Nonmetal
 from torchpt.bsdfs.null import Null
 from torchpt.bsdfs.phong import Phong
+from torchpt.bsdfs.plastic import Plastic
 from torchpt.bsdfs.principled import Principled
 from torchpt.bsdfs.roughconductor import RoughConductor
 from torchpt.bsdfs.roughdielectric import RoughDielectric
+from torchpt.bsdfs.roughplastic import RoughPlastic
 from torchpt.bsdfs.thindielectric import ThinDielectric
 
 __all__ = [
@@ -30,9 +32,11 @@ __all__ = [
     "Null",
     "Parameters",
     "Phong",
+    "Plastic",
     "Principled",
     "RoughConductor",
     "RoughDielectric",
+    "RoughPlastic",
     "Table",
     "ThinDielectric",
     "gather",
@@ -62,4 +66,8 @@ MODELS: tuple[Bsdf, ...] = (
     Principled(transmissive=True),
     Principled(anisotropic=True),
     Principled(transmissive=True, anisotropic=True),
+    Plastic(),
+    Plastic(nonlinear=True),
+    RoughPlastic(),
+    RoughPlastic(nonlinear=True),
 )

@@ -17,14 +17,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.math.fresnel import fresnel_dielectric
+from torchpt.math.fresnel import fresnel_dielectric, refract
 from torchpt.math.vectors import dot, normalize
+from torchpt.math.warps import concentric_disk
 
 __all__ = [
     "ALPHA_MIN",
     "BOUNDED",
     "Reflection",
     "coat_reflectance",
+    "coat_transmittance",
     "correlated_masking",
     "ggx",
     "half_vector",
@@ -174,31 +176,79 @@ def reflection(
     return Reflection(m, dot(wo, m), value, 0.5 * d / (scaled + s_o))
 
 
-def _nodes(azimuths: int, heights: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Points ``(2, Q)`` of [0, 1/2] x [0, 1] and weights ``(Q,)`` for what is symmetric about the plane of ``wo``."""
-    (a, wa), (b, wb) = np.polynomial.legendre.leggauss(azimuths), np.polynomial.legendre.leggauss(heights)
-    u, v = np.meshgrid(0.25 * (a + 1.0), 0.5 * (b + 1.0), indexing="ij")
-    weights = 0.25 * np.outer(wa, wb)
-    return like.new_tensor(np.stack((u.ravel(), v.ravel()))), like.new_tensor(weights.ravel())
+class _Normals(NamedTuple):
+    """Visible normals ``m (3, K Q)`` of directions ``wo (3, K Q)``, and the weights ``(Q,)`` of a mean over those of each."""
+
+    wo: Tensor
+    m: Tensor
+    alpha: Tensor
+    weights: Tensor
+
+    def mean(self, x: Tensor) -> Tensor:
+        """``(K Q,) -> (K,)``."""
+        return (x.reshape(-1, len(self.weights)) * self.weights).sum(1)
 
 
-def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor, azimuths: int = 32, heights: int = 64) -> Tensor:
-    """Directional albedo ``(K,)`` of rough dielectric facets that reflect once: the mean of ``F G1(wi)`` over visible normals.
+def _legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss and Legendre's nodes and weights on [0, 1]."""
+    x, weights = np.polynomial.legendre.leggauss(n)
+    return 0.5 * (x + 1.0), 0.5 * weights
+
+
+def _lanes(cosines: Tensor, alpha: Tensor, n: int) -> tuple[Tensor, Tensor]:
+    """Directions in the xz plane with these cosines, each ``n`` times, and as many roughnesses."""
+    z = cosines.repeat_interleave(n)
+    return torch.stack(((1.0 - z * z).clamp_min(0.0).sqrt(), torch.zeros_like(z), z)), alpha.expand_as(z)
+
+
+def _cap_normals(cosines: Tensor, alpha: Tensor, azimuths: int = 32, heights: int = 32) -> _Normals:
+    """By :func:`sample_normal` at Gauss-Legendre nodes; half the azimuths stand for all."""
+    (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)
+    u = cosines.new_tensor(np.stack(np.meshgrid(0.5 * a, b, indexing="ij")).reshape(2, -1))
+    wo, alphas = _lanes(cosines, alpha, u.shape[1])
+    m = sample_normal(wo, alphas, alphas, u.repeat(1, len(cosines)))
+    return _Normals(wo, m, alphas, cosines.new_tensor(np.outer(wa, wb).ravel()))
+
+
+def _disk_normals(cosines: Tensor, alpha: Tensor, n: int = 32) -> _Normals:
+    """By projected hemispheres (Heitz, *Sampling the GGX Distribution of Visible Normals*, 2018), as Mitsuba integrates."""
+    (a, wa), (b, wb) = _legendre(n), _legendre(n)
+    half = n // 2  # the disk's left half stands for the right one
+    u = np.stack(np.meshgrid(a[:half], b, indexing="ij")).reshape(2, -1)
+    x, y = concentric_disk(cosines.new_tensor(u)).repeat(1, len(cosines))
+    wo, alphas = _lanes(cosines, alpha, u.shape[1])
+    stretched = normalize(torch.stack((wo[0] * alphas, wo[1], wo[2])))
+    s = 0.5 * (1.0 + stretched[2])
+    y = (1.0 - s) * (1.0 - x * x).clamp_min(0.0).sqrt() + s * y
+    z = (1.0 - x * x - y * y).clamp_min(1e-12).sqrt()
+    along, up = stretched[0] * z - stretched[2] * y, stretched[0] * y + stretched[2] * z
+    m = normalize(torch.stack((alphas * along, -alphas * x, up)))
+    return _Normals(wo, m, alphas, cosines.new_tensor(2.0 * np.outer(wa[:half], wb).ravel()))
+
+
+def coat_reflectance(cosines: Tensor, alpha: Tensor, eta: Tensor) -> Tensor:
+    """Light ``(K,)`` that rough dielectric facets reflect at once: the mean of ``F G1(wi)`` over visible normals.
 
     Args:
         cosines: ``(K,)`` of ``wo``, positive.
         alpha: ``(1,)``.
         eta: ``(1,)`` index of the far side over that of the side of ``wo``.
-        azimuths: Gauss-Legendre nodes.
-        heights: Gauss-Legendre nodes.
     """
-    u, weights = _nodes(azimuths, heights, cosines)
-    z = cosines.repeat_interleave(len(weights))
-    wo = torch.stack(((1.0 - z * z).clamp_min(0.0).sqrt(), torch.zeros_like(z), z))
-    alpha = alpha.expand_as(z)
-    m = sample_normal(wo, alpha, alpha, u.repeat(1, len(cosines)))
-    cos = dot(wo, m)
-    wi = reflect(wo, m, cos)
-    up = wi[2].clamp_min(0.0)
-    seen = fresnel_dielectric(cos, eta).reflectance * masking(up, stretched_length(wi, alpha, alpha))
-    return (seen.reshape(len(cosines), -1) * weights).sum(1)
+    over = _cap_normals(cosines, alpha)
+    cos = dot(over.wo, over.m)
+    wi = reflect(over.wo, over.m, cos)
+    seen = masking(wi[2].clamp_min(0.0), stretched_length(wi, over.alpha, over.alpha))
+    return over.mean(fresnel_dielectric(cos, eta).reflectance * seen)
+
+
+def coat_transmittance(cosines: Tensor, alpha: Tensor, eta: Tensor) -> Tensor:
+    """Light ``(K,)`` that they let through at once: the mean of ``(1 - F) G1(wi)``.
+
+    Of Mitsuba's 32 x 32 nodes, whose error of up to 4e-4 would show as 1 % of the little that a coat reflects.
+    """
+    over = _disk_normals(cosines, alpha)
+    cos = dot(over.wo, over.m)
+    side = fresnel_dielectric(cos, eta)
+    wi = normalize(refract(over.wo, over.m, cos, side))
+    seen = masking((-wi[2]).clamp_min(0.0), stretched_length(wi, over.alpha, over.alpha))
+    return over.mean((1.0 - side.reflectance) * seen)

@@ -1,0 +1,92 @@
+"""A diffuse base under a polished clear coat, with all reflections between the two."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.bsdfs.base import Bsdf, Parameters
+from torchpt.bsdfs.dielectric import tinted
+from torchpt.bsdfs.lobes import share, weighed, with_delta
+from torchpt.math.fresnel import fresnel_dielectric, fresnel_diffuse
+from torchpt.math.warps import cosine_hemisphere
+from torchpt.records import BsdfSample
+
+__all__ = ["Plastic", "coated"]
+
+
+def coated(values: Parameters, eta: Tensor, inner: Tensor, nonlinear: bool) -> Parameters:
+    """What the coats have in common.
+
+    Args:
+        values: as given.
+        eta: ``(1,)`` index of the coat over that outside.
+        inner: ``(1,)`` reflectance of the coat for diffuse light from within.
+        nonlinear: whether light that the coat throws back takes the base's colour again, which saturates it.
+    """
+    diffuse, specular = values["diffuse_reflectance"], values.get("specular_reflectance")
+    mean = diffuse.mean(0)
+    return {
+        "eta": eta,
+        "base": diffuse / ((1.0 - inner * (diffuse if nonlinear else 1.0)) * eta * eta),
+        "diffuse_reflectance": diffuse,
+        "specular_reflectance": specular,
+        "specular_share": share(torch.ones_like(mean) if specular is None else specular.mean(0), mean),
+    }
+
+
+@dataclass(frozen=True)
+class Plastic(Bsdf):
+    """A mirror coat over a diffuse base. Its diffuse fits (see ``fresnel_diffuse``) conserve energy to 0.2 %.
+
+    Attributes:
+        nonlinear: light that the coat throws back takes the base's colour again.
+    """
+
+    name = "plastic"
+    parameters = {  # noqa: RUF012
+        "diffuse_reflectance": (0.5, 0.5, 0.5),
+        "int_ior": 1.49,
+        "ext_ior": 1.000277,
+        "specular_reflectance": (1.0, 1.0, 1.0),
+    }
+    lobed = True
+    delta = True
+
+    nonlinear: bool = False
+
+    def prepare(self, values: Parameters) -> Parameters:
+        """See :class:`Bsdf`."""
+        eta = values["int_ior"] / values["ext_ior"]
+        return coated(values, eta, fresnel_diffuse(1.0 / eta), self.nonlinear)
+
+    def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+        """The base, seen through the coat both ways."""
+        f_o = fresnel_dielectric(wo[2], parameters["eta"]).reflectance
+        f_i = fresnel_dielectric(wi[2], parameters["eta"]).reflectance
+        cosine = wi[2].clamp_min(0.0) * (1.0 / math.pi) * wo[2].sign().clamp_min(0.0)
+        value = parameters["base"] * ((1.0 - f_o) * (1.0 - f_i) * cosine)
+        return value, (1.0 - self._specular(parameters, f_o)) * cosine
+
+    def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        """The mirror image, or a direction about the normal."""
+        assert lobe is not None
+        f_o = fresnel_dielectric(wo[2], parameters["eta"]).reflectance
+        specular = self._specular(parameters, f_o)
+        drawn = weighed(self, parameters, wo, cosine_hemisphere(u))
+        chosen = (lobe < specular) & (wo[2] > 0)
+        mirrored = torch.stack((-wo[0], -wo[1], wo[2]))
+        weight = tinted(f_o / torch.where(specular > 0, specular, 1.0), parameters["specular_reflectance"])
+        return with_delta(drawn, chosen, mirrored, weight)
+
+    def albedo(self, parameters: Parameters) -> Tensor:
+        """That of the base."""
+        return parameters["diffuse_reflectance"]
+
+    def _specular(self, parameters: Parameters, f_o: Tensor) -> Tensor:
+        """How often the coat is chosen."""
+        weight = parameters["specular_share"]
+        return share(f_o * weight, (1.0 - f_o) * (1.0 - weight))
