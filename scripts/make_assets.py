@@ -1,12 +1,16 @@
 """Makes the meshes in `scenes/`: `python scripts/make_assets.py` writes them again, byte for byte.
 
-`standin.ply` stands where the Stanford bunny would: a smooth closed figure (an icosphere pushed out along its own
-directions: body, head, two ears, tail, feet) with the bunny's bounding box, pose and no vertex normals.
+- `standin.ply` stands where the Stanford bunny would: a smooth closed figure (an icosphere pushed out along its own
+  directions: body, head, two ears, tail, feet) with the bunny's bounding box, pose and no vertex normals.
+- `statue.ply`: a draped figure on a plinth that holds up a sphere, of height 1 from y = 0, facing +z; closed.
+- `cup.ply`: a cup with a handle, of height 1 from y = 0; two closed pieces.
+- `curved_wall.ply`: an upright sheet along an arc of radius 1 about the y axis, of height 1, facing the axis.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +78,267 @@ def standin() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     return (box_low + (points - low) / (high - low) * (box_high - box_low)).astype("<f4"), faces.astype("<i4")
 
 
+def surface_nets(
+    field: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    step: float,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Where ``field((..., 3))`` is zero, closed where it is positive on the border; normals toward the positive side.
+
+    One vertex for each cell that the surface crosses, at the mean of the crossings of its edges (Gibson, *Constrained
+    Elastic Surface Nets*, 1998), then moved onto the surface by Newton's steps.
+
+    Args:
+        field: negative inside.
+        low: corner of the grid.
+        high: the opposite one.
+        step: size of a cell.
+    """
+    axes = [np.arange(a, b + step, step) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    value = field(grid)
+    cells = [n - 1 for n in value.shape]
+    total, count, quads = np.zeros((*cells, 3)), np.zeros(cells), []
+    index = np.arange(count.size).reshape(cells)
+    for axis in range(3):
+        start, end = (np.take(value, range(k, k + cells[axis]), axis) for k in (0, 1))
+        crossed = (start < 0) != (end < 0)
+        point = np.take(grid, range(cells[axis]), axis)
+        point[..., axis] += step * np.where(crossed, start / np.where(crossed, start - end, 1.0), 0.0)
+        edges = np.argwhere(crossed)
+        edges = edges[[all(0 < e[a] < cells[a] for a in range(3) if a != axis) for e in edges]]
+        ring = []  # the four cells about an edge, counter-clockwise as seen from its end
+        for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)):
+            offset = [0, 0, 0]
+            offset[(axis + 1) % 3], offset[(axis + 2) % 3] = i, j
+            part = tuple(slice(o, o + n) for o, n in zip(offset, cells, strict=True))
+            total += np.where(crossed[part][..., None], point[part], 0.0)
+            count += crossed[part]
+            ring.append(index[tuple((edges - offset).T)])
+        quad = np.stack(ring, axis=1)
+        quads.append(np.where((start[tuple(edges.T)] < 0)[:, None], quad, quad[:, ::-1]))
+    used = count.reshape(-1) > 0
+    points = total.reshape(-1, 3)[used] / count.reshape(-1)[used][:, None]
+    quad = (np.cumsum(used) - 1)[np.concatenate(quads)]
+    for _ in range(4):
+        points -= np.clip(_newton(field, points, 1e-3 * step), -0.25 * step, 0.25 * step)
+    a, b, c, d = (points[quad[:, k]] for k in range(4))
+    short = np.linalg.norm(a - c, axis=1) <= np.linalg.norm(b - d, axis=1)  # cut along the shorter diagonal
+    first = np.where(short[:, None], quad[:, [0, 1, 2]], quad[:, [1, 2, 3]])
+    second = np.where(short[:, None], quad[:, [0, 2, 3]], quad[:, [1, 3, 0]])
+    return points, np.concatenate([first, second])
+
+
+def _newton(
+    field: Callable[[NDArray[np.float64]], NDArray[np.float64]], points: NDArray[np.float64], step: float
+) -> NDArray[np.float64]:
+    """How far points ``(V, 3)`` are from the zero of a field, along its gradient."""
+    gradient = np.stack([field(points + e) - field(points - e) for e in step * np.eye(3)], axis=-1) / (2.0 * step)
+    return field(points)[:, None] * gradient / np.maximum((gradient**2).sum(axis=-1, keepdims=True), 1e-6)
+
+
+def curve(keys: tuple[tuple[float, float], ...], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A smooth curve through ``(x, y)`` keys: cubic pieces with the slopes of Catmull and Rom, constant beyond the ends."""
+    at, value = np.array(keys).T
+    slope = np.gradient(value, at)
+    k = np.clip(np.searchsorted(at, x) - 1, 0, len(at) - 2)
+    width = at[k + 1] - at[k]
+    t = np.clip((x - at[k]) / width, 0.0, 1.0)
+    left = value[k] * (1 + 2 * t) + width * slope[k] * t
+    right = value[k + 1] * (3 - 2 * t) - width * slope[k + 1] * (1 - t)
+    return (1 - t) ** 2 * left + t**2 * right
+
+
+def _join(a: NDArray[np.float64], b: NDArray[np.float64], soft: float) -> NDArray[np.float64]:
+    """Union of two fields with a fillet of about ``soft``."""
+    return np.minimum(a, b) - np.maximum(soft - np.abs(a - b), 0.0) ** 2 / (4.0 * soft)
+
+
+def _ball(p: NDArray[np.float64], centre: tuple[float, ...], radii: tuple[float, ...]) -> NDArray[np.float64]:
+    """About the distance from an ellipsoid."""
+    return (np.linalg.norm((p - centre) / radii, axis=-1) - 1.0) * min(radii)
+
+
+def _limb(
+    p: NDArray[np.float64], a: tuple[float, ...], b: tuple[float, ...], thick: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Distance from a rod of changing thickness."""
+    start, along = np.array(a), np.array(b) - np.array(a)
+    t = np.clip((p - start) @ along / (along @ along), 0.0, 1.0)
+    return np.linalg.norm(p - start - t[..., None] * along, axis=-1) - (thick[0] + (thick[1] - thick[0]) * t)
+
+
+# Height against half width, half depth, sideways and forward sway of the robe; depth of its folds.
+WIDTH = (
+    (0.07, 0.125),
+    (0.2, 0.112),
+    (0.38, 0.1),
+    (0.5, 0.098),
+    (0.6, 0.072),
+    (0.7, 0.082),
+    (0.77, 0.088),
+    (0.81, 0.05),
+    (0.84, 0.02),
+)
+DEPTH = (
+    (0.07, 0.115),
+    (0.2, 0.098),
+    (0.38, 0.082),
+    (0.5, 0.075),
+    (0.6, 0.056),
+    (0.7, 0.064),
+    (0.77, 0.05),
+    (0.81, 0.035),
+    (0.84, 0.02),
+)
+SWAY = ((0.07, -0.005), (0.3, 0.0), (0.5, 0.022), (0.64, 0.006), (0.8, -0.008))
+LEAN = ((0.07, 0.01), (0.34, 0.016), (0.5, 0.0), (0.7, 0.008), (0.82, -0.006))
+FOLD = ((0.07, 0.13), (0.25, 0.11), (0.45, 0.06), (0.56, 0.035), (0.6, 0.03), (0.66, 0.045), (0.8, 0.03))
+
+
+def figure(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The statue's field at ``(..., 3)``: a robed figure with one arm raised, height 1 with plinth and sphere."""
+    x, y, z = np.moveaxis(p, -1, 0)
+    side, front = x - curve(SWAY, y), z - curve(LEAN, y)
+    wide, deep = curve(WIDTH, y), curve(DEPTH, y)
+    angle = np.arctan2(front / deep, side / wide)
+    drift = 1.5 * np.sin(3.0 * y + 1.0) + 0.5 * np.sin(angle * 2.0 + 9.0 * y)  # folds do not fall straight
+    fold = np.sin(11.0 * angle + 3.0 * drift) + 0.5 * np.sin(19.0 * angle - 4.0 * drift + 1.0)
+    fold = np.tanh(1.6 * fold + 0.5)
+    reach = np.sqrt((side / wide) ** 2 + (front / deep) ** 2)
+    robe = (reach / (1.0 + curve(FOLD, y) * fold) - 1.0) * np.minimum(wide, deep)
+    robe = np.maximum(robe, np.maximum(y - 0.85, 0.03 - y))
+    # The near leg bends: its knee and shin push the cloth out.
+    robe = _join(robe, _limb(p, (-0.035, 0.47, 0.03), (-0.042, 0.29, 0.075), (0.05, 0.042)), 0.05)
+    robe = _join(robe, _limb(p, (-0.042, 0.29, 0.075), (-0.05, 0.1, 0.06), (0.042, 0.05)), 0.05)
+    # A girdle, and the overfold of cloth that hangs from it.
+    ring = np.sqrt((reach - 1.02) ** 2 * 0.004 + ((y - 0.6 - 0.01 * np.sin(angle)) * 1.0) ** 2) - 0.008
+    robe = _join(robe, ring, 0.012)
+    hem = 0.50 + 0.018 * np.sin(2.0 * angle + 0.6) + 0.008 * np.sin(11.0 * angle)
+    over = np.maximum(
+        (reach / (1.1 + 0.05 * fold) - 1.0) * np.minimum(wide, deep), np.abs(y - 0.5 * (hem + 0.6)) - 0.5 * (0.6 - hem)
+    )
+    robe = _join(robe, over, 0.018)
+    chest = _join(
+        _ball(p, (-0.042, 0.735, 0.048), (0.035, 0.035, 0.033)),
+        _ball(p, (0.034, 0.74, 0.048), (0.035, 0.035, 0.033)),
+        0.03,
+    )
+    robe = _join(robe, chest, 0.04)
+    shoulders = _join(
+        _limb(p, (-0.08, 0.795, -0.004), (0.0, 0.815, -0.008), (0.032, 0.036)),
+        _limb(p, (0.0, 0.815, -0.008), (0.078, 0.81, -0.004), (0.036, 0.032)),
+        0.02,
+    )
+    body = _join(robe, shoulders, 0.035)
+    # One arm hangs and gathers the robe at the hip, the other lifts a sphere.
+    arm = _join(
+        _limb(p, (-0.105, 0.785, -0.004), (-0.15, 0.665, -0.02), (0.03, 0.023)),
+        _limb(p, (-0.15, 0.665, -0.02), (-0.108, 0.56, 0.045), (0.023, 0.016)),
+        0.015,
+    )
+    arm = _join(arm, _ball(p, (-0.1, 0.545, 0.052), (0.022, 0.026, 0.02)), 0.015)
+    body = _join(body, arm, 0.018)
+    lifted = _join(
+        _limb(p, (0.1, 0.805, -0.002), (0.175, 0.845, 0.02), (0.03, 0.024)),
+        _limb(p, (0.175, 0.845, 0.02), (0.185, 0.935, 0.035), (0.024, 0.015)),
+        0.015,
+    )
+    lifted = _join(lifted, _ball(p, (0.185, 0.947, 0.037), (0.024, 0.014, 0.022)), 0.012)
+    body = _join(body, lifted, 0.02)
+    body = _join(body, _ball(p, (0.185, 0.972, 0.037), (0.028, 0.028, 0.028)), 0.004)
+    # Head: skull, jaw, nose, brow, hair in a knot, turned toward the sphere.
+    body = _join(body, _limb(p, (-0.004, 0.815, -0.008), (0.002, 0.875, 0.002), (0.03, 0.024)), 0.022)
+    turn = 0.45
+    centre = np.array([0.004, 0.925, 0.008])
+    local = p - centre
+    cos, sin = np.cos(turn), np.sin(turn)
+    head = np.stack(
+        [cos * local[..., 0] - sin * local[..., 2], local[..., 1], sin * local[..., 0] + cos * local[..., 2]], -1
+    )
+    skull = _join(
+        _ball(head, (0.0, 0.012, -0.004), (0.039, 0.043, 0.047)),
+        _ball(head, (0.0, -0.025, 0.014), (0.027, 0.032, 0.029)),
+        0.02,
+    )
+    skull = _join(skull, _limb(head, (0.0, 0.004, 0.042), (0.0, -0.014, 0.051), (0.004, 0.006)), 0.008)
+    skull = _join(skull, _limb(head, (-0.02, 0.009, 0.037), (0.02, 0.009, 0.037), (0.005, 0.005)), 0.01)
+    skull = _join(skull, _ball(head, (0.0, -0.033, 0.04), (0.011, 0.004, 0.006)), 0.006)
+    wave = 0.0035 * np.sin(70.0 * head[..., 1] + 30.0 * np.abs(head[..., 0]))
+    hair = np.maximum(
+        _ball(head, (0.0, 0.014, -0.01), (0.046, 0.048, 0.052)) + wave, 0.55 * head[..., 2] - head[..., 1] + 0.002
+    )
+    hair = _join(hair, _ball(head, (0.0, 0.0, -0.062), (0.024, 0.022, 0.022)) + wave, 0.012)
+    body = _join(body, _join(skull, hair, 0.006), 0.012)
+    # Plinth with a moulding.
+    flat = np.hypot(x, z)
+    drum = np.hypot(np.maximum(flat - 0.145, 0.0), np.maximum(np.abs(y - 0.035) - 0.03, 0.0)) - 0.005
+    foot = np.hypot(np.maximum(flat - 0.16, 0.0), np.maximum(np.abs(y - 0.0125) - 0.0075, 0.0)) - 0.005
+    return _join(_join(body, drum, 0.012), foot, 0.004)
+
+
+def statue() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Vertices and triangles of the statue."""
+    points, faces = surface_nets(figure, np.array([-0.21, -0.02, -0.18]), np.array([0.24, 1.02, 0.18]), 0.0074)
+    points[:, 1] -= points[:, 1].min()
+    return (points / points[:, 1].max()).astype("<f4"), faces.astype("<i4")
+
+
+def _grid(index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles of a grid of vertices: rows step to the right of columns, seen from outside."""
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+
+
+def lathe(outline: NDArray[np.float64], segments: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A closed solid of revolution about y; ``outline (K, 2)`` (radius, height) runs counter-clockwise from axis to axis."""
+    angle = np.linspace(0.0, 2.0 * np.pi, segments, endpoint=False)[:, None]
+    radius, height = outline[1:-1].T
+    rings = np.stack([radius * np.sin(angle), height + 0.0 * angle, radius * np.cos(angle)], axis=-1)
+    inner = len(outline) - 2
+    index = np.arange(segments * inner).reshape(segments, inner)
+    index = np.concatenate([index, index[:1]])
+    south, north = segments * inner, segments * inner + 1
+    a, b = index[:-1], index[1:]
+    caps = [np.stack([np.full(segments, south), b[:, 0], a[:, 0]], -1)]
+    caps += [np.stack([np.full(segments, north), a[:, -1], b[:, -1]], -1)]
+    poles = [(0.0, outline[0, 1], 0.0), (0.0, outline[-1, 1], 0.0)]
+    return np.concatenate([rings.reshape(-1, 3), poles]), np.concatenate([_grid(index), *caps])
+
+
+def cup() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """A cup of height 1, turned on a lathe, and its handle."""
+    outline = np.array(
+        [(0.0, 0.0), (0.24, 0.0), (0.3, 0.004), (0.325, 0.03), (0.37, 0.09), (0.42, 0.2), (0.445, 0.35), (0.455, 0.6),
+         (0.465, 0.9), (0.472, 0.98), (0.46, 1.0), (0.445, 0.985), (0.435, 0.9), (0.425, 0.6), (0.415, 0.36),
+         (0.39, 0.22), (0.34, 0.12), (0.27, 0.07), (0.15, 0.055), (0.0, 0.05)]
+    )  # fmt: skip
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(outline, axis=0), axis=1))])
+    at = np.sort(np.concatenate([np.linspace(0.0, length[-1], 80), length[1:-1]]))
+    fine = [curve(tuple(zip(length.tolist(), column.tolist(), strict=True)), at) for column in outline.T]
+    points, faces = lathe(np.stack(fine, axis=-1), 96)
+    bend = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)[:, None]
+    around = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    reach = 0.46 + (0.24 + 0.05 * np.cos(around)) * np.cos(bend)
+    height = 0.54 + (0.27 + 0.05 * np.cos(around)) * np.sin(bend)
+    depth = 0.07 * np.sin(around) + 0.0 * bend
+    radius = np.hypot(reach, depth)
+    reach *= np.maximum(radius, 0.44) / radius  # the half of the ring that is not outside stays within the wall
+    index = np.pad(np.arange(64 * 24).reshape(64, 24), ((0, 1), (0, 1)), mode="wrap")
+    ring = np.stack([reach, height, depth], axis=-1).reshape(-1, 3)
+    both = np.concatenate([faces, _grid(index)[:, ::-1] + len(points)])
+    return np.concatenate([points, ring]).astype("<f4"), both.astype("<i4")
+
+
+def curved_wall() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """A sheet of height 1 along 150 degrees of the unit circle about y, its middle toward -z, facing the axis."""
+    angle = np.radians(np.linspace(-75.0, 75.0, 193))[:, None]
+    height = np.linspace(0.0, 1.0, 9)
+    points = np.stack([np.sin(angle) + 0.0 * height, height + 0.0 * angle, -np.cos(angle) + 0.0 * height], axis=-1)
+    return points.reshape(-1, 3).astype("<f4"), _grid(np.arange(193 * 9).reshape(193, 9)).astype("<i4")
+
+
 def write_ply(path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
     """A binary little-endian PLY without normals."""
     header = (
@@ -92,7 +357,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=SCENES, help="folder to write to")
     folder = parser.parse_args().out
     folder.mkdir(parents=True, exist_ok=True)
-    write_ply(folder / "standin.ply", *standin())
+    for make in (standin, statue, cup, curved_wall):
+        write_ply(folder / f"{make.__name__}.ply", *make())
 
 
 if __name__ == "__main__":
