@@ -232,7 +232,7 @@ def _rough_dielectric(model: Bsdf) -> Iterator[Case]:
         yield Case(
             model, {**_ior(eta), **rough}, eta, lossless=compensated, furnace=0.01, differentiable=_is_wide(rough)
         )
-    yield Case(model, {**_ior(1.0), **roughs[2]}, 1.0, differentiable=False)
+    yield Case(model, {**_ior(1.0), **roughs[2]}, 1.0, smooth=True, lossless=True)  # straight through
     tints = {"specular_reflectance": RED, "specular_transmittance": (0.2, 0.9, 0.5)}
     yield Case(model, {**_ior(1.5), **roughs[3], **tints}, 1.5)
     smooth = {"alpha_u": 0.0, "alpha_v": 0.0} if model.anisotropic else {"alpha": 0.0}
