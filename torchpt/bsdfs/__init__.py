@@ -52,7 +52,6 @@ MODELS: tuple[Bsdf, ...] = (
     BlinnPhong(),
     Nonmetal(),
     Microfacet(),
-    Blend(Diffuse(), Microfacet()),
     RoughConductor(),
     RoughConductor(schlick=True),
     RoughConductor(anisotropic=True),
@@ -70,4 +69,7 @@ MODELS: tuple[Bsdf, ...] = (
     Plastic(nonlinear=True),
     RoughPlastic(),
     RoughPlastic(nonlinear=True),
+    Blend(Diffuse(), RoughConductor()),
+    Blend(Dielectric(), Diffuse()),
+    Blend(Blend(Diffuse(), Conductor(schlick=True)), RoughDielectric()),
 )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchpt.bsdfs.base import Bsdf, Parameters
-from torchpt.bsdfs.lobes import weighed
+from torchpt.bsdfs.lobes import weighed, with_delta
 from torchpt.records import BsdfSample
 
 __all__ = ["Blend"]
@@ -90,17 +90,14 @@ class Blend(Bsdf):
         b = self._facing(self.b).sample(parameters["b"], wo, lobe if self.b.lobed else None, u)
         wi, pdf = torch.where(second, b.wi, a.wi), torch.where(second, b.pdf, a.pdf).detach()
         drawn = weighed(self, parameters, wo, wi, (pdf > 0).to(pdf.dtype))
-        density, value = drawn.pdf, drawn.weight
         if self.delta:
-            jump = torch.isinf(pdf)
             amount = torch.where(second, weight, 1.0 - weight) / width
-            value = torch.where(jump, torch.where(second, b.weight, a.weight) * amount, value)
-            density = torch.where(jump, torch.inf, density)
+            drawn = with_delta(drawn, torch.isinf(pdf), wi, torch.where(second, b.weight, a.weight) * amount)
         eta = None
         if self.refracts:
             one = torch.ones_like(lobe)
             eta = torch.where(second, one if b.eta is None else b.eta, one if a.eta is None else a.eta)
-        return BsdfSample(drawn.wi, density, value, eta)
+        return replace(drawn, eta=eta)
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Blended likewise."""

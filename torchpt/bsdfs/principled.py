@@ -171,13 +171,14 @@ class Principled(Bsdf):
         value = torch.addcmul(value, self._diffuse(parameters, cos_o, cos_i, main.cos), shown)
         pdf = pdf + chance.diffuse * (cos_i * seen * (1.0 / math.pi))
         if chance.clearcoat is not None:
-            d = gtr1(main.m, clearcoat_alpha(_or_zero(parameters["clearcoat_gloss"], cos_o)))
+            m = torch.where(seen > 0, main.m, _up(main.m))
+            d = gtr1(m, clearcoat_alpha(_or_zero(parameters["clearcoat_gloss"], cos_o)))
             f = lerp(0.04, 1.0, facet.schlick)
             cos_o, cos_i = torch.where(seen > 0, cos_o, 1.0), torch.where(seen > 0, cos_i, 1.0)
             g = clearcoat_masking(wo, wi, cos_o, cos_i)
             value = value + (0.25 * parameters["clearcoat"]) * (f * d * g * shown)
             cos = torch.where(main.cos > 0, main.cos, 1.0)
-            pdf = pdf + chance.clearcoat * seen * (d * main.m[2] / (4.0 * cos))
+            pdf = pdf + chance.clearcoat * seen * (d * m[2] / (4.0 * cos))
         return value, pdf
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
@@ -281,7 +282,7 @@ class Principled(Bsdf):
         square = dot(s, s)
         usable = square > 0
         square = torch.where(usable, square, 1.0)
-        m = s * torch.copysign(square.rsqrt(), s[2])
+        m = torch.where(usable, s * torch.copysign(square.rsqrt(), s[2]), _up(s))
         cos, far = dot(wo, m), dot(wi, m)
         meets = usable & (wo[2] > 0) & (wi[2] != 0) & (cos > 0)
         reflects, refracts = meets & ~below & (far > 0), meets & below & (far < 0)
@@ -354,6 +355,12 @@ class Principled(Bsdf):
 def _alphas(parameters: Parameters) -> tuple[Tensor, Tensor]:
     u, v = parameters["alpha_u"], parameters["alpha_v"]
     return u, u if v is None else v
+
+
+def _up(like: Tensor) -> Tensor:
+    """The normal in every lane: what stands in where there is no half vector."""
+    zero = torch.zeros_like(like[0])
+    return torch.stack((zero, zero, torch.ones_like(zero)))
 
 
 def _or_zero(value: Tensor | None, like: Tensor) -> Tensor:
