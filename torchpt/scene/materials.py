@@ -259,7 +259,7 @@ class RoughConductor(_Metal, _Anisotropic):
         return bsdfs.RoughConductor(
             schlick=self.schlick,
             anisotropic=self.alpha_u is not None,
-            **({"energy_compensation": True} if self.energy_compensation else {}),
+            energy_compensation=self.energy_compensation,
         )
 
 
