@@ -72,4 +72,8 @@ MODELS: tuple[Bsdf, ...] = (
     Blend(Diffuse(), RoughConductor()),
     Blend(Dielectric(), Diffuse()),
     Blend(Blend(Diffuse(), Conductor(schlick=True)), RoughDielectric()),
+    RoughConductor(energy_compensation=True),
+    RoughConductor(anisotropic=True, energy_compensation=True),
+    RoughDielectric(energy_compensation=True),
+    RoughDielectric(anisotropic=True, energy_compensation=True),
 )

@@ -74,7 +74,7 @@ class Dielectric(Bsdf):
             tinted(share * side.eta_ti * side.eta_ti, parameters["specular_transmittance"]),
         )
         return BsdfSample(
-            wi.detach(),
+            wi,
             torch.where(wo[2] != 0, math.inf, 0.0).to(wo.dtype),
             weight,
             torch.where(reflects, 1.0, side.eta_it).detach(),

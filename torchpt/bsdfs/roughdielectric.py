@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpt.bsdfs.base import Bsdf, Parameters
 from torchpt.bsdfs.dielectric import Dielectric, clear, tinted
 from torchpt.bsdfs.lobes import weighed
-from torchpt.bsdfs.roughconductor import alphas, rough
+from torchpt.bsdfs.roughconductor import alphas, energy_at, energy_table, rough
 from torchpt.math import microfacet
 from torchpt.math.fresnel import INDEX_MATCHED, fresnel_dielectric, refract
 from torchpt.math.vectors import dot, normalize
@@ -28,6 +28,8 @@ class RoughDielectric(Bsdf):
 
     Attributes:
         anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
+        energy_compensation: what is lost between facets is given back: each direction ``wo`` has both its lobes scaled by
+            ``1 / E(wo)``, where E is what leaves at once (Turquin 2019). Masking is correlated by height. Not reciprocal.
     """
 
     name = "roughdielectric"
@@ -38,12 +40,22 @@ class RoughDielectric(Bsdf):
     refracts = True
 
     anisotropic: bool = False
+    energy_compensation: bool = False
+
+    @property
+    def reciprocal(self) -> bool:
+        """See :class:`Bsdf`."""
+        return not self.energy_compensation
 
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
         out = {**clear(values), **rough(values, self.anisotropic)}
         # Facets between equal indices bend nothing, however they lie.
         out["smooth"] = out["smooth"] | ((out["eta"] - 1.0).abs() < INDEX_MATCHED)
+        if self.energy_compensation:
+            # Equal indices would refract nothing: such a row is smooth, and reads no energy.
+            eta = torch.where(out["smooth"], 1.5, out["eta"])
+            out["energy"] = energy_table(out, [eta, 1.0 / eta])
         return out
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,7 +80,11 @@ class RoughDielectric(Bsdf):
         spread = torch.where(reflects, 0.25, through)
         visible = torch.where(on, microfacet.ggx(m, au, av) * 2.0 / (cos_o + s_o).clamp_min(_TINY) * spread, 0.0)
         r = side.reflectance
-        value = visible * microfacet.masking(cos_i, s_i)
+        if self.energy_compensation:
+            energy = energy_at(parameters["energy"], parameters, wo, (wo[2] < 0).to(wo.dtype))
+            value = visible * microfacet.correlated(cos_o, s_o, cos_i, s_i) / energy
+        else:
+            value = visible * microfacet.masking(cos_i, s_i)
         colour = torch.where(
             reflects,
             tinted(r * value, parameters["specular_reflectance"]),

@@ -73,12 +73,14 @@ class RoughPlastic(Bsdf):
         """Reflect at a visible normal, or about the surface's."""
         assert lobe is not None
         alpha, smooth = parameters["alpha_u"], parameters["smooth"]
-        specular = self._specular(parameters, parameters["transmittance"].at(wo[2]))
+        through = parameters["transmittance"].at(wo[2])
+        specular = self._specular(parameters, through)
         chosen = lobe < specular
         m = microfacet.sample_normal(wo, alpha, alpha, u, microfacet.BOUNDED)
         wi = torch.where(chosen, microfacet.reflect(wo, m, dot(wo, m)), cosine_hemisphere(u))
         drawn = weighed(self, parameters, wo, wi)
-        f_o = fresnel_dielectric(wo[2], parameters["eta"]).reflectance
+        # Under a mirror, what the table says is let through is not reflected as well.
+        f_o = torch.minimum(fresnel_dielectric(wo[2], parameters["eta"]).reflectance, 1.0 - through)
         mirrored = torch.stack((-wo[0], -wo[1], wo[2]))
         weight = tinted(f_o / torch.where(specular > 0, specular, 1.0), parameters["specular_reflectance"])
         return with_delta(drawn, chosen & smooth & (wo[2] > 0), mirrored, weight)

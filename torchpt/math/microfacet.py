@@ -27,7 +27,8 @@ __all__ = [
     "Reflection",
     "coat_reflectance",
     "coat_transmittance",
-    "correlated_masking",
+    "correlated",
+    "energy",
     "ggx",
     "half_vector",
     "is_smooth",
@@ -77,9 +78,12 @@ def masking(cos: Tensor, length: Tensor) -> Tensor:
     return 2.0 * cos / (cos + length)
 
 
-def correlated_masking(cos_o: Tensor, s_o: Tensor, cos_i: Tensor, s_i: Tensor) -> Tensor:
-    """Height-correlated ``G2 / cos_o = 2 cos_i / (cos_o s_i + cos_i s_o)`` (Heitz 2014, equation 99), finite everywhere."""
-    return 2.0 * cos_i / (cos_o * s_i + cos_i * s_o).clamp_min(torch.finfo(cos_i.dtype).tiny)
+def correlated(cos_o: Tensor, s_o: Tensor, cos_i: Tensor, s_i: Tensor) -> Tensor:
+    """``G2 / G1(wo)`` of height-correlated masking ``(N,)`` (Heitz 2014, equation 99), at most 1, finite everywhere.
+
+    For refraction too, where it stands for a beta function (Dupuy, Heitz, d'Eon 2016) of nearly the same values.
+    """
+    return cos_i * (cos_o + s_o) / (cos_o * s_i + cos_i * s_o).clamp_min(torch.finfo(cos_i.dtype).tiny)
 
 
 def half_vector(wo: Tensor, wi: Tensor) -> Tensor:
@@ -151,7 +155,7 @@ class Reflection(NamedTuple):
 
 
 def reflection(
-    wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, bounded: bool = False, correlated: bool = False
+    wo: Tensor, wi: Tensor, alpha_u: Tensor, alpha_v: Tensor, bounded: bool = False, by_height: bool = False
 ) -> Reflection:
     """``D G2 / (4 cos_o)`` and the density of visible normals ``D / (2 (k cos_o + s(wo)))`` carried over to ``wi``.
 
@@ -161,19 +165,23 @@ def reflection(
         alpha_u: ``(N,)``.
         alpha_v: ``(N,)``.
         bounded: as the normal was drawn.
-        correlated: masking and shadowing correlated by height, rather than the product ``G1(wo) G1(wi)``.
+        by_height: masking and shadowing correlated by height, rather than the product ``G1(wo) G1(wi)``.
     """
     m = half_vector(wo, wi)
     above = torch.minimum(wo[2], wi[2]).sign().clamp_min(0.0)
     cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].clamp_min(0.0)
     s_o, s_i = stretched_length(wo, alpha_u, alpha_v), stretched_length(wi, alpha_u, alpha_v)
     d = ggx(m, alpha_u, alpha_v) * above
-    if correlated:
-        value = 0.25 * d * correlated_masking(cos_o, s_o, cos_i, s_i)
-    else:
-        value = d * cos_i / ((cos_o + s_o) * (cos_i + s_i))
+    shadowing = correlated(cos_o, s_o, cos_i, s_i) if by_height else masking(cos_i, s_i)
+    value = 0.5 * d / (cos_o + s_o) * shadowing
     scaled = _bound(wo, alpha_u, alpha_v).k * cos_o if bounded else cos_o
     return Reflection(m, dot(wo, m), value, 0.5 * d / (scaled + s_o))
+
+
+def _legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss and Legendre's nodes and weights on [0, 1]."""
+    x, weights = np.polynomial.legendre.leggauss(n)
+    return 0.5 * (x + 1.0), 0.5 * weights
 
 
 class _Normals(NamedTuple):
@@ -189,10 +197,39 @@ class _Normals(NamedTuple):
         return (x.reshape(-1, len(self.weights)) * self.weights).sum(1)
 
 
-def _legendre(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss and Legendre's nodes and weights on [0, 1]."""
-    x, weights = np.polynomial.legendre.leggauss(n)
-    return 0.5 * (x + 1.0), 0.5 * weights
+def energy(
+    wo: Tensor, alpha_u: Tensor, alpha_v: Tensor | None, eta: Tensor | None, azimuths: int = 32, heights: int = 32
+) -> Tensor:
+    """Light ``(K,)`` that leaves the facets after one reflection or refraction, masking correlated by height.
+
+    The directional albedo of facets that absorb nothing; what is missing to 1 would meet further facets.
+
+    Args:
+        wo: ``(3, K)`` above the surface; in the xz plane where it is isotropic.
+        alpha_u: ``(1,)``.
+        alpha_v: ``(1,)``; None where it is isotropic: half the azimuths stand for all then.
+        eta: ``(1,)`` index of the far side over that of the side of ``wo``; None where the facets are mirrors.
+        azimuths: Gauss-Legendre nodes.
+        heights: Gauss-Legendre nodes.
+    """
+    (a, wa), (b, wb) = _legendre(azimuths), _legendre(heights)
+    u = wo.new_tensor(np.stack(np.meshgrid(a if alpha_v is not None else 0.5 * a, b, indexing="ij")).reshape(2, -1))
+    k, q = wo.shape[1], azimuths * heights
+    wo = wo.repeat_interleave(q, 1)
+    au = alpha_u.expand(k * q)
+    av = au if alpha_v is None else alpha_v.expand(k * q)
+    m = sample_normal(wo, au, av, u.repeat(1, k), bounded=eta is None)
+    cos, s_o = dot(wo, m), stretched_length(wo, au, av)
+    back = reflect(wo, m, cos)
+    out = correlated(wo[2], s_o, back[2].clamp_min(0.0), stretched_length(back, au, av))
+    if eta is None:
+        out = out * (_bound(wo, au, av).k * wo[2] + s_o) / (wo[2] + s_o)
+    else:
+        boundary = fresnel_dielectric(cos, eta)
+        on = normalize(refract(wo, m, cos, boundary))
+        through = correlated(wo[2], s_o, (-on[2]).clamp_min(0.0), stretched_length(on, au, av))
+        out = boundary.reflectance * out + (1.0 - boundary.reflectance) * through
+    return (out.reshape(k, q) * wo.new_tensor(np.outer(wa, wb).ravel())).sum(1)
 
 
 def _lanes(cosines: Tensor, alpha: Tensor, n: int) -> tuple[Tensor, Tensor]:
