@@ -1,0 +1,210 @@
+"""Phong, Blinn-Phong, nonmetal and microfacet: against their formulas written out, one pair of directions at a time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from oracle import ours_eval_pdf, random_pairs
+from torch import Tensor
+
+from torchpt.bsdfs import BlinnPhong, Bsdf, Microfacet, Nonmetal, Parameters, Phong, gather
+
+RED, GREY = (0.8, 0.5, 0.1), (0.2, 0.3, 0.4)
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+
+Vector = tuple[float, float, float]
+
+
+def dot(a: Vector, b: Vector) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def half(a: Vector, b: Vector) -> Vector:
+    s = tuple(x + y for x, y in zip(a, b, strict=True))
+    length = math.sqrt(sum(x * x for x in s))
+    return (s[0] / length, s[1] / length, s[2] / length)
+
+
+def phong(v: dict[str, Any], wo: Vector, wi: Vector) -> list[float]:
+    n, cos = v["exponent"], dot((-wo[0], -wo[1], wo[2]), wi)
+    lobe = (n + 2) / (2 * math.pi) * max(cos, 0) ** n if cos > 0 else 0.0
+    return [(kd / math.pi + ks * lobe) * wi[2] for kd, ks in zip(v["diffuse"], v["specular"], strict=True)]
+
+
+def blinn_phong(v: dict[str, Any], wo: Vector, wi: Vector) -> list[float]:
+    n = v["exponent"]
+    lobe = (n + 2) / (2 * math.pi) * half(wo, wi)[2] ** n
+    return [(kd / math.pi + ks * lobe) * wi[2] for kd, ks in zip(v["diffuse"], v["specular"], strict=True)]
+
+
+def ggx_with_shortcut(roughness: float, wo: Vector, wi: Vector) -> float:
+    """``D G / (4 cos cos)``."""
+    a2, k, z = roughness**4, (roughness + 1) ** 2 / 8, half(wo, wi)[2]
+    d = a2 / (math.pi * (z * z * (a2 - 1) + 1) ** 2)
+    g = math.prod(w[2] / (w[2] * (1 - k) + k) for w in (wo, wi))
+    return d * g / (4 * wo[2] * wi[2])
+
+
+def nonmetal(v: dict[str, Any], wo: Vector, wi: Vector) -> list[float]:
+    s, facets = v["specular"], ggx_with_shortcut(v["roughness"], wo, wi)
+    return [(s * facets + (1 - s) * base / math.pi) * wi[2] for base in v["base_color"]]
+
+
+def microfacet(v: dict[str, Any], wo: Vector, wi: Vector) -> list[float]:
+    facets, eta, cos = ggx_with_shortcut(v["roughness"], wo, wi), v["ior"], wo[2]
+    cos2_t = 1 - (1 - cos * cos) / eta**2
+    f = 1.0
+    if cos2_t > 0:
+        cos_t = math.sqrt(cos2_t)
+        f = (((cos - eta * cos_t) / (cos + eta * cos_t)) ** 2 + ((eta * cos - cos_t) / (eta * cos + cos_t)) ** 2) / 2
+    return [
+        (ks * f * facets + (1 - f) * kd / math.pi) * wi[2] for kd, ks in zip(v["diffuse"], v["specular"], strict=True)
+    ]
+
+
+FORMULAS = [
+    *(
+        (model, formula, {"diffuse": RED, "specular": GREY, "exponent": n})
+        for n in (0.0, 0.5, 30.0, 1000.0, 1e5)
+        for model, formula in ((Phong(), phong), (BlinnPhong(), blinn_phong))
+    ),
+    *((Nonmetal(), nonmetal, {"base_color": RED, "specular": 0.04, "roughness": r}) for r in (0.1, 0.5, 1.0)),
+    *(
+        (Microfacet(), microfacet, {"diffuse": RED, "specular": GREY, "roughness": r, "ior": ior})
+        for r, ior in ((0.4, 1.85), (1.0, 1.5), (0.2, 0.7))
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("model", "formula", "values"),
+    FORMULAS,
+    ids=[f"{model} {list(values.values())[-2:]}" for model, _, values in FORMULAS],
+)
+def test_values_are_the_formulas(model, formula, values):
+    exponent = values.get("exponent", 0.0)
+    wo, wi = random_pairs(21, 2000, sharp=0.1 if exponent <= 1000 else 0.003)
+    expected = torch.tensor(
+        [formula(values, a, b) for a, b in zip(wo.T.double().tolist(), wi.T.double().tolist(), strict=True)]
+    ).T
+    value, _ = ours_eval_pdf(model, values, wo, wi)
+    assert float(expected.max()) > 1e-2
+    # Unit vectors in float32 have lengths off by 6e-8, which the formulas above take for an angle.
+    torch.testing.assert_close(value, expected.float(), rtol=1e-4 if exponent <= 1000 else 2e-2, atol=1e-5)
+
+
+def exact(values: dict[str, Any], dtype: torch.dtype = torch.float64) -> Parameters:
+    return {
+        k: torch.tensor(v, dtype=dtype).reshape((3, 1) if isinstance(v, tuple) else (1,)) for k, v in values.items()
+    }
+
+
+def lanes(model: Bsdf, values: dict[str, Any], n: int, dtype: torch.dtype = torch.float64) -> Parameters:
+    return gather(model.prepare(exact(values, dtype)), torch.zeros(n, dtype=torch.int64))
+
+
+@pytest.mark.parametrize("model", [Phong(), BlinnPhong()], ids=str)
+def test_an_exponent_of_1e5_is_as_good_in_float32_as_in_float64(model):
+    values = {"diffuse": RED, "specular": GREY, "exponent": 1e5}
+    wo, wi = random_pairs(22, 4000, near=1.0, sharp=0.003)
+    # The same directions, unit in float64 too.
+    wide = [w.double() / w.double().norm(dim=0) for w in (wo, wi)]
+    value, pdf = model.eval_pdf(lanes(model, values, 4000, torch.float32), wo, wi)
+    value_there, pdf_there = model.eval_pdf(lanes(model, values, 4000), *wide)
+    assert float(pdf_there.max()) > 1e3
+    torch.testing.assert_close(value.double(), value_there, rtol=2e-3, atol=1e-4)
+    torch.testing.assert_close(pdf.double(), pdf_there, rtol=2e-3, atol=1e-4)
+
+
+def grid(n: int = 700) -> tuple[Tensor, Tensor]:
+    """Directions ``(3, M)`` of the upper half and their weights; close about the normal, where lobes are narrow."""
+    x = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+    z, wz = 1 - x**3, 3 * x**2 / n
+    phi = (torch.arange(64, dtype=torch.float64) + 0.5) * (math.pi / 32)
+    z, phi = z.repeat_interleave(64), phi.repeat(n)
+    r = (1 - z * z).sqrt()
+    return torch.stack((r * phi.cos(), r * phi.sin(), z)), wz.repeat_interleave(64) * (math.pi / 32)
+
+
+@pytest.mark.parametrize(("exponent", "albedo"), [(0.0, 1.0), (10.0, 2.87), (100.0, 3.846), (1000.0, 3.984)])
+def test_blinn_phong_creates_as_much_energy_as_its_integral_says(exponent, albedo):
+    """At normal incidence ``4 (n + 2^(-n/2)) / (n + 4)``, and the draws agree."""
+    model = BlinnPhong()
+    values = {"diffuse": BLACK, "specular": WHITE, "exponent": exponent}
+    wi, weight = grid()
+    wo = torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64)
+    value, _ = model.eval_pdf(lanes(model, values, wi.shape[1]), wo.expand_as(wi), wi)
+    found = float((value[0] * weight).sum())
+    assert found == pytest.approx(4 * (exponent + 2 ** (-exponent / 2)) / (exponent + 4), rel=1e-4)
+    assert found == pytest.approx(albedo, abs=5e-3)
+    n = 1 << 16
+    u = torch.rand(3, n, generator=torch.Generator().manual_seed(23))
+    drawn = model.sample(lanes(model, values, n, torch.float32), wo.float().expand(3, n), u[2], u[:2]).weight[0]
+    assert float(drawn.mean()) == pytest.approx(found, abs=5 * float(drawn.std()) / n**0.5)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 50.0])
+@pytest.mark.parametrize("cos", [1.0, 0.5, 0.05])
+def test_phong_of_reflectances_that_add_up_to_1_creates_no_energy(exponent, cos):
+    model = Phong()
+    values = {"diffuse": (0.0, 0.5, 0.9), "specular": (1.0, 0.5, 0.1), "exponent": exponent}
+    wi, weight = grid()
+    wo = torch.tensor([[math.sqrt(1 - cos * cos)], [0.0], [cos]], dtype=torch.float64).expand_as(wi)
+    value, _ = model.eval_pdf(lanes(model, values, wi.shape[1]), wo, wi)
+    albedo = (value * weight).sum(1)
+    assert float(albedo.max()) <= 1.002
+    if cos == 1.0:  # nothing of the lobe is below the surface
+        torch.testing.assert_close(albedo, torch.ones(3, dtype=torch.float64), rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("model", [Nonmetal(), Microfacet()], ids=str)
+def test_a_polished_surface_is_the_limit_of_smooth_ones(model):
+    """The delta's share of the light is what the narrowest lobe with a density reflects."""
+    rough: dict[str, Any] = {"roughness": 0.011}
+    if isinstance(model, Nonmetal):
+        values: dict[str, Any] = {"base_color": RED, "specular": 0.3}
+    else:
+        values = {"diffuse": RED, "specular": WHITE, "ior": 1.85}
+    n = 1 << 16
+    u = torch.rand(3, n, generator=torch.Generator().manual_seed(24))
+    for cos in (1.0, 0.4, 0.1):
+        wo = torch.tensor([[math.sqrt(1 - cos * cos)], [0.0], [cos]]).expand(3, n)
+        narrow = model.sample(lanes(model, {**values, **rough}, n, torch.float32), wo, u[2], u[:2])
+        polished = model.sample(lanes(model, {**values, "roughness": 0.0}, n, torch.float32), wo, u[2], u[:2])
+        delta = torch.isinf(polished.pdf)
+        assert delta.any() and not torch.isinf(narrow.pdf).any()
+        mirror = torch.stack((-wo[0], -wo[1], wo[2]))
+        torch.testing.assert_close(polished.wi[:, delta], mirror[:, delta])
+        error = 5 * (narrow.weight.var(1) / n).sqrt() + 5e-3
+        assert ((narrow.weight.mean(1) - polished.weight.mean(1)).abs() < error).all()
+
+
+@pytest.mark.parametrize(
+    ("model", "values"),
+    [
+        (Phong(), {"diffuse": RED, "specular": GREY, "exponent": 20.0}),
+        (BlinnPhong(), {"diffuse": RED, "specular": GREY, "exponent": 20.0}),
+        (Nonmetal(), {"base_color": RED, "specular": 0.3, "roughness": 0.0}),
+        (Microfacet(), {"diffuse": RED, "specular": GREY, "roughness": 0.0, "ior": 1.5}),
+    ],
+    ids=lambda x: str(x) if isinstance(x, Bsdf) else "",
+)
+def test_the_mean_weight_has_the_derivative_of_the_albedo(model, values):
+    """Sampling is detached: the weights alone carry the derivative, through deltas too."""
+    n = 1 << 16
+    u = torch.rand(3, n, generator=torch.Generator().manual_seed(25)).double()
+    wo = torch.tensor([[0.6], [0.0], [0.8]], dtype=torch.float64).expand(3, n)
+    name = "diffuse" if "diffuse" in values else "specular"
+
+    def mean(scale: float, grad: bool) -> Tensor:
+        inputs = exact(values)
+        inputs[name] = (inputs[name] * scale).requires_grad_(grad)
+        p = gather(model.prepare(inputs), torch.zeros(n, dtype=torch.int64))
+        weight = model.sample(p, wo, u[2], u[:2]).weight[0].mean()
+        return torch.autograd.grad(weight, inputs[name])[0].reshape(-1)[0] if grad else weight
+
+    slope, change = float(mean(1.0, True)), float(mean(1.05, False) - mean(0.95, False))
+    assert slope == pytest.approx(change / (0.1 * float(exact(values)[name].reshape(-1)[0])), rel=0.05, abs=0.02)
