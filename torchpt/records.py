@@ -114,7 +114,9 @@ class Hit:
     prim: Tensor  # (N,) int64, -1 for a miss
     u: Tensor  # (N,)
     v: Tensor  # (N,)
-    chance: Tensor | None = None  # (N,) 1, with the derivative of the chance to get here; None: no derivative, or no chance
+    chance: Tensor | None = (
+        None  # (N,) 1, with the derivative of the chance to get here; None: no derivative, or no chance
+    )
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,9 @@ def test_shadows_let_through_what_the_surfaces_do(strategy):
     veiled = {"sky": {"type": "constant", "radiance": 0.8}}
     keys = {"max_depth": 2, "strategy": strategy}
     # Seen through the leaf; lit through the leaf, by the sky through the ball as well.
-    expected = 0.6 * 0.6 * shoot({**LEAVES, "shapes": plain, "lights": veiled}, 256, 5, "sobol", keys, film_of(16)).image
+    expected = (
+        0.6 * 0.6 * shoot({**LEAVES, "shapes": plain, "lights": veiled}, 256, 5, "sobol", keys, film_of(16)).image
+    )
     image = shoot(LEAVES, 256, 6, "sobol", keys, film_of(16)).image
     (mean, error), (value, noise) = estimate(image), estimate(expected)
     assert ((mean - value).abs() < z_limit(12) * (error**2 + noise**2).sqrt()).all(), (mean, value, error)
@@ -80,7 +82,11 @@ def test_emission_is_covered_by_opacity():
     lamp = {"type": "diffuse", "reflectance": 0, "emission": [1, 2, 3], "emission_strength": 2, "opacity": 0.25}
     shapes = {
         "lamp": {"type": "rectangle", "material": "lamp", "transform": [{"translate": [0, 0, 1]}]},
-        "floor": {"type": "rectangle", "material": "white", "transform": [{"rotate": {"axis": [0, 1, 0], "angle": 30}}]},
+        "floor": {
+            "type": "rectangle",
+            "material": "white",
+            "transform": [{"rotate": {"axis": [0, 1, 0], "angle": 30}}],
+        },
     }
     own = scene({"lamp": {**shapes["lamp"], "transform": []}}, lamp=lamp)
     mean, error = estimate(shoot(own, 64, 1, film=film_of(32)).image)
@@ -118,7 +124,11 @@ def test_gradients_of_opacity():
     described = scene(LEAVES["shapes"], SKY, **LEAVES["materials"])
     loaded = torchpt.load(described, device="cpu")
     name = "materials.leaf.opacity"
-    wish: dict[str, Any] = {"film": {**film_of(8), "filter": "box"}, "spp": 256, "integrator": {"type": "path", "max_depth": 2}}
+    wish: dict[str, Any] = {
+        "film": {**film_of(8), "filter": "box"},
+        "spp": 256,
+        "integrator": {"type": "path", "max_depth": 2},
+    }
 
     def mean(value: float, seed: int) -> torch.Tensor:
         params = {name: torch.tensor(value)}
@@ -151,5 +161,7 @@ def test_layers_see_through():
 
 
 def test_any_chunk_size_gives_the_same_picture():
-    pictures = [shoot(LEAVES, 8, 2, "sobol", {"max_depth": 4}, film_of(16), max_memory=m).image for m in (None, 3_000_00)]
+    pictures = [
+        shoot(LEAVES, 8, 2, "sobol", {"max_depth": 4}, film_of(16), max_memory=m).image for m in (None, 3_000_00)
+    ]
     assert torch.equal(*pictures)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from showcase import showcase
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from trials import film_of, shoot
@@ -44,6 +45,18 @@ MIXED: dict[str, Any] = {
 @pytest.fixture(scope="module", params=["cornell_box", "mixed"])
 def scene(request):
     return torchpt.load(MIXED if request.param == "mixed" else "cornell_box", device="cpu")
+
+
+def test_every_material_in_chunks_and_threads():
+    scene = torchpt.load(showcase(), device="cpu")
+
+    def image(lanes: int | None, threads: int) -> torch.Tensor:
+        memory = None if lanes is None else lanes * PER_LANE
+        return shoot(scene, 4, 1, "sobol", {"max_depth": 4}, film_of(40), max_memory=memory, threads=threads).image
+
+    whole = image(None, 1)
+    for lanes, threads in ((1003, 1), (None, 2)):
+        assert torch.equal(image(lanes, threads), whole), (lanes, threads)
 
 
 @pytest.mark.parametrize("sampler", ["sobol", "independent"])
@@ -119,6 +132,14 @@ OPERATIONS: list[tuple[str, Callable[..., torch.Tensor]]] = [
     ("copysign", lambda a, b, u: torch.copysign(a, b)),
     ("clamp_min", lambda a, b, u: a.clamp_min(0.0)),
     ("clamp_max", lambda a, b, u: a.clamp_max(0.95)),
+    ("clamp", lambda a, b, u: a.clamp(-0.5, 0.5)),
+    ("exp", lambda a, b, u: torch.exp(a.clamp(-80.0, 80.0))),
+    ("expm1", lambda a, b, u: torch.expm1(a.clamp(-80.0, 80.0))),
+    ("log", lambda a, b, u: torch.log(a.abs() + 1e-6)),
+    ("log1p", lambda a, b, u: torch.log1p(-u * (1.0 - 2.0**-24))),
+    ("pow", lambda a, b, u: a.square()),
+    ("rsqrt", lambda a, b, u: (a.abs() + 1e-6).rsqrt()),
+    ("floor", lambda a, b, u: torch.floor(a)),
     ("minimum", lambda a, b, u: torch.minimum(a, b)),
     ("maximum", lambda a, b, u: torch.maximum(a, b)),
     ("addcmul", lambda a, b, u: torch.addcmul(a, b, u)),
@@ -140,7 +161,7 @@ OPERATIONS: list[tuple[str, Callable[..., torch.Tensor]]] = [
 #: that tests of their own hold to the bit: tests/samplers/test_kernels.py, tests/accel.
 EXACT = {
     "_to_copy", "_unsafe_view", "alias", "arange", "cat", "clone", "copy_", "detach", "empty", "empty_like", "expand",
-    "full", "full_like", "gather", "index", "index_select", "lift_fresh", "new_zeros", "ones", "ones_like", "permute",
+    "full", "full_like", "gather", "index", "index_copy", "index_select", "lift_fresh", "new_zeros", "ones", "ones_like", "permute",
     "repeat", "repeat_interleave", "scalar_tensor", "scatter_", "scatter_add_", "select", "slice", "sort", "split",
     "squeeze", "stack", "take", "unsqueeze", "view", "zeros", "zeros_like", "brute_intersect", "brute_occluded", "draw",
 }  # fmt: skip
@@ -202,6 +223,9 @@ def test_the_audit_covers_what_waves_use(monkeypatch):
             return radiance(self, *span)
 
     monkeypatch.setattr(Wave, "radiance", recorded)
+    materials = torchpt.load(showcase(), device="cpu")
+    for strategy in ("mis", "light", "uniform"):
+        shoot(materials, 2, 0, "sobol", {"strategy": strategy, "max_depth": 4}, film_of(16), accel="brute")
     scene = torchpt.load(MIXED, device="cpu")
     for sampler in SAMPLERS:
         for strategy in ("mis", "bsdf", "light", "uniform"):

@@ -67,7 +67,9 @@ def checked(scene: torchpt.Scene, *names: str) -> None:
 DIRECT = {"max_depth": 3, "strategy": "light"}
 
 
-@pytest.mark.parametrize("name", ["shapes.plate.to_world", "shapes.before.to_world", "camera.to_world", "shapes.lamp.vertices"])
+@pytest.mark.parametrize(
+    "name", ["shapes.plate.to_world", "shapes.before.to_world", "camera.to_world", "shapes.lamp.vertices"]
+)
 def test_what_a_mirror_shows_follows_the_geometry(name):
     described = room(GOLD, DIRECT)
     del described["shapes"]["bulb"], described["shapes"]["behind"]

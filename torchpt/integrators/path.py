@@ -24,6 +24,7 @@ __all__ = ["ENDLESS", "Limits", "Tally", "trace"]
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted.
 ENDLESS = 4096
 
+
 @dataclass(frozen=True)
 class Limits:
     """Where paths end."""

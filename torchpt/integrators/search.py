@@ -6,8 +6,6 @@ straight to the search.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 

@@ -45,6 +45,7 @@ SHORTEN = 1e-4
 #: Roulette never lets a path live on for sure: throughput above one would make it immortal.
 SURVIVAL_CAP = 0.95
 
+
 @dataclass(frozen=True)
 class Plan:
     """What a render asks of the stages; static."""

@@ -130,7 +130,8 @@ def assemble(
         bound = torch.where(planar, bound, (p0.abs().sum(0) + 2.0 * e1[0].abs()).detach())
 
     surfaces = {
-        slot.name: surface_of(slot, parameters, dtype) for slot in {part.material.name: part.material for part in parts}.values()
+        slot.name: surface_of(slot, parameters, dtype)
+        for slot in {part.material.name: part.material for part in parts}.values()
     }
     models, rows, tables, two_sided = _materials(parts, surfaces, device)
     opacity = _opacity(parts, surfaces, sizes, dtype, device)

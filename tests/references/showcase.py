@@ -1,0 +1,93 @@
+"""A scene with a ball of every material in every variant, for tests that must hold whatever a scene is made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["MATERIALS", "showcase"]
+
+#: Materials by name, at least one for each variant in ``bsdfs.MODELS``.
+MATERIALS: dict[str, dict[str, Any]] = {
+    "diffuse": {"type": "diffuse", "reflectance": [0.6, 0.3, 0.2]},
+    "phong": {"type": "phong", "diffuse": [0.3, 0.4, 0.5], "specular": 0.3, "exponent": 40},
+    "blinn_phong": {"type": "blinn_phong", "diffuse": [0.3, 0.2, 0.1], "specular": 0.1, "exponent": 60},
+    "mirror": {"type": "conductor"},
+    "silver": {"type": "conductor", "material": "Ag"},
+    "gold": {"type": "roughconductor", "material": "Au", "alpha": 0.2},
+    "bronze": {"type": "roughconductor", "reflectance": [0.7, 0.5, 0.3], "roughness": 0.5},
+    "brushed": {"type": "roughconductor", "material": "Al", "alpha_u": 0.05, "alpha_v": 0.4},
+    "brushed_tint": {"type": "roughconductor", "reflectance": [0.9, 0.6, 0.5], "alpha_u": 0.3, "alpha_v": 0.1},
+    "full_gold": {"type": "roughconductor", "material": "Au", "alpha": 0.7, "energy_compensation": True},
+    "full_tint": {"type": "roughconductor", "reflectance": 0.8, "alpha": 0.9, "energy_compensation": True},
+    "full_brushed": {
+        "type": "roughconductor",
+        "material": "Cu",
+        "alpha_u": 0.3,
+        "alpha_v": 0.6,
+        "energy_compensation": True,
+    },
+    "glass": {"type": "dielectric"},
+    "pane": {"type": "thindielectric", "specular_transmittance": [0.8, 0.9, 1.0]},
+    "frosted": {"type": "roughdielectric", "alpha": 0.3},
+    "wiped": {"type": "roughdielectric", "alpha_u": 0.05, "alpha_v": 0.3},
+    "full_frosted": {"type": "roughdielectric", "alpha": 0.6, "energy_compensation": True},
+    "clear_rough": {"type": "roughdielectric", "alpha": 0.0},
+    "plastic": {"type": "plastic", "diffuse_reflectance": [0.1, 0.3, 0.6]},
+    "plastic_nonlinear": {"type": "plastic", "diffuse_reflectance": [0.1, 0.3, 0.6], "nonlinear": True},
+    "satin": {"type": "roughplastic", "diffuse_reflectance": [0.6, 0.3, 0.1], "alpha": 0.15},
+    "satin_nonlinear": {"type": "roughplastic", "diffuse_reflectance": [0.6, 0.3, 0.1], "nonlinear": True},
+    "nonmetal": {"type": "nonmetal", "base_color": [0.4, 0.6, 0.4], "roughness": 0.3},
+    "microfacet": {"type": "microfacet", "diffuse": [0.7, 0.7, 0.6], "roughness": 0.4},
+    "paint": {
+        "type": "principled",
+        "base_color": [0.7, 0.1, 0.1],
+        "roughness": 0.3,
+        "metallic": 0.3,
+        "clearcoat": 0.8,
+        "clearcoat_gloss": 0.7,
+        "sheen": 0.4,
+        "sheen_tint": 0.5,
+        "spec_tint": 0.5,
+        "flatness": 0.3,
+    },
+    "lathe": {"type": "principled", "base_color": 0.8, "metallic": 0.8, "roughness": 0.4, "anisotropic": 0.7},
+    "gel": {"type": "principled", "base_color": [0.3, 0.8, 0.4], "roughness": 0.2, "spec_trans": 0.8, "eta": 1.4},
+    "comb": {"type": "principled", "roughness": 0.4, "spec_trans": 0.5, "anisotropic": 0.6},
+    "mixed": {"type": "blend", "a": "gold", "b": "satin", "weight": 0.4},
+    "window": {"type": "blend", "a": "glass", "b": "diffuse", "weight": 0.5},
+    "nothing": {"type": "null"},
+    "lace": {"type": "diffuse", "opacity": 0.5},
+    "shell": {"type": "diffuse", "two_sided": False, "reflectance": 0.6},
+    "ember": {"type": "roughconductor", "alpha": 0.3, "material": "Cu", "emission": [0.5, 0.2, 0.1]},
+}
+
+
+def showcase(*names: str) -> dict[str, Any]:
+    """Balls of ``names`` (all materials by default) in rows on a floor, under a lamp and a dim sky."""
+    chosen = names or tuple(MATERIALS)
+    side = max(int(len(chosen) ** 0.5), 1)
+    shapes: dict[str, Any] = {
+        "floor": {
+            "type": "rectangle",
+            "transform": [{"scale": 3 * side}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}],
+        },
+        "lamp": {"type": "sphere", "center": [side, 3 * side, 3 * side], "radius": 0.5 * side, "emission": 12},
+    }
+    for number, name in enumerate(chosen):
+        x, z = number % side, number // side
+        shapes[f"ball_{name}"] = {
+            "type": "sphere",
+            "center": [2.4 * (x - 0.5 * (side - 1)), 1, -2.4 * z],
+            "radius": 1,
+            "material": name,
+        }
+    needed = set(chosen)
+    for name in chosen:
+        needed |= {MATERIALS[name][key] for key in ("a", "b") if MATERIALS[name]["type"] == "blend"}
+    return {
+        "camera": {"origin": [0, 2.2 * side, 3.2 * side], "target": [0, 0, -1.2 * side], "fov": 50},
+        "materials": {name: material for name, material in MATERIALS.items() if name in needed},
+        "lights": {"sky": {"type": "constant", "radiance": [0.3, 0.35, 0.4]}},
+        "shapes": shapes,
+        "integrator": {"type": "path", "max_depth": 8},
+    }
