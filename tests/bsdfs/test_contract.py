@@ -15,7 +15,7 @@ from functools import cached_property
 import pytest
 import torch
 from cases import BUILDERS, Case, Values, cases_of, edges_of, lanes, leaves, tensors
-from chi_square import Integral, Tree, chart, counts_p, integrate
+from chi_square import Chart, Integral, SlopeChart, Tree, counts_p, integrate
 from significance import SIGNIFICANCE, z_limit
 from torch import Tensor
 
@@ -84,6 +84,17 @@ EACH = 1.0 - (1.0 - SIGNIFICANCE) ** (1.0 / max(len(SETTINGS), 1))  # Šidák
 Z = z_limit(3 * max(len(SETTINGS), 1))
 
 
+@dataclass(frozen=True)
+class Half:
+    """Bins on one side of the surface."""
+
+    below: bool
+    chart: Chart | SlopeChart
+    tree: Tree
+    integral: Integral
+    density: Tensor  # of the leaves, roughly
+
+
 class Experiment:
     """Draws of a material from one direction, and the integrals that they estimate."""
 
@@ -99,7 +110,6 @@ class Experiment:
         self.number = number or (FULL if setting.full else FAST)
         self.seed = torch.seed() if setting.full else zlib.crc32(str(setting).encode())
         self.generator = torch.Generator().manual_seed(self.seed)
-        self.azimuth = AZIMUTH + math.pi  # of the mirror direction
         self.sampled_rows = (replace(self.case, values=drawn) if drawn else self.case).rows(self.dtype)
         self.rows = self.case.rows(torch.float64)
         self.draws = self.drawn(self.number)
@@ -150,46 +160,67 @@ class Experiment:
         w = torch.where(torch.arange(n) % 2 == 0, near, uniform_sphere(u[:2]))
         return torch.stack((w[0], w[1], w[2].abs() * (-1 if below else 1)))
 
+    def chart(self, below: bool) -> Chart | SlopeChart:
+        """Of one half of the directions: that in which this material's lobes are widest."""
+        height = abs(float(self.wo[2]))
+        if self.case.narrowest * height > 0.02:
+            return Chart(AZIMUTH + math.pi, max(height, 1e-3))
+        wo = normalize(self.wo.double())
+        if self.setting.below == below:
+            return SlopeChart(wo)
+        if self.case.eta == 1.0:
+            return Chart(AZIMUTH + math.pi, max(height, 1e-3))
+        return SlopeChart(wo, 1 / self.case.eta if self.setting.below else self.case.eta)
+
     @cached_property
-    def cells(self) -> tuple[list[Tree], list[bool], Integral]:
-        """Trees of both halves (of one where light cannot pass), and the integrals over their leaves."""
+    def halves(self) -> list[Half]:
+        """Above and, where light can pass, below."""
         depth = 7 if self.setting.full else 6
+        tolerance = 0.02 / math.sqrt(self.number * 2**depth)
         scout = self.drawn(1 << 14)
         known = scout.wi[:, (scout.pdf > 0) & torch.isfinite(scout.pdf)].double()
-        trees, sides = [], [False, True] if self.model.transmits else [False]
-        places, homes = [], []
-        for i, below in enumerate(sides):
+        halves = []
+        for below in (False, True) if self.model.transmits else (False,):
+            chart = self.chart(below)
             here = known[:, (known[2] < 0) == below]
-            points = self.guides(below, 1 << 13)
+            here = here[:, chart.covers(here)]
+            points = self.guides(below, 1 << 14)
+            points = points[:, chart.covers(points)]
+            points = points[:, torch.randint(points.shape[1], (1 << 13,), generator=self.generator)]
             if here.shape[1] > 100:
                 pick = torch.randint(here.shape[1], (3 << 11,), generator=self.generator)
                 points = torch.cat((here[:, pick], points[:, : 1 << 11]), 1)
-            at = chart(points, self.azimuth)
-            trees.append(Tree.over(at, depth, below))
-            places.append(at)
-            homes.append(trees[-1].leaf(at) + (i << depth))
-        rects = torch.cat([tree.rects for tree in trees], 1)
-        tolerance = 0.02 / math.sqrt(self.number * rects.shape[1])
-        scouts = torch.cat(places, 1), torch.cat(homes)
-        return trees, sides, integrate(self.values, rects, self.azimuth, tolerance, scouts)
+            places = chart.places(points)
+            tree = Tree.over(places, depth, chart.ends(below))
+            integral = integrate(self.values, tree.rects, chart, tolerance, (places, tree.leaf(places)))
+            density = (
+                torch.zeros(1 << depth).double().scatter_reduce_(0, tree.leaf(places), self.values(points)[0], "mean")
+            )
+            halves.append(Half(below, chart, tree, integral, density))
+        return halves
+
+    @cached_property
+    def integral(self) -> Integral:
+        return Integral(
+            torch.cat([half.integral.value for half in self.halves], 1),
+            torch.cat([half.integral.error for half in self.halves], 1),
+        )
 
     def counts(self) -> Tensor:
         """Draws in each leaf."""
-        trees, sides, _ = self.cells
         wi = self.draws.wi[:, self.spread]
         out = []
-        for tree, below in zip(trees, sides, strict=True):
-            here = wi[:, (wi[2] < 0) == below]
-            out.append(torch.bincount(tree.leaf(chart(here, self.azimuth)), minlength=tree.rects.shape[1]))
+        for half in self.halves:
+            here = wi[:, (wi[2] < 0) == half.below]
+            here = here[:, half.chart.covers(here)]
+            out.append(torch.bincount(half.tree.leaf(half.chart.places(here)), minlength=half.tree.rects.shape[1]))
         return torch.cat(out)
 
     def p_value(self) -> float:
         """Of the hypothesis that the draws follow the density."""
-        trees, _, integral = self.cells
-        y0, y1, p0, p1 = torch.cat([tree.rects for tree in trees], 1)
-        area = (torch.tanh(y1) - torch.tanh(y0)) * (p1 - p0)
+        density = torch.cat([half.density for half in self.halves])
         n = self.number
-        return counts_p(self.counts(), n * integral.value[0], area, n, n * integral.error[0])
+        return counts_p(self.counts(), n * self.integral.value[0], density, n, n * self.integral.error[0])
 
     def mean(self, where: Tensor, radiance: bool = False) -> tuple[Tensor, Tensor]:
         """Mean weight ``(3,)`` over all draws of those ``where``, and its standard error.
@@ -227,14 +258,14 @@ def test_every_model_has_cases_and_edges():
 def test_draws_follow_the_density(experiment):
     if experiment.case.smooth:
         assert not experiment.spread.any()
-        assert experiment.cells[2].value.abs().max() == 0
+        assert experiment.integral.value.abs().max() == 0
         return
     p = experiment.p_value()
     assert p > EACH, f"p = {p:.3g} (seed {experiment.seed}), limit {EACH:.2g}"
 
 
 def test_the_density_holds_at_most_one(experiment):
-    integral = experiment.cells[2]
+    integral = experiment.integral
     mass, error = float(integral.value[0].sum()), float(integral.error[0].sum())
     assert error < 2e-3, f"the cubature is known to {error:.2g} only"
     share = float((~experiment.spread).double().mean())
@@ -243,7 +274,7 @@ def test_the_density_holds_at_most_one(experiment):
 
 
 def test_the_mean_weight_is_the_integral_of_eval(experiment):
-    integral = experiment.cells[2]
+    integral = experiment.integral
     mean, error = experiment.mean(experiment.spread)
     expected, doubt = integral.value[1:].sum(1), integral.error[1:].sum(1)
     assert (doubt < 2e-3 * (1 + expected)).all(), f"the cubature is known to {doubt.tolist()} only"
