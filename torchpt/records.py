@@ -7,7 +7,7 @@ Directions (pbrt): ``wo`` points toward the previous vertex, ``wi`` toward the n
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from torchpt.math.vectors import take
 
@@ -182,8 +182,9 @@ R = TypeVar("R", PathState, Hit)
 
 def rows(record: R, index: Tensor) -> R:
     """The lanes ``index`` of a record of tensors."""
-    values = {f.name: getattr(record, f.name) for f in fields(record)}
-    return type(record)(**{name: None if value is None else take(value, index) for name, value in values.items()})
+    values: dict[str, Any] = {f.name: getattr(record, f.name) for f in fields(record)}
+    found: dict[str, Any] = {name: None if value is None else take(value, index) for name, value in values.items()}
+    return type(record)(**found)
 
 
 def joined(records: list[R]) -> R:
@@ -193,7 +194,8 @@ def joined(records: list[R]) -> R:
     if len(records) == 1:
         return records[0]
     columns = {f.name: [getattr(r, f.name) for r in records] for f in fields(records[0])}
-    return type(records[0])(**{name: None if c[0] is None else torch.cat(c, -1) for name, c in columns.items()})
+    whole: dict[str, Any] = {name: None if c[0] is None else torch.cat(c, -1) for name, c in columns.items()}
+    return type(records[0])(**whole)
 
 
 def tensors_of(record: object) -> list[Tensor]:

@@ -100,8 +100,8 @@ def render(
     attached = _moves(scene, names)
     if attached:
         warnings.warn(
-            "the gradient with respect to what moves or bends rays leaves out visibility edges (silhouettes and shadow edges that move); "
-            "see docs/gradients.md",
+            "the gradient with respect to what moves or bends rays leaves out visibility edges (silhouettes and shadow edges "
+            "that move); see docs/gradients.md",
             EdgeWarning,
             stacklevel=2,
         )

@@ -161,7 +161,8 @@ OPERATIONS: list[tuple[str, Callable[..., torch.Tensor]]] = [
 #: that tests of their own hold to the bit: tests/samplers/test_kernels.py, tests/accel.
 EXACT = {
     "_to_copy", "_unsafe_view", "alias", "arange", "cat", "clone", "copy_", "detach", "empty", "empty_like", "expand",
-    "full", "full_like", "gather", "index", "index_copy", "index_select", "lift_fresh", "new_zeros", "ones", "ones_like", "permute",
+    "full", "full_like", "gather", "index", "index_copy", "index_select", "lift_fresh", "new_zeros", "ones", "ones_like",
+    "permute",
     "repeat", "repeat_interleave", "scalar_tensor", "scatter_", "scatter_add_", "select", "slice", "sort", "split",
     "squeeze", "stack", "take", "unsqueeze", "view", "zeros", "zeros_like", "brute_intersect", "brute_occluded", "draw",
 }  # fmt: skip

@@ -95,10 +95,9 @@ class Bsdf:
 
     def weights(self) -> Iterator[Tensor]:
         """Trainable tensors of its own, those of modules it holds: gradients flow to them."""
-        own = self if isinstance(self, torch.nn.Module) else None
         held = [value for value in vars(self).values() if isinstance(value, torch.nn.Module)]
-        for module in [own] if own is not None else held:
-            yield from module.parameters()
+        for module in [self] if isinstance(self, torch.nn.Module) else held:
+            yield from torch.nn.Module.parameters(module)
 
     def __str__(self) -> str:
         variants = [key.replace("_", " ") for key, value in vars(self).items() if value is True]

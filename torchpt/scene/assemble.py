@@ -129,10 +129,8 @@ def assemble(
     if planar is not None:
         bound = torch.where(planar, bound, (p0.abs().sum(0) + 2.0 * e1[0].abs()).detach())
 
-    surfaces = {
-        slot.name: surface_of(slot, parameters, dtype)
-        for slot in {part.material.name: part.material for part in parts}.values()
-    }
+    slots = {part.material.name: part.material for part in parts}
+    surfaces = {name: surface_of(slot, parameters, dtype) for name, slot in slots.items()}
     models, rows, tables, two_sided = _materials(parts, surfaces, device)
     opacity = _opacity(parts, surfaces, sizes, dtype, device)
     emissive = spread([int(part.emission is None) for part in parts])  # 0 where it emits
