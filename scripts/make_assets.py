@@ -169,113 +169,109 @@ def _limb(
     return np.linalg.norm(p - start - t[..., None] * along, axis=-1) - (thick[0] + (thick[1] - thick[0]) * t)
 
 
-# Height against half width, half depth, sideways and forward sway of the robe; depth of its folds.
+# Height against half width, half depth, sideways and forward sway of the robe, and depth of its folds.
 WIDTH = (
-    (0.07, 0.125),
-    (0.2, 0.112),
-    (0.38, 0.1),
-    (0.5, 0.098),
-    (0.6, 0.072),
-    (0.7, 0.082),
-    (0.77, 0.088),
-    (0.81, 0.05),
+    (0.07, 0.125), (0.2, 0.112), (0.38, 0.1), (0.5, 0.098), (0.6, 0.072), (0.7, 0.082), (0.77, 0.088), (0.81, 0.05),
     (0.84, 0.02),
-)
+)  # fmt: skip
 DEPTH = (
-    (0.07, 0.115),
-    (0.2, 0.098),
-    (0.38, 0.082),
-    (0.5, 0.075),
-    (0.6, 0.056),
-    (0.7, 0.064),
-    (0.77, 0.05),
-    (0.81, 0.035),
+    (0.07, 0.115), (0.2, 0.098), (0.38, 0.082), (0.5, 0.075), (0.6, 0.056), (0.7, 0.064), (0.77, 0.05), (0.81, 0.035),
     (0.84, 0.02),
-)
+)  # fmt: skip
 SWAY = ((0.07, -0.005), (0.3, 0.0), (0.5, 0.022), (0.64, 0.006), (0.8, -0.008))
 LEAN = ((0.07, 0.01), (0.34, 0.016), (0.5, 0.0), (0.7, 0.008), (0.82, -0.006))
 FOLD = ((0.07, 0.13), (0.25, 0.11), (0.45, 0.06), (0.56, 0.035), (0.6, 0.03), (0.66, 0.045), (0.8, 0.03))
+# Rods of the limbs: both ends and both thicknesses.
+LEG = (
+    ((-0.035, 0.47, 0.03), (-0.042, 0.29, 0.075), (0.05, 0.042)),
+    ((-0.042, 0.29, 0.075), (-0.05, 0.1, 0.06), (0.042, 0.05)),
+)
+SHOULDERS = (
+    ((-0.08, 0.795, -0.004), (0.0, 0.815, -0.008), (0.032, 0.036)),
+    ((0.0, 0.815, -0.008), (0.078, 0.81, -0.004), (0.036, 0.032)),
+)
+HANGING = (
+    ((-0.105, 0.785, -0.004), (-0.15, 0.665, -0.02), (0.03, 0.023)),
+    ((-0.15, 0.665, -0.02), (-0.108, 0.56, 0.045), (0.023, 0.016)),
+)
+LIFTED = (
+    ((0.1, 0.805, -0.002), (0.175, 0.845, 0.02), (0.03, 0.024)),
+    ((0.175, 0.845, 0.02), (0.185, 0.935, 0.035), (0.024, 0.015)),
+)
 
 
 def figure(p: NDArray[np.float64]) -> NDArray[np.float64]:
     """The statue's field at ``(..., 3)``: a robed figure with one arm raised, height 1 with plinth and sphere."""
-    x, y, z = np.moveaxis(p, -1, 0)
-    side, front = x - curve(SWAY, y), z - curve(LEAN, y)
-    wide, deep = curve(WIDTH, y), curve(DEPTH, y)
-    angle = np.arctan2(front / deep, side / wide)
-    drift = 1.5 * np.sin(3.0 * y + 1.0) + 0.5 * np.sin(angle * 2.0 + 9.0 * y)  # folds do not fall straight
-    fold = np.sin(11.0 * angle + 3.0 * drift) + 0.5 * np.sin(19.0 * angle - 4.0 * drift + 1.0)
-    fold = np.tanh(1.6 * fold + 0.5)
-    reach = np.sqrt((side / wide) ** 2 + (front / deep) ** 2)
-    robe = (reach / (1.0 + curve(FOLD, y) * fold) - 1.0) * np.minimum(wide, deep)
-    robe = np.maximum(robe, np.maximum(y - 0.85, 0.03 - y))
-    # The near leg bends: its knee and shin push the cloth out.
-    robe = _join(robe, _limb(p, (-0.035, 0.47, 0.03), (-0.042, 0.29, 0.075), (0.05, 0.042)), 0.05)
-    robe = _join(robe, _limb(p, (-0.042, 0.29, 0.075), (-0.05, 0.1, 0.06), (0.042, 0.05)), 0.05)
-    # A girdle, and the overfold of cloth that hangs from it.
-    ring = np.sqrt((reach - 1.02) ** 2 * 0.004 + ((y - 0.6 - 0.01 * np.sin(angle)) * 1.0) ** 2) - 0.008
-    robe = _join(robe, ring, 0.012)
-    hem = 0.50 + 0.018 * np.sin(2.0 * angle + 0.6) + 0.008 * np.sin(11.0 * angle)
-    over = np.maximum(
-        (reach / (1.1 + 0.05 * fold) - 1.0) * np.minimum(wide, deep), np.abs(y - 0.5 * (hem + 0.6)) - 0.5 * (0.6 - hem)
-    )
-    robe = _join(robe, over, 0.018)
-    chest = _join(
-        _ball(p, (-0.042, 0.735, 0.048), (0.035, 0.035, 0.033)),
-        _ball(p, (0.034, 0.74, 0.048), (0.035, 0.035, 0.033)),
-        0.03,
-    )
-    robe = _join(robe, chest, 0.04)
-    shoulders = _join(
-        _limb(p, (-0.08, 0.795, -0.004), (0.0, 0.815, -0.008), (0.032, 0.036)),
-        _limb(p, (0.0, 0.815, -0.008), (0.078, 0.81, -0.004), (0.036, 0.032)),
-        0.02,
-    )
-    body = _join(robe, shoulders, 0.035)
+    body = _join(_robe(p), _rods(p, SHOULDERS, 0.02), 0.035)
     # One arm hangs and gathers the robe at the hip, the other lifts a sphere.
-    arm = _join(
-        _limb(p, (-0.105, 0.785, -0.004), (-0.15, 0.665, -0.02), (0.03, 0.023)),
-        _limb(p, (-0.15, 0.665, -0.02), (-0.108, 0.56, 0.045), (0.023, 0.016)),
-        0.015,
+    body = _join(
+        body, _join(_rods(p, HANGING, 0.015), _ball(p, (-0.1, 0.545, 0.052), (0.022, 0.026, 0.02)), 0.015), 0.018
     )
-    arm = _join(arm, _ball(p, (-0.1, 0.545, 0.052), (0.022, 0.026, 0.02)), 0.015)
-    body = _join(body, arm, 0.018)
-    lifted = _join(
-        _limb(p, (0.1, 0.805, -0.002), (0.175, 0.845, 0.02), (0.03, 0.024)),
-        _limb(p, (0.175, 0.845, 0.02), (0.185, 0.935, 0.035), (0.024, 0.015)),
-        0.015,
+    body = _join(
+        body, _join(_rods(p, LIFTED, 0.015), _ball(p, (0.185, 0.947, 0.037), (0.024, 0.014, 0.022)), 0.012), 0.02
     )
-    lifted = _join(lifted, _ball(p, (0.185, 0.947, 0.037), (0.024, 0.014, 0.022)), 0.012)
-    body = _join(body, lifted, 0.02)
     body = _join(body, _ball(p, (0.185, 0.972, 0.037), (0.028, 0.028, 0.028)), 0.004)
-    # Head: skull, jaw, nose, brow, hair in a knot, turned toward the sphere.
     body = _join(body, _limb(p, (-0.004, 0.815, -0.008), (0.002, 0.875, 0.002), (0.03, 0.024)), 0.022)
-    turn = 0.45
-    centre = np.array([0.004, 0.925, 0.008])
-    local = p - centre
-    cos, sin = np.cos(turn), np.sin(turn)
-    head = np.stack(
-        [cos * local[..., 0] - sin * local[..., 2], local[..., 1], sin * local[..., 0] + cos * local[..., 2]], -1
+    body = _join(body, _head(p), 0.012)
+    drum = _disc(p, 0.145, 0.035, 0.03)  # the plinth and its moulding
+    return _join(_join(body, drum, 0.012), _disc(p, 0.16, 0.0125, 0.0075), 0.004)
+
+
+def _rods(
+    p: NDArray[np.float64],
+    rods: tuple[tuple[tuple[float, ...], tuple[float, ...], tuple[float, float]], ...],
+    soft: float,
+) -> NDArray[np.float64]:
+    """Two rods that meet."""
+    return _join(_limb(p, *rods[0]), _limb(p, *rods[1]), soft)
+
+
+def _disc(p: NDArray[np.float64], radius: float, height: float, half: float) -> NDArray[np.float64]:
+    """An upright drum about the y axis with rounded edges."""
+    flat = np.hypot(p[..., 0], p[..., 2])
+    return np.hypot(np.maximum(flat - radius, 0.0), np.maximum(np.abs(p[..., 1] - height) - half, 0.0)) - 0.005
+
+
+def _robe(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cloth about a swaying column of elliptical section, in folds that do not fall straight."""
+    x, y, z = np.moveaxis(p, -1, 0)
+    wide, deep = curve(WIDTH, y), curve(DEPTH, y)
+    side, front = (x - curve(SWAY, y)) / wide, (z - curve(LEAN, y)) / deep
+    thin = np.minimum(wide, deep)
+    angle, reach = np.arctan2(front, side), np.hypot(side, front)
+    drift = 1.5 * np.sin(3.0 * y + 1.0) + 0.5 * np.sin(angle * 2.0 + 9.0 * y)
+    fold = np.tanh(1.6 * (np.sin(11.0 * angle + 3.0 * drift) + 0.5 * np.sin(19.0 * angle - 4.0 * drift + 1.0)) + 0.5)
+    robe = (reach / (1.0 + curve(FOLD, y) * fold) - 1.0) * thin
+    robe = np.maximum(robe, np.maximum(y - 0.85, 0.03 - y))
+    for rod in LEG:  # the near leg bends: its knee and shin push the cloth out
+        robe = _join(robe, _limb(p, *rod), 0.05)
+    # A girdle, and the overfold of cloth that hangs from it.
+    girdle = np.sqrt(0.004 * (reach - 1.02) ** 2 + (y - 0.6 - 0.01 * np.sin(angle)) ** 2) - 0.008
+    robe = _join(robe, girdle, 0.012)
+    hem = 0.50 + 0.018 * np.sin(2.0 * angle + 0.6) + 0.008 * np.sin(11.0 * angle)
+    band = np.abs(y - 0.5 * (hem + 0.6)) - 0.5 * (0.6 - hem)
+    robe = _join(robe, np.maximum((reach / (1.1 + 0.05 * fold) - 1.0) * thin, band), 0.018)
+    radii = (0.035, 0.035, 0.033)
+    return _join(
+        robe, _join(_ball(p, (-0.042, 0.735, 0.048), radii), _ball(p, (0.034, 0.74, 0.048), radii), 0.03), 0.04
     )
-    skull = _join(
-        _ball(head, (0.0, 0.012, -0.004), (0.039, 0.043, 0.047)),
-        _ball(head, (0.0, -0.025, 0.014), (0.027, 0.032, 0.029)),
-        0.02,
-    )
+
+
+def _head(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Skull, jaw, nose, brow, mouth, and hair in a knot, turned toward the sphere."""
+    x, y, z = np.moveaxis(p - (0.004, 0.925, 0.008), -1, 0)
+    cos, sin = np.cos(0.45), np.sin(0.45)
+    head = np.stack([cos * x - sin * z, y, sin * x + cos * z], axis=-1)
+    skull = _ball(head, (0.0, 0.012, -0.004), (0.039, 0.043, 0.047))
+    skull = _join(skull, _ball(head, (0.0, -0.025, 0.014), (0.027, 0.032, 0.029)), 0.02)
     skull = _join(skull, _limb(head, (0.0, 0.004, 0.042), (0.0, -0.014, 0.051), (0.004, 0.006)), 0.008)
     skull = _join(skull, _limb(head, (-0.02, 0.009, 0.037), (0.02, 0.009, 0.037), (0.005, 0.005)), 0.01)
     skull = _join(skull, _ball(head, (0.0, -0.033, 0.04), (0.011, 0.004, 0.006)), 0.006)
-    wave = 0.0035 * np.sin(70.0 * head[..., 1] + 30.0 * np.abs(head[..., 0]))
-    hair = np.maximum(
-        _ball(head, (0.0, 0.014, -0.01), (0.046, 0.048, 0.052)) + wave, 0.55 * head[..., 2] - head[..., 1] + 0.002
-    )
+    wave = 0.0035 * np.sin(70.0 * y + 30.0 * np.abs(head[..., 0]))
+    hair = _ball(head, (0.0, 0.014, -0.01), (0.046, 0.048, 0.052)) + wave
+    hair = np.maximum(hair, 0.55 * head[..., 2] - y + 0.002)
     hair = _join(hair, _ball(head, (0.0, 0.0, -0.062), (0.024, 0.022, 0.022)) + wave, 0.012)
-    body = _join(body, _join(skull, hair, 0.006), 0.012)
-    # Plinth with a moulding.
-    flat = np.hypot(x, z)
-    drum = np.hypot(np.maximum(flat - 0.145, 0.0), np.maximum(np.abs(y - 0.035) - 0.03, 0.0)) - 0.005
-    foot = np.hypot(np.maximum(flat - 0.16, 0.0), np.maximum(np.abs(y - 0.0125) - 0.0075, 0.0)) - 0.005
-    return _join(_join(body, drum, 0.012), foot, 0.004)
+    return _join(skull, hair, 0.006)
 
 
 def statue() -> tuple[NDArray[np.float32], NDArray[np.int32]]:

@@ -1,20 +1,40 @@
-"""A torchpt scene as Mitsuba 3 sees it: the same description, so that numbers match. For references and benchmarks."""
+"""A torchpt scene as Mitsuba 3 sees it: the same description, so that numbers match. For references and benchmarks.
+
+Rough models are built with GGX, opaque materials as ``twosided``, meshes with torchpt's own shading normals. In Mitsuba light
+that passes an opacity or ``null`` counts as a bounce and here it does not: scenes with such need a large ``max_depth``.
+"""
 
 from __future__ import annotations
 
 import ctypes.util
 import importlib
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+import yaml
 
+import torchpt
+from torchpt.math.vectors import cross, dot
 from torchpt.scene import Scene
-from torchpt.scene.parts import Part
+from torchpt.scene.assemble import corners_of
+from torchpt.scene.parts import MaterialSlot, Part
 from torchpt.scene.settings import Film, PathIntegrator, Settings
 
-__all__ = ["convert", "find_llvm", "load_mitsuba"]
+__all__ = ["NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "load_mitsuba"]
+
+#: Models with the same parameters on both sides; those with microfacets become the smooth one where alpha is next to nothing.
+SHARED = ("diffuse", "conductor", "dielectric", "thindielectric", "plastic", "principled", "null")
+SMOOTH = {"roughconductor": "conductor", "roughdielectric": "dielectric", "roughplastic": "plastic"}
+#: Below this alpha torchpt's rough models are mirrors.
+LEAST_ALPHA = 1e-4
+
+
+class NoCounterpartError(ValueError):
+    """A material that Mitsuba cannot express."""
 
 
 def find_llvm() -> str | None:
@@ -52,9 +72,12 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
 
     Args:
         mitsuba: the module, with its variant set.
-        scene: what; diffuse materials, as all of torchpt's are two-sided here.
+        scene: what.
         settings: film size, filter and integrator; the sampler is ``independent``.
-        folder: where meshes are put as PLY files, from which Mitsuba computes smooth normals itself.
+        folder: where meshes are put as PLY files.
+
+    Raises:
+        NoCounterpartError: a material that Mitsuba cannot express.
     """
     integrator = settings.integrator
     assert isinstance(integrator, PathIntegrator)
@@ -74,11 +97,28 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
         },
     }
     for number, part in enumerate(scene.parts.parts):
-        out[f"part{number}"] = _shape(mitsuba, part, folder / f"part{number}.ply")
+        out[f"part{number}"] = _shape(mitsuba, scene, part, folder / f"part{number}.ply")
     if scene.parts.environment is not None:
         radiance = scene.parts.parameters[scene.parts.environment]
         out["environment"] = {"type": "constant", "radiance": _rgb(radiance)}
     return out
+
+
+def comparable(name: str) -> Scene:
+    """A scene of ``configs/scene`` without the shapes whose material Mitsuba cannot express."""
+    scene = torchpt.load(name, device="cpu")
+    lacking = set()
+    for part in scene.parts.parts:
+        try:
+            bsdf(part.material)
+        except NoCounterpartError:
+            lacking.add(part.shape)
+    if not lacking:
+        return scene
+    assert scene.description.file is not None
+    raw = yaml.safe_load(Path(scene.description.file).read_text(encoding="utf-8"))
+    raw["shapes"] = {shape: value for shape, value in raw["shapes"].items() if shape not in lacking}
+    return torchpt.load(raw, device="cpu")
 
 
 def _film(film: Film) -> dict[str, Any]:
@@ -100,28 +140,104 @@ def _rgb(colour: Any) -> dict[str, Any]:
     return {"type": "rgb", "value": [float(x) for x in colour]}
 
 
-def _shape(mitsuba: Any, part: Part, file: Path) -> dict[str, Any]:
-    lambert = {"type": "diffuse", "reflectance": _rgb(part.material.values["reflectance"])}
-    shape: dict[str, Any] = {"bsdf": {"type": "twosided", "material": lambert} if part.material.two_sided else lambert}
+def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]:
+    if part.emission is not None and _passing(part.material) != 1.0:
+        raise NoCounterpartError(f"{part.name}: Mitsuba's lights shine in full whatever their opacity")
+    shape: dict[str, Any] = {"bsdf": bsdf(part.material)}
     if part.kind == "triangle":
-        assert part.vertices is not None and part.faces is not None
-        world = part.vertices @ part.to_world[:3, :3].T + part.to_world[:3, 3]
-        write_ply(file, world, part.faces)
+        if part.uvs is None and part.material.model.anisotropic:
+            raise NoCounterpartError(f"{part.name}: anisotropic, and no uv to agree on a tangent")
+        _write_part(file, scene, part)
         shape |= {"type": "ply", "filename": str(file), "face_normals": not part.smooth}
     else:
         shape |= {"type": part.kind, "to_world": _transform(mitsuba, part.to_world)}
     if part.flip:
         shape["flip_normals"] = True
     if part.emission is not None:
-        shape["emitter"] = {"type": "area", "radiance": _rgb(part.emission)}
+        strength = part.material.emission_strength if len(part.emission_names) > 1 else 1.0
+        shape["emitter"] = {"type": "area", "radiance": _rgb(strength * np.array(part.emission))}
     return shape
 
 
-def write_ply(file: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """A binary PLY of positions ``(V, 3)`` and triangles ``(F, 3)``."""
-    names = "".join(f"property float {axis}\n" for axis in "xyz")
+def bsdf(slot: MaterialSlot) -> dict[str, Any]:
+    """Mitsuba's dict of a material.
+
+    Raises:
+        NoCounterpartError: what Mitsuba lacks, by the material's name.
+    """
+    opacity = _passing(slot)
+    if slot.inner and (slot.model.transmits or any(_passing(inner) != 1.0 for inner in slot.inner)):
+        a, b = (bsdf(inner) for inner in slot.inner)
+        found: dict[str, Any] = {"type": "blendbsdf", "weight": slot.values["weight"], "bsdf_0": a, "bsdf_1": b}
+    else:
+        found = _bare(slot)
+        if slot.two_sided and not slot.model.transmits:
+            found = {"type": "twosided", "material": found}
+    return found if opacity == 1.0 else {"type": "mask", "opacity": opacity, "material": found}
+
+
+def _passing(slot: MaterialSlot) -> float:
+    """Opacity of a material itself."""
+    return slot.opacity if slot.alpha_cutoff is None else float(slot.opacity >= slot.alpha_cutoff)
+
+
+def _bare(slot: MaterialSlot) -> dict[str, Any]:
+    """A material as seen from its front, with nothing around it."""
+    model, values = slot.model, dict(slot.values)
+    if slot.inner:
+        a, b = (_bare(inner) for inner in slot.inner)
+        return {"type": "blendbsdf", "weight": values["weight"], "bsdf_0": a, "bsdf_1": b}
+    if model.name not in (*SHARED, *SMOOTH):
+        raise NoCounterpartError(f"{slot.name}: {model.name} has no counterpart in Mitsuba")
+    if getattr(model, "energy_compensation", False):
+        raise NoCounterpartError(f"{slot.name}: energy_compensation has no counterpart in Mitsuba")
+    out: dict[str, Any] = {"type": model.name}
+    if getattr(model, "schlick", False):
+        if values.pop("reflectance") != (1.0, 1.0, 1.0):
+            raise NoCounterpartError(f"{slot.name}: a conductor given by its reflectance has no counterpart in Mitsuba")
+        out["material"] = "none"
+    if model.name in SMOOTH:
+        if "roughness" in values:
+            values["alpha"] = values.pop("roughness") ** 2  # type: ignore[operator]
+        alphas = {key: values.pop(key) for key in ("alpha", "alpha_u", "alpha_v") if key in values}
+        if max(alphas.values()) < LEAST_ALPHA:  # type: ignore[type-var]
+            out["type"] = SMOOTH[model.name]
+        else:
+            out |= {"distribution": "ggx", **{k: max(LEAST_ALPHA, alpha) for k, alpha in alphas.items()}}  # type: ignore[type-var]
+    if getattr(model, "nonlinear", False):
+        out["nonlinear"] = True
+    return out | {key: _rgb(value) if isinstance(value, tuple) else value for key, value in values.items()}
+
+
+def _write_part(file: Path, scene: Scene, part: Part) -> None:
+    """A mesh in the world, each triangle with corners of its own so that Mitsuba interpolates the same normals."""
+    corners = corners_of(part, scene.params, torch.zeros(3, dtype=torch.float64), torch.float64)
+    columns = [torch.stack((corners.p0, corners.p1, corners.p2))]  # (3 corners, 3, F)
+    if corners.normals is not None:
+        columns.append(torch.stack(corners.normals))
+        face = cross(corners.p1 - corners.p0, corners.p2 - corners.p0)
+        against = dot(face, columns[1].sum(0)) < 0  # the outside is where the shading normals point
+    else:
+        against = torch.zeros(corners.p0.shape[1], dtype=torch.bool)
+    if part.uvs is not None:
+        assert part.faces is not None
+        columns.append(torch.from_numpy(part.uvs[part.faces]).permute(1, 2, 0))
+    rows = torch.cat(columns, 1)
+    rows = torch.where(against, rows[[0, 2, 1]], rows)
+    names = [
+        *"xyz",
+        *(("nx", "ny", "nz") if corners.normals is not None else ()),
+        *("uv" if part.uvs is not None else ""),
+    ]
+    vertices = rows.permute(2, 0, 1).reshape(-1, len(names)).detach().numpy()
+    write_ply(file, vertices, np.arange(len(vertices)).reshape(-1, 3), names)
+
+
+def write_ply(file: Path, vertices: np.ndarray, faces: np.ndarray, names: Sequence[str] = "xyz") -> None:
+    """A binary PLY of vertices ``(V, C)`` with properties ``names`` and triangles ``(F, 3)``."""
+    properties = "".join(f"property float {name}\n" for name in names)
     header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{names}"
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     rows = np.empty(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
