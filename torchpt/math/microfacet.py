@@ -63,7 +63,7 @@ def ggx(m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
     """
     x, y = m[0] / alpha_u, m[1] / alpha_v
     # At least 1 for unit normals; a zero vector, which stands for no normal, must not divide by 0.
-    bracket = torch.addcmul(torch.addcmul(m[2] * m[2], x, x), y, y).clamp_min(1e-9)
+    bracket = torch.addcmul(torch.addcmul(m[2] * m[2], x, x), y, y).clamp_min(0.5)
     return 1.0 / (math.pi * (alpha_u * alpha_v) * (bracket * bracket))
 
 
