@@ -24,6 +24,9 @@ __all__ = ["Bsdf", "Parameters", "Table", "gather", "stacked"]
 #: By name: a tensor, ``(3, N)`` or ``(N,)``; a :class:`Table`; such a mapping again; None where it asks for nothing.
 Parameters = dict[str, Any]
 
+#: Parameters that scale a lobe: where they are absent they count as 1.
+FACTORS = ("specular_reflectance", "specular_transmittance")
+
 Default = float | tuple[float, float, float]
 
 
@@ -143,7 +146,7 @@ def gather(rows: Parameters, row: Tensor) -> Parameters:
 
 
 def stacked(prepared: Sequence[Parameters]) -> Parameters:
-    """One mapping of rows from those of several materials of one model. What is None in some is zero (false) there."""
+    """One mapping of rows from those of several materials of one model. Of what is None in some, they get 0, of a factor 1."""
     out: Parameters = {}
     for name in dict.fromkeys(name for values in prepared for name in values):
         column = [values.get(name) for values in prepared]
@@ -155,5 +158,6 @@ def stacked(prepared: Sequence[Parameters]) -> Parameters:
         elif isinstance(like, Table):
             out[name] = Table(torch.cat([torch.zeros_like(like.values) if t is None else t.values for t in column]))
         else:
-            out[name] = torch.cat([torch.zeros_like(like) if t is None else t for t in column], -1)
+            nothing = torch.ones_like(like) if name in FACTORS else torch.zeros_like(like)
+            out[name] = torch.cat([nothing if t is None else t for t in column], -1)
     return out

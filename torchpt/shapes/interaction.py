@@ -74,9 +74,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
     return Interaction(p, ng, ns, _tangent(world, prim, u, v, e1, e2, ng), prim)
 
 
-def _tangent(
-    world: World, prim: Tensor, u: Tensor, v: Tensor, e1: Tensor, e2: Tensor, ng: Tensor
-) -> Tensor | None:
+def _tangent(world: World, prim: Tensor, u: Tensor, v: Tensor, e1: Tensor, e2: Tensor, ng: Tensor) -> Tensor | None:
     """Derivative of the point along the shape's first parameter, as Mitsuba has it: radial on a disk, around a sphere."""
     if world.tangents is None:
         return None
