@@ -196,7 +196,9 @@ def traversal(name: str, size: int) -> Callable[[], dict[str, float]]:
     at = interact(world, first.o[:, seen], first.d[:, seen], hit)
     frame = Frame.about(at.ns)
     side = frame.to_local(-first.d[:, seen])[2]
-    d = frame.to_world(cosine_hemisphere(torch.rand(2, len(side), generator=torch.Generator().manual_seed(0)), side))
+    local = cosine_hemisphere(torch.rand(2, len(side), generator=torch.Generator().manual_seed(0)))
+    local[2] *= torch.sign(side)
+    d = frame.to_world(local)
     o = offset_origin(world, at, d)
     rays = {"coherent": (first.o, first.d), "diffuse": (o, d)}
 

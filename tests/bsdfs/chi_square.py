@@ -302,5 +302,5 @@ def counts_p(observed: Tensor, expected: Tensor, density: Tensor, number: int, d
     grouped = [torch.cat((torch.zeros(16).double().index_add_(0, group, a[:-1]), a[-1:])) for a in (o, e, d)]
     half = [torch.stack((a[:8].sum(), a[8:16].sum(), a[16])) for a in grouped]
     # The rest comes first, so that it is merged into a leaf where it is small, and not dropped.
-    p = min(_p(*(a.roll(1) for a in cells)) for cells in ((o, e, d), grouped, half))
+    p = min(_p(a.roll(1), b.roll(1), c.roll(1)) for a, b, c in ((o, e, d), grouped, half))
     return 1.0 - (1.0 - p) ** 3
