@@ -368,6 +368,7 @@ def delta_amounts(case: Case, values: bsdfs.Parameters, wo: Tensor) -> tuple[Ten
     return f * reflectance, (1 - f) * transmittance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", ANGLES)
 @pytest.mark.parametrize("case", [case for case in CASES if case.model.delta], ids=identify)
 def test_deltas_carry_what_fresnel_gives_them(case, angle):
@@ -422,6 +423,7 @@ def pairs(case: Case, n: int, dtype: torch.dtype, generator: torch.Generator) ->
     return normalize(wo.to(dtype)), normalize(wi.to(dtype))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=identify)
 def test_reciprocity(case):
     """``f(wo, wi) = f(wi, wo)`` on one side; across, the radiance of either is divided by its squared index."""
@@ -438,6 +440,7 @@ def test_reciprocity(case):
     torch.testing.assert_close(there, back, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=identify)
 def test_opaque_models_are_black_from_behind(case):
     if case.model.transmits:
@@ -449,6 +452,7 @@ def test_opaque_models_are_black_from_behind(case):
     assert not value.any() and not pdf.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", bsdfs.MODELS, ids=identify)
 def test_rows_of_one_model_do_not_meet(model):
     """Two materials in one group of lanes give what each gives alone, whatever one has and the other has not."""
@@ -514,6 +518,7 @@ def edge_lanes(case: Case) -> tuple[Tensor, Tensor, Tensor]:
     return wo, wi, u
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", EDGES, ids=identify)
 def test_edge_numbers_stay_finite(case):
     model = case.model
@@ -550,6 +555,7 @@ def test_edge_numbers_stay_finite(case):
     assert torch.isfinite(albedo).all() and (albedo >= 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", EDGES, ids=identify)
 def test_gradients_stay_finite_at_the_edges(case):
     """Through ``prepare``: of eval, and of the weights of all draws, deltas and failed ones too."""
@@ -594,6 +600,7 @@ def inside(values: bsdfs.Parameters) -> bsdfs.Parameters:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [case for case in CASES if case.differentiable and not case.smooth], ids=identify)
 def test_gradients_of_eval(case):
     """Finite differences in every number that a material is given, at directions within its lobes."""
