@@ -11,6 +11,7 @@ import os
 import re
 import sys
 import tempfile
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,12 +34,14 @@ torchpt: a wavefront path tracer that is a PyTorch program
   torchpt render scene=cornell_box render.spp=64 out=cornell.exr    render a picture
   torchpt info   scene=cornell_box                                  what the scene holds, what was built, what left out
 
-torchpt COMMAND --help says more. Scenes: {scenes}
+torchpt COMMAND --help says more. Scenes that ship:
+{scenes}
 """
 HELP_RENDER = """\
 torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
 
-  scene=   a scene that ships ({scenes}), or a file ending in .yaml
+  scene=   a file ending in .yaml, or a scene that ships:
+{scenes}
   out=     .exr .hdr .png .jpg .ppm; several as out=[a.exr,a.png]; NAME.png where nothing is said
   {keys}
 
@@ -54,7 +57,8 @@ HELP_INFO = """\
 torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
 
   What the scene holds, what was built for it, and what was left out because nothing needs it.
-  scene=   a scene that ships ({scenes}), or a file ending in .yaml
+  scene=   a file ending in .yaml, or a scene that ships:
+{scenes}
   {keys}
 """
 
@@ -327,4 +331,5 @@ def _scenes() -> str:
 
 def _help(text: str) -> str:
     keys = "\n  ".join(f"{group + '.':12}{' '.join(names)}" for group, names in _known_keys().items())
-    return text.format(scenes=_scenes(), keys=keys)
+    scenes = textwrap.fill(_scenes(), 110, initial_indent=" " * 11, subsequent_indent=" " * 11, break_on_hyphens=False)
+    return text.format(scenes=scenes, keys=keys)

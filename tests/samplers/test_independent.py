@@ -104,8 +104,8 @@ def test_keys_of_pixels_never_collide():
 def test_golden_values():
     key = Sampler("independent", 7, 4).key(torch.tensor([0, 1, 4095]), torch.tensor([0, 5, 1023]))
     salt = salts(2, CPU)
-    assert independent.draw_1d(key, salt[6]).tolist() == [0.38377881050109863, 0.059665560722351074, 0.265847384929657]
+    assert independent.draw_1d(key, salt[6]).tolist() == [0.25919538736343384, 0.06587833166122437, 0.7398347854614258]
     assert independent.draw_2d(key, salt[5]).tolist() == [
-        [0.3944065570831299, 0.19259750843048096, 0.2710598111152649],
-        [0.5249653458595276, 0.3540409207344055, 0.9425065517425537],
+        [0.9896961450576782, 0.4407835602760315, 0.849068284034729],
+        [0.8941990733146667, 0.5070334672927856, 0.6855378746986389],
     ]

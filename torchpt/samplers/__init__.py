@@ -57,7 +57,7 @@ class Draws:
     Args:
         kind: type of the sampler.
         key: ``(2, N)`` int32 as given by :meth:`Sampler.key`.
-        salts: ``(STREAMS,)`` int32, the dimensions' names at this depth; a tensor, so that a compiled stage does not
+        salts: ``(len(Dimension),)`` int32, the dimensions' names at this depth; a tensor, so that a compiled stage does not
             specialize on the depth.
     """
 
@@ -94,5 +94,5 @@ def _(kind: str, rows: int, key: Tensor, salts: Tensor, dimension: int) -> Tenso
 
 @lru_cache(maxsize=4096)
 def salts(depth: int, device: torch.device) -> Tensor:
-    """The dimensions' names at path vertex ``depth``: ``(STREAMS,)`` int32; 0 is the camera."""
+    """The dimensions' names at path vertex ``depth``: ``(len(Dimension),)`` int32; 0 is the camera."""
     return torch.tensor([salt(d, depth) for d in Dimension], dtype=torch.int32, device=device)

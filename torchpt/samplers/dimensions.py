@@ -22,7 +22,8 @@ class Dimension(IntEnum):
     OPACITY = 7  # 1D, whether a surface is met
 
 
-STREAMS = len(Dimension)
+#: More than there are dimensions, so that a new one leaves the numbers of the others as they were.
+STREAMS = 16
 
 
 def salt(dimension: Dimension, depth: int) -> int:
