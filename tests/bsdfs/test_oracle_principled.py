@@ -31,6 +31,8 @@ SETS: list[dict[str, Any]] = [
     {"base_color": RED, "roughness": 0.5, "clearcoat": 0.9, "clearcoat_gloss": 0.3},
     {"base_color": RED, "roughness": 0.5, "flatness": 0.6},
     {"base_color": RED, "roughness": 0.4, "anisotropic": 0.8, "metallic": 0.5},
+    {"base_color": RED, "roughness": 1.0, "anisotropic": 1.0, "metallic": 1.0},
+    {"base_color": RED, "roughness": 1.0, "anisotropic": 1.0, "spec_trans": 0.7, "eta": 1.5},
     {"base_color": RED, "roughness": 0.5, "eta": 0.7, "spec_tint": 0.5, "metallic": 0.3, "clearcoat": 0.5},
     {"base_color": RED, "roughness": 0.2, "spec_trans": 1.0, "eta": 1.5},
     {"base_color": RED, "roughness": 0.5, "spec_trans": 0.6, "eta": 1.33, "metallic": 0.2},

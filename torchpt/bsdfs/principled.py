@@ -27,6 +27,7 @@ from torchpt.bsdfs.principled_lobes import (
     sample_gtr1,
     schlick_weight,
     tint,
+    wide_ggx,
 )
 from torchpt.math import microfacet
 from torchpt.math.fresnel import INDEX_MATCHED, Interface, fresnel_dielectric, refract
@@ -156,7 +157,7 @@ class Principled(Bsdf):
         if self.transmissive:
             wo, wi, eta, front = _upward(wo, wi, eta)
         main = self._main(parameters, wo, wi, eta)
-        facet = self._facet(parameters, main.cos, eta, front)
+        facet = self._facet(parameters, wo, main.m, main.cos, eta, front)
         chance = self.probabilities(parameters, wo, facet, front)
         value = facet.reflected * main.reflection
         pdf = chance.reflect * main.reflection_pdf
@@ -191,7 +192,7 @@ class Principled(Bsdf):
         alpha_u, alpha_v = _alphas(parameters)
         m = microfacet.sample_normal(above, alpha_u, alpha_v, u, self._bounded)
         cos = dot(above, m)
-        facet = self._facet(parameters, cos.clamp_min(0.0), eta, front)
+        facet = self._facet(parameters, above, m, cos.clamp_min(0.0), eta, front)
         chance = self.probabilities(parameters, above, facet, front)
         wi = microfacet.reflect(above, m, cos)
         threshold = chance.diffuse
@@ -269,16 +270,16 @@ class Principled(Bsdf):
 
     @property
     def _bounded(self) -> bool:
-        return microfacet.BOUNDED and not self.transmissive
+        return microfacet.BOUNDED and not (self.transmissive or self.anisotropic)
 
     def _main(self, parameters: Parameters, wo: Tensor, wi: Tensor, eta: Tensor) -> _Main:
         """Both main lobes; with the half vector ``s = wo + wi`` or ``wo + eta wi``, ``s . m = |s|``: nothing cancels."""
         alpha_u, alpha_v = _alphas(parameters)
-        if not self.transmissive:
+        if not (self.transmissive or self.anisotropic):
             r = microfacet.reflection(wo, wi, alpha_u, alpha_v, self._bounded)
             return _Main(r.m, r.cos_m.clamp_min(0.0), r.value, r.pdf, r.value, r.pdf)
         below = wi[2] < 0
-        s = torch.where(below, wo + wi * eta, wo + wi)
+        s = torch.where(below, wo + wi * eta, wo + wi) if self.transmissive else wo + wi
         square = dot(s, s)
         usable = square > 0
         square = torch.where(usable, square, 1.0)
@@ -289,7 +290,8 @@ class Principled(Bsdf):
         cos_o, cos_i = wo[2].clamp_min(0.0), wi[2].abs()
         s_o, s_i = (microfacet.stretched_length(w, alpha_u, alpha_v) for w in (wo, wi))
         # Density of visible normals over their cosine with wo, and Smith's masking of wi.
-        d = 2.0 * microfacet.ggx(m, alpha_u, alpha_v) / (cos_o + s_o)
+        d = microfacet.ggx(m, alpha_u, alpha_v) if not self.anisotropic else wide_ggx(m, alpha_u, alpha_v)
+        d = 2.0 * d / (cos_o + s_o)
         g = 2.0 * cos_i / (cos_i + s_i)
         jacobian = cos * far.abs() / square
         return _Main(
@@ -301,10 +303,16 @@ class Principled(Bsdf):
             torch.where(refracts, d * jacobian * (eta * eta), 0.0),
         )
 
-    def _facet(self, parameters: Parameters, cos: Tensor, eta: Tensor, front: Tensor | None) -> Facet:
+    def _facet(
+        self, parameters: Parameters, wo: Tensor, m: Tensor, cos: Tensor, eta: Tensor, front: Tensor | None
+    ) -> Facet:
         """Fresnel at a facet: of a dielectric, with tint and metal by Schlick's weight of the angle on the thinner side."""
         base, metallic = parameters["base_color"], parameters["metallic"]
-        interface = fresnel_dielectric(cos, eta)
+        sin2 = None
+        if self.transmissive:  # the refracted direction is as good as this sine
+            across = torch.addcmul(wo, m, cos, value=-1)
+            sin2 = dot(across, across)
+        interface = fresnel_dielectric(cos, eta, sin2)
         f = interface.reflectance
         schlick = schlick_weight(torch.where(eta > 1.0, cos, -interface.cos_t))
         rest = 1.0 if metallic is None else 1.0 - metallic

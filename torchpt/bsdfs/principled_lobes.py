@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchpt.math.microfacet import masking, stretched_length
+from torchpt.math.microfacet import ggx, masking, stretched_length
 from torchpt.math.vectors import luminance
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "sample_gtr1",
     "schlick_weight",
     "tint",
+    "wide_ggx",
 ]
 
 
@@ -103,3 +104,13 @@ def clearcoat_masking(wo: Tensor, wi: Tensor, cos_o: Tensor, cos_i: Tensor) -> T
     """Smith's product for a fixed roughness of 0.25 (2012, section 5.6); positive cosines ``(N,)``."""
     alpha = torch.full_like(cos_o, 0.25)
     return masking(cos_o, stretched_length(wo, alpha, alpha)) * masking(cos_i, stretched_length(wi, alpha, alpha))
+
+
+def wide_ggx(m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
+    """GGX where full anisotropy makes a rough surface still rougher along one axis: alpha up to 3.2.
+
+    :func:`~torchpt.math.microfacet.ggx` takes roughnesses up to 1. In units of the largest, heights are as much greater,
+    and so is the density by its square.
+    """
+    unit = torch.maximum(alpha_u, alpha_v).clamp_min(1.0)
+    return unit * unit * ggx(torch.stack((m[0], m[1], m[2] * unit)), alpha_u / unit, alpha_v / unit)
