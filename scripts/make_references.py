@@ -1,9 +1,9 @@
 """Make the references of the tests with Mitsuba 3: means of independent seeds, and the variance of each mean.
 
-    python scripts/make_references.py [cornell_box] [cornell_bunny]
+    python scripts/make_references.py [NAME ...]
 
 Needs the extra ``bench``; ``cornell_bunny`` needs ``$TORCHPT_ASSETS/bunny.ply``. Writes ``tests/references/NAME.exr``
-with the picture and the layer ``variance``: box filter, max_depth 8, rr_depth 5, 64 x 64 pixels.
+with the picture and the layer ``variance``: box filter, rr_depth 5. Shapes whose material Mitsuba lacks are left out.
 """
 
 from __future__ import annotations
@@ -16,20 +16,26 @@ from typing import Any
 
 import numpy as np
 import torch
-from mitsuba_scene import convert, load_mitsuba
+from mitsuba_scene import comparable, convert, load_mitsuba
 
 import torchpt
 from torchpt.scene.description import settings
 
-SCENES = ("cornell_box", "cornell_bunny")
-SIZE = 64
+#: Width, height and max_depth by scene. Deep where light passes null, which Mitsuba counts as a bounce.
+SCENES = {
+    "cornell_box": (64, 64, 8),
+    "cornell_bunny": (64, 64, 8),
+    "veach_mis": (72, 48, 2),
+    "material_row": (96, 32, 64),
+    "studio": (72, 48, 64),
+}
 FOLDER = Path(__file__).resolve().parent.parent / "tests" / "references"
 
 
 def main() -> None:
     """Render and write the references named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", default=SCENES, help=f"of {', '.join(SCENES)}")
+    parser.add_argument("scenes", nargs="*", default=list(SCENES), help=f"of {', '.join(SCENES)}")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba's variant")
     parser.add_argument("--seeds", type=int, default=64, help="independent pictures")
     parser.add_argument("--spp", type=int, default=512, help="samples a pixel of each")
@@ -46,9 +52,10 @@ def main() -> None:
 
 def reference(mitsuba: Any, name: str, seeds: int, spp: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean ``(H, W, 3)`` over ``seeds`` pictures and the variance of that mean."""
-    scene = torchpt.load(name, device="cpu")
-    film = {"width": SIZE, "height": SIZE, "filter": "box"}
-    integrator = {"type": "path", "max_depth": 8, "rr_depth": 5}
+    scene = comparable(name)
+    width, height, depth = SCENES[name]
+    film = {"width": width, "height": height, "filter": "box"}
+    integrator = {"type": "path", "max_depth": depth, "rr_depth": 5}
     wishes = settings(scene.description, {"film": film, "integrator": integrator, "render": {"spp": spp}})
     with tempfile.TemporaryDirectory() as folder:
         theirs = mitsuba.load_dict(convert(mitsuba, scene, wishes, Path(folder)))
