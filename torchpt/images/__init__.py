@@ -1,6 +1,8 @@
 """Pictures: files in and out, colour, and how far one is from another."""
 
+from torchpt.images.decode import EncodedImage
 from torchpt.images.read import read_image, read_layers
+from torchpt.images.texels import Texels, read_texels
 from torchpt.images.write import check_writable, write_image
 
-__all__ = ["check_writable", "read_image", "read_layers", "write_image"]
+__all__ = ["EncodedImage", "Texels", "check_writable", "read_image", "read_layers", "read_texels", "write_image"]

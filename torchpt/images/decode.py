@@ -1,0 +1,230 @@
+"""Picture files to arrays as stored: OpenEXR, Radiance HDR and 16-bit colour PNG through OpenImageIO, the rest through Pillow.
+
+A file is decoded as what its first bytes say it is, whatever its name ends in. The declared size is held against the cap,
+and as far as the format allows against the size of the file, before memory is asked for.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from dataclasses import dataclass
+from io import BytesIO
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.errors import AssetError
+
+__all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "existing", "pixels_of"]
+
+MAX_PIXELS = 64 * 2**20  # a header may claim anything: refuse before memory is asked for
+FLOAT_FORMATS = (".exr", ".hdr")
+INTEGER_FORMATS = (".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".bmp", ".tga")
+READABLE = FLOAT_FORMATS + INTEGER_FORMATS
+
+_CHANNELS = 16  # most values a pixel, on average over the largest picture
+_SIGNATURES = {
+    b"\x89PNG\r\n\x1a\n": ".png",
+    b"\xff\xd8\xff": ".jpg",
+    b"BM": ".bmp",
+    b"\x76\x2f\x31\x01": ".exr",
+    b"#?RADIANCE": ".hdr",
+    b"#?RGBE": ".hdr",
+}
+# Most pixels that one byte of a file can stand for: 8 of a 1-bit PNG, deflated by at most 1032 (zlib's technical notes);
+# JPEG, TGA, BMP and PNM stay below.
+_PIXELS_PER_BYTE = 8 * 1032
+_BAND = 2**20  # values read at a time, so that an absent rest is noticed before its memory is touched
+
+
+@dataclass(frozen=True)
+class EncodedImage:
+    """A picture file in memory, e.g. one that lies inside a GLB file or a data: URI.
+
+    Attributes:
+        label: what errors call it: the file that holds it, and which of its images it is.
+        data: the bytes of the file.
+        kind: its format as a file ending without the dot, such as ``png``; empty where only the bytes can tell.
+    """
+
+    label: str
+    data: bytes
+    kind: str = ""
+
+    def __repr__(self) -> str:
+        return f"EncodedImage({self.label!r}, {len(self.data)} bytes, {self.kind!r})"
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """What a file stores.
+
+    Attributes:
+        values: ``(H, W, C)``, row 0 at the top: integers, booleans or float32.
+        white: the stored value that means 1.
+        channels: names of the channels of an EXR or HDR, else empty.
+    """
+
+    values: NDArray[Any]
+    white: int
+    channels: tuple[str, ...] = ()
+
+    @property
+    def eight_bit(self) -> bool:
+        """Whether no more than 8 bits a value were stored."""
+        return self.values.dtype.kind in "ub" and self.white <= 255
+
+
+def existing(path: str | PathLike[str]) -> Path:
+    """The path of a picture file that is there.
+
+    Raises:
+        AssetError: an unknown ending, no such file, or no file.
+    """
+    path = Path(fspath(path))
+    if path.suffix.lower() not in READABLE:
+        raise AssetError(path, f"unknown kind of image {path.suffix!r}; known: {' '.join(READABLE)}")
+    try:
+        if not path.exists():
+            raise AssetError(path, "no such file")
+        if not path.is_file():
+            raise AssetError(path, "is not a file")
+    except (OSError, ValueError) as problem:
+        raise AssetError(path, f"cannot be read ({problem})") from problem
+    return path
+
+
+def pixels_of(source: Path | EncodedImage, max_pixels: int) -> Pixels:
+    """Decodes a file that exists, or one in memory.
+
+    Raises:
+        AssetError: malformed, truncated, of more than ``max_pixels`` pixels, or CMYK.
+    """
+    label = str(source) if isinstance(source, Path) else source.label
+    try:
+        data = _head(source)
+        kind = next((kind for magic, kind in _SIGNATURES.items() if data.startswith(magic)), None)
+        if kind is None:
+            kind = source.suffix.lower() if isinstance(source, Path) else f".{source.kind.lower()}"
+        if kind not in READABLE:
+            known = " ".join(READABLE)
+            raise AssetError(label, f"unknown kind of image {kind.strip('.')!r}; known: {known}")
+        # byte 24 of a PNG: bits a value; byte 25: what they mean. Pillow keeps 8 bits of 16-bit colours.
+        deep = kind == ".png" and data[24:26] in (b"\x10\x02", b"\x10\x04", b"\x10\x06")
+        if kind in FLOAT_FORMATS or deep:
+            return _through_oiio(source, label, kind, "uint16" if deep else "float", max_pixels)
+        return _through_pillow(source, label, kind, max_pixels)
+    except OSError as error:
+        raise AssetError(label, f"cannot be read ({error.strerror or error})") from None
+
+
+def _head(source: Path | EncodedImage) -> bytes:
+    if isinstance(source, EncodedImage):
+        return source.data[:32]
+    with source.open("rb") as file:
+        return file.read(32)
+
+
+def _check_size(label: str, width: int, height: int, channels: int, max_pixels: int) -> None:
+    if width < 1 or height < 1 or channels < 1:
+        raise AssetError(label, f"has no pixels ({width} x {height}, {channels} channels)")
+    if width * height > max_pixels or width * height * channels > _CHANNELS * max_pixels:
+        limit = f"{max_pixels / 2**20:g} Mpixel" if max_pixels >= 2**20 else f"{max_pixels} pixels"
+        raise AssetError(label, f"{width} x {height} pixels, {channels} channels: more than {limit} are not read")
+
+
+def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: str, max_pixels: int) -> Pixels:
+    """All channels of the first part of a file that OpenImageIO reads."""
+    if isinstance(source, EncodedImage):  # it reads files only
+        with tempfile.NamedTemporaryFile(suffix=kind) as file:
+            file.write(source.data)
+            file.flush()
+            return _through_oiio(Path(file.name), label, kind, stored, max_pixels)
+    import OpenImageIO as oiio
+
+    wishes = oiio.ImageSpec()
+    wishes.attribute("oiio:UnassociatedAlpha", 1)  # a PNG's colours as stored, not multiplied by alpha
+    wishes.attribute("oiio:RawColor", 1)
+    picture = oiio.ImageInput.open(str(source), wishes)
+    if picture is None:
+        raise AssetError(label, f"cannot be read ({_brief(oiio.geterror() or 'unknown format')})")
+    try:
+        spec = picture.spec()
+        if spec.deep:
+            raise AssetError(label, "holds deep pixels, which are not read")
+        _check_size(label, spec.width, spec.height, spec.nchannels, max_pixels)
+        values: NDArray[Any] | None = None
+        if spec.tile_width:
+            values = picture.read_image(stored)
+            if values is None:
+                raise AssetError(label, f"cannot be read ({_brief(picture.geterror() or 'truncated')})")
+            return Pixels(values.reshape(spec.height, spec.width, spec.nchannels), 65535, tuple(spec.channelnames))
+        step = max(1, _BAND // (spec.width * spec.nchannels))
+        for start in range(0, spec.height, step):
+            end = min(start + step, spec.height)
+            band = picture.read_scanlines(0, 0, spec.y + start, spec.y + end, 0, 0, spec.nchannels, stored)
+            if band is None:
+                raise AssetError(label, f"cannot be read ({_brief(picture.geterror() or 'truncated')})")
+            if values is None:
+                values = np.empty((spec.height, spec.width, spec.nchannels), band.dtype)
+            values[start:end] = band.reshape(end - start, spec.width, spec.nchannels)
+        assert values is not None
+        return Pixels(values, 65535, tuple(spec.channelnames))
+    finally:
+        picture.close()
+
+
+def _through_pillow(source: Path | EncodedImage, label: str, kind: str, max_pixels: int) -> Pixels:
+    """A file of an integer format."""
+    from PIL.BmpImagePlugin import BmpImageFile
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
+    from PIL.PpmImagePlugin import PpmImageFile
+    from PIL.TgaImagePlugin import TgaImageFile
+
+    # The plugins themselves: each takes its own format only, and none warns of sizes that are checked here.
+    plugin = {".png": PngImageFile, ".jpg": JpegImageFile, ".jpeg": JpegImageFile, ".bmp": BmpImageFile}
+    plugin |= {".tga": TgaImageFile, ".ppm": PpmImageFile, ".pgm": PpmImageFile}
+    data = source.read_bytes() if isinstance(source, Path) else source.data
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow warns of odd metadata, of which nothing is used
+            return _pillow_pixels(plugin[kind](BytesIO(data)), label, len(data), max_pixels)
+    except AssetError:
+        raise
+    except Exception as problem:  # decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error, ...
+        raise AssetError(label, f"cannot be read ({_brief(problem)})") from None
+
+
+def _pillow_pixels(picture: Any, label: str, size: int, max_pixels: int) -> Pixels:
+    width, height = picture.size
+    _check_size(label, width, height, len(picture.getbands()), max_pixels)
+    if width * height > _PIXELS_PER_BYTE * size:
+        raise AssetError(label, f"cannot be read ({width} x {height} pixels declared in {size} bytes)")
+    if picture.mode not in _MODES:
+        raise AssetError(label, f"colours stored as {picture.mode} are not read; expected grey or RGB")
+    if "transparency" in picture.info and picture.mode in ("1", "L", "P", "RGB"):
+        picture.load()
+        grey = picture.mode in ("1", "L")
+        picture = (picture.convert("L") if grey else picture).convert("LA" if grey else "RGBA")
+    elif picture.mode == "P":
+        picture.load()
+        picture = picture.convert(picture.palette.mode if picture.palette.mode in ("RGB", "RGBA") else "RGB")
+    values = np.array(picture)
+    return Pixels(values[..., None] if values.ndim == 2 else values, _MODES[picture.mode])
+
+
+# Pillow's modes that are read, and the value that means 1
+_MODES = {
+    **{"1": 1, "L": 255, "LA": 255, "P": 255, "RGB": 255, "RGBA": 255},
+    **{"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I": 65535},
+}
+
+
+def _brief(problem: object) -> str:
+    """The first line of a decoder's complaint."""
+    return (str(problem).strip().splitlines() or [type(problem).__name__])[0][:120]
