@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from torchpt.bsdfs import Bsdf, Parameters
     from torchpt.math.distributions import Discrete
+    from torchpt.textures import Atlas, Look, Veils
 
 __all__ = [
     "KINDS",
@@ -95,12 +96,23 @@ class World:
     bound: Tensor  # (P,) sum |n_i| max |p_i| over the primitive: scales the rounding of its plane
     flip: Tensor | None  # (P,) orientation of spheres
     normals: tuple[Tensor, Tensor, Tensor] | None  # (3, P) shading normals at the corners, where any are smooth
-    tangents: Tensor | None  # (3, P) along u where any material is anisotropic; of a sphere its axis, zero: any will do
+    tangents: (
+        Tensor | None
+    )  # (3, P) how p moves with texture coordinate u; zero: any direction will do. Of a sphere the
+    # vector whose cross product with the normal it is. None where no frame needs it
+    bitangents: Tensor | None  # (3, P) the same for v; of a sphere (pi r, 0, 0). None without bump maps
+    uvs: tuple[Tensor, Tensor, Tensor] | None  # (2, P) texture coordinates at the corners; None without textures
+    axes: tuple[Tensor, Tensor, Tensor] | None  # (3, S) unit x, y, z of the spheres; None without textures or spheres
+    mirrored: Tensor | None  # (P,) bool: disks whose u and v are swapped; None where none are, or none matter
+    colors: tuple[Tensor, Tensor, Tensor] | None  # (3, P) at the corners, where vertex colours are read
     opacity: Tensor | None  # (P,) chance that a ray meets the surface; None where it always does
     material: Tensor  # (P,) int64 row in the parameters of its model
     key: Tensor  # (P + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
     models: tuple[Bsdf, ...]  # the BSDFs present
-    bsdfs: tuple[Parameters, ...]  # stacked parameters of each model
+    bsdfs: tuple[Parameters, ...]  # stacked parameters of each model; where it has a look, as its materials were given
+    looks: tuple[Look | None, ...]  # textures of each model; None where it has none
+    textures: Atlas | None  # None where no image is read
+    veils: Veils | None  # textures of opacity; None where there are none
     two_sided: tuple[Tensor | None, ...]  # (M,) bool for the rows of each model; None where all are
     object_id: Tensor  # (P,) int64, order of the shape in the scene
     lights: Lights | None  # None where nothing emits
@@ -126,8 +138,11 @@ class Interaction:
     p: Tensor  # (3, N)
     ng: Tensor  # (3, N) unit geometric normal, on the shape's own outside
     ns: Tensor  # (3, N) unit shading normal
-    tangent: Tensor | None  # (3, N) along u, neither unit nor orthogonal; None where nothing is anisotropic
+    tangent: Tensor | None  # (3, N) along u, neither unit nor orthogonal; None where no frame needs it
+    bitangent: Tensor | None  # (3, N) along v; None without bump maps
     prim: Tensor  # (N,)
+    u: Tensor  # (N,) of the primitive's own parametrization
+    v: Tensor  # (N,)
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt import bsdfs
 from torchpt.integrators.path import partition
 from torchpt.integrators.search import Search
+from torchpt.integrators.surfaces import parameters_at, shading_normal
 from torchpt.math.vectors import take
 from torchpt.records import PathState, World, rows
-from torchpt.shapes import interact
+from torchpt.shapes import interact, surface_uv
 
 __all__ = ["CHANNELS", "first_hit"]
 
@@ -34,10 +34,13 @@ def first_hit(
         at = interact(world, take(state.o, index), take(state.d, index), found)
         values: dict[str, Tensor] = {}
         if "albedo" in names:
-            parameters = bsdfs.gather(world.bsdfs[model], take(world.material, at.prim))
+            uv = surface_uv(world, at) if world.uvs is not None else None
+            parameters = parameters_at(world, model, take(world.material, at.prim), at, uv)
             values["albedo"] = world.models[model].albedo(parameters)
         if "normal" in names:
-            values["normal"] = at.ns
+            values["normal"] = shading_normal(world, model, take(state.d, index), at)
+        if "uv" in names:
+            values["uv"] = surface_uv(world, at)
         if "depth" in names:
             values["depth"] = found.t[None]
         if "position" in names:

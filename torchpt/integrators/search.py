@@ -6,6 +6,8 @@ straight to the search.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -13,7 +15,8 @@ from torchpt.accel import Accel
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import Dimension, Draws, salts
-from torchpt.shapes import interact, offset_origin
+from torchpt.shapes import interact, offset_origin, surface_uv
+from torchpt.textures import Veils, look_up
 
 __all__ = ["Search"]
 
@@ -49,10 +52,27 @@ class Search:
         t, prim, u, v = self._accel.intersect(o, d, t_max)
         return Hit(t.to(self._dtype), prim.to(torch.int64), u.to(self._dtype), v.to(self._dtype))
 
-    def _opacity(self, hit: Hit, miss: float) -> Tensor:
-        """Opacity ``(N,)`` of what was hit; ``miss`` where nothing was."""
+    def _opacity(self, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
+        """Opacity ``(N,)`` of what rays ``o, d`` hit; ``miss`` where they hit nothing."""
         assert self._world.opacity is not None
-        return torch.where(hit.prim < 0, miss, take(self._world.opacity, hit.prim.clamp_min(0)))
+        missed = hit.prim < 0
+        there = replace(hit, prim=hit.prim.clamp_min(0), t=torch.where(missed, 0.0, hit.t))
+        opacity = take(self._world.opacity, there.prim)
+        if self._world.veils is not None:
+            opacity = opacity * self._veil(self._world.veils, o, d, there)
+        return torch.where(missed, miss, opacity)
+
+    def _veil(self, veils: Veils, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
+        """What textures make of the opacity ``(N,)`` at hits, none of them a miss."""
+        assert self._world.textures is not None
+        node = take(veils.nodes, hit.prim)
+        uv = surface_uv(self._world, interact(self._world, o, d, hit))
+        value = look_up(self._world.textures, node.clamp_min(0), uv, False)
+        value = torch.addcmul(take(veils.bias, hit.prim), take(veils.factor, hit.prim), value)
+        if veils.cutoff is not None:
+            cutoff = take(veils.cutoff, hit.prim)
+            value = torch.where(cutoff < 0, value, (value >= cutoff).to(value.dtype))
+        return torch.where(node < 0, 1.0, value)
 
     @torch.no_grad()
     def _beyond(self, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
@@ -61,7 +81,7 @@ class Search:
 
     def _met(self, state: PathState, hit: Hit, depth: int) -> Hit:
         """The hits that hold: a surface is met with the chance of its opacity, else the ray goes on behind it."""
-        opacity = self._opacity(hit, 1.0)
+        opacity = self._opacity(state.o, state.d, hit, 1.0)
         chance = torch.ones_like(hit.t) if opacity.requires_grad else None
         t, prim, u, v = hit.t, hit.prim, hit.u, hit.v
         step, lanes = 0, (opacity.detach() < 1).nonzero().squeeze(1)
@@ -75,11 +95,12 @@ class Search:
             lanes = take(lanes, (~met).nonzero().squeeze(1))
             at = Hit(take(t, lanes), take(prim, lanes), take(u, lanes), take(v, lanes))
             o, d = take(state.o.detach(), lanes), take(state.d.detach(), lanes)
-            behind = self._trace(self._beyond(o, d, at), d, take(state.t_max, lanes))
+            o = self._beyond(o, d, at)
+            behind = self._trace(o, d, take(state.t_max, lanes))
             # Distances are counted from where the ray began; the step over the surface is below their rounding.
             t, prim = t.index_copy(0, lanes, behind.t + at.t), prim.index_copy(0, lanes, behind.prim)
             u, v = u.index_copy(0, lanes, behind.u), v.index_copy(0, lanes, behind.v)
-            opacity = self._opacity(behind, 1.0)
+            opacity = self._opacity(o, d, behind, 1.0)
             again = (opacity.detach() < 1).nonzero().squeeze(1)
             lanes, opacity, step = take(lanes, again), take(opacity, again), step + 1
         return Hit(t, prim, u, v, chance)
@@ -91,7 +112,7 @@ class Search:
         lanes = torch.arange(len(t_max), device=t_max.device)
         while len(lanes):
             hit = self._trace(o, d, t_max)
-            opacity = self._opacity(hit, 0.0)
+            opacity = self._opacity(o, d, hit, 0.0)
             clear = clear.index_copy(0, lanes, take(clear, lanes) * (1.0 - opacity))
             on = ((hit.prim >= 0) & (opacity.detach() < 1)).nonzero().squeeze(1)
             at, o, d = rows(hit, on), take(o, on), take(d, on)

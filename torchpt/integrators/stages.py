@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchpt import bsdfs, lights
+from torchpt import lights
 from torchpt.cameras import Perspective
 from torchpt.film import Filter
-from torchpt.math.frames import Frame
+from torchpt.integrators.surfaces import Surface, surface_at
 from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import dot, largest, take
 from torchpt.math.warps import uniform_hemisphere, uniform_sphere
@@ -28,7 +28,6 @@ from torchpt.shapes.interaction import OFFSET
 __all__ = [
     "STRATEGIES",
     "Plan",
-    "Surface",
     "bounce",
     "emit",
     "escape",
@@ -56,17 +55,6 @@ class Plan:
     dtype: torch.dtype
     tape: bool  # whether derivatives are wanted
     attached: bool  # whether they are wanted with respect to geometry
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A surface point with its material resolved."""
-
-    frame: Frame  # about the shading normal, turned to the side of wo where light does not pass through
-    side: Tensor | None  # (N,) -1 where it was turned around; None where light passes through
-    shown: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
-    parameters: bsdfs.Parameters  # lane values of the BSDF
-    wo: Tensor  # (3, N) local
 
 
 def generate(
@@ -149,20 +137,6 @@ def bounce(
     return after, found, shadow
 
 
-def _surface(world: World, number: int, state: PathState, at: Interaction) -> Surface:
-    """Resolve the material at the surface points."""
-    model, row = world.models[number], take(world.material, at.prim)
-    ns, side, shown = at.ns, None, None
-    if not model.transmits:
-        side = torch.copysign(torch.ones_like(ns[0]), -dot(state.d, ns).detach())
-        ns = ns * side
-        both = world.two_sided[number]
-        if both is not None:
-            shown = ((side > 0) | take(both, row)).to(side.dtype)
-    frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
-    return Surface(frame, side, shown, bsdfs.gather(world.bsdfs[number], row), frame.to_local(-state.d))
-
-
 def shade(
     plan: Plan, world: World, model: int, state: PathState, at: Interaction, salts: Tensor
 ) -> tuple[Surface, Shadow | None]:
@@ -171,7 +145,7 @@ def shade(
     Returns:
         The surface, and the shadow rays (None where no light is sampled).
     """
-    surface, kind = _surface(world, model, state, at), world.models[model]
+    surface, kind = surface_at(world, model, state.d, at), world.models[model]
     if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
         return surface, None
     table = world.lights
@@ -185,7 +159,7 @@ def shade(
         weight = weight * power_heuristic(light.pdf, pdf).detach()
     else:
         reflected = kind.eval(surface.parameters, surface.wo, wi)
-    if world.normals is not None:
+    if _leaning(world, model):
         weight = weight * (_through(at, surface, light.wi, wi) > 0)
     if surface.shown is not None:
         weight = weight * surface.shown
@@ -198,6 +172,12 @@ def shade(
         d = torch.where(light.distant, light.wi, d)
         t_max = torch.where(light.distant & lit, math.inf, t_max)
     return surface, Shadow(o, d, t_max, radiance)
+
+
+def _leaning(world: World, model: int) -> bool:
+    """Whether the shading normals of a model's surfaces may differ from the geometric ones."""
+    look = world.looks[model]
+    return world.normals is not None or (look is not None and (look.normal is not None or look.bump is not None))
 
 
 def _through(at: Interaction, surface: Surface, world_wi: Tensor, wi: Tensor) -> Tensor:
@@ -238,7 +218,7 @@ def scatter(
     o = offset_origin(world, at, d)
     # Least of what must be positive for the path to go on: comparisons cost more than minima.
     least = pdf
-    if world.normals is not None:
+    if _leaning(world, model):
         least = torch.minimum(least, _through(at, surface, d, wi.detach()))
     if surface.shown is not None:
         least = torch.minimum(least, surface.shown)

@@ -6,6 +6,7 @@ picture, so that image right is ``(target - origin) x up`` in the right-handed w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -25,6 +26,7 @@ __all__ = [
     "scale",
     "similarity_scale",
     "translate",
+    "uv_matrix",
 ]
 
 Matrix = NDArray[np.float64]
@@ -53,6 +55,18 @@ def _float(value: Any) -> float:
         return float(value)
     except OverflowError:
         return float("inf")
+
+
+def uv_matrix(
+    scale: tuple[float, float], degrees: float, translate: tuple[float, float], repeats: tuple[float, float]
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Rows ``(2, 3)`` of an affine map of texture coordinates: scale, turn from u to v, move, multiply by ``repeats``."""
+    angle = math.radians(degrees)
+    c, s = math.cos(angle), math.sin(angle)
+    if degrees % 90.0 == 0.0:
+        c, s = float(round(c)), float(round(s))
+    (a, b), (x, y) = scale, repeats
+    return (x * c * a, -x * s * b, x * translate[0]), (y * s * a, y * c * b, y * translate[1])
 
 
 def is_singular(matrix: Matrix) -> bool:

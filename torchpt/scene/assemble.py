@@ -6,8 +6,9 @@ Whatever the scene does not hold is left out here: no smooth normals, no lights,
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,21 +18,31 @@ from torchpt.errors import SceneError
 from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import cross, dot, luminance, normalize
 from torchpt.records import KINDS, Geometry, Lights, World
-from torchpt.scene.parts import Part
+from torchpt.scene.parts import MaterialSlot, Part, VertexColors
 from torchpt.scene.surfaces import Surface, surface_of
+from torchpt.scene.texels import images_of
 from torchpt.shapes.normals import smooth_normals
+from torchpt.textures import Look, Node, Pick, Veils, atlas_of
 
 __all__ = ["Corners", "assemble", "corners_of"]
 
 
 @dataclass(frozen=True)
 class Corners:
-    """The primitives of one part: ``(3, P)`` each, see :class:`~torchpt.records.Geometry`; normals at corners or None."""
+    """The primitives of one part: ``(3, P)`` each, see :class:`~torchpt.records.Geometry`.
+
+    Attributes:
+        normals: at the corners, or None.
+        faces: ``(P, 3)`` vertices at the corners; of meshes only.
+        mirrored: whether a flat shape's two axes changed places.
+    """
 
     p0: Tensor
     p1: Tensor
     p2: Tensor
-    normals: tuple[Tensor, Tensor, Tensor] | None
+    normals: tuple[Tensor, Tensor, Tensor] | None = None
+    faces: Tensor | None = None
+    mirrored: bool = False
 
 
 def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dtype: torch.dtype) -> Corners:
@@ -43,27 +54,28 @@ def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dty
         radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)
         zero = torch.zeros_like(radius)
         p1 = torch.stack((radius, zero, zero))[:, None]
-        return Corners(move.to(dtype), p1.to(dtype), torch.zeros_like(move).to(dtype), None)
+        return Corners(move.to(dtype), p1.to(dtype), torch.zeros_like(move).to(dtype))
     x, y = linear[:, 0:1], linear[:, 1:2]
-    if bool(torch.linalg.det(linear.detach()) < 0):
+    mirrored = bool(torch.linalg.det(linear.detach()) < 0)
+    if mirrored:
         x, y = y, x  # mirrored, a flat shape still faces where its own +z goes, as in Mitsuba
     if part.kind == "rectangle":  # Mitsuba's unit shape [-1, 1]^2 from its lower corner
         x, y = 2.0 * x, 2.0 * y
         p0 = move - 0.5 * (x + y)
-        return Corners(p0.to(dtype), (p0 + x).to(dtype), (p0 + y).to(dtype), None)
+        return Corners(p0.to(dtype), (p0 + x).to(dtype), (p0 + y).to(dtype), mirrored=mirrored)
     if part.kind == "disk":
         p1, p2 = move + x, move + y
-        return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), None)
+        return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), mirrored=mirrored)
     vertices = linear @ parameters[f"{part.name}.vertices"].T.double() + move
     device = vertices.device
     assert part.faces is not None
     faces = torch.from_numpy(part.faces).to(device)
-    if bool(torch.linalg.det(linear.detach()) < 0):
+    if mirrored:
         faces = faces[:, [0, 2, 1]]  # a mirrored mesh keeps its outside
     vertices = vertices.to(dtype)
     p0, p1, p2 = (vertices.index_select(1, faces[:, k]) for k in range(3))
     if not part.smooth:
-        return Corners(p0, p1, p2, None)
+        return Corners(p0, p1, p2, None, faces)
     if part.normals is None:
         normals = smooth_normals(vertices, faces)
     else:
@@ -73,7 +85,7 @@ def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dty
     n0, n1, n2 = (normals.index_select(1, faces[:, k]) for k in range(3))
     # A corner without a normal takes its face's.
     n0, n1, n2 = (torch.where(dot(n, n) > 0, n, flat) for n in (n0, n1, n2))
-    return Corners(p0, p1, p2, (n0, n1, n2))
+    return Corners(p0, p1, p2, (n0, n1, n2), faces)
 
 
 def assemble(
@@ -131,10 +143,12 @@ def assemble(
 
     slots = {part.material.name: part.material for part in parts}
     surfaces = {name: surface_of(slot, parameters, dtype) for name, slot in slots.items()}
-    models, rows, tables, two_sided = _materials(parts, surfaces, device)
+    nodes = _nodes(slots.values())
+    kinds, rows, tables, looks, two_sided = _materials(slots, surfaces, nodes, device)
+    models = tuple(model for model, _ in kinds)
     opacity = _opacity(parts, surfaces, sizes, dtype, device)
     emissive = spread([int(part.emission is None) for part in parts])  # 0 where it emits
-    keys = emissive * len(models) + spread([models.index(surfaces[part.material.name].model) for part in parts])
+    keys = emissive * len(models) + spread([rows[part.material.name][0] for part in parts])
     key = torch.cat((torch.full((1,), 2 * len(models), device=device), keys)).to(torch.uint8)
     lights = _lights(
         parts, sizes, parameters, environment, p0, e1, e2, normal, bound, sign, face, opacity, emissive, dtype
@@ -151,12 +165,15 @@ def assemble(
         bound=bound,
         flip=sign if ball else None,
         normals=normals,
-        tangents=_tangents(parts, corners, parameters) if any(model.anisotropic for model in models) else None,
+        **_charts(parts, corners, sizes, parameters, slots, models),
         opacity=opacity,
-        material=spread(rows),
+        material=spread([rows[part.material.name][1] for part in parts]),
         key=key,
         models=models,
         bsdfs=tables,
+        looks=looks,
+        textures=atlas_of(list(nodes), images_of(list(nodes), parameters), dtype, device) if nodes else None,
+        veils=_veils(parts, surfaces, nodes, sizes, dtype, device),
         two_sided=two_sided,
         object_id=spread([part.object_id for part in parts]),
         lights=lights,
@@ -173,57 +190,211 @@ def _largest(p0: Tensor, e1: Tensor, e2: Tensor) -> Tensor:
 MOST_MODELS = 120
 
 
+def _nodes(slots: Iterable[MaterialSlot]) -> dict[Node, int]:
+    """Every way in which images are read, numbered."""
+    readings = [reading for slot in slots for reading in slot.readings()]
+    return {node: k for k, node in enumerate(dict.fromkeys(r for r in readings if isinstance(r, Node)))}
+
+
+#: What the lanes of a group have in common: a model, and which of its parameters are read from what.
+Kind = tuple[Bsdf, Any]
+
+
 def _materials(
-    parts: Sequence[Part], surfaces: Mapping[str, Surface], device: torch.device
-) -> tuple[tuple[Bsdf, ...], list[int], tuple[Parameters, ...], tuple[Tensor | None, ...]]:
-    """Models present, the row of each part in its model, the stacked parameters, and which rows are two-sided."""
-    models = tuple(dict.fromkeys(surfaces[part.material.name].model for part in parts)) or (Diffuse(),)
-    if len(models) > MOST_MODELS:
-        raise SceneError("materials", len(models), f"at most {MOST_MODELS} models, blends of different models included")
-    slots: list[dict[str, int]] = [{} for _ in models]
-    rows = []
-    for part in parts:
-        names = slots[models.index(surfaces[part.material.name].model)]
-        rows.append(names.setdefault(part.material.name, len(names)))
-    used = {part.material.name: part.material for part in parts}
-    tables, sides = [], []
-    for model, names in zip(models, slots, strict=True):
-        tables.append(stacked([model.prepare(surfaces[name].values) for name in names]))
-        both = [used[name].two_sided for name in names]
+    slots: Mapping[str, MaterialSlot], surfaces: Mapping[str, Surface], nodes: Mapping[Node, int], device: torch.device
+) -> tuple[
+    tuple[Kind, ...],
+    dict[str, tuple[int, int]],
+    tuple[Parameters, ...],
+    tuple[Look | None, ...],
+    tuple[Tensor | None, ...],
+]:
+    """Groups of materials, the group and row of each, stacked parameters, textures, and which rows are two-sided."""
+    groups: dict[Kind, list[str]] = {}
+    for name, surface in surfaces.items():
+        groups.setdefault(_kind(slots[name], surface), []).append(name)
+    if not groups:
+        groups[Diffuse(), None] = []
+    if len(groups) > MOST_MODELS:
+        expected = f"at most {MOST_MODELS} models, blends and textured ones counted by what they are made of"
+        raise SceneError("materials", len(groups), expected)
+    rows, tables, looks, sides = {}, [], [], []
+    for number, ((model, form), names) in enumerate(groups.items()):
+        rows |= {name: (number, row) for row, name in enumerate(names)}
+        if form is None:
+            tables.append(stacked([model.prepare(surfaces[name].values) for name in names]))
+            looks.append(None)
+        else:
+            tables.append(stacked([surfaces[name].values for name in names]))
+            looks.append(_look([slots[name] for name in names], [surfaces[name] for name in names], nodes, device))
+        both = [slots[name].two_sided for name in names]
         sides.append(None if all(both) else torch.tensor(both, device=device))
-    return models, rows, tuple(tables), tuple(sides)
+    return tuple(groups), rows, tuple(tables), tuple(looks), tuple(sides)
+
+
+def _kind(slot: MaterialSlot, surface: Surface) -> Kind:
+    """The group of a material; materials without textures share that of their model."""
+    if not surface.readings and slot.normal_map is None and slot.bump_map is None:
+        return surface.model, None
+
+    def form(value: Any) -> Any:
+        if isinstance(value, dict):
+            return tuple(sorted((key, form(item)) for key, item in value.items()))
+        if isinstance(value, VertexColors):
+            return ("vertices", str(value.channel))
+        return ("image", str(value.channel is None)) if isinstance(value, Node) else "number"
+
+    maps = slot.normal_map is not None, slot.bump_map is not None
+    return surface.model, (form(surface.values), form(surface.readings), maps)
+
+
+def _look(
+    slots: Sequence[MaterialSlot], surfaces: Sequence[Surface], nodes: Mapping[Node, int], device: torch.device
+) -> Look:
+    """The textures of materials of one form."""
+
+    def numbers(column: list[Node | None]) -> Tensor | None:
+        found = [nodes[node] for node in column if node is not None]
+        return torch.tensor(found, device=device) if found else None
+
+    def pick(column: list[Any]) -> Any:
+        first = column[0]
+        if isinstance(first, dict):
+            return {key: pick([item[key] for item in column]) for key in first}
+        if isinstance(first, VertexColors):
+            return Pick(None, first.channel)
+        return Pick(numbers(column), first.channel)
+
+    readings = pick([surface.readings for surface in surfaces])
+    return Look(readings, numbers([slot.normal_map for slot in slots]), numbers([slot.bump_map for slot in slots]))
+
+
+def _veils(
+    parts: Sequence[Part],
+    surfaces: Mapping[str, Surface],
+    nodes: Mapping[Node, int],
+    sizes: list[int],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Veils | None:
+    """Textures of opacity by primitive; None where there are none."""
+    covers = [surfaces[part.material.name].cover for part in parts]
+    if all(cover is None for cover in covers):
+        return None
+    size = torch.tensor(sizes, dtype=torch.int64, device=device)
+
+    def spread(values: list[Any], kind: torch.dtype) -> Tensor:
+        return torch.repeat_interleave(torch.tensor(values, dtype=kind, device=device), size)
+
+    cutoffs = [
+        -1.0 if cover is None or part.material.alpha_cutoff is None else part.material.alpha_cutoff
+        for cover, part in zip(covers, parts, strict=True)
+    ]
+    return Veils(
+        spread([-1 if cover is None else nodes[cover.node] for cover in covers], torch.int64),
+        spread([0.0 if cover is None else cover.bias for cover in covers], dtype),
+        spread([1.0 if cover is None else cover.factor for cover in covers], dtype),
+        spread(cutoffs, dtype) if any(cutoff >= 0 for cutoff in cutoffs) else None,
+    )
 
 
 def _opacity(
     parts: Sequence[Part], surfaces: Mapping[str, Surface], sizes: list[int], dtype: torch.dtype, device: torch.device
 ) -> Tensor | None:
     """The chance ``(P,)`` that a ray meets a primitive; None where it always does."""
-    if all(surface.opacity is None for surface in surfaces.values()):
+    if all(surface.opacity is None and surface.cover is None for surface in surfaces.values()):
         return None
     whole = torch.ones(1, dtype=dtype, device=device)
     found = [surfaces[part.material.name].opacity for part in parts]
     return torch.cat([(whole if x is None else x).expand(n) for x, n in zip(found, sizes, strict=True)])
 
 
-def _tangents(parts: Sequence[Part], corners: Sequence[Corners], parameters: Mapping[str, Tensor]) -> Tensor:
-    """Directions ``(3, P)`` along the first surface parameter; of a sphere the axis about which it runs."""
-    found = []
-    for part, c in zip(parts, corners, strict=True):
-        if part.kind == "sphere":
-            linear = parameters[f"{part.name}.to_world"][:3, :3].to(c.p0)
-            found.append(normalize(linear[:, 2:3]))
-        elif part.kind != "triangle":
-            found.append(c.p1 - c.p0)
-        elif part.uvs is None:
-            found.append(torch.zeros_like(c.p0))
-        else:
-            assert part.faces is not None
-            uv = torch.from_numpy(part.uvs[part.faces]).to(c.p0)  # (P, 3, 2)
-            a, b = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
-            det = a[0] * b[1] - a[1] * b[0]
-            along = (c.p1 - c.p0) * b[1] - (c.p2 - c.p0) * a[1]
-            found.append(torch.where(det == 0, 0.0, along * torch.sign(det)))
-    return torch.cat(found, 1)
+def _charts(
+    parts: Sequence[Part],
+    corners: Sequence[Corners],
+    sizes: list[int],
+    parameters: Mapping[str, Tensor],
+    slots: Mapping[str, MaterialSlot],
+    models: Sequence[Bsdf],
+) -> dict[str, Any]:
+    """What of :class:`World` says where a point lies on its surface, each thing only where something reads it."""
+    readings = [reading for slot in slots.values() for reading in slot.readings()]
+    bumpy = any(slot.bump_map is not None for slot in slots.values())
+    framed = bumpy or any(slot.normal_map is not None for slot in slots.values()) or any(m.anisotropic for m in models)
+    imaged = any(isinstance(reading, Node) for reading in readings)
+    coloured = any(isinstance(reading, VertexColors) for reading in readings)
+    pairs = list(zip(parts, corners, strict=True))
+    uvs = [_uvs(part, c) for part, c in pairs] if imaged or framed else []
+    found: dict[str, Any] = dict.fromkeys(("tangents", "bitangents", "uvs", "axes", "mirrored", "colors"))
+    if framed:
+        moves = [_moves(part, c, uv, parameters) for (part, c), uv in zip(pairs, uvs, strict=True)]
+        found["tangents"] = torch.cat([move[0] for move in moves], 1)
+        found["bitangents"] = torch.cat([move[1] for move in moves], 1) if bumpy else None
+    if imaged:
+        found["uvs"] = tuple(torch.cat([uv[k] for uv in uvs], 1) for k in range(3))
+        balls = [parameters[f"{part.name}.to_world"][:3, :3] for part in parts if part.kind == "sphere"]
+        if balls:
+            dtype = corners[0].p0.dtype
+            found["axes"] = tuple(normalize(torch.stack([b[:, k] for b in balls], 1).to(dtype)) for k in range(3))
+    if (imaged or bumpy) and any(c.mirrored and part.kind == "disk" for part, c in pairs):
+        flags = torch.tensor([c.mirrored for c in corners], device=corners[0].p0.device)
+        found["mirrored"] = torch.repeat_interleave(flags, torch.tensor(sizes, device=flags.device))
+    if coloured:
+        colors = [_colors(part, c) for part, c in pairs]
+        found["colors"] = tuple(torch.cat([triple[k] for triple in colors], 1) for k in range(3))
+    return found
+
+
+def _uvs(part: Part, c: Corners) -> tuple[Tensor, Tensor, Tensor]:
+    """Texture coordinates ``(2, P)`` at the corners; zero for shapes that have others, see ``shapes.uv``."""
+    like = c.p0[:2]
+    if part.kind not in ("triangle", "rectangle"):
+        nothing = torch.zeros_like(like)
+        return nothing, nothing, nothing
+    if part.uvs is None:
+        origin, u, v = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+        if c.mirrored:
+            u, v = v, u
+        first, second, third = (like.new_tensor(corner)[:, None].expand_as(like) for corner in (origin, u, v))
+        return first, second, third
+    assert c.faces is not None
+    uv = torch.from_numpy(part.uvs).to(like).T
+    first, second, third = (uv.index_select(1, c.faces[:, k]) for k in range(3))
+    return first, second, third
+
+
+def _moves(
+    part: Part, c: Corners, uvs: tuple[Tensor, Tensor, Tensor], parameters: Mapping[str, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """How points move with ``u`` and with ``v``, ``(3, P)`` each; of spheres and disks see :class:`World`."""
+    if part.kind == "disk":
+        return torch.zeros_like(c.p0), torch.zeros_like(c.p0)
+    if part.kind == "sphere":
+        linear = parameters[f"{part.name}.to_world"][:3, :3].to(c.p0)
+        radius, zero = c.p1[0].abs(), torch.zeros_like(c.p1[0])
+        turned = -1.0 if part.flip else 1.0  # the normal is
+        handed = torch.sign(torch.linalg.det(linear.detach())) * turned
+        around = normalize(linear[:, 2:3]) * (2.0 * math.pi * radius * handed)
+        return around, torch.stack((math.pi * radius * handed, zero, zero))
+    if part.kind == "triangle" and part.uvs is None:
+        return torch.zeros_like(c.p0), torch.zeros_like(c.p0)
+    e1, e2 = c.p1 - c.p0, c.p2 - c.p0
+    a, b = uvs[1] - uvs[0], uvs[2] - uvs[0]
+    det = a[0] * b[1] - a[1] * b[0]
+    some = det != 0
+    inverse = torch.where(some, 1.0, 0.0) / torch.where(some, det, 1.0)
+    return (e1 * b[1] - e2 * a[1]) * inverse, (e2 * a[0] - e1 * b[0]) * inverse
+
+
+def _colors(part: Part, c: Corners) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours ``(3, P)`` at the corners; 1 where a shape has none."""
+    if part.colors is None:
+        white = torch.ones_like(c.p0)
+        return white, white, white
+    assert c.faces is not None
+    colors = torch.from_numpy(part.colors).to(c.p0).T
+    first, second, third = (colors.index_select(1, c.faces[:, k]) for k in range(3))
+    return first, second, third
 
 
 def _emission(part: Part, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> Tensor:

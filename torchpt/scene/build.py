@@ -15,6 +15,7 @@ from torchpt.scene.loaders import MeshPart, load_mesh, unit_cube
 from torchpt.scene.materials import slot_of
 from torchpt.scene.parts import MaterialSlot, Part
 from torchpt.scene.schema import Cube, Disk, Mesh, Rectangle, Shape, Sphere
+from torchpt.scene.texels import Opener
 
 __all__ = ["Built", "build_parts"]
 
@@ -49,10 +50,11 @@ def build_parts(description: Description) -> Built:
     """
     parameters: dict[str, np.ndarray] = {}
     parts: list[Part] = []
+    opener = Opener(description.textures, description.resolve, parameters, description.file)
     for number, (name, shape) in enumerate(description.shapes.items(), 1):
-        parts += _shape_parts(description, name, shape, number, parameters)
+        parts += _shape_parts(description, name, shape, number, parameters, opener)
     for name, material in description.materials.items():
-        _declare(slot_of(material, f"materials.{name}", description.materials), parameters)
+        _declare(slot_of(material, f"materials.{name}", description.materials, opener), parameters)
     if len(description.lights) > 1:
         first, second = list(description.lights)[:2]
         raise SceneError(f"lights.{second}", "constant", f"one environment only ({first} is one)", description.file)
@@ -71,7 +73,7 @@ def _declare(slot: MaterialSlot, parameters: dict[str, np.ndarray]) -> None:
 
 
 def _shape_parts(
-    description: Description, name: str, shape: Shape, number: int, parameters: dict[str, np.ndarray]
+    description: Description, name: str, shape: Shape, number: int, parameters: dict[str, np.ndarray], opener: Opener
 ) -> list[Part]:
     prefix = f"shapes.{name}"
     pose = shape.to_world()
@@ -85,7 +87,7 @@ def _shape_parts(
             if similarity_scale(pose) is None:
                 raise SceneError(f"{prefix}.transform", pose.tolist(), "a transform of uniform scale", description.file)
         parameters[f"{prefix}.to_world"] = pose
-        return [_part(description, shape, prefix, name, number, kind, pose, None, parameters)]
+        return [_part(description, shape, prefix, name, number, kind, pose, None, parameters, opener)]
     if isinstance(shape, Cube):
         pieces, source, flat = [unit_cube()], "", True
     elif shape.path is None:
@@ -102,7 +104,18 @@ def _shape_parts(
         parameters[f"{stem}.vertices"] = np.asarray(piece.vertices, np.float64)
         parameters[f"{stem}.to_world"] = pose
         part = _part(
-            description, shape, stem, name, number, "triangle", pose, piece, parameters, flat=flat, source=source
+            description,
+            shape,
+            stem,
+            name,
+            number,
+            "triangle",
+            pose,
+            piece,
+            parameters,
+            opener,
+            flat=flat,
+            source=source,
         )
         parts.append(part)
     if all(len(part.faces) == 0 for part in parts if part.faces is not None):
@@ -135,15 +148,18 @@ def _part(
     pose: np.ndarray,
     piece: MeshPart | None,
     parameters: dict[str, np.ndarray],
+    opener: Opener,
     *,
     flat: bool = True,
     source: str = "",
 ) -> Part:
     own = piece.material if piece is not None else None
     if isinstance(shape.material, str):
-        slot = slot_of(description.materials[shape.material], f"materials.{shape.material}", description.materials)
+        slot = slot_of(
+            description.materials[shape.material], f"materials.{shape.material}", description.materials, opener
+        )
     elif shape.material is not None:
-        slot = slot_of(shape.material, f"{prefix}.material", description.materials)
+        slot = slot_of(shape.material, f"{prefix}.material", description.materials, opener)
     else:
         colour = _GREY if own is None or own.reflectance is None else own.reflectance
         slot = MaterialSlot(Diffuse(), f"{prefix}.material", {"reflectance": colour})

@@ -10,12 +10,13 @@ from typing import Any, TypeVar
 
 from torchpt import paths
 from torchpt.bsdfs import Bsdf
-from torchpt.errors import AssetError, NotBuiltError, SceneError
+from torchpt.errors import AssetError, SceneError
 from torchpt.scene import schema
 from torchpt.scene import settings as run_settings
 from torchpt.scene.materials import MATERIALS, Material, check_material, custom_types, read_material
 from torchpt.scene.schema import ConstantLight, Perspective, Shape
 from torchpt.scene.settings import BLOCKS, Settings
+from torchpt.scene.textures import TEXTURES, Texture
 from torchpt.scene.validate import check_keys, select
 from torchpt.scene.yaml_file import plain, read_yaml
 
@@ -40,7 +41,7 @@ class Description:
         integrator: the same for the integrator.
         sampler: the same for the sampler.
         render: the same for the run.
-        textures: by name (none is built yet).
+        textures: by name.
         materials: by name.
         shapes: by name, in file order.
         lights: by name.
@@ -54,7 +55,7 @@ class Description:
     integrator: dict[str, Any] = field(default_factory=dict)
     sampler: dict[str, Any] = field(default_factory=dict)
     render: dict[str, Any] = field(default_factory=dict)
-    textures: dict[str, Any] = field(default_factory=dict)
+    textures: dict[str, Texture] = field(default_factory=dict)
     materials: dict[str, Material] = field(default_factory=dict)
     shapes: dict[str, Shape] = field(default_factory=dict)
     lights: dict[str, ConstantLight] = field(default_factory=dict)
@@ -161,13 +162,15 @@ def _describe(raw: dict[str, Any], types: Mapping[str, type[Material]], file: st
     camera = select("camera", schema.CAMERAS, raw["camera"], "camera", file, "perspective")
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
     run_settings.merge(blocks, {}, file)
-    _named(raw, "textures", file, lambda item, key: _texture(item, key, file))
+    textures = _named(raw, "textures", file, lambda item, key: select("texture", TEXTURES, item, key, file))
     materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
     for name, material in materials.items():
-        check_material(material, f"materials.{name}", materials, file)
-    shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, types, file))
+        check_material(material, f"materials.{name}", materials, textures, file)
+    shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, textures, types, file))
     lights = _named(raw, "lights", file, lambda item, key: select("light", schema.LIGHTS, item, key, file))
-    return Description(file, base, camera, version, **blocks, materials=materials, shapes=shapes, lights=lights)
+    return Description(
+        file, base, camera, version, **blocks, textures=textures, materials=materials, shapes=shapes, lights=lights
+    )
 
 
 def _settings_block(raw: Mapping[str, Any], name: str, file: str | None) -> dict[str, Any]:
@@ -188,17 +191,17 @@ def _named(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[
     return {name: read(item, f"{block}.{name}") for name, item in items.items()}
 
 
-def _texture(item: Any, key: str, file: str | None) -> None:
-    select("texture", {}, item, key, file)
-    raise NotBuiltError(key, item, "numbers and colours", file)
-
-
 def _shape(
-    item: Any, key: str, materials: Mapping[str, Material], types: Mapping[str, type[Material]], file: str | None
+    item: Any,
+    key: str,
+    materials: Mapping[str, Material],
+    textures: Mapping[str, Texture],
+    types: Mapping[str, type[Material]],
+    file: str | None,
 ) -> Shape:
     if isinstance(item, dict) and isinstance(item.get("material"), dict):
         inline = read_material(item["material"], f"{key}.material", types, file)
-        check_material(inline, f"{key}.material", materials, file)
+        check_material(inline, f"{key}.material", materials, textures, file)
         item = {**item, "material": inline}
     shape = select("shape", schema.SHAPES, item, key, file)
     material, where = shape.material, f"{key}.material"

@@ -20,11 +20,11 @@ from torchpt.math import transforms
 
 __all__ = [
     "Affine", "Color", "FaceArray", "Flag", "Rows2", "Rows3", "Text", "Transform", "Vec3",
-    "bounded", "choice", "color", "integer", "memory_size", "number", "number_field", "refuse_texture", "scalar", "vector",
-    "wrong",
+    "bounded", "choice", "color", "integer", "memory_size", "number", "number_field", "pair", "scalar", "vector", "wrong",
 ]  # fmt: skip
 
 _LARGEST = float(np.finfo(np.float32).max)
+_OR_TEXTURE = ", or a texture"
 
 
 def wrong(
@@ -102,32 +102,57 @@ def vector(value: Any, expected: str = "three finite numbers [x, y, z]") -> tupl
     return x, y, z
 
 
+def pair(expected: str, *, single: bool = False) -> PlainValidator:
+    """A validator for two finite numbers; with ``single`` one number stands for both."""
+
+    def check(value: Any) -> tuple[float, float]:
+        if single and not isinstance(value, list | tuple | np.ndarray):
+            value = (value, value)
+        if not isinstance(value, list | tuple | np.ndarray) or len(value) != 2:
+            raise wrong(expected)
+        return number(value[0], expected), number(value[1], expected)
+
+    return PlainValidator(check)
+
+
 def bounded(value: Any, low: float, high: float, expected: str) -> float:
-    """A finite float in ``low..high``, where a texture may stand one day."""
-    refuse_texture(value, expected)
+    """A finite float in ``low..high``."""
     result = number(value, expected)
     if not low <= result <= high:
         raise wrong(expected)
     return result
 
 
-def scalar(low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False) -> PlainValidator:
-    """A validator for a material's number in ``low..high`` (any, where ``low`` is None)."""
+def scalar(
+    low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False, texture: bool = False
+) -> PlainValidator:
+    """A validator for a number in ``low..high`` (any, where ``low`` is None), or a texture that gives it."""
     floor = -_LARGEST if low is None else low
-    expected = f"a finite number{_bound(low, high)}"
-    return PlainValidator(lambda value: None if value is None and optional else bounded(value, floor, high, expected))
+    expected = f"a finite number{_bound(low, high)}{_OR_TEXTURE if texture else ''}"
 
-
-def color(low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False) -> PlainValidator:
-    """A validator for a linear RGB colour: three numbers or one for all, each in ``low..high`` (any, if low is None)."""
-    floor = -_LARGEST if low is None else low
-    bound = _bound(low, high)
-    expected = f"[r, g, b] or one number, each finite{' and' if bound else ''}{bound}"
-
-    def check(value: Any) -> tuple[float, float, float] | None:
+    def check(value: Any) -> Any:
         if value is None and optional:
             return None
-        refuse_texture(value, expected)
+        if texture and isinstance(value, Mapping):
+            return _slot(value, False, floor, high)
+        return bounded(value, floor, high, expected)
+
+    return PlainValidator(check)
+
+
+def color(
+    low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False, texture: bool = False
+) -> PlainValidator:
+    """A validator for a linear RGB colour: three numbers or one for all, each in ``low..high``, or a texture."""
+    floor = -_LARGEST if low is None else low
+    bound = _bound(low, high)
+    expected = f"[r, g, b] or one number, each finite{' and' if bound else ''}{bound}{_OR_TEXTURE if texture else ''}"
+
+    def check(value: Any) -> Any:
+        if value is None and optional:
+            return None
+        if texture and isinstance(value, Mapping):
+            return _slot(value, True, floor, high)
         if isinstance(value, list | tuple | np.ndarray):
             rgb = vector(value, expected)
         else:
@@ -146,27 +171,10 @@ def _bound(low: float | None, high: float) -> str:
     return f" in {low:g}..{high:g}" if high < _LARGEST else f" >= {low:g}"
 
 
-def refuse_texture(value: Any, expected: str) -> None:
-    """Raises the error for a texture where a number or colour stands; anything else passes."""
-    if isinstance(value, Mapping):
-        raise _texture(value, expected)
+def _slot(value: Mapping[str, Any], coloured: bool, low: float, high: float) -> Any:
+    from torchpt.scene.textures import slot_value  # whose own fields are of these types
 
-
-def _texture(value: Mapping[str, Any], expected: str) -> PydanticCustomError:
-    """The error for a texture where a colour stands: misspelt, or not built yet."""
-    from torchpt.scene.not_built import TYPES
-
-    if set(value) == {"texture"} and isinstance(value["texture"], str):
-        return wrong(expected, not_built=True)
-    known = TYPES["texture"]
-    kind = value.get("type")
-    if not isinstance(kind, str) or kind not in known:
-        at = ("type",) if "type" in value else ()
-        return wrong(f"{{texture: NAME}} or a type of {', '.join(known)}", kind if at else value, at)
-    for key in value:
-        if key != "type" and key not in known[kind]:
-            return wrong(f"a known key: {', '.join(('type', *known[kind]))}", value[key], (key,))
-    return wrong(expected, not_built=True)
+    return slot_value(value, coloured, low, high)
 
 
 def _flag(value: Any) -> bool:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import difflib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from pydantic import PlainValidator, create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from torchpt import bsdfs
 from torchpt.bsdfs import Bsdf
-from torchpt.errors import EnergyWarning, SceneError
-from torchpt.scene import not_built
-from torchpt.scene.fields import Flag, bounded, color, number, refuse_texture, scalar, vector, wrong
-from torchpt.scene.parts import MaterialSlot
+from torchpt.errors import EnergyWarning, NotBuiltError, SceneError
+from torchpt.scene.fields import Flag, bounded, color, number, scalar, vector, wrong
+from torchpt.scene.parts import MaterialSlot, Reading
 from torchpt.scene.presets import INDICES, METALS, metal
+from torchpt.scene.textures import Named, Slot, Texture, VertexColor, slot_value
 from torchpt.scene.validate import Model, select
 
 __all__ = [
@@ -26,7 +27,11 @@ __all__ = [
 ]  # fmt: skip
 
 Rgb = tuple[float, float, float]
-Values = dict[str, float | Rgb]
+Number = float | Slot
+Color = Rgb | Slot
+Values = dict[str, Number | Color]
+#: What makes the texture of a slot, by its dotted key, one that can be read.
+Resolve = Callable[[Slot, str], Reading]
 
 #: How deep blends may be nested: every level can double the models that a lane evaluates.
 MAX_BLENDS = 8
@@ -36,10 +41,11 @@ _WHITE: Rgb = (1.0, 1.0, 1.0)
 _MIRROR = "none"  # Mitsuba's name of the metal that reflects everything
 
 
-def _index(value: Any) -> float:
-    """An index of refraction: a number, or the name of a medium."""
-    expected = f"a number in 0.001..1000 or one of {', '.join(INDICES)}"
-    refuse_texture(value, expected)
+def _index(value: Any) -> Number:
+    """An index of refraction: a number, the name of a medium, or a texture."""
+    expected = f"a number in 0.001..1000, a texture, or one of {', '.join(INDICES)}"
+    if isinstance(value, Mapping):
+        return slot_value(value, False, 1e-3, 1e3)
     if isinstance(value, str):
         found = INDICES.get(value.lower())
         if found is None:
@@ -66,19 +72,38 @@ def _mirror_like(rough: str) -> PlainValidator:
     expected = f"0, as this type is smooth (use {rough})"
 
     def check(value: Any) -> None:
-        refuse_texture(value, expected)
         if value is not None and (isinstance(value, bool) or value != 0):
             raise wrong(expected)
 
     return PlainValidator(check)
 
 
-Fraction = Annotated[float, scalar(0.0, 1.0)]
-MaybeFraction = Annotated[float | None, scalar(0.0, 1.0, optional=True)]
-Reflectance = Annotated[Rgb, color(0.0, 1.0)]
-MaybeReflectance = Annotated[Rgb | None, color(0.0, 1.0, optional=True)]
-MaybeColor = Annotated[Rgb | None, color(optional=True)]
-Index = Annotated[float, PlainValidator(_index)]
+def _normals(value: Any) -> Slot | None:
+    if value is None:
+        return None
+    if not isinstance(value, Mapping):
+        raise wrong("a texture whose colours hold normals: {type: image, path: FILE} or {texture: NAME}")
+    return slot_value(value, True, 0.0, 1.0, linear=True)
+
+
+def _heights(value: Any) -> Slot | None:
+    if value is None:
+        return None
+    if not isinstance(value, Mapping):
+        raise wrong(
+            "a texture of heights in the scene's units: {type: image, path: FILE, scale: UNITS} or {texture: NAME}"
+        )
+    return slot_value(value, False, -_LARGEST, _LARGEST)
+
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+Fraction = Annotated[Number, scalar(0.0, 1.0, texture=True)]
+MaybeFraction = Annotated[Number | None, scalar(0.0, 1.0, optional=True, texture=True)]
+Reflectance = Annotated[Color, color(0.0, 1.0, texture=True)]
+MaybeReflectance = Annotated[Color | None, color(0.0, 1.0, optional=True, texture=True)]
+MaybeColor = Annotated[Color | None, color(optional=True, texture=True)]
+Index = Annotated[Number, PlainValidator(_index)]
 
 
 class Material(Model):
@@ -90,19 +115,25 @@ class Material(Model):
         alpha_cutoff: opacity below it counts as 0, else as 1.
         emission: radiance leaving the front side, linear RGB.
         emission_strength: factor of it.
+        normal_map: shading normals in the surface's own frame, ``2 c - 1`` of the colours c.
+        bump_map: heights along the normal, in the scene's units, whose slope tilts the shading normal.
     """
 
     two_sided: Flag = True
     opacity: Fraction = 1.0
-    alpha_cutoff: MaybeFraction = None
+    alpha_cutoff: Annotated[float | None, scalar(0.0, 1.0, optional=True)] = None
     emission: MaybeColor = None
     emission_strength: Annotated[float, scalar(0.0)] = 1.0
+    normal_map: Annotated[Slot | None, PlainValidator(_normals)] = None
+    bump_map: Annotated[Slot | None, PlainValidator(_heights)] = None
 
     @model_validator(mode="after")
     def _asks_for_something(self) -> Material:
         given = self.model_fields_set
         if self.alpha_cutoff is not None and "opacity" not in given:
             raise wrong("an opacity beside alpha_cutoff", self.alpha_cutoff, ("alpha_cutoff",))
+        if self.normal_map is not None and self.bump_map is not None:
+            raise wrong("either normal_map or bump_map, not both", self.bump_map, ("bump_map",))
         if "emission_strength" in given and self.emission is None:
             raise wrong("an emission beside emission_strength", self.emission_strength, ("emission_strength",))
         return self
@@ -114,7 +145,14 @@ class Material(Model):
     def values(self) -> Values:
         """What the model is given: the type's own numbers and colours, those left out without a default excepted."""
         own = {key: getattr(self, key) for key in type(self).model_fields if key not in Material.model_fields}
-        return {key: value for key, value in own.items() if type(value) in (float, tuple)}
+        return {key: value for key, value in own.items() if type(value) in (float, tuple, Slot)}
+
+    def slots(self) -> Iterator[tuple[str, Slot]]:
+        """Its textures by key, those of inline materials excepted."""
+        for key in type(self).model_fields:
+            value = getattr(self, key)
+            if isinstance(value, Slot):
+                yield key, value
 
     def energy(self) -> str:
         """Why the material reflects more than it receives, or ""."""
@@ -138,7 +176,7 @@ class Phong(Material):
     type: Literal["phong"] = "phong"
     diffuse: Reflectance = _GREY
     specular: Reflectance = (0.2, 0.2, 0.2)
-    exponent: Annotated[float, scalar(0.0, 1e5)] = 30.0
+    exponent: Annotated[Number, scalar(0.0, 1e5, texture=True)] = 30.0
 
     _share: ClassVar[float] = 1.0  # most energy that a unit of `specular` reflects
 
@@ -148,6 +186,8 @@ class Phong(Material):
 
     def energy(self) -> str:
         """See :class:`Material`."""
+        if isinstance(self.diffuse, Slot) or isinstance(self.specular, Slot):
+            return ""  # images are not open yet
         most = max(kd + self._share * ks for kd, ks in zip(self.diffuse, self.specular, strict=True))
         if most <= 1.0 + 1e-6:
             return ""
@@ -373,7 +413,7 @@ class Principled(Material):
     roughness: Fraction = 0.5
     metallic: Fraction = 0.0
     specular: MaybeFraction = None
-    eta: Annotated[float | None, scalar(1e-3, 1e3, optional=True)] = None
+    eta: Annotated[Number | None, scalar(1e-3, 1e3, optional=True, texture=True)] = None
     spec_tint: Fraction = 0.0
     anisotropic: Fraction = 0.0
     sheen: Fraction = 0.0
@@ -394,7 +434,7 @@ class Principled(Material):
 
     def bsdf(self) -> Bsdf:
         """See :class:`Material`."""
-        return bsdfs.Principled(transmissive=self.spec_trans > 0.0, anisotropic=self.anisotropic > 0.0)
+        return bsdfs.Principled(transmissive=self.spec_trans != 0.0, anisotropic=self.anisotropic != 0.0)
 
     def values(self) -> Values:
         """See :class:`Material`."""
@@ -508,19 +548,21 @@ def _custom(name: str, model: Bsdf, key: str) -> type[Material]:
     if not isinstance(model.parameters, Mapping):
         raise SceneError(f"{key}.parameters", model.parameters, "a mapping from names to defaults")
     fields: dict[str, Any] = {"type": (Literal[name], name)}
-    taken = {*not_built.KEYS["material"], "type"}
     for parameter, default in model.parameters.items():
         at = f"{key}.parameters.{parameter}"
         if not isinstance(parameter, str) or not parameter.isidentifier() or parameter.startswith("_"):
             raise SceneError(f"{key}.parameters", parameter, "names made of letters, digits and underscores")
-        if parameter in taken or parameter in Material.model_fields or hasattr(Custom, parameter):
+        if parameter == "type" or parameter in Material.model_fields or hasattr(Custom, parameter):
             raise SceneError(at, default, f"another name ({parameter} is taken)")
         colored = isinstance(default, tuple | list)
         try:
             start = vector(default) if colored else number(default)
         except PydanticCustomError:
             raise SceneError(at, default, "a finite number, or three of them for a colour") from None
-        fields[parameter] = (Annotated[Any, color(None) if colored else scalar(None)], start)
+        fields[parameter] = (
+            Annotated[Any, color(None, texture=True) if colored else scalar(None, texture=True)],
+            start,
+        )
     made = create_model("Custom", __base__=Custom, **fields)
     made.model = model
     return made
@@ -553,55 +595,74 @@ def read_material(
     return select("material", types, raw, key, file)
 
 
-def slot_of(material: Material, name: str, materials: Mapping[str, Material]) -> MaterialSlot:
-    """What a material comes to: a model and the numbers it is given.
+def slot_of(
+    material: Material, name: str, materials: Mapping[str, Material], resolve: Resolve | None = None
+) -> MaterialSlot:
+    """What a material comes to: a model and what it is given.
 
     Args:
         material: the material.
         name: its dotted name, e.g. ``materials.red``.
         materials: all materials by name, for blends.
+        resolve: opens textures; without it only the model and the numbers can be asked for.
     """
     inner: tuple[MaterialSlot, ...] = ()
     if isinstance(material, Blend):
-        inner = tuple(_inner_slot(item, f"{name}.{side}", materials) for side, item in _sides(material))
+        inner = tuple(_inner_slot(item, f"{name}.{side}", materials, resolve) for side, item in _sides(material))
         model: Bsdf = bsdfs.Blend(*(slot.model for slot in inner))
     else:
         model = material.bsdf()
+
+    def opened(value: Any, key: str) -> Any:
+        return resolve(value, f"{name}.{key}") if resolve is not None and isinstance(value, Slot) else value
+
     return MaterialSlot(
         model=model,
         name=name,
-        values=material.values(),
+        values={key: opened(value, key) for key, value in material.values().items()},
         two_sided=material.two_sided,
-        opacity=material.opacity,
+        opacity=opened(material.opacity, "opacity"),
         alpha_cutoff=material.alpha_cutoff,
-        emission=material.emission,
+        emission=material.emission if isinstance(material.emission, tuple) else None,
         emission_strength=material.emission_strength,
+        normal_map=opened(material.normal_map, "normal_map"),
+        bump_map=opened(material.bump_map, "bump_map"),
         inner=inner,
     )
 
 
-def _inner_slot(item: str | Material, name: str, materials: Mapping[str, Material]) -> MaterialSlot:
+def _inner_slot(
+    item: str | Material, name: str, materials: Mapping[str, Material], resolve: Resolve | None
+) -> MaterialSlot:
     if isinstance(item, str):
-        return slot_of(materials[item], f"materials.{item}", materials)
-    return slot_of(item, name, materials)
+        return slot_of(materials[item], f"materials.{item}", materials, resolve)
+    return slot_of(item, name, materials, resolve)
 
 
 def _sides(blend: Blend) -> tuple[tuple[str, str | Material], tuple[str, str | Material]]:
     return ("a", blend.a), ("b", blend.b)
 
 
-def check_material(material: Material, key: str, materials: Mapping[str, Material], file: str | None) -> None:
+def check_material(
+    material: Material,
+    key: str,
+    materials: Mapping[str, Material],
+    textures: Mapping[str, Texture],
+    file: str | None,
+) -> None:
     """What can be said of a material only once all are known.
 
     Args:
         material: the material.
         key: its dotted key.
         materials: all materials by name.
+        textures: all textures by name.
         file: scene file for errors.
 
     Raises:
-        SceneError: a blend of what does not exist, of itself or of what cannot be blended; ``two_sided`` where light
-            passes through.
+        SceneError: a texture that does not exist; a blend of what does not exist, of itself or of what cannot be
+            blended; ``two_sided`` where light passes through.
+        NotBuiltError: a texture where none is built yet.
 
     Warns:
         EnergyWarning: it may reflect more light than it receives.
@@ -611,7 +672,21 @@ def check_material(material: Material, key: str, materials: Mapping[str, Materia
         _check_blend(material, key, materials, file, (name,) if materials.get(name) is material else (), 1)
         for side, item in _sides(material):
             if isinstance(item, Material):
-                check_material(item, f"{key}.{side}", materials, file)
+                check_material(item, f"{key}.{side}", materials, textures, file)
+    for slot, found in material.slots():
+        if isinstance(found.texture, Named) and found.texture.texture not in textures:
+            known = ", ".join(textures) or "none is defined"
+            raise SceneError(f"{key}.{slot}.texture", found.texture.texture, f"the name of a texture ({known})", file)
+        if slot == "emission":
+            raise NotBuiltError(f"{key}.{slot}", "a texture", "a colour", file)
+        texture = textures[found.texture.texture] if isinstance(found.texture, Named) else found.texture
+        sheer = slot == "weight" and any(isinstance(item, Null) for item in _materials(material, materials))
+        if isinstance(texture, VertexColor) and (slot in ("opacity", "normal_map", "bump_map") or sheer):
+            raise SceneError(f"{key}.{slot}", "vertex_color", "an image, or a number", file)
+    if getattr(material, "energy_compensation", False):
+        for slot, _ in material.slots():
+            if slot in material.values():
+                raise NotBuiltError(f"{key}.{slot}", "a texture", "numbers beside energy_compensation", file)
     if "two_sided" in material.model_fields_set and slot_of(material, key, materials).model.transmits:
         expected = "no two_sided, as light passes through this material (it is for opaque ones only)"
         raise SceneError(f"{key}.two_sided", material.two_sided, expected, file)
@@ -639,8 +714,40 @@ def _check_blend(
         if inner.emission is not None:
             where, value = (at, item) if isinstance(item, str) else (f"{at}.emission", inner.emission)
             raise SceneError(where, value, "a material without emission (give it to the blend itself)", file)
+        _check_sides(blend, inner, item, at, materials, file)
         if not inner.two_sided:
             where, value = (at, item) if isinstance(item, str) else (f"{at}.two_sided", False)
             raise SceneError(where, value, "a two-sided material (say two_sided on the blend itself)", file)
         if isinstance(inner, Blend):
             _check_blend(inner, at, materials, file, beyond, depth + 1)
+
+
+def _check_sides(
+    blend: Blend, inner: Material, item: str | Material, at: str, materials: Mapping[str, Material], file: str | None
+) -> None:
+    """Refuse textures that would have to be known before a blend can be: of normals and of how much is there at all."""
+    for key, advice in (("normal_map", "give it to the blend itself"), ("bump_map", "give it to the blend itself")):
+        if getattr(inner, key) is not None:
+            where = at if isinstance(item, str) else f"{at}.{key}"
+            raise SceneError(where, item if isinstance(item, str) else "a texture", f"no {key} ({advice})", file)
+    if isinstance(inner.opacity, Slot):
+        where = at if isinstance(item, str) else f"{at}.opacity"
+        raise NotBuiltError(where, "an opacity texture inside a blend", "an opacity texture of the blend itself", file)
+    if isinstance(blend.weight, Slot) and _sheer(inner, materials):
+        if not isinstance(inner, Null) or isinstance(blend.opacity, Slot):
+            expected = "an opacity texture instead, or numbers"
+            raise NotBuiltError(at, "a blend by a texture with what light passes by chance", expected, file)
+
+
+def _materials(material: Material, materials: Mapping[str, Material]) -> list[Material | None]:
+    """The two materials of a blend; of others none."""
+    if not isinstance(material, Blend):
+        return []
+    return [materials.get(item) if isinstance(item, str) else item for _, item in _sides(material)]
+
+
+def _sheer(material: Material, materials: Mapping[str, Material]) -> bool:
+    """Whether rays may pass a material as if it were not there."""
+    if isinstance(material, Null) or material.opacity != 1.0:
+        return True
+    return any(side is not None and _sheer(side, materials) for side in _materials(material, materials))

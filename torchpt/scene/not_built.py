@@ -23,11 +23,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
         "ibl": ("strict",),
         "bdpt": ("max_depth", "rr_depth", "rr_prob", "clamp", "strict"),
     },
-    "texture": {
-        "image": ("path", "wrap", "filter", "colorspace", "scale", "uv_transform", "channel"),
-        "checkerboard": ("color0", "color1", "scale", "uv_transform"),
-        "vertex_color": (),
-    },
     "shape": {
         "cylinder": ("center", "radius", "height", "capped", *_SHAPE),
         "cone": ("apex", "height", "slope", "capped", *_SHAPE),
@@ -44,7 +39,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
 #: kind of thing -> keys of built types that are not built -> the value that asks for nothing.
 KEYS: dict[str, dict[str, object]] = {
     "camera": {"aperture_radius": 0, "focus_distance": None, "blades": 0},
-    "material": {"normal_map": None, "bump_map": None},
     "mesh": {"displacement": None},
     "sampler": {"adaptive": False},
     "render": {"time_limit": None, "target_error": None, "checkpoint": None, "resume": False},

@@ -7,8 +7,21 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from torchpt.bsdfs import Bsdf
+from torchpt.textures import Node
 
-__all__ = ["MaterialSlot", "Part"]
+__all__ = ["MaterialSlot", "Part", "Reading", "Value", "VertexColors"]
+
+
+@dataclass(frozen=True)
+class VertexColors:
+    """The colours of a mesh's vertices in place of a number or colour; ``channel`` as of a node."""
+
+    channel: int | None
+
+
+#: A texture in place of a number or a colour.
+Reading = Node | VertexColors
+Value = float | tuple[float, float, float] | Reading
 
 
 @dataclass(frozen=True)
@@ -18,23 +31,27 @@ class MaterialSlot:
     Attributes:
         model: its model, in the variant that it needs.
         name: dotted prefix of its parameters, e.g. ``materials.red``.
-        values: what the model is given, by parameter name: colours as three floats, numbers as one.
+        values: what the model is given, by parameter name: colours as three floats, numbers as one, textures.
         two_sided: whether the back of an opaque model reflects as the front does.
         opacity: fraction of the light that meets the surface at all.
         alpha_cutoff: where set, opacity below it counts as 0, else as 1.
         emission: radiance, or None where it does not emit.
         emission_strength: factor of it.
+        normal_map: a colour texture, or None.
+        bump_map: a number texture, or None.
         inner: the two materials of a blend, whose own ``values`` hold but the weight.
     """
 
     model: Bsdf
     name: str
-    values: dict[str, float | tuple[float, float, float]]
+    values: dict[str, Value]
     two_sided: bool = True
-    opacity: float = 1.0
+    opacity: float | Node = 1.0
     alpha_cutoff: float | None = None
     emission: tuple[float, float, float] | None = None
     emission_strength: float = 1.0
+    normal_map: Node | None = None
+    bump_map: Node | None = None
     inner: tuple[MaterialSlot, ...] = ()
 
     def all(self) -> list[MaterialSlot]:
@@ -42,16 +59,22 @@ class MaterialSlot:
         return [self, *(slot for inner in self.inner for slot in inner.all())]
 
     def numbers(self) -> dict[str, float | tuple[float, float, float]]:
-        """Its parameters by dotted name, those of inner materials included."""
-        found = {f"{self.name}.{key}": value for key, value in self.values.items()}
+        """Its parameters by dotted name, those of inner materials included, textures excepted."""
+        mine: dict[str, Value] = dict(self.values)
         if self.opacity != 1.0:
-            found[f"{self.name}.opacity"] = self.opacity
+            mine["opacity"] = self.opacity
         if self.emission is not None:
-            found[f"{self.name}.emission"] = self.emission
-            found[f"{self.name}.emission_strength"] = self.emission_strength
+            mine |= {"emission": self.emission, "emission_strength": self.emission_strength}
+        found = {f"{self.name}.{key}": value for key, value in mine.items() if isinstance(value, float | tuple)}
         for inner in self.inner:
             found |= inner.numbers()
         return found
+
+    def readings(self) -> list[Reading]:
+        """Its textures, those of inner materials included."""
+        mine = [*self.values.values(), self.opacity, self.normal_map, self.bump_map]
+        found: list[Reading] = [value for value in mine if isinstance(value, Node | VertexColors)]
+        return [*found, *(reading for inner in self.inner for reading in inner.readings())]
 
 
 @dataclass(frozen=True)
@@ -72,6 +95,7 @@ class Part:
         faces: ``(F, 3)`` int64.
         normals: ``(V, 3)`` from the file, or None.
         uvs: ``(V, 2)``, or None.
+        colors: ``(V, 3)`` linear, or None.
         smooth: whether shading normals are interpolated.
         dropped: faces without area, left out.
         source: the file it was read from, or "".
@@ -91,6 +115,7 @@ class Part:
     faces: np.ndarray | None = None
     normals: np.ndarray | None = None
     uvs: np.ndarray | None = None
+    colors: np.ndarray | None = None
     smooth: bool = False
     dropped: int = 0
     source: str = ""

@@ -10,6 +10,8 @@ The search is free of gradients. Here the point comes from the primitive's own c
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -71,22 +73,38 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         ns = normalize(_blend(world.normals, prim, u, v))
         if triangles < len(world.bound):
             ns = torch.where(prim < triangles, ns, ng)
-    return Interaction(p, ng, ns, _tangent(world, prim, u, v, e1, e2, ng), prim)
+    tangent, bitangent = _tangents(world, prim, u, v, e1, e2, ng)
+    return Interaction(p, ng, ns, tangent, bitangent, prim, u, v)
 
 
-def _tangent(world: World, prim: Tensor, u: Tensor, v: Tensor, e1: Tensor, e2: Tensor, ng: Tensor) -> Tensor | None:
-    """Derivative of the point along the shape's first parameter, as Mitsuba has it: radial on a disk, around a sphere."""
+def _tangents(
+    world: World, prim: Tensor, u: Tensor, v: Tensor, e1: Tensor, e2: Tensor, ng: Tensor
+) -> tuple[Tensor | None, Tensor | None]:
+    """How points move with their texture coordinates: on a disk outward and around, on a sphere around and down (Mitsuba)."""
     if world.tangents is None:
-        return None
+        return None, None
     tangent = take(world.tangents, prim)
+    bitangent = None if world.bitangents is None else take(world.bitangents, prim)
     triangles, rectangles, disks, spheres = world.counts
     if spheres:
-        first = len(world.bound) - spheres
-        tangent = torch.where(prim >= first, cross(tangent, ng), tangent)
+        ball = prim >= len(world.bound) - spheres
+        around = cross(tangent, ng)
+        if bitangent is not None:
+            bitangent = torch.where(ball, cross(normalize(around), ng) * bitangent[0], bitangent)
+        tangent = torch.where(ball, around, tangent)
     if disks:
         first = triangles + rectangles
-        tangent = torch.where((prim >= first) & (prim < first + disks), e1 * u + e2 * v, tangent)
-    return tangent
+        disk = (prim >= first) & (prim < first + disks)
+        away = torch.addcmul(e1 * u, e2, v)
+        square = torch.where(disk, u * u + v * v, 1.0)
+        some = square > 0
+        tangent = torch.where(disk, torch.where(some, away / torch.where(some, square, 1.0).sqrt(), e1), tangent)
+        if bitangent is not None:
+            around = torch.addcmul(e2 * u, e1, v, value=-1) * (2.0 * math.pi)
+            if world.mirrored is not None:
+                around = torch.where(take(world.mirrored, prim), -around, around)
+            bitangent = torch.where(disk, around, bitangent)
+    return tangent, bitangent
 
 
 def _sphere_distance(o: Tensor, d: Tensor, centre: Tensor, radius: Tensor, near: Tensor) -> Tensor:

@@ -1,0 +1,136 @@
+"""A surface point with its material resolved: parameters from rows and textures, the shading frame with its maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt import bsdfs
+from torchpt.math.frames import Frame
+from torchpt.math.vectors import affine, cross, dot, luminance, normalize, take
+from torchpt.records import Interaction, World
+from torchpt.shapes import surface_uv, vertex_colors
+from torchpt.textures import Look, Pick, look_up, slope
+
+__all__ = ["Surface", "parameters_at", "shading_normal", "surface_at"]
+
+#: Least cosine between a mapped normal and the direction it is seen from: a steeper one is bent back, else it was black.
+LEAST_COSINE = 0.05
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface point with its material resolved."""
+
+    frame: Frame  # about the shading normal, turned to the side of wo where light does not pass through
+    side: Tensor | None  # (N,) -1 where it was turned around; None where light passes through
+    shown: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
+    parameters: bsdfs.Parameters  # lane values of the BSDF
+    wo: Tensor  # (3, N) local
+
+
+def surface_at(world: World, number: int, d: Tensor, at: Interaction) -> Surface:
+    """Resolve the material at surface points.
+
+    Args:
+        world: the scene's tensors.
+        number: of the model that all of them have.
+        d: directions ``(3, N)`` of the rays that came.
+        at: the points.
+    """
+    model, row = world.models[number], take(world.material, at.prim)
+    look = world.looks[number]
+    uv = None if look is None or world.uvs is None else surface_uv(world, at)
+    ns, side, shown = at.ns, None, None
+    if not model.transmits:
+        side = torch.copysign(torch.ones_like(ns[0]), -dot(d, ns).detach())
+        both = world.two_sided[number]
+        if both is not None:
+            shown = ((side > 0) | take(both, row)).to(side.dtype)
+    if look is not None and (look.normal is not None or look.bump is not None):
+        assert uv is not None
+        frame = _mapped(world, look, row, uv, d, at, side)
+    else:
+        ns = ns if side is None else ns * side
+        frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
+    return Surface(frame, side, shown, parameters_at(world, number, row, at, uv), frame.to_local(-d))
+
+
+def parameters_at(world: World, number: int, row: Tensor, at: Interaction, uv: Tensor | None) -> bsdfs.Parameters:
+    """Lane values of the BSDF ``number`` at rows ``(N,)``; ``uv (2, N)`` where images are read."""
+    values, look = bsdfs.gather(world.bsdfs[number], row), world.looks[number]
+    if look is None:
+        return values
+    return world.models[number].prepare(_filled(world, values, look.readings, row, at, uv))
+
+
+def _filled(
+    world: World, values: bsdfs.Parameters, readings: dict[str, Any], row: Tensor, at: Interaction, uv: Tensor | None
+) -> bsdfs.Parameters:
+    """Values with those that textures give."""
+    found = dict(values)
+    for key, reading in readings.items():
+        if isinstance(reading, Pick):
+            found[key] = _read(world, reading, row, at, uv)
+        else:
+            found[key] = _filled(world, values.get(key, {}), reading, row, at, uv)
+    return found
+
+
+def _read(world: World, pick: Pick, row: Tensor, at: Interaction, uv: Tensor | None) -> Tensor:
+    if pick.nodes is None:
+        colors = vertex_colors(world, at)
+        if pick.channel is None:
+            return colors
+        return colors[pick.channel] if pick.channel >= 0 else luminance(colors)
+    assert world.textures is not None and uv is not None
+    return look_up(world.textures, take(pick.nodes, row), uv, pick.channel is None)
+
+
+def shading_normal(world: World, number: int, d: Tensor, at: Interaction) -> Tensor:
+    """The shading normal ``(3, N)`` on the shape's own outside, maps included."""
+    look = world.looks[number]
+    if look is None or (look.normal is None and look.bump is None):
+        return at.ns
+    uv, row = surface_uv(world, at), take(world.material, at.prim)
+    side = torch.copysign(torch.ones_like(d[0]), -dot(d, at.ns))
+    return _mapped(world, look, row, uv, d, at, side).n * side
+
+
+def _mapped(
+    world: World, look: Look, row: Tensor, uv: Tensor, d: Tensor, at: Interaction, side: Tensor | None
+) -> Frame:
+    """The frame about the normal of a normal or bump map.
+
+    A normal map's vectors are relative to the shading normal, the tangent along u, and their cross product. A bump map's
+    heights move the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). What is seen from behind is
+    the mirror image. As Mitsuba's ``normalmap`` and ``bumpmap``, but that normals turned away from the eye are bent back.
+    """
+    assert world.textures is not None and at.tangent is not None
+    n = at.ns
+    if look.normal is not None:
+        base = Frame.along(n, at.tangent)
+        local = look_up(world.textures, take(look.normal, row), uv, True) * 2.0 - 1.0
+        up = local[2] if side is None else local[2] * side
+        normal = affine(base.s * local[0], base.t, local[1], n, up)
+    else:
+        assert look.bump is not None and at.bitangent is not None
+        du, dv = slope(world.textures, take(look.bump, row), uv)
+        along = torch.addcmul(at.tangent, n, du - dot(n, at.tangent))
+        across = torch.addcmul(at.bitangent, n, dv - dot(n, at.bitangent))
+        normal = cross(along, across)
+        normal = normal * torch.copysign(torch.ones_like(du), dot(normal, n).detach())
+        flat = dot(normal, normal) == 0  # no texture coordinates: no slope
+        normal = torch.where(flat, n, normal)
+        if side is not None:
+            # Seen from behind, the hills are valleys: mirrored about the tangent plane.
+            normal = torch.where(side > 0, normal, torch.addcmul(normal, n, dot(normal, n), value=-2.0))
+    normal = normalize(normal)
+    if side is not None:
+        # The least turn towards the eye that shows it.
+        hidden = LEAST_COSINE + dot(d, normal)
+        normal = normalize(torch.addcmul(normal, d, hidden.clamp_min(0.0), value=-1.0))
+    return Frame.along(normal, at.tangent)
