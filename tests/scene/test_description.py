@@ -139,10 +139,6 @@ def test_bad_input_is_one_line_that_names_the_key(name: str) -> None:
 LATER: dict[str, tuple[dict[str, Any], str]] = {
     "camera": ({"camera": {**CAMERA, "type": "thinlens", "aperture_radius": 1}}, "camera.type"),
     "camera key": (camera(blades=5), "camera.blades"),
-    "material key": (material(bump_map={"type": "image", "path": "a.png"}), "materials.m.bump_map"),
-    "texture by name": (material(reflectance={"texture": "wood"}), "materials.m.reflectance"),
-    "texture inline": (material(reflectance={"type": "image", "path": "a.png"}), "materials.m.reflectance"),
-    "textures block": (scene(textures={"t": {"type": "checkerboard"}}), "textures.t.type"),
     "shape": (shape(type="cylinder", radius=1), "shapes.s.type"),
     "displacement": (mesh(displacement={"scale": 1}), "shapes.s.displacement"),
     "light": (scene(lights={"l": {"type": "envmap", "path": "a.exr"}}), "lights.l.type"),

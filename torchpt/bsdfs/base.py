@@ -38,6 +38,7 @@ class Bsdf:
     Attributes:
         name: its ``type`` in a scene file.
         parameters: names and defaults of what a material of this type is given: a number, or three for a colour.
+        tabulated: parameters that :meth:`tabulate` needs, so that no texture can give them.
         lobed: whether ``sample`` reads ``lobe``; the others are spared that number.
         delta: whether ``sample`` may give ``pdf = inf``.
         smooth: whether it gives nothing else: then no light is sampled for it.
@@ -51,6 +52,7 @@ class Bsdf:
 
     name: ClassVar[str] = ""
     parameters: ClassVar[Mapping[str, Default]] = {}
+    tabulated: ClassVar[tuple[str, ...]] = ()
     lobed: ClassVar[bool] = False
     conserves: ClassVar[bool] = True
     reciprocal: ClassVar[bool] = True
@@ -65,8 +67,16 @@ class Bsdf:
         if cls.eval_pdf is Bsdf.eval_pdf and (cls.eval is Bsdf.eval or cls.pdf is Bsdf.pdf):
             raise TypeError(f"{cls.__name__} has to define eval_pdf, or eval and pdf")
 
+    def tabulate(self, values: Parameters) -> Parameters:
+        """What :meth:`prepare` needs beside ``values`` and can be had once a material: integrals over directions."""
+        return {}
+
     def prepare(self, values: Parameters) -> Parameters:
-        """Lane parameters from those a material was given (``(3, 1)`` or ``(1,)``); differentiable, once a material."""
+        """Lane parameters from those a material was given, differentiable.
+
+        Once a material (``(3, 1)`` or ``(1,)``); where textures give some of them at every lane (``(3, N)``, ``(N,)``),
+        with what :meth:`tabulate` gave.
+        """
         return dict(values)
 
     def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:

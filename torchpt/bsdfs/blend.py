@@ -66,6 +66,10 @@ class Blend(Bsdf):
         """Where both are."""
         return self.a.reciprocal and self.b.reciprocal
 
+    def tabulate(self, values: Parameters) -> Parameters:
+        """Both, each by its own."""
+        return {"a": self.a.tabulate(values["a"]), "b": self.b.tabulate(values["b"])}
+
     def prepare(self, values: Parameters) -> Parameters:
         """Both, each by its own."""
         return {"weight": values["weight"], "a": self.a.prepare(values["a"]), "b": self.b.prepare(values["b"])}

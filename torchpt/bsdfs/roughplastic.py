@@ -35,14 +35,15 @@ class RoughPlastic(Bsdf):
     """
 
     name = "roughplastic"
+    tabulated = ("alpha", "roughness", "int_ior", "ext_ior")
     parameters = {**Plastic.parameters, "alpha": 0.1}  # noqa: RUF012
     lobed = True
     delta = True
 
     nonlinear: bool = False
 
-    def prepare(self, values: Parameters) -> Parameters:
-        """See :class:`Bsdf`."""
+    def tabulate(self, values: Parameters) -> Parameters:
+        """How much the coat lets through by cosine, and how much of the base's light it sends back."""
         eta = values["int_ior"] / values["ext_ior"]
         surface = rough(values, False)
         cosines = torch.linspace(0, 1, _ENTRIES, dtype=torch.float64, device=eta.device).clamp_min(1e-6)
@@ -50,10 +51,15 @@ class RoughPlastic(Bsdf):
         through = microfacet.coat_transmittance(cosines, alpha, index)
         inner = microfacet.coat_reflectance(cosines, alpha, 1.0 / index)
         diffuse = 2.0 * (inner * cosines).mean()[None].to(eta.dtype)
+        return {"transmittance": Table(through.to(eta.dtype)[None]), "inner": diffuse}
+
+    def prepare(self, values: Parameters) -> Parameters:
+        """See :class:`Bsdf`."""
+        tables = values if "transmittance" in values else self.tabulate(values)
         return {
-            **coated(values, eta, diffuse, self.nonlinear),
-            **surface,
-            "transmittance": Table(through.to(eta.dtype)[None]),
+            **coated(values, values["int_ior"] / values["ext_ior"], tables["inner"], self.nonlinear),
+            **rough(values, False),
+            "transmittance": tables["transmittance"],
         }
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:

@@ -163,6 +163,8 @@ def shade(
         weight = weight * (_through(at, surface, light.wi, wi) > 0)
     if surface.shown is not None:
         weight = weight * surface.shown
+    if surface.relief is not None:
+        weight = weight * surface.relief.shadowing(light.wi)
     radiance = state.throughput * reflected * light.radiance * weight
     o = offset_origin(world, at, light.wi)
     d = light.target - o
@@ -237,6 +239,8 @@ def scatter(
         if plan.attached:
             # The direction of a delta follows the surface that it leaves; the next point slides along it.
             d = follow if sharp is None else torch.where(sharp, frame.to_world(wi), follow)
+    if surface.relief is not None:
+        weight = weight * surface.relief.shadowing(d)
     throughput = state.throughput * weight
     brightest = largest(throughput.detach())
     alive = torch.minimum(least, brightest) > 0

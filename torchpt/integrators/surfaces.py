@@ -17,8 +17,23 @@ from torchpt.textures import Look, Pick, look_up, slope
 
 __all__ = ["Surface", "parameters_at", "shading_normal", "surface_at"]
 
-#: Least cosine between a mapped normal and the direction it is seen from: a steeper one is bent back, else it was black.
-LEAST_COSINE = 0.05
+
+@dataclass(frozen=True)
+class Relief:
+    """What a normal or bump map did to the shading normal."""
+
+    normal: Tensor  # (3, N) without the map, turned as the frame is
+    alpha2: Tensor  # (N,) squared roughness of a surface whose facets lean as the map does
+
+    def shadowing(self, w: Tensor) -> Tensor:
+        """How much of the light from unit directions ``w (3, N)`` the relief lets through ``(N,)``.
+
+        Smith's masking by the facets that the tilt stands for, which takes the place of the hard edge where mapped and true
+        horizon differ (Conty Estevez, Lecocq, Stein, *A Microfacet-Based Shadowing Function to Solve the Bump Terminator
+        Problem*, Ray Tracing Gems, 2019).
+        """
+        square = dot(w, self.normal).square().clamp_min(1e-12)
+        return 2.0 / (1.0 + (1.0 + self.alpha2 * (1.0 - square).clamp_min(0.0) / square).sqrt())
 
 
 @dataclass(frozen=True)
@@ -30,6 +45,7 @@ class Surface:
     shown: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
     parameters: bsdfs.Parameters  # lane values of the BSDF
     wo: Tensor  # (3, N) local
+    relief: Relief | None  # None where no map bends the normals
 
 
 def surface_at(world: World, number: int, d: Tensor, at: Interaction) -> Surface:
@@ -44,7 +60,7 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction) -> Surface
     model, row = world.models[number], take(world.material, at.prim)
     look = world.looks[number]
     uv = None if look is None or world.uvs is None else surface_uv(world, at)
-    ns, side, shown = at.ns, None, None
+    ns, side, shown, relief = at.ns, None, None, None
     if not model.transmits:
         side = torch.copysign(torch.ones_like(ns[0]), -dot(d, ns).detach())
         both = world.two_sided[number]
@@ -52,11 +68,11 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction) -> Surface
             shown = ((side > 0) | take(both, row)).to(side.dtype)
     if look is not None and (look.normal is not None or look.bump is not None):
         assert uv is not None
-        frame = _mapped(world, look, row, uv, d, at, side)
+        frame, relief = _mapped(world, look, row, uv, d, at, side)
     else:
         ns = ns if side is None else ns * side
         frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
-    return Surface(frame, side, shown, parameters_at(world, number, row, at, uv), frame.to_local(-d))
+    return Surface(frame, side, shown, parameters_at(world, number, row, at, uv), frame.to_local(-d), relief)
 
 
 def parameters_at(world: World, number: int, row: Tensor, at: Interaction, uv: Tensor | None) -> bsdfs.Parameters:
@@ -97,40 +113,38 @@ def shading_normal(world: World, number: int, d: Tensor, at: Interaction) -> Ten
         return at.ns
     uv, row = surface_uv(world, at), take(world.material, at.prim)
     side = torch.copysign(torch.ones_like(d[0]), -dot(d, at.ns))
-    return _mapped(world, look, row, uv, d, at, side).n * side
+    return _mapped(world, look, row, uv, d, at, side)[0].n * side
 
 
 def _mapped(
     world: World, look: Look, row: Tensor, uv: Tensor, d: Tensor, at: Interaction, side: Tensor | None
-) -> Frame:
-    """The frame about the normal of a normal or bump map.
+) -> tuple[Frame, Relief]:
+    """The frame about the normal of a normal or bump map, and what the map did.
 
     A normal map's vectors are relative to the shading normal, the tangent along u, and their cross product. A bump map's
     heights move the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). What is seen from behind is
-    the mirror image. As Mitsuba's ``normalmap`` and ``bumpmap``, but that normals turned away from the eye are bent back.
+    the mirror image. A normal that turns from the eye is mirrored about the surface's own (after Schuessler, Heitz,
+    Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017): all as Mitsuba's ``normalmap`` and ``bumpmap``.
     """
     assert world.textures is not None and at.tangent is not None
-    n = at.ns
+    base = Frame.along(at.ns, at.tangent)
     if look.normal is not None:
-        base = Frame.along(n, at.tangent)
         local = look_up(world.textures, take(look.normal, row), uv, True) * 2.0 - 1.0
-        up = local[2] if side is None else local[2] * side
-        normal = affine(base.s * local[0], base.t, local[1], n, up)
+        x, y, z = local[0], local[1], local[2].clamp_min(1e-3)
     else:
         assert look.bump is not None and at.bitangent is not None
         du, dv = slope(world.textures, take(look.bump, row), uv)
-        along = torch.addcmul(at.tangent, n, du - dot(n, at.tangent))
-        across = torch.addcmul(at.bitangent, n, dv - dot(n, at.bitangent))
-        normal = cross(along, across)
-        normal = normal * torch.copysign(torch.ones_like(du), dot(normal, n).detach())
-        flat = dot(normal, normal) == 0  # no texture coordinates: no slope
-        normal = torch.where(flat, n, normal)
-        if side is not None:
-            # Seen from behind, the hills are valleys: mirrored about the tangent plane.
-            normal = torch.where(side > 0, normal, torch.addcmul(normal, n, dot(normal, n), value=-2.0))
-    normal = normalize(normal)
-    if side is not None:
-        # The least turn towards the eye that shows it.
-        hidden = LEAST_COSINE + dot(d, normal)
-        normal = normalize(torch.addcmul(normal, d, hidden.clamp_min(0.0), value=-1.0))
-    return Frame.along(normal, at.tangent)
+        along = torch.addcmul(at.tangent, at.ns, du - dot(at.ns, at.tangent))
+        across = torch.addcmul(at.bitangent, at.ns, dv - dot(at.ns, at.bitangent))
+        x, y, z = base.to_local(cross(along, across))
+        sign = torch.copysign(torch.ones_like(z), z.detach())
+        x, y, z = x * sign, y * sign, z * sign
+    n = at.ns if side is None else at.ns * side
+    normal = normalize(affine(base.s * x, base.t, y, n, z))
+    away = (dot(d, n) * dot(d, normal) <= 0).detach()
+    normal = torch.where(away, normalize(affine(base.s * -x, base.t, -y, n, z)), normal)
+    flat = dot(normal, normal) == 0  # no texture coordinates, so no slope
+    normal = torch.where(flat, n, normal)
+    square = dot(normal, n).square().clamp_min(1e-12)
+    alpha2 = (0.125 * (1.0 - square).clamp_min(0.0) / square).clamp_max(1.0)
+    return Frame.along(normal, at.tangent), Relief(n, alpha2)

@@ -225,11 +225,21 @@ def _materials(
             tables.append(stacked([model.prepare(surfaces[name].values) for name in names]))
             looks.append(None)
         else:
-            tables.append(stacked([surfaces[name].values for name in names]))
+            tables.append(stacked([_tabulated(model, surfaces[name].values) for name in names]))
             looks.append(_look([slots[name] for name in names], [surfaces[name] for name in names], nodes, device))
         both = [slots[name].two_sided for name in names]
         sides.append(None if all(both) else torch.tensor(both, device=device))
     return tuple(groups), rows, tuple(tables), tuple(looks), tuple(sides)
+
+
+def _tabulated(model: Bsdf, values: Parameters) -> Parameters:
+    """Values with what the model tabulates of them."""
+
+    def merged(a: Parameters, b: Parameters) -> Parameters:
+        inner = {key: merged(a[key], value) for key, value in b.items() if isinstance(value, dict)}
+        return {**a, **b, **inner}
+
+    return merged(values, model.tabulate(values))
 
 
 def _kind(slot: MaterialSlot, surface: Surface) -> Kind:

@@ -39,10 +39,13 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     memory = sum(x.numel() * x.element_size() for x in tensors_of(world))
     made: dict[str, Any] = {
         "accel": accel.describe(),
-        "bsdfs": dict(zip(map(str, world.models), map(_rows, world.bsdfs), strict=True)),
+        "bsdfs": _groups(world),
         "lights": {} if lights is None else {"rows": len(lights.area), "kinds": list(lights.kinds)},
         "scene_bytes": memory,
     }
+    if world.textures is not None:
+        texels = world.textures.texels
+        made["textures"] = {"reads": world.textures.places.shape[1], "bytes": texels.numel() * texels.element_size()}
     if built.centre.any():
         made["origin_moved_to"] = built.centre.tolist()
     return {
@@ -97,8 +100,37 @@ def _left_out(world: World, settings: Settings) -> list[str]:
         absent.append("Russian roulette (paths end before rr_depth)")
     if not settings.film.aovs:
         absent.append("aov layers")
-    absent += ["textures", "volumes", "derivative tape (until a parameter requires gradients)"]
+    if world.textures is None:
+        absent.append("textures (no image is read)")
+    if world.colors is None:
+        absent.append("vertex colours")
+    if all(look is None or (look.normal is None and look.bump is None) for look in world.looks):
+        absent.append("normal and bump maps")
+    absent += ["volumes", "derivative tape (until a parameter requires gradients)"]
     return absent
+
+
+def _groups(world: World) -> dict[str, int]:
+    """Models by name, with what textures give them, and how many materials share each."""
+    found: dict[str, int] = {}
+    for model, table, look in zip(world.models, world.bsdfs, world.looks, strict=True):
+        name, rows = str(model), _rows(table)
+        if look is not None:
+            maps = ["normal_map"] * (look.normal is not None) + ["bump_map"] * (look.bump is not None)
+            name = f"{name}, textured: {', '.join([*_keys(look.readings), *maps])}"
+            picks = tensors_of(look)
+            rows = max([rows, *(len(pick) for pick in picks)])
+        while name in found:
+            name += ", again"
+        found[name] = rows
+    return found
+
+
+def _keys(readings: dict[str, Any]) -> list[str]:
+    found = []
+    for key, value in readings.items():
+        found += [f"{key}.{inner}" for inner in _keys(value)] if isinstance(value, dict) else [key]
+    return found
 
 
 def _rows(table: bsdfs.Parameters) -> int:

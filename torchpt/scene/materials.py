@@ -683,10 +683,13 @@ def check_material(
         sheer = slot == "weight" and any(isinstance(item, Null) for item in _materials(material, materials))
         if isinstance(texture, VertexColor) and (slot in ("opacity", "normal_map", "bump_map") or sheer):
             raise SceneError(f"{key}.{slot}", "vertex_color", "an image, or a number", file)
-    if getattr(material, "energy_compensation", False):
+    if not isinstance(material, Blend):
+        compensated = getattr(material, "energy_compensation", False)
+        fixed = tuple(material.values()) if compensated else material.bsdf().tabulated
         for slot, _ in material.slots():
-            if slot in material.values():
-                raise NotBuiltError(f"{key}.{slot}", "a texture", "numbers beside energy_compensation", file)
+            if slot in fixed:
+                beside = " beside energy_compensation" if compensated else ""
+                raise NotBuiltError(f"{key}.{slot}", "a texture", f"a number{beside}", file)
     if "two_sided" in material.model_fields_set and slot_of(material, key, materials).model.transmits:
         expected = "no two_sided, as light passes through this material (it is for opaque ones only)"
         raise SceneError(f"{key}.two_sided", material.two_sided, expected, file)
