@@ -58,6 +58,27 @@ MATERIALS: dict[str, dict[str, Any]] = {
     "nothing": {"type": "null"},
     "lace": {"type": "diffuse", "opacity": 0.5},
     "shell": {"type": "diffuse", "two_sided": False, "reflectance": 0.6},
+    "tiles": {"type": "diffuse", "reflectance": {"type": "checkerboard", "scale": [8, 4], "color0": [0.7, 0.3, 0.2]}},
+    "inlay": {
+        "type": "principled",
+        "base_color": {"type": "checkerboard", "scale": 6, "color0": [0.9, 0.7, 0.3], "color1": 0.1},
+        "metallic": {"type": "checkerboard", "scale": 6, "color0": 1, "color1": 0},
+        "roughness": {"type": "checkerboard", "scale": 3, "color0": 0.2, "color1": 0.6},
+        "spec_trans": {"type": "checkerboard", "scale": 3, "color0": 0.5, "color1": 0},
+        "anisotropic": {"type": "checkerboard", "scale": 3, "color0": 0.5, "color1": 0},
+    },
+    "lattice": {
+        "type": "roughplastic",
+        "diffuse_reflectance": {"type": "checkerboard", "scale": 5},
+        "opacity": {"type": "checkerboard", "scale": [8, 4], "color0": 1, "color1": 0.2},
+    },
+    "patches": {
+        "type": "blend",
+        "a": "gold",
+        "b": "frosted",
+        "weight": {"type": "checkerboard", "scale": 4, "color0": 1, "color1": 0.3},
+        "normal_map": {"type": "checkerboard", "scale": 9, "color0": [0.6, 0.45, 0.95], "color1": [0.4, 0.5, 0.95]},
+    },
     "ember": {"type": "roughconductor", "alpha": 0.3, "material": "Cu", "emission": [0.5, 0.2, 0.1]},
 }
 

@@ -28,14 +28,18 @@ def coated(values: Parameters, eta: Tensor, inner: Tensor, nonlinear: bool) -> P
         nonlinear: whether light that the coat throws back takes the base's colour again, which saturates it.
     """
     diffuse, specular = values["diffuse_reflectance"], values.get("specular_reflectance")
-    mean = diffuse.mean(0)
+    mean = _mean(diffuse)
     return {
         "eta": eta,
         "base": diffuse / ((1.0 - inner * (diffuse if nonlinear else 1.0)) * eta * eta),
         "diffuse_reflectance": diffuse,
         "specular_reflectance": specular,
-        "specular_share": share(torch.ones_like(mean) if specular is None else specular.mean(0), mean),
+        "specular_share": share(torch.ones_like(mean) if specular is None else _mean(specular), mean),
     }
+
+
+def _mean(color: Tensor) -> Tensor:
+    return (color[0] + color[1] + color[2]) * (1.0 / 3.0)
 
 
 @dataclass(frozen=True)
