@@ -461,6 +461,7 @@ def test_ply_colours_and_coordinates(tmp_path: Path, kind: str, row: str, names:
     rows = "".join(f"{point} {row}\n" for point in ("0 0 0 0 0", "1 0 0 1 0", "0 1 0 0 0.5"))
     (tmp_path / "a.ply").write_text(f"{text}end_header\n{rows}3 0 1 2\n")
     (part,) = load_mesh(tmp_path / "a.ply")
+    assert part.colors is not None and part.uvs is not None
     np.testing.assert_allclose(part.colors, [[1, 0.2, 0]] * 3)
     np.testing.assert_allclose(part.uvs, [[0, 0], [1, 0], [0, 0.5]])
     assert part.material is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,11 +30,18 @@ def decoded_lines(data: bytes) -> list[str]:
     except UnicodeDecodeError:
         text = data.decode("latin-1")
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    if "\\" in text:
-        for number in range(len(lines) - 2, -1, -1):
-            if lines[number].endswith("\\"):
-                lines[number] = f"{lines[number][:-1]} {lines[number + 1]}"
-                lines[number + 1] = ""
+    if "\\" not in text:
+        return lines
+    number = 0
+    while number < len(lines):
+        end = number
+        while lines[end].endswith("\\") and end + 1 < len(lines):
+            lines[end] = lines[end][:-1]
+            end += 1
+        if end > number:
+            lines[number] = " ".join(lines[number : end + 1])
+            lines[number + 1 : end + 1] = [""] * (end - number)
+        number = end + 1
     return lines
 
 
@@ -130,7 +138,8 @@ def _color(text: str, key: str, line: _Line) -> Rgb:
 
 def _map(key: str, text: str, line: _Line) -> Map:
     """A map statement: options, then a file name that may hold blanks."""
-    words, at = text.split(), 0
+    found = list(re.finditer(r"\S+", text))
+    words, starts, at = [word[0] for word in found], [word.start() for word in found], 0
     options: dict[str, list[str]] = {}
     while at < len(words) - 1 and words[at].lower() in _OPTIONS:
         option = words[at].lower()
@@ -141,9 +150,7 @@ def _map(key: str, text: str, line: _Line) -> Map:
             end -= 1  # a file may be called 1
         options[option] = words[at + 1 : end]
         at = end
-    rest = text
-    for _ in range(at):
-        rest = rest.split(None, 1)[1] if len(rest.split(None, 1)) > 1 else ""
+    rest = text[starts[at] :] if at < len(starts) else ""
     if not rest:
         raise line.wrong(f"{key} and the name of a file", text)
 
