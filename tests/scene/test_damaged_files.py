@@ -205,7 +205,7 @@ def check_mesh(file: Path) -> None:
     try:
         parts = load_mesh(file)
     except AssetError as error:
-        assert "\n" not in str(error) and "\0" not in str(error) and str(error).startswith(str(file.parent)), error
+        assert str(error).isprintable() and str(error).startswith(str(file.parent)), error
         parts = []
     for part in parts:
         assert np.isfinite(part.vertices).all() and part.faces.min() >= 0 and part.faces.max() < len(part.vertices)
@@ -224,7 +224,7 @@ def check_image(image: EncodedImage) -> None:
     try:
         texels = read_texels(image)
     except AssetError as error:
-        assert "\n" not in str(error) and str(error).startswith(f"{image.label}: "), error
+        assert str(error).isprintable() and str(error).startswith(f"{image.label}: "), error
     else:
         assert np.isfinite(texels.values).all() and texels.values.ndim == 3
     assert time.monotonic() - start < SECONDS

@@ -127,7 +127,7 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
         elif words[0] == "element" and len(words) == 3:
             if not words[2].isdigit() or len(words[2]) > 15:
                 raise problem
-            elements.append(_Element(words[1], int(words[2])))
+            elements.append(_Element(words[1][:80], int(words[2])))
         elif words[0] == "property" and elements:
             elements[-1].properties.append(_property(words, problem))
         else:
