@@ -5,11 +5,15 @@
 - `statue.ply`: a draped figure on a plinth that holds up a sphere, of height 1 from y = 0, facing +z; closed.
 - `cup.ply`: a cup with a handle, of height 1 from y = 0; two closed pieces.
 - `curved_wall.ply`: an upright sheet along an arc of radius 1 about the y axis, of height 1, facing the axis.
+- `toy_duck.glb`: a bath duck with a painted texture, facing +x, with the bounding box of Khronos' sample duck; closed.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -335,6 +339,110 @@ def curved_wall() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     return points.reshape(-1, 3).astype("<f4"), _grid(np.arange(193 * 9).reshape(193, 9)).astype("<i4")
 
 
+DUCK_BOX = ((-0.692985, 0.0992937, -0.613282), (0.961799, 1.6397, 0.539252))
+BILL = ((0.8, 1.13, 0.0), (0.24, 0.065, 0.15))
+EYE = (0.655, 1.33)
+
+
+def duck_field(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The duck's field at ``(..., 3)``, symmetric about z = 0."""
+    x, y, z = np.moveaxis(p, -1, 0)
+    body = _ball(p, (0.02, 0.52, 0.0), (0.66, 0.42, 0.52))
+    body = _join(body, _limb(p, (-0.4, 0.6, 0.0), (-0.68, 0.93, 0.0), (0.2, 0.03)), 0.15)
+    folded = np.stack([x, y, np.abs(z)], axis=-1)
+    body = _join(body, _ball(folded, (-0.1, 0.58, 0.42), (0.38, 0.2, 0.16)), 0.04)  # wings
+    body = _join(body, _ball(p, (0.44, 1.24, 0.0), (0.39, 0.39, 0.37)), 0.12)
+    return _join(body, _ball(p, *BILL), 0.03)
+
+
+def duck_paint(size: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """The duck's colours as seen from its side: indices ``(size, size)``, row 0 at the top, and their palette ``(K, 3)``."""
+    low, high = np.array(DUCK_BOX)
+    step = (np.arange(size) + 0.5) / size
+    x, y = np.meshgrid(low[0] + (high[0] - low[0]) * step, high[1] - (high[1] - low[1]) * step)
+    inks = np.array([(250, 200, 25), (240, 110, 15), (250, 250, 245), (20, 20, 25)])
+    ink = np.zeros((size, size), dtype=np.int64)
+    shade = np.clip(0.82 + 0.18 * (y - 0.1) / 0.8, 0.0, 1.0)  # the belly is darker
+    (bx, by, _), (wide, tall, _) = BILL
+    bill = ((x - bx) / (1.2 * wide)) ** 2 + ((y - by) / (1.6 * tall)) ** 2 < 1.0
+    bill &= x > 0.735 + 0.02 * np.cos(2.0 * (y - by) / tall)
+    ink[bill] = 1
+    shade = np.where(bill, np.where(np.abs(y - by + 0.004) < 0.009, 0.55, 1.0), shade)  # the line between its halves
+    away = np.hypot(x - EYE[0], y - EYE[1])
+    ink[away < 0.085], ink[away < 0.055] = 2, 3
+    shade = np.where(away < 0.085, 1.0, shade)
+    ink[np.hypot(x - EYE[0] - 0.018, y - EYE[1] - 0.02) < 0.016] = 2
+    # Feathers: rows of arcs on the wing.
+    reach = np.hypot((x + 0.1) / 0.36, (y - 0.58) / 0.19)
+    row = np.floor((x + 0.5) / 0.13)
+    arc = np.hypot(((x + 0.5) / 0.13 - row) - 0.2, np.mod((y - 0.5) / 0.1 + 0.5 * np.mod(row, 2.0), 1.0) - 0.5)
+    shade = np.where((ink == 0) & (reach < 0.95) & (np.abs(arc - 0.55) < 0.07), 0.72 * shade, shade)
+    shade = np.where((ink == 0) & (np.abs(reach - 1.0) < 0.045), 0.72 * shade, shade)
+    levels = 64
+    level = np.round(shade * (levels - 1)).astype(np.int64)
+    palette = np.round(inks[:, None] * (np.arange(levels) / (levels - 1))[:, None]).reshape(-1, 3)
+    return (ink * levels + level).astype(np.uint8), palette.astype(np.uint8)
+
+
+def png(index: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
+    """A PNG with a palette; not compressed, so that its bytes are the same everywhere."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    height, width = index.shape
+    rows = np.pad(index, ((0, 0), (1, 0))).tobytes()  # a filter byte of 0 before each row
+    blocks = [rows[at : at + 65535] for at in range(0, len(rows), 65535)]
+    stored = b"".join(
+        struct.pack("<BHH", block is blocks[-1], len(block), len(block) ^ 0xFFFF) + block for block in blocks
+    )
+    body = b"\x78\x01" + stored + struct.pack(">I", zlib.adler32(rows))
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"PLTE", palette.tobytes()) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
+
+
+def write_toy_duck(path: Path) -> None:
+    """The duck as a GLB file; its texture is projected from the side."""
+    points, faces = surface_nets(duck_field, np.array([-0.82, 0.0, -0.7]), np.array([1.15, 1.75, 0.7]), 0.0575)
+    low, high = np.array(DUCK_BOX)
+    # In the field's own coordinates the paint fits; after that the box is made exact.
+    uv = np.stack([(points[:, 0] - low[0]) / (high[0] - low[0]), (high[1] - points[:, 1]) / (high[1] - low[1])], axis=1)
+    small, large = points.min(axis=0), points.max(axis=0)
+    points = low + (points - small) / (large - small) * (high - low)
+    image = png(*duck_paint(128))
+    pieces = [points.astype("<f4").tobytes(), uv.astype("<f4").tobytes(), faces.astype("<u2").tobytes(), image]
+    pieces = [piece + b"\0" * (-len(piece) % 4) for piece in pieces]
+    starts = np.cumsum([0, *map(len, pieces)]).tolist()
+    views = [{"buffer": 0, "byteOffset": at, "byteLength": len(piece)} for at, piece in zip(starts, pieces, strict=False)]
+    views[3]["byteLength"] = len(image)
+    box = {"min": points.astype("<f4").min(axis=0).tolist(), "max": points.astype("<f4").max(axis=0).tolist()}
+    pbr = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 0.4}
+    primitive = {"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}
+    document = {
+        "asset": {"version": "2.0", "generator": "scripts/make_assets.py"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "duck"}],
+        "meshes": [{"name": "duck", "primitives": [primitive]}],
+        "materials": [{"name": "paint", "pbrMetallicRoughness": pbr}],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [{"wrapS": 33071, "wrapT": 33071}],
+        "images": [{"bufferView": 3, "mimeType": "image/png"}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(points), "type": "VEC3", **box},
+            {"bufferView": 1, "componentType": 5126, "count": len(points), "type": "VEC2"},
+            {"bufferView": 2, "componentType": 5123, "count": faces.size, "type": "SCALAR"},
+        ],
+        "bufferViews": views,
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    body = b"".join(pieces)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    path.write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+
+
 def write_ply(path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
     """A binary little-endian PLY without normals."""
     header = (
@@ -355,6 +463,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for make in (standin, statue, cup, curved_wall):
         write_ply(folder / f"{make.__name__}.ply", *make())
+    write_toy_duck(folder / "toy_duck.glb")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,12 @@ def _shown(value: object, limit: int = 80) -> str:
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
+def _one_line(text: str, limit: int = 500) -> str:
+    """Text of a damaged file in one readable line."""
+    text = "".join(letter if letter.isprintable() else " " for letter in text[: limit + 1])
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
 class TorchptError(Exception):
     """Base of every error that is the input's fault. ``str()`` is always a single line."""
 
@@ -59,7 +65,7 @@ class AssetError(TorchptError):
     """A file (mesh, image) that is missing, unreadable or malformed."""
 
     def __init__(self, file: object, problem: str) -> None:
-        self.file, self.problem = str(file), problem.replace("\n", " ")
+        self.file, self.problem = str(file), _one_line(problem)
         super().__init__(f"{self.file}: {self.problem}")
 
     def __reduce__(self) -> tuple:

@@ -2,7 +2,16 @@
 
 from torchpt.images.decode import EncodedImage
 from torchpt.images.read import read_image, read_layers
-from torchpt.images.texels import Texels, read_texels
+from torchpt.images.texels import Texels, has_alpha, read_texels
 from torchpt.images.write import check_writable, write_image
 
-__all__ = ["EncodedImage", "Texels", "check_writable", "read_image", "read_layers", "read_texels", "write_image"]
+__all__ = [
+    "EncodedImage",
+    "Texels",
+    "check_writable",
+    "has_alpha",
+    "read_image",
+    "read_layers",
+    "read_texels",
+    "write_image",
+]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from os import PathLike
+from os import PathLike, fspath
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from torchpt.errors import AssetError
 from torchpt.images.decode import MAX_PIXELS, EncodedImage, Pixels, existing, pixels_of
 from torchpt.images.layers import group_channels
 
-__all__ = ["Texels", "read_texels"]
+__all__ = ["Texels", "has_alpha", "picture_of", "read_texels"]
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,22 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
     else:
         scaled /= np.float32(pixels.white)
     return Texels(scaled, pixels.eight_bit)
+
+
+def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
+    """Whether a PNG declares an alpha channel, or transparent colours; False for any other file."""
+    try:
+        data = source.data if isinstance(source, EncodedImage) else Path(fspath(source)).read_bytes()
+    except OSError:
+        return False
+    if not data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return False
+    if data[25:26] in (b"\x04", b"\x06"):
+        return True
+    at = 8
+    while at + 8 <= len(data) and data[at + 4 : at + 8] not in (b"IDAT", b"tRNS"):
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    return data[at + 4 : at + 8] == b"tRNS"
 
 
 def picture_of(pixels: Pixels) -> NDArray:

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchpt.bsdfs import Diffuse
 from torchpt.errors import AssetError, SceneError
 from torchpt.math.transforms import similarity_scale
 from torchpt.records import KINDS
 from torchpt.scene.description import Description
-from torchpt.scene.loaders import MeshPart, load_mesh, unit_cube
-from torchpt.scene.materials import slot_of
+from torchpt.scene.loaders import FileMaterial, MeshPart, load_mesh, unit_cube
+from torchpt.scene.materials import MATERIALS, Diffuse, Material, read_material, slot_of
 from torchpt.scene.parts import MaterialSlot, Part
 from torchpt.scene.schema import Cube, Disk, Mesh, Rectangle, Shape, Sphere
 from torchpt.scene.texels import Opener
@@ -21,7 +20,6 @@ __all__ = ["Built", "build_parts"]
 
 #: A scene is moved to the origin where it lies further away than this many times its own size.
 RECENTRE = 8.0
-_GREY = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
@@ -161,20 +159,11 @@ def _part(
     elif shape.material is not None:
         slot = slot_of(shape.material, f"{prefix}.material", description.materials, opener)
     else:
-        colour = _GREY if own is None or own.reflectance is None else own.reflectance
-        slot = MaterialSlot(Diffuse(), f"{prefix}.material", {"reflectance": colour})
+        slot = slot_of(_own_material(own, f"{prefix}.material", source), f"{prefix}.material", description.materials)
     _declare(slot, parameters)
     emission, names = shape.emission, (f"shapes.{name}.emission",)
     if emission is None and slot.emission is not None:
         emission, names = slot.emission, (f"{slot.name}.emission", f"{slot.name}.emission_strength")
-    if (
-        emission is None
-        and shape.material is None
-        and own is not None
-        and own.emission is not None
-        and any(own.emission)
-    ):
-        emission, names = own.emission, (f"{prefix}.emission",)
     if emission is not None and names[0] not in parameters:
         parameters[names[0]] = np.asarray(emission, np.float64)
     faces, dropped = _solid(piece, pose) if piece is not None else (None, 0)
@@ -197,6 +186,17 @@ def _part(
         source=source,
         ignored=tuple(piece.ignored) + (tuple(own.ignored) if own is not None else ()) if piece is not None else (),
     )
+
+
+def _own_material(own: FileMaterial | None, key: str, source: str) -> Material:
+    """The material of a mesh file, or the grey of a mesh without one."""
+    if own is None:
+        return Diffuse()
+    try:
+        return read_material(own.material, key, MATERIALS, None)
+    except SceneError as error:
+        problem = str(error).removeprefix(f"{key}.").removeprefix(f"{key}: ")
+        raise AssetError(source, f"material {own.name[:80]!r}: {problem}") from None
 
 
 def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:

@@ -1,13 +1,15 @@
-"""Mesh files to plain arrays: OBJ with MTL, PLY, STL, GLB. One table of formats."""
+"""Mesh files to plain arrays: OBJ with MTL, PLY, STL, glTF. One table of formats."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from torchpt.errors import AssetError
 from torchpt.scene.loaders.cube import unit_cube
-from torchpt.scene.loaders.gltf import load_glb
+from torchpt.scene.loaders.gltf import load_gltf
 from torchpt.scene.loaders.mesh_part import FileMaterial, MeshPart, checked
 from torchpt.scene.loaders.normals import smooth_normals
 from torchpt.scene.loaders.obj import load_obj
@@ -21,7 +23,8 @@ FORMATS: dict[str, Callable[[Path, bytes, bool], list[MeshPart]]] = {
     ".obj": load_obj,
     ".ply": load_ply,
     ".stl": load_stl,
-    ".glb": load_glb,
+    ".glb": load_gltf,
+    ".gltf": load_gltf,
 }
 
 
@@ -43,4 +46,5 @@ def load_mesh(path: Path, *, materials: bool = True) -> list[MeshPart]:
         data = path.read_bytes()
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror})") from None
-    return checked(reader(path, data, materials), path)
+    with np.errstate(all="ignore"):  # what is not finite is found by the checks
+        return checked(reader(path, data, materials), path)

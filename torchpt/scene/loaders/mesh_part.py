@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +22,17 @@ Rgb = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FileMaterial:
-    """A mesh file's own material, as far as it is read.
+    """A mesh file's own material.
 
     Attributes:
         name: as in the file.
-        reflectance: diffuse colour, linear RGB in 0..1, or None where the file has none.
-        emission: radiance, or None.
+        material: what a scene file would have: ``type``, parameters, textures inline with absolute paths or
+            `EncodedImage`.
         ignored: what the file says about the look and torchpt does not read, by the file's names.
     """
 
     name: str
-    reflectance: Rgb | None = None
-    emission: Rgb | None = None
+    material: dict[str, Any] = field(default_factory=lambda: {"type": "diffuse"})
     ignored: tuple[str, ...] = ()
 
 
@@ -46,6 +46,7 @@ class MeshPart:
         faces: ``(F, 3)`` int64, front side counter-clockwise.
         normals: ``(V, 3)`` float64 of unit length where the file has them, else None.
         uvs: ``(V, 2)`` float64, row 0 of an image at v = 0, or None.
+        colors: ``(V, 3)`` float64, linear RGB >= 0, or None.
         material: the file's own, or None.
         ignored: what else of the file was left out, by name.
     """
@@ -55,6 +56,7 @@ class MeshPart:
     faces: NDArray[np.int64]
     normals: NDArray[np.float64] | None = None
     uvs: NDArray[np.float64] | None = None
+    colors: NDArray[np.float64] | None = None
     material: FileMaterial | None = None
     ignored: tuple[str, ...] = ()
 
@@ -65,7 +67,7 @@ def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:
     A zero normal becomes the smooth one of its vertex; a texture coordinate that is not finite becomes 0.
 
     Raises:
-        AssetError: no triangle at all, a vertex or normal that is not finite, an index out of range.
+        AssetError: no triangle at all, a vertex, normal or colour that is not finite, an index out of range.
     """
     if not parts or all(len(part.faces) == 0 for part in parts):
         raise AssetError(path, "the mesh is empty (no face)")
@@ -93,6 +95,10 @@ def _checked(part: MeshPart, path: Path) -> MeshPart:
         normals = scaled / np.where(zero, 1.0, np.linalg.norm(scaled, axis=1))[:, None]
         if zero.any():
             normals[zero] = smooth_normals(part.vertices, part.faces)[zero]
+    if part.colors is not None:
+        bad = np.flatnonzero(~((part.colors >= 0) & (part.colors <= _LARGEST)).all(axis=1))
+        if len(bad):
+            raise AssetError(path, f"colour {bad[0]}{label} is not finite and >= 0: {part.colors[bad[0]].tolist()}")
     if uvs is not None and not np.isfinite(uvs).all():
         uvs = np.where(np.isfinite(uvs), uvs, 0.0)
     return replace(part, normals=normals, uvs=uvs)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
 from torchpt.scene.loaders.mesh_part import FileMaterial, MeshPart, corners_of_polygons
-from torchpt.scene.loaders.mtl import decoded_lines, read_mtl
+from torchpt.scene.loaders.mtl import beside, decoded_lines, read_mtl
 from torchpt.scene.loaders.normals import smooth_normals
 
 __all__ = ["load_obj"]
@@ -69,7 +69,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
         part_uvs = None if all_uvs is None else all_uvs[used]
         left_out = tuple(dict.fromkeys(text.ignored))
         faces = local.reshape(-1, 3)
-        parts.append(MeshPart(name, all_positions[used], faces, part_normals, part_uvs, material, left_out))
+        parts.append(MeshPart(name, all_positions[used], faces, part_normals, part_uvs, None, material, left_out))
     return parts
 
 
@@ -124,22 +124,14 @@ def _absolute(words: list[str], counts: tuple[int, int, int], path: Path, number
 def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
     known: dict[str, FileMaterial] = {}
     for number, name in text.libraries:
-        whole = _beside(path, name)  # a name may hold blanks; else blanks separate several names
-        files = [whole] if whole is not None else [_beside(path, word) for word in name.split()]
+        whole = beside(path, name)  # a name may hold blanks; else blanks separate several names
+        files = [whole] if whole is not None else [beside(path, word) for word in name.split()]
         if not files or None in files:
             raise AssetError(path, f"line {number}: the material file {name!r} is missing")
         for file in files:
             if file is not None:
-                known.update(read_mtl(file))
+                known.update(read_mtl(file, set(text.groups)))
     return known
-
-
-def _beside(path: Path, name: str) -> Path | None:
-    for form in (name, name.replace("\\", "/")):
-        candidate = path.parent / form
-        if form and candidate.is_file():
-            return candidate
-    return None
 
 
 def _numbers(text: _Text, key: str, columns: int, path: Path) -> NDArray[np.float64]:

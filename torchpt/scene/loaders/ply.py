@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
-from torchpt.scene.loaders.mesh_part import MeshPart, corners_of_polygons
+from torchpt.scene.loaders.mesh_part import FileMaterial, MeshPart, corners_of_polygons
 
 __all__ = ["load_ply"]
 
@@ -23,6 +23,8 @@ _TYPES = {
     **{"double": "f8", "float64": "f8"},
 }
 _INDICES = ("vertex_indices", "vertex_index")
+_COLORS = ("red", "green", "blue")
+_COLORED = {"type": "diffuse", "reflectance": {"type": "vertex_color"}}
 _UVS = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
 
 
@@ -44,12 +46,11 @@ Columns = dict[str, Any]  # scalar property: (n,); list property: (lengths (n,),
 
 
 def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
-    """The faces of a PLY file as one part.
+    """The faces of a PLY file as one part; the format has no materials, but vertices may have colours.
 
     Raises:
         AssetError: truncated, malformed, or without vertices and faces.
     """
-    del materials  # the format has none
     layout, elements, start = _header(path, data)
     reader = _Ascii(path, data[start:]) if layout == "ascii" else _Binary(path, data, start, layout)
     found: dict[str, Columns] = {}
@@ -63,10 +64,10 @@ def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
             break
     if "vertex" not in found:
         raise AssetError(path, "no element vertex")
-    return [_part(path, found["vertex"], found.get("face", {}), elements)]
+    return [_part(path, found["vertex"], found.get("face", {}), elements, materials)]
 
 
-def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element]) -> MeshPart:
+def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], materials: bool) -> MeshPart:
     missing = [name for name in "xyz" if not isinstance(vertex.get(name), np.ndarray)]
     if missing:
         raise AssetError(path, f"element vertex has no property {missing[0]}")
@@ -79,8 +80,8 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element]) 
     vertices = stack(("x", "y", "z"))
     assert vertices is not None
     uvs = next((pair for pair in map(stack, _UVS) if pair is not None), None)
-    ignored = [name for name in ("red", "green", "blue") if name in vertex]
-    ignored += [name for name in face if name not in _INDICES and name in ("texcoord", "texnumber")]
+    ignored = [name for name in face if name in ("texcoord", "texnumber")]
+    ignored += [name for name in ("alpha",) if name in vertex]
     key = next((name for name in _INDICES if isinstance(face.get(name), tuple)), None)
     if key is None:
         if any(element.name == "face" and element.size for element in elements):
@@ -92,9 +93,20 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element]) 
         raise AssetError(path, f"face {bad[0]} has {counts[bad[0]]} corners, expected three or more")
     if items.dtype.kind == "f":
         raise AssetError(path, "the vertex indices of element face are no integers")
+    colors = _colors(vertex, elements)
+    own = FileMaterial("vertex colors", _COLORED) if materials and colors is not None else None
     starts = np.cumsum(counts) - counts
     faces = items.astype(np.int64)[corners_of_polygons(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
-    return MeshPart("", vertices, faces, stack(("nx", "ny", "nz")), uvs, None, tuple(ignored))
+    return MeshPart("", vertices, faces, stack(("nx", "ny", "nz")), uvs, colors, own, tuple(ignored))
+
+
+def _colors(vertex: Columns, elements: list[_Element]) -> NDArray[np.float64] | None:
+    """Linear RGB: floats as stored, integers over the largest of their declared type."""
+    kinds = {p.name: p.kind for element in elements if element.name == "vertex" for p in element.properties}
+    if not all(isinstance(vertex.get(name), np.ndarray) for name in _COLORS):
+        return None
+    white = [1.0 if kinds[name][0] == "f" else np.iinfo(kinds[name]).max for name in _COLORS]
+    return np.stack([np.asarray(vertex[c], dtype=np.float64) / w for c, w in zip(_COLORS, white, strict=True)], axis=1)
 
 
 def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
@@ -115,7 +127,7 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
         elif words[0] == "element" and len(words) == 3:
             if not words[2].isdigit() or len(words[2]) > 15:
                 raise problem
-            elements.append(_Element(words[1], int(words[2])))
+            elements.append(_Element(words[1][:80], int(words[2])))
         elif words[0] == "property" and elements:
             elements[-1].properties.append(_property(words, problem))
         else:

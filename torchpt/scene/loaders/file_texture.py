@@ -1,0 +1,49 @@
+"""Texture entries of the materials that loaders make: as a user would have written them, defaults left out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchpt.images import EncodedImage
+
+__all__ = ["image_texture", "plain_scale"]
+
+Rgb = tuple[float, float, float]
+
+
+def plain_scale(color: Rgb) -> float | list[float]:
+    """A colour as the scene file has it: one number where it is grey."""
+    return color[0] if color[0] == color[1] == color[2] else list(color)
+
+
+def image_texture(
+    path: str | EncodedImage,
+    *,
+    scale: float | list[float] = 1.0,
+    channel: str | None = None,
+    wrap: str = "repeat",
+    nearest: bool = False,
+    uv_transform: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """An entry ``{type: image, path: ..., ...}``.
+
+    Args:
+        path: absolute, or an image in memory.
+        scale: factor of the values.
+        channel: what a number reads; None for colours.
+        wrap: ``repeat``, ``clamp`` or ``mirror``.
+        nearest: whether texels are not interpolated.
+        uv_transform: as the scene file has it.
+    """
+    entry: dict[str, Any] = {"type": "image", "path": path}
+    if wrap != "repeat":
+        entry["wrap"] = wrap
+    if nearest:
+        entry["filter"] = "nearest"
+    if scale != 1.0:
+        entry["scale"] = scale
+    if channel is not None:
+        entry["channel"] = channel
+    if uv_transform:
+        entry["uv_transform"] = uv_transform
+    return entry

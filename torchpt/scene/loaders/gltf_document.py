@@ -1,0 +1,193 @@
+"""A glTF 2.0 document and its bytes: GLB chunks, buffers, data: URIs, accessors.
+
+Khronos glTF 2.0 specification, 3.6 (binary data), 4.4 (GLB). Every declared size is held against what is there.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, unquote_to_bytes
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.errors import AssetError
+
+__all__ = ["Document"]
+
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+#: Most rows of an accessor that has nothing but sparse ones: the others are zeros for which no byte is there.
+_MOST_ZEROS = 2**20
+
+
+class Document:
+    """The JSON of a file, and what it points to.
+
+    Attributes:
+        path: the file.
+        json: its object.
+    """
+
+    def __init__(self, path: Path, data: bytes) -> None:
+        self.path = path
+        binary: bytes | None = None
+        if data[:4] == b"glTF":
+            data, binary = _chunks(path, data)
+        elif path.suffix.lower() == ".glb":
+            raise AssetError(path, "no GLB file (it does not start with glTF and a header)")
+        try:
+            self.json = json.loads(data)
+        except (ValueError, RecursionError):
+            raise AssetError(path, "the JSON is missing or malformed") from None
+        if not isinstance(self.json, dict):
+            raise AssetError(path, "the JSON is no object")
+        self._buffers: dict[int, bytes] = {}
+        if binary is not None:
+            first = self.json.get("buffers")
+            if isinstance(first, list) and first and isinstance(first[0], dict) and "uri" not in first[0]:
+                self._buffers[0] = binary
+
+    def item(self, block: str, index: Any) -> dict[str, Any]:
+        """An object of one of the document's lists."""
+        items = self.json.get(block, [])
+        if type(index) is not int or not isinstance(items, list) or not 0 <= index < len(items):
+            count = len(items) if isinstance(items, list) else 0
+            raise AssetError(self.path, f"{block} {str(index)[:40]} does not exist ({count} are declared)")
+        if not isinstance(items[index], dict):
+            raise AssetError(self.path, f"{block} {index} is no object")
+        return items[index]
+
+    def resource(self, uri: Any, where: str) -> bytes:
+        """The bytes of a data: URI, or of a file beside the document."""
+        if not isinstance(uri, str):
+            raise AssetError(self.path, f"{where}: the uri is no text")
+        if uri.startswith("data:"):
+            head, _, body = uri.partition(",")
+            try:
+                return base64.b64decode(body, validate=True) if head.endswith(";base64") else unquote_to_bytes(body)
+            except (binascii.Error, ValueError):
+                raise AssetError(self.path, f"{where}: malformed data: URI") from None
+        file = self.file(uri, where)
+        try:
+            return file.read_bytes()
+        except OSError as error:
+            raise AssetError(file, f"cannot be read ({error.strerror}), {where} of {self.path}") from None
+
+    def file(self, uri: str, where: str) -> Path:
+        """The file that a relative URI names."""
+        if "://" in uri:
+            raise AssetError(self.path, f"{where}: only files and data: URIs are read, got {uri[:60]!r}")
+        for name in dict.fromkeys((unquote(uri), uri)):
+            try:
+                file = self.path.parent / name
+                if file.is_file():
+                    return file
+            except (OSError, ValueError):
+                continue
+        raise AssetError(self.path, f"{where}: the file {uri[:80]!r} is missing")
+
+    def view(self, number: Any) -> tuple[memoryview, int | None]:
+        """The bytes of a bufferView, and its stride where it has one."""
+        view = self.item("bufferViews", number)
+        index = view.get("buffer")
+        begin, length = view.get("byteOffset", 0), view.get("byteLength")
+        if not all(type(x) is int and x >= 0 for x in (begin, length)):
+            raise AssetError(self.path, f"bufferViews {number} has a size that is no whole number >= 0")
+        data = self._buffer(index)
+        assert isinstance(length, int)
+        if begin + length > len(data):
+            raise AssetError(self.path, f"bufferViews {number} reaches beyond its buffer of {len(data)} bytes")
+        return memoryview(data)[begin : begin + length], view.get("byteStride")
+
+    def _buffer(self, index: Any) -> bytes:
+        buffer = self.item("buffers", index)
+        if index not in self._buffers:
+            if "uri" not in buffer:
+                raise AssetError(self.path, f"buffers {index} has neither a uri nor a binary chunk")
+            self._buffers[index] = self.resource(buffer["uri"], f"buffers {index}")
+        return self._buffers[index]
+
+    def accessor(self, number: Any, *kinds: str) -> NDArray[np.float64]:
+        """The rows of an accessor of one of some types, ``(n, width)`` float64; normalized integers become 0..1 or -1..1."""
+        accessor = self.item("accessors", number)
+        where = f"accessors {number}"
+        kind, code, count = accessor.get("type"), accessor.get("componentType"), accessor.get("count")
+        if kind not in kinds or code not in _COMPONENTS:
+            raise AssetError(
+                self.path, f"{where} holds {str(kind)[:40]} of {str(code)[:40]}, expected {' or '.join(kinds)}"
+            )
+        if type(count) is not int or count < 0:
+            raise AssetError(self.path, f"{where} has a count that is no whole number >= 0")
+        component, width = np.dtype(_COMPONENTS[code]), _WIDTHS[kind]
+        sparse = accessor.get("sparse")
+        if "bufferView" in accessor:
+            offset = accessor.get("byteOffset", 0)
+            values = self._rows(accessor["bufferView"], offset, count, component, width, where).astype(np.float64)
+        elif sparse is None:
+            raise AssetError(self.path, f"{where} has no data (no bufferView)")
+        elif count > _MOST_ZEROS:
+            raise AssetError(self.path, f"{where} declares {count} rows without data (at most {_MOST_ZEROS} are read)")
+        else:
+            values = np.zeros((count, width))
+        if sparse is not None:
+            self._displace(values, sparse, component, width, where)
+        if accessor.get("normalized") and component.kind in "iu":
+            values = np.maximum(values / np.iinfo(component).max, -1.0)
+        return values
+
+    def _rows(self, view: Any, offset: Any, count: int, component: np.dtype, width: int, where: str) -> NDArray[Any]:
+        data, stride = self.view(view)
+        packed = component.itemsize * width
+        stride = packed if stride is None else stride
+        if not all(type(x) is int and x >= 0 for x in (offset, stride)):
+            raise AssetError(self.path, f"{where} has an offset or stride that is no whole number >= 0")
+        needed = offset + (count - 1) * stride + packed if count else 0
+        if stride < packed or needed > len(data):
+            raise AssetError(self.path, f"{where} reaches beyond its bufferView: {count} elements of {packed} bytes")
+        if not count:
+            return np.zeros((0, width), component)
+        raw = np.frombuffer(data, np.uint8, needed - offset, offset)
+        rows = np.lib.stride_tricks.as_strided(raw, (count, packed), (stride, 1), writeable=False)
+        return np.ascontiguousarray(rows).view(component)
+
+    def _displace(self, values: NDArray[np.float64], sparse: Any, component: np.dtype, width: int, where: str) -> None:
+        """Puts the rows of a sparse accessor over those of its base (specification 3.6.2.3)."""
+        where = f"{where}.sparse"
+        count, indices, rows = sparse["count"], sparse["indices"], sparse["values"]
+        if (
+            type(count) is not int
+            or not 0 <= count <= len(values)
+            or indices["componentType"] not in (5121, 5123, 5125)
+        ):
+            raise AssetError(self.path, f"{where} has a count or a componentType out of range")
+        kind = np.dtype(_COMPONENTS[indices["componentType"]])
+        at = self._rows(indices["bufferView"], indices.get("byteOffset", 0), count, kind, 1, where).reshape(-1)
+        if count and int(at.max()) >= len(values):
+            raise AssetError(self.path, f"{where} has an index outside 0..{len(values) - 1}")
+        found = self._rows(rows["bufferView"], rows.get("byteOffset", 0), count, component, width, where)
+        values[at.astype(np.int64)] = found
+
+
+def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
+    """The JSON and the binary chunk of a GLB file."""
+    if len(data) < 20:
+        raise AssetError(path, f"truncated: {len(data)} bytes")
+    version, length = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8))
+    if version != 2:
+        raise AssetError(path, f"glTF version {version}, expected 2")
+    if length > len(data):
+        raise AssetError(path, f"truncated: {length} bytes declared, got {len(data)}")
+    found: dict[bytes, bytes] = {}
+    at = 12
+    while at + 8 <= length:
+        size, kind = int.from_bytes(data[at : at + 4], "little"), data[at + 4 : at + 8]
+        if at + 8 + size > length:
+            raise AssetError(path, f"truncated: a chunk of {size} bytes reaches beyond the file")
+        found.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    return found.get(b"JSON", b""), found.get(b"BIN\0", b"")
