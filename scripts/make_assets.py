@@ -413,7 +413,9 @@ def write_toy_duck(path: Path) -> None:
     pieces = [points.astype("<f4").tobytes(), uv.astype("<f4").tobytes(), faces.astype("<u2").tobytes(), image]
     pieces = [piece + b"\0" * (-len(piece) % 4) for piece in pieces]
     starts = np.cumsum([0, *map(len, pieces)]).tolist()
-    views = [{"buffer": 0, "byteOffset": at, "byteLength": len(piece)} for at, piece in zip(starts, pieces, strict=False)]
+    views = [
+        {"buffer": 0, "byteOffset": at, "byteLength": len(piece)} for at, piece in zip(starts, pieces, strict=False)
+    ]
     views[3]["byteLength"] = len(image)
     box = {"min": points.astype("<f4").min(axis=0).tolist(), "max": points.astype("<f4").max(axis=0).tolist()}
     pbr = {"baseColorTexture": {"index": 0}, "metallicFactor": 0, "roughnessFactor": 0.4}

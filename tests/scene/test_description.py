@@ -140,7 +140,6 @@ LATER: dict[str, tuple[dict[str, Any], str]] = {
     "camera": ({"camera": {**CAMERA, "type": "thinlens", "aperture_radius": 1}}, "camera.type"),
     "camera key": (camera(blades=5), "camera.blades"),
     "shape": (shape(type="cylinder", radius=1), "shapes.s.type"),
-    "displacement": (mesh(displacement={"scale": 1}), "shapes.s.displacement"),
     "light": (scene(lights={"l": {"type": "envmap", "path": "a.exr"}}), "lights.l.type"),
     "filter": (scene(film={"filter": "tent"}), "film.filter.type"),
     "sampler": (scene(sampler={"type": "zsobol"}), "sampler.type"),

@@ -10,10 +10,11 @@ from torchpt.errors import AssetError, SceneError
 from torchpt.math.transforms import similarity_scale
 from torchpt.records import KINDS
 from torchpt.scene.description import Description
+from torchpt.scene.displacement import displaced
 from torchpt.scene.loaders import FileMaterial, MeshPart, load_mesh, unit_cube
 from torchpt.scene.materials import MATERIALS, Diffuse, Material, read_material, slot_of
 from torchpt.scene.parts import MaterialSlot, Part
-from torchpt.scene.schema import Cube, Disk, Mesh, Rectangle, Shape, Sphere
+from torchpt.scene.schema import Cube, Disk, Displacement, Mesh, Rectangle, Shape, Sphere
 from torchpt.scene.texels import Opener
 
 __all__ = ["Built", "build_parts"]
@@ -95,6 +96,8 @@ def _shape_parts(
     else:
         path = description.resolve(shape.path, f"{prefix}.path")
         pieces, source, flat = load_mesh(path, materials=shape.material is None), str(path), shape.face_normals
+    if isinstance(shape, Mesh) and shape.displacement is not None:
+        pieces = [_displaced(piece, shape.displacement, prefix, opener, source) for piece in pieces]
     labels = _labels([piece.name for piece in pieces])
     parts = []
     for piece, label in zip(pieces, labels, strict=True):
@@ -122,6 +125,28 @@ def _shape_parts(
             raise AssetError(source, f"{problem}, named by {prefix}.path")
         raise SceneError(f"{prefix}.faces", "no face with area", "a face with area", description.file)
     return parts
+
+
+#: Faces that a displaced mesh may come to.
+MOST_FACES = 20_000_000
+
+
+def _displaced(piece: MeshPart, wish: Displacement, prefix: str, opener: Opener, source: str) -> MeshPart:
+    """A piece of a mesh under its displacement map."""
+    key = f"{prefix}.displacement"
+    if piece.uvs is None:
+        problem = f"has no texture coordinates, which {key} needs"
+        raise (
+            AssetError(source, problem)
+            if source
+            else SceneError(key, "a mesh without uvs", "uvs beside it", opener.file)
+        )
+    faces = len(piece.faces) * 4**wish.subdivisions
+    if faces > MOST_FACES:
+        expected = f"at most {MOST_FACES:,} faces ({faces:,} are asked for)"
+        raise SceneError(f"{key}.subdivisions", wish.subdivisions, expected, opener.file)
+    heights = opener.values(wish.texture, f"{key}.texture")
+    return displaced(piece, lambda uvs: wish.scale * heights(uvs), wish.subdivisions)
 
 
 def _labels(names: list[str]) -> list[str]:
@@ -159,7 +184,11 @@ def _part(
     elif shape.material is not None:
         slot = slot_of(shape.material, f"{prefix}.material", description.materials, opener)
     else:
-        slot = slot_of(_own_material(own, f"{prefix}.material", source), f"{prefix}.material", description.materials)
+        made, shared = (
+            _own_material(own, f"{prefix}.material", source),
+            opener.sharing(f"shapes.{name}.textures", source),
+        )
+        slot = slot_of(made, f"{prefix}.material", description.materials, shared)
     _declare(slot, parameters)
     emission, names = shape.emission, (f"shapes.{name}.emission",)
     if emission is None and slot.emission is not None:
@@ -181,6 +210,7 @@ def _part(
         faces=faces,
         normals=None if piece is None or flat else piece.normals,
         uvs=None if piece is None else piece.uvs,
+        colors=None if piece is None else piece.colors,
         smooth=not flat,
         dropped=dropped,
         source=source,

@@ -16,7 +16,7 @@ from torchpt.scene import settings as run_settings
 from torchpt.scene.materials import MATERIALS, Material, check_material, custom_types, read_material
 from torchpt.scene.schema import ConstantLight, Perspective, Shape
 from torchpt.scene.settings import BLOCKS, Settings
-from torchpt.scene.textures import TEXTURES, Texture
+from torchpt.scene.textures import TEXTURES, Named, Texture
 from torchpt.scene.validate import check_keys, select
 from torchpt.scene.yaml_file import plain, read_yaml
 
@@ -204,6 +204,12 @@ def _shape(
         check_material(inline, f"{key}.material", materials, textures, file)
         item = {**item, "material": inline}
     shape = select("shape", schema.SHAPES, item, key, file)
+    displacement = getattr(shape, "displacement", None)
+    if displacement is not None and isinstance(displacement.texture.texture, Named):
+        name = displacement.texture.texture.texture
+        if name not in textures:
+            known = ", ".join(textures) or "none is defined"
+            raise SceneError(f"{key}.displacement.texture", name, f"the name of a texture ({known})", file)
     material, where = shape.material, f"{key}.material"
     if isinstance(material, str):
         if material not in materials:

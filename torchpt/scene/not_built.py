@@ -39,7 +39,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
 #: kind of thing -> keys of built types that are not built -> the value that asks for nothing.
 KEYS: dict[str, dict[str, object]] = {
     "camera": {"aperture_radius": 0, "focus_distance": None, "blades": 0},
-    "mesh": {"displacement": None},
     "sampler": {"adaptive": False},
     "render": {"time_limit": None, "target_error": None, "checkpoint": None, "resume": False},
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -21,11 +22,13 @@ from torchpt.scene.fields import (
     Vec3,
     choice,
     color,
+    integer,
     number_field,
     wrong,
 )  # fmt: skip
 from torchpt.scene.materials import Material
-from torchpt.scene.validate import Model
+from torchpt.scene.textures import Slot, slot_value
+from torchpt.scene.validate import Model, construct
 
 __all__ = [
     "CAMERAS", "FOV_AXES", "LIGHTS", "SHAPES",
@@ -113,6 +116,34 @@ def _path(value: Any) -> tuple[str, ...] | None:
     return paths
 
 
+def _heights(value: Any) -> Slot:
+    if isinstance(value, str):
+        value = {"texture": value}
+    if not isinstance(value, Mapping):
+        raise wrong("the name of a texture, or a texture")
+    return slot_value(value, False, -_LARGEST, _LARGEST)
+
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+class Displacement(Model):
+    """How far vertices move along their normals: ``scale`` times a texture, after cutting triangles in four."""
+
+    texture: Annotated[Slot, PlainValidator(_heights)]
+    scale: Annotated[float, number_field("a finite number")] = 1.0
+    subdivisions: Annotated[int, integer(0, 12)] = 0
+
+
+def _displacement(value: Any) -> Displacement | None:
+    if value is None or isinstance(value, Displacement):
+        return value
+    try:
+        return construct(Displacement, value, "", None, "displacement")
+    except SceneError as error:
+        raise wrong(error.expected, error.value, tuple(part for part in error.key.split(".") if part)) from None
+
+
 class Mesh(Shape):
     """Triangles from a file, or from inline ``vertices`` and ``faces``.
 
@@ -123,6 +154,7 @@ class Mesh(Shape):
         normals: ``(V, 3)`` or None.
         uvs: ``(V, 2)`` or None.
         face_normals: shade flat, whatever normals there are.
+        displacement: moves the vertices when the scene is built.
     """
 
     type: Literal["mesh"] = "mesh"
@@ -132,6 +164,7 @@ class Mesh(Shape):
     normals: Rows3 = None
     uvs: Rows2 = None
     face_normals: Flag = False
+    displacement: Annotated[Displacement | None, PlainValidator(_displacement)] = None
 
     @model_validator(mode="after")
     def _complete(self) -> Mesh:

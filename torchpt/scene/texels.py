@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from torchpt.images.colour import srgb_to_linear
 from torchpt.math.transforms import uv_matrix
 from torchpt.scene.parts import Reading, VertexColors
 from torchpt.scene.textures import CHANNELS, Checkerboard, Image, Named, Slot, Texture, VertexColor
-from torchpt.textures import Node
+from torchpt.textures import Node, atlas_of, look_up
 
 __all__ = ["Opener", "images_of"]
 
@@ -40,10 +41,11 @@ class Opener:
         parameters: dict[str, np.ndarray],
         file: str | None,
     ) -> None:
-        self._textures, self._resolve, self._parameters, self._file = textures, resolve, parameters, file
-        self._files: dict[str, Texels] = {}
+        self._textures, self._resolve, self._parameters, self.file = textures, resolve, parameters, file
+        self.files: dict[str, Texels] = {}
         #: What the texels of a parameter mean; a number slot and a colour slot may read the same image differently.
         self._decoded: dict[str, bool] = {}
+        self._shared: dict[str, dict[str, str]] = {}
 
     def __call__(self, slot: Slot, key: str) -> Reading:
         """The node of the slot ``key``.
@@ -52,25 +54,73 @@ class Opener:
             SceneError: a channel that is not there, a value that the slot does not accept.
             AssetError: an image that is missing or malformed.
         """
-        texture, name, channel = slot.texture, key, None
+        texture = slot.texture
         if isinstance(texture, Named):
-            name, channel = f"textures.{texture.texture}", texture.channel
-            texture = self._textures[texture.texture]
+            return self._opened(
+                slot, self._textures[texture.texture], f"textures.{texture.texture}", texture.channel, key
+            )
+        return self._opened(slot, texture, key, None, key)
+
+    def _opened(self, slot: Slot, texture: Texture | Named, name: str, channel: str | None, key: str) -> Reading:
+        """The node of a slot whose texels are called ``name``."""
         if isinstance(texture, Image):
             return self._image(slot, texture, name, channel or texture.channel or "luminance", key)
         channel = channel or "luminance"
         if isinstance(texture, VertexColor):
             if channel == "a":
                 raise SceneError(
-                    f"{key}.channel", channel, "one of luminance, r, g, b (vertices have no alpha)", self._file
+                    f"{key}.channel", channel, "one of luminance, r, g, b (vertices have no alpha)", self.file
                 )
             return VertexColors(None if slot.coloured else CHANNELS.index(channel) - 1)
         assert isinstance(texture, Checkerboard)
         return self._checkerboard(slot, texture, name, channel, key)
 
+    def sharing(self, prefix: str, source: str) -> Callable[[Slot, str], Reading]:
+        """The same for the materials of a mesh file, whose images are named after themselves and shared.
+
+        Raises:
+            AssetError: what is wrong with a texture, by the mesh file's name.
+        """
+
+        def opened(slot: Slot, key: str) -> Reading:
+            texture, name = slot.texture, key
+            if isinstance(texture, Image):
+                path = texture.path
+                label = path.label if isinstance(path, EncodedImage) else path[0]
+                known = self._shared.setdefault(prefix, {})
+                stem = re.sub(r"\W+", "_", Path(label).stem) or "image"
+                if label not in known:
+                    known[label] = stem if stem not in known.values() else f"{stem}_{len(known)}"
+                name = f"{prefix}.{known[label]}"
+            try:
+                return self._opened(slot, texture, name, None, key)
+            except SceneError as error:
+                raise AssetError(source, str(error)) from None
+
+        return opened
+
+    def values(self, slot: Slot, key: str) -> Callable[[np.ndarray], np.ndarray]:
+        """A number texture as a function from texture coordinates ``(V, 2)`` to values ``(V,)``, float64."""
+        before = dict(self._parameters)
+        node = self(slot, key)
+        if not isinstance(node, Node):
+            raise SceneError(key, "vertex_color", "an image or a checkerboard", self.file)
+        images = images_of([node], {name: torch.from_numpy(value) for name, value in self._parameters.items()})
+        # What shapes the mesh is spent with it: no parameter.
+        for name in set(self._parameters) - set(before):
+            del self._parameters[name]
+            self._decoded.pop(name, None)
+        atlas = atlas_of([node], images, torch.float64, torch.device("cpu"))
+
+        def look(uvs: np.ndarray) -> np.ndarray:
+            lanes = torch.zeros(len(uvs), dtype=torch.int64)
+            return look_up(atlas, lanes, torch.from_numpy(np.ascontiguousarray(uvs.T)), False).numpy()
+
+        return look
+
     def _checkerboard(self, slot: Slot, texture: Checkerboard, name: str, channel: str, key: str) -> Node:
         if channel == "a":
-            raise SceneError(f"{key}.channel", channel, "one of luminance, r, g, b (squares have no alpha)", self._file)
+            raise SceneError(f"{key}.channel", channel, "one of luminance, r, g, b (squares have no alpha)", self.file)
         for which in _COLORS:
             color = getattr(texture, which)
             self._check(np.asarray(color), slot, f"{name}.{which}", "")
@@ -85,9 +135,9 @@ class Opener:
         else:
             source = self._resolve(texture.path, f"{name}.path")
             label = str(source)
-        if label not in self._files:
-            self._files[label] = read_texels(source)
-        found = self._files[label]
+        if label not in self.files:
+            self.files[label] = read_texels(source)
+        found = self.files[label]
         alpha = not slot.coloured and channel == "a"  # which is never encoded
         colour = texture.colorspace == "srgb" or (texture.colorspace == "auto" and (alpha or not slot.linear))
         decode = found.eight_bit and colour
@@ -95,7 +145,7 @@ class Opener:
         if alpha and channels in (1, 3):
             raise AssetError(label, f"has no alpha channel, asked for by {key}")
         if not slot.coloured and len(set(texture.scale)) > 1:
-            raise SceneError(f"{name}.scale", list(texture.scale), f"one number, as {key} is one", self._file)
+            raise SceneError(f"{name}.scale", list(texture.scale), f"one number, as {key} is one", self.file)
         name = self._declare(name, found, decode, alpha)
         self._check(self._parameters[name], slot, key, label, texture.scale)
         index = None
@@ -138,7 +188,7 @@ class Opener:
             return
         where = f" in the texels of {label}" if label else ""
         expected = f"numbers in {slot.low:g}..{slot.high:g}" if slot.high < 1e30 else f"numbers >= {slot.low:g}"
-        raise SceneError(key, [low, high], f"{expected}{where}", self._file)
+        raise SceneError(key, [low, high], f"{expected}{where}", self.file)
 
 
 def images_of(nodes: list[Node], parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
