@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -29,7 +30,7 @@ class Case:
         values: what ``prepare`` is given.
         eta: index of the inside over that of the outside, where it refracts.
         lossless: nothing is absorbed or lost between facets: a white furnace shows 1.
-        furnace: how far below 1 the furnace may be where it is lossless.
+        furnace: how far from 1 the furnace may be where it is lossless: energy tables are linear between few cosines.
         conserves: whether this material may not create energy.
         smooth: nothing but deltas.
         differentiable: wide enough lobes for finite differences of eval.
@@ -55,13 +56,22 @@ class Case:
 
     def rows(self, dtype: torch.dtype = torch.float32) -> Parameters:
         """The material as stacked rows of its model."""
-        return bsdfs.stacked([self.model.prepare(tensors(self.values, dtype))])
+        if dtype not in self._rows:
+            self._rows[dtype] = bsdfs.stacked([self.model.prepare(tensors(self.values, dtype))])
+        return self._rows[dtype]
+
+    @cached_property
+    def _rows(self) -> dict[torch.dtype, Parameters]:
+        """Those already asked for: the tables of some models take a second."""
+        return {}
 
 
 def _narrowest(values: Values) -> float:
     inner = [_narrowest(value) for value in values.values() if isinstance(value, dict)]
     own = _alphas({key: value for key, value in values.items() if key in ("alpha", "alpha_u", "alpha_v", "roughness")})
-    return min([1.0, *inner, *(max(alpha, 1e-4) for alpha in own)])
+    # Blinn's exponent as a roughness; Phong's lobe is none of facets, but is as narrow.
+    powers = [(2.0 / (values["exponent"] + 2.0)) ** 0.5] if "exponent" in values else []
+    return min([1.0, *inner, *powers, *(max(alpha, 1e-4) for alpha in own)])
 
 
 def brief(values: Values) -> str:
@@ -185,7 +195,7 @@ def _rough_conductor(model: Bsdf) -> Iterator[Case]:
         tint = {"specular_reflectance": RED} if i == 2 else {}
         yield Case(model, {**_metal(model), **rough, **tint}, differentiable=_is_wide(rough))
     for rough in _roughness(model)[-2:] if compensated else _roughness(model)[-1:]:
-        yield Case(model, {**_mirror(model), **rough}, lossless=compensated, furnace=0.01)
+        yield Case(model, {**_mirror(model), **rough}, lossless=compensated, furnace=0.01 if compensated else 0.0)
     smooth = {"alpha_u": 0.0, "alpha_v": 0.0} if model.anisotropic else {"alpha": 0.0}
     yield Case(model, {**_mirror(model), **smooth}, smooth=True, lossless=True)
     if model.anisotropic:
@@ -223,14 +233,15 @@ def _dielectric_edges(model: Bsdf) -> Iterator[Case]:
 
 def _rough_dielectric(model: Bsdf) -> Iterator[Case]:
     compensated = getattr(model, "energy_compensation", False)
-    roughs = _roughness(model)
+    roughs, furnace = _roughness(model), 0.01 if compensated else 0.0
     for rough in roughs:
         lossless = compensated and not model.anisotropic
-        yield Case(model, {**_ior(1.5), **rough}, 1.5, lossless=lossless, furnace=0.01, differentiable=_is_wide(rough))
+        wide = _is_wide(rough)
+        yield Case(model, {**_ior(1.5), **rough}, 1.5, lossless=lossless, furnace=furnace, differentiable=wide)
     for eta in (1 / 1.5, 10.0, 1.1):
         rough = roughs[{1 / 1.5: 2, 10.0: 3, 1.1: 1}[eta]]
         yield Case(
-            model, {**_ior(eta), **rough}, eta, lossless=compensated, furnace=0.01, differentiable=_is_wide(rough)
+            model, {**_ior(eta), **rough}, eta, lossless=compensated, furnace=furnace, differentiable=_is_wide(rough)
         )
     yield Case(model, {**_ior(1.0), **roughs[2]}, 1.0, smooth=True, lossless=True)  # straight through
     tints = {"specular_reflectance": RED, "specular_transmittance": (0.2, 0.9, 0.5)}
@@ -249,7 +260,14 @@ def _rough_dielectric_edges(model: Bsdf) -> Iterator[Case]:
 
 def _plastic(model: Bsdf) -> Iterator[Case]:
     for colour, eta in ((RED, 1.49), (WHITE, 1.5), (RED, 1.0), (RED, 10.0), (BLACK, 1.5)):
-        yield Case(model, {"diffuse_reflectance": colour, **_ior(eta)}, eta)
+        # Without a base it is a mirror. At equal indices the fits of the diffuse reflectance jump.
+        yield Case(
+            model,
+            {"diffuse_reflectance": colour, **_ior(eta)},
+            eta,
+            smooth=colour == BLACK,
+            differentiable=eta != 1.0,
+        )
     yield Case(model, {"diffuse_reflectance": RED, **_ior(1.5), "specular_reflectance": (0.2, 0.9, 0.5)}, 1.5)
 
 
@@ -390,7 +408,7 @@ def _blend(model: Bsdf) -> Iterator[Case]:
             {"weight": weight, "a": first.values, "b": second.values},
             eta=first.eta if getattr(model, "a").refracts else second.eta,  # noqa: B009
             conserves=first.conserves and second.conserves,
-            smooth=first.smooth and second.smooth,
+            smooth=(first.smooth or weight == 1.0) and (second.smooth or weight == 0.0),
             differentiable=first.differentiable and second.differentiable,
         )
 

@@ -21,6 +21,7 @@ from significance import chi_square_p
 from torch import Tensor
 
 TOP = 30.0  # of y: 1e-13 from the pole
+COARSEST = 2.0  # side of a cell: in the logarithmic charts the widest lobe is about as wide
 Function = Callable[[Tensor], Tensor]  #: directions (3, n) float64 -> values (C, n)
 
 
@@ -212,7 +213,8 @@ def integrate(
 
     Nor is a cell done while a scout in it has seen a far larger value than any node: else a narrow lobe at the end of a
     long leaf would be passed by. A curve along which the function jumps is followed down to cells whose whole content is
-    below the tolerance. The difference of a cell and its parts bounds the error of the parts generously where it is smooth.
+    below the tolerance, and no cell is larger than ``COARSEST``: two that see nothing agree as well. The difference of a
+    cell and its parts bounds the error of the parts: generously where it is smooth, about rightly across a jump.
 
     Args:
         f: the functions.
@@ -240,8 +242,9 @@ def integrate(
         difference = (fine.sum(2) - coarse).abs()
         most = torch.zeros_like(coarse).scatter_reduce_(1, home.expand_as(seen), seen, "amax")
         extent = (cells[1] - cells[0]) * (cells[3] - cells[2])
+        longest = (cells[1] - cells[0]).maximum(cells[3] - cells[2])
         missed = (most > 1.5 * peak.amax(2)) & (most * extent > tolerance)
-        again = ((difference > tolerance) | missed).any(0)
+        again = ((difference > tolerance) | missed).any(0) | (longest > COARSEST)
         # Strips one way say nothing of the other way.
         cross = (~again & (rows != 2)).nonzero()[:, 0]
         if len(cross):
@@ -252,7 +255,7 @@ def integrate(
             again[cross] = (apart > tolerance).any(0)
         done = ~again | last
         value.index_add_(1, leaf[done], fine[:, done].sum(2))
-        error.index_add_(1, leaf[done], difference[:, done] * (1.0 if last else 0.1))
+        error.index_add_(1, leaf[done], difference[:, done])
         again = ~done
         if not again.any():
             break

@@ -2,6 +2,9 @@
 
 Each promise is tested as if the model broke it. Statistics are judged at one significance over the whole file (Šidák),
 against float64 cubature of the model's own ``eval`` and ``pdf``, on float32 lanes as a render runs them.
+
+All cases from all directions are slow tests, with a quarter of a million draws each: a million would find errors half the
+size, and take an hour. One case of each model is fast.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import pytest
 import torch
@@ -26,11 +30,24 @@ from torchpt.records import BsdfSample
 
 ANGLES = (0.0, 30.0, 60.0, 85.0, 89.9)
 AZIMUTH = 0.7  # of wo: on no axis, so that no anisotropy is hidden
-FAST, FULL = 1 << 18, 1_000_000
+FAST, FULL = 1 << 15, 1 << 18
 LANES = 1 << 16
 
 CASES = [case for model in bsdfs.MODELS for case in cases_of(model)]
-EDGES = [case for model in bsdfs.MODELS for case in (*edges_of(model), *cases_of(model))]
+EDGES = [case for model in bsdfs.MODELS for case in edges_of(model)] + CASES
+
+
+def heavy(model: bsdfs.Bsdf) -> bool:
+    """Energy tables of glass and of anisotropic facets take a second, their derivatives several."""
+    return getattr(model, "energy_compensation", False) and (model.refracts or model.anisotropic)
+
+
+def first_fast(cases: list[Case], tables: bool = False) -> list[Any]:
+    """Parameters of which only the first of each model is fast, where its ``tables`` are differentiated if not heavy."""
+    first = {str(case.model): case for case in reversed(cases)}.values()
+    quick = [any(case is one for one in first) and not (tables and heavy(case.model)) for case in cases]
+    slow = [pytest.mark.slow]
+    return [pytest.param(c, marks=[] if fast else slow, id=str(c)) for c, fast in zip(cases, quick, strict=True)]
 
 
 def towards(angle: float, below: bool = False, azimuth: float = AZIMUTH) -> Tensor:
@@ -111,8 +128,7 @@ class Experiment:
         if narrow:
             self.wo = normalize(self.wo.double())
         self.number = number or (FULL if setting.full else FAST)
-        self.seed = torch.seed() if setting.full else zlib.crc32(str(setting).encode())
-        self.generator = torch.Generator().manual_seed(self.seed)
+        self.generator = torch.Generator().manual_seed(zlib.crc32(str(setting).encode()))
         self.sampled_rows = (replace(self.case, values=drawn) if drawn else self.case).rows(self.dtype)
         self.rows = self.case.rows(torch.float64)
         self.draws = self.drawn(self.number)
@@ -166,7 +182,8 @@ class Experiment:
     def chart(self, below: bool) -> Chart | SlopeChart:
         """Of one half of the directions: that in which this material's lobes are widest."""
         height = abs(float(self.wo[2]))
-        if self.case.narrowest * height > 0.02:
+        # Phong's lobe is about the mirror direction, as wide across as along, and not made of facets.
+        if self.case.narrowest * height > 0.02 or self.model.name == "phong":
             return Chart(AZIMUTH + math.pi, max(height, 1e-3))
         wo = normalize(self.wo.double())
         if self.setting.below == below:
@@ -236,10 +253,6 @@ class Experiment:
         return weight.mean(1), weight.std(1) / math.sqrt(self.number)
 
 
-def identify(x: object) -> str:
-    return str(x)
-
-
 @pytest.fixture(
     scope="module",
     params=[pytest.param(s, marks=[pytest.mark.slow] if s.full else [], id=str(s)) for s in SETTINGS],
@@ -264,7 +277,7 @@ def test_draws_follow_the_density(experiment):
         assert experiment.integral.value.abs().max() == 0
         return
     p = experiment.p_value()
-    assert p > EACH, f"p = {p:.3g} (seed {experiment.seed}), limit {EACH:.2g}"
+    assert p > EACH, f"p = {p:.3g}, limit {EACH:.2g}"
 
 
 def test_the_density_holds_at_most_one(experiment):
@@ -272,7 +285,7 @@ def test_the_density_holds_at_most_one(experiment):
     mass, error = float(integral.value[0].sum()), float(integral.error[0].sum())
     assert error < 2e-3, f"the cubature is known to {error:.2g} only"
     share = float((~experiment.spread).double().mean())
-    assert mass <= 1 + error + 1e-5
+    assert mass <= 1 + error + 1e-5, f"1 + {mass - 1:.3g} +- {error:.2g}"
     assert abs(mass - (1 - share)) < error + 1e-5 + 5 * math.sqrt(max(share * (1 - share), 1e-9) / experiment.number)
 
 
@@ -289,7 +302,7 @@ def test_no_energy_is_created(experiment):
     if not (experiment.model.conserves and experiment.case.conserves):
         pytest.skip("this material may reflect more than it receives")
     mean, error = experiment.mean(experiment.draws.pdf > 0, radiance=True)
-    assert (mean <= 1 + Z * error + 2e-5).all(), f"albedo {mean.tolist()} +- {error.tolist()}"
+    assert (mean <= 1 + experiment.case.furnace + Z * error + 2e-5).all(), f"albedo {mean.tolist()} +- {error.tolist()}"
 
 
 def test_white_furnace(experiment):
@@ -350,13 +363,14 @@ def fresnel(cos: Tensor, eta: Tensor) -> Tensor:
     return torch.where(cos2 > 0, 0.5 * (s * s + p * p), 1.0)
 
 
-def delta_amounts(case: Case, values: bsdfs.Parameters, wo: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Reflected and transmitted shares ``(3,)`` of the deltas of simple models; None for the others."""
+CLOSED = ("null", "dielectric", "thindielectric", "plastic")
+
+
+def delta_amounts(case: Case, values: bsdfs.Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
+    """Reflected and transmitted shares ``(3,)`` of the deltas of the models that have a ``CLOSED`` form."""
     name, one = case.model.name, torch.ones(3, dtype=torch.float64)
     if name == "null":
         return 0 * one, one
-    if name not in ("dielectric", "thindielectric", "plastic"):
-        return None
     ratio = values["int_ior"] / values["ext_ior"]
     f = fresnel(wo[2].abs(), ratio if name != "dielectric" or float(wo[2]) > 0 else 1 / ratio)
     reflectance = values["specular_reflectance"][:, 0] if "specular_reflectance" in values else one
@@ -368,9 +382,8 @@ def delta_amounts(case: Case, values: bsdfs.Parameters, wo: Tensor) -> tuple[Ten
     return f * reflectance, (1 - f) * transmittance
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("angle", ANGLES)
-@pytest.mark.parametrize("case", [case for case in CASES if case.model.delta], ids=identify)
+@pytest.mark.parametrize("case", first_fast([case for case in CASES if case.model.name in CLOSED]))
 def test_deltas_carry_what_fresnel_gives_them(case, angle):
     """In the mean over ``lobe``, with its gradient: a probability is detached, an amount is not."""
     for below in (False, True) if case.model.transmits else (False,):
@@ -378,8 +391,6 @@ def test_deltas_carry_what_fresnel_gives_them(case, angle):
         values = tensors(case.values, torch.float64)
         inputs = [t.requires_grad_() for t in leaves(values)]
         expected = delta_amounts(case, values, wo)
-        if expected is None:
-            pytest.skip("no closed form here")
         n = 1 << 12
         rows = bsdfs.stacked([case.model.prepare(values)])
         u = torch.full((2, n), 0.3, dtype=torch.float64)
@@ -423,8 +434,7 @@ def pairs(case: Case, n: int, dtype: torch.dtype, generator: torch.Generator) ->
     return normalize(wo.to(dtype)), normalize(wi.to(dtype))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES, ids=identify)
+@pytest.mark.parametrize("case", first_fast(CASES))
 def test_reciprocity(case):
     """``f(wo, wi) = f(wi, wo)`` on one side; across, the radiance of either is divided by its squared index."""
     if not case.model.reciprocal:
@@ -440,8 +450,7 @@ def test_reciprocity(case):
     torch.testing.assert_close(there, back, rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", CASES, ids=identify)
+@pytest.mark.parametrize("case", first_fast(CASES))
 def test_opaque_models_are_black_from_behind(case):
     if case.model.transmits:
         pytest.skip("light passes")
@@ -452,15 +461,17 @@ def test_opaque_models_are_black_from_behind(case):
     assert not value.any() and not pdf.any()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("model", bsdfs.MODELS, ids=identify)
+@pytest.mark.parametrize(
+    "model",
+    [pytest.param(m, marks=[pytest.mark.slow] if heavy(m) else [], id=str(m)) for m in bsdfs.MODELS],
+)
 def test_rows_of_one_model_do_not_meet(model):
     """Two materials in one group of lanes give what each gives alone, whatever one has and the other has not."""
     cases = cases_of(model)
     generator = torch.Generator().manual_seed(5)
     n = 512
     for a, b in zip(cases, [*cases[1:], cases[0]], strict=True):
-        rows = bsdfs.stacked([case.model.prepare(tensors(case.values, torch.float32)) for case in (a, b)])
+        rows = bsdfs.stacked([case.rows() for case in (a, b)])
         u = torch.rand(3, n, generator=generator)
         wo = uniform_sphere(torch.rand(2, n, generator=generator))
         wi = uniform_sphere(torch.rand(2, n, generator=generator))
@@ -518,8 +529,7 @@ def edge_lanes(case: Case) -> tuple[Tensor, Tensor, Tensor]:
     return wo, wi, u
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", EDGES, ids=identify)
+@pytest.mark.parametrize("case", first_fast(EDGES))
 def test_edge_numbers_stay_finite(case):
     model = case.model
     wo, wi, u = edge_lanes(case)
@@ -555,8 +565,7 @@ def test_edge_numbers_stay_finite(case):
     assert torch.isfinite(albedo).all() and (albedo >= 0).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", EDGES, ids=identify)
+@pytest.mark.parametrize("case", first_fast(EDGES, tables=True))
 def test_gradients_stay_finite_at_the_edges(case):
     """Through ``prepare``: of eval, and of the weights of all draws, deltas and failed ones too."""
     wo, wi, u = edge_lanes(case)
@@ -600,8 +609,9 @@ def inside(values: bsdfs.Parameters) -> bsdfs.Parameters:
     return out
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", [case for case in CASES if case.differentiable and not case.smooth], ids=identify)
+@pytest.mark.parametrize(
+    "case", first_fast([case for case in CASES if case.differentiable and not case.smooth], tables=True)
+)
 def test_gradients_of_eval(case):
     """Finite differences in every number that a material is given, at directions within its lobes."""
     values = inside(tensors(case.values, torch.float64))
@@ -616,4 +626,5 @@ def test_gradients_of_eval(case):
         return case.model.eval(p, wo, wi)
 
     assert value(*flat).requires_grad
-    assert torch.autograd.gradcheck(value, flat, eps=1e-6, atol=1e-5, rtol=1e-3)
+    # A longer step moves the edge of total internal reflection over the nodes at which tables are integrated.
+    assert torch.autograd.gradcheck(value, flat, eps=1e-7, atol=1e-5, rtol=1e-3, fast_mode=True)

@@ -18,6 +18,7 @@ from torchpt.scene.description import settings
 __all__ = [
     "SIGNIFICANCE",
     "chi_square_p",
+    "coarse",
     "estimate",
     "film_of",
     "grid_cells",
@@ -64,6 +65,11 @@ def spread(images: list[Tensor]) -> tuple[Tensor, Tensor]:
     """Mean of independent pictures and the variance of that mean."""
     stack = torch.stack([image.double() for image in images])
     return stack.mean(0), stack.var(0) / len(stack)
+
+
+def coarse(picture: Tensor, side: int) -> Tensor:
+    """Means ``(H / side, W / side, C)`` over squares of pixels of a picture ``(H, W, C)``."""
+    return torch.nn.functional.avg_pool2d(picture.double().permute(2, 0, 1)[None], side)[0].permute(1, 2, 0)
 
 
 def uniform_p(cells: Tensor, number: int) -> float:

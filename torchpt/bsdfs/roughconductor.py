@@ -94,9 +94,8 @@ def energy_at(table: Table, parameters: Parameters, wo: Tensor, block: Tensor | 
     r2 = torch.addcmul(wo[0] * wo[0], wo[1], wo[1]).clamp_min(1e-12)
     x, y = wo[0] * au, wo[1] * av
     seen = (torch.addcmul(x * x, y, y).clamp_min(1e-20) / r2).sqrt()
-    width = av - au
-    step = torch.where(width != 0, (seen - au) / torch.where(width != 0, width, 1.0), 0.0).clamp(0.0, 1.0)
-    step = step * (azimuths - 1)
+    # (seen - au) / (av - au), also where both roughnesses are the same.
+    step = ((au + av) * (wo[1] * wo[1] / r2) / (seen + au)).clamp(0.0, 1.0) * (azimuths - 1)
     below = step.detach().floor().clamp_max(azimuths - 2)
     low = table.at((place + below * cosines) * (1.0 / last))
     return low + (table.at((place + (below + 1.0) * cosines) * (1.0 / last)) - low) * (step - below)

@@ -88,7 +88,8 @@ def fresnel_conductor(cos_i: Tensor, eta: Tensor, k: Tensor) -> Tensor:
     s = (one - two) / (one + two).clamp_min(tiny)
     three, four = ab2 * cos2 + sin2 * sin2, two * sin2
     p = s * (three - four) / (three + four).clamp_min(tiny)
-    return 0.5 * (s + p)
+    # Where the metal's index is that of the air, what is left is rounding, of either sign.
+    return (0.5 * (s + p)).clamp_min(0.0)
 
 
 def schlick(cos_i: Tensor, f0: Tensor) -> Tensor:
