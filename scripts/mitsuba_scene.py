@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes.util
 import importlib
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,10 @@ import torchpt
 from torchpt.math.vectors import cross, dot
 from torchpt.scene import Scene
 from torchpt.scene.assemble import corners_of
-from torchpt.scene.parts import MaterialSlot, Part
+from torchpt.scene.parts import MaterialSlot, Part, VertexColors
 from torchpt.scene.settings import Film, PathIntegrator, Settings
+from torchpt.scene.texels import images_of
+from torchpt.textures import Node
 
 __all__ = ["NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "load_mitsuba"]
 
@@ -143,9 +145,10 @@ def _rgb(colour: Any) -> dict[str, Any]:
 def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]:
     if part.emission is not None and _passing(part.material) != 1.0:
         raise NoCounterpartError(f"{part.name}: Mitsuba's lights shine in full whatever their opacity")
-    shape: dict[str, Any] = {"bsdf": bsdf(part.material)}
+    shape: dict[str, Any] = {"bsdf": bsdf(part.material, lambda node: _bitmap(mitsuba, scene, node))}
     if part.kind == "triangle":
-        if part.uvs is None and part.material.model.anisotropic:
+        mapped = part.material.normal_map is not None or part.material.bump_map is not None
+        if part.uvs is None and (part.material.model.anisotropic or mapped):
             raise NoCounterpartError(f"{part.name}: anisotropic, and no uv to agree on a tangent")
         _write_part(file, scene, part)
         shape |= {"type": "ply", "filename": str(file), "face_normals": not part.smooth}
@@ -159,34 +162,83 @@ def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]
     return shape
 
 
-def bsdf(slot: MaterialSlot) -> dict[str, Any]:
+def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
+    """Mitsuba's dict of a texture."""
+    image = images_of([node], scene.params)[node.texels].detach()
+    if node.channel is None:
+        image = image[..., :3] if image.shape[2] >= 3 else image[..., :1].expand(-1, -1, 3)
+        image = image * torch.tensor(node.scale)
+    else:
+        weights = torch.tensor([0.212671, 0.715160, 0.072169])
+        channel = image[..., node.channel] if node.channel >= 0 else image[..., :3] @ weights
+        image = channel[..., None] * node.scale[0]
+    return {
+        "type": "bitmap",
+        "bitmap": mitsuba.Bitmap(np.ascontiguousarray(image.numpy(), np.float32)),
+        "raw": True,
+        "wrap_mode": node.wrap,
+        "filter_type": "nearest" if node.nearest else "bilinear",
+        "to_uv": mitsuba.ScalarTransform3f([*map(list, node.transform), [0.0, 0.0, 1.0]]),
+    }
+
+
+def _refuse(node: Node) -> dict[str, Any]:
+    raise NoCounterpartError(f"{node.texels}: a texture, and no scene to take it from")
+
+
+Opened = Callable[[Node], dict[str, Any]]
+
+
+def bsdf(slot: MaterialSlot, opened: Opened = _refuse) -> dict[str, Any]:
     """Mitsuba's dict of a material.
+
+    Args:
+        slot: the material.
+        opened: makes Mitsuba's textures.
 
     Raises:
         NoCounterpartError: what Mitsuba lacks, by the material's name.
     """
     opacity = _passing(slot)
     if slot.inner and (slot.model.transmits or any(_passing(inner) != 1.0 for inner in slot.inner)):
-        a, b = (bsdf(inner) for inner in slot.inner)
-        found: dict[str, Any] = {"type": "blendbsdf", "weight": slot.values["weight"], "bsdf_0": a, "bsdf_1": b}
+        a, b = (bsdf(inner, opened) for inner in slot.inner)
+        weight = _value(slot.values["weight"], opened)
+        found: dict[str, Any] = {"type": "blendbsdf", "weight": weight, "bsdf_0": a, "bsdf_1": b}
     else:
-        found = _bare(slot)
+        found = _bare(slot, opened)
+        if slot.normal_map is not None:
+            found = {"type": "normalmap", "normalmap": opened(slot.normal_map), "bsdf": found}
+        if slot.bump_map is not None:
+            found = {"type": "bumpmap", "bump_texture": opened(slot.bump_map), "bsdf": found}
         if slot.two_sided and not slot.model.transmits:
             found = {"type": "twosided", "material": found}
-    return found if opacity == 1.0 else {"type": "mask", "opacity": opacity, "material": found}
+    return found if opacity == 1.0 else {"type": "mask", "opacity": _value(opacity, opened), "material": found}
 
 
-def _passing(slot: MaterialSlot) -> float:
+def _value(value: Any, opened: Opened) -> Any:
+    """A parameter as Mitsuba's dict has it."""
+    if isinstance(value, VertexColors):
+        raise NoCounterpartError("vertex colours are not converted")
+    if isinstance(value, Node):
+        return opened(value)
+    return _rgb(value) if isinstance(value, tuple) else value
+
+
+def _passing(slot: MaterialSlot) -> float | Node:
     """Opacity of a material itself."""
+    if isinstance(slot.opacity, Node):
+        if slot.alpha_cutoff is not None:
+            raise NoCounterpartError(f"{slot.name}: a cutoff of an opacity texture has no counterpart in Mitsuba")
+        return slot.opacity
     return slot.opacity if slot.alpha_cutoff is None else float(slot.opacity >= slot.alpha_cutoff)
 
 
-def _bare(slot: MaterialSlot) -> dict[str, Any]:
+def _bare(slot: MaterialSlot, opened: Opened) -> dict[str, Any]:
     """A material as seen from its front, with nothing around it."""
     model, values = slot.model, dict(slot.values)
     if slot.inner:
-        a, b = (_bare(inner) for inner in slot.inner)
-        return {"type": "blendbsdf", "weight": values["weight"], "bsdf_0": a, "bsdf_1": b}
+        a, b = (_bare(inner, opened) for inner in slot.inner)
+        return {"type": "blendbsdf", "weight": _value(values["weight"], opened), "bsdf_0": a, "bsdf_1": b}
     if model.name not in (*SHARED, *SMOOTH):
         raise NoCounterpartError(f"{slot.name}: {model.name} has no counterpart in Mitsuba")
     if getattr(model, "energy_compensation", False):
@@ -197,16 +249,20 @@ def _bare(slot: MaterialSlot) -> dict[str, Any]:
             raise NoCounterpartError(f"{slot.name}: a conductor given by its reflectance has no counterpart in Mitsuba")
         out["material"] = "none"
     if model.name in SMOOTH:
+        if isinstance(values.get("roughness"), Node):
+            raise NoCounterpartError(f"{slot.name}: Mitsuba interpolates alpha, torchpt a texture of roughness")
         if "roughness" in values:
             values["alpha"] = values.pop("roughness") ** 2  # type: ignore[operator]
         alphas = {key: values.pop(key) for key in ("alpha", "alpha_u", "alpha_v") if key in values}
-        if max(alphas.values()) < LEAST_ALPHA:  # type: ignore[type-var]
+        numbers = [alpha for alpha in alphas.values() if isinstance(alpha, float)]
+        if numbers and max(numbers) < LEAST_ALPHA:
             out["type"] = SMOOTH[model.name]
         else:
-            out |= {"distribution": "ggx", **{k: max(LEAST_ALPHA, alpha) for k, alpha in alphas.items()}}  # type: ignore[type-var]
+            least = {k: max(LEAST_ALPHA, alpha) if isinstance(alpha, float) else alpha for k, alpha in alphas.items()}
+            out |= {"distribution": "ggx", **{key: _value(alpha, opened) for key, alpha in least.items()}}
     if getattr(model, "nonlinear", False):
         out["nonlinear"] = True
-    return out | {key: _rgb(value) if isinstance(value, tuple) else value for key, value in values.items()}
+    return out | {key: _value(value, opened) for key, value in values.items()}
 
 
 def _write_part(file: Path, scene: Scene, part: Part) -> None:
@@ -220,8 +276,8 @@ def _write_part(file: Path, scene: Scene, part: Part) -> None:
     else:
         against = torch.zeros(corners.p0.shape[1], dtype=torch.bool)
     if part.uvs is not None:
-        assert part.faces is not None
-        columns.append(torch.from_numpy(part.uvs[part.faces]).permute(1, 2, 0))
+        assert corners.faces is not None
+        columns.append(torch.from_numpy(part.uvs)[corners.faces].permute(1, 2, 0))
     rows = torch.cat(columns, 1)
     rows = torch.where(against, rows[[0, 2, 1]], rows)
     names = [

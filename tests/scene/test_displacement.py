@@ -38,8 +38,8 @@ def test_subdivision_keeps_the_shape():
 
 
 def test_heights_of_a_known_function():
-    part = MeshPart("", *(np.array(SQUARE[k], float) for k in ("vertices",)), np.array([[0, 1, 2], [0, 2, 3]]), None,
-                    np.array(SQUARE["uvs"], float))  # fmt: skip
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    part = MeshPart("", np.array(SQUARE["vertices"], float), faces, uvs=np.array(SQUARE["uvs"], float))
     found = displaced(part, lambda uv: 0.1 * np.sin(2 * np.pi * uv[:, 0]), 5)
     assert found.uvs is not None and found.normals is not None
     assert np.allclose(found.vertices[:, :2], found.uvs)
