@@ -77,7 +77,8 @@ def test_parts_of_one_material_share_it(tmp_path: Path) -> None:
     Image.new("RGB", (2, 2)).save(tmp_path / "picture.png")
     (tmp_path / "a.gltf").write_text(json.dumps(data))
     made = torchpt.load(scene(tmp_path / "a.gltf"), device="cpu")
-    assert [name for name in made.params if name.endswith("base_color")] == ["shapes.m.part0.material.base_color"]
+    assert [name for name in made.params if "texture" in name] == ["shapes.m.textures.picture"]
+    assert [name for name in made.params if name.endswith("roughness")] == ["shapes.m.part0.material.roughness"]
     assert [name for name in made.params if name.endswith("vertices")] == [
         "shapes.m.part0.vertices",
         "shapes.m.part1.vertices",

@@ -181,7 +181,7 @@ def _own_slot(own: FileMaterial, prefix: str, key: str, source: str, opener: Ope
         entry = {name: value for name, value in own.material.items() if name not in _unbuilt(own)}
         material = read_material(entry, key, MATERIALS, None)
         check_material(material, key, {}, {}, None)
-        return slot_of(material, key, {}, opener.sharing(f"{prefix}.textures", source))
+        return slot_of(material, key, {}, opener.sharing(f"{prefix}.textures"))
     except SceneError as error:
         raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None
 
