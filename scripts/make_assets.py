@@ -365,7 +365,7 @@ def duck_paint(size: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     shade = np.clip(0.82 + 0.18 * (y - 0.1) / 0.8, 0.0, 1.0)  # the belly is darker
     (bx, by, _), (wide, tall, _) = BILL
     bill = ((x - bx) / (1.2 * wide)) ** 2 + ((y - by) / (1.6 * tall)) ** 2 < 1.0
-    bill &= x > 0.735 + 0.02 * np.cos(2.0 * (y - by) / tall)
+    bill &= x > 0.78 + 0.02 * np.cos(2.0 * (y - by) / tall)
     ink[bill] = 1
     shade = np.where(bill, np.where(np.abs(y - by + 0.004) < 0.009, 0.55, 1.0), shade)  # the line between its halves
     away = np.hypot(x - EYE[0], y - EYE[1])

@@ -103,6 +103,12 @@ def test_obj_groups_meet_without_a_crease(tmp_path: Path) -> None:
     assert a.material is not None and a.material.ignored == ("not defined in an MTL file",)
 
 
+def test_obj_vertex_colours_are_named(tmp_path: Path) -> None:
+    rows = "".join(f"v {x} {y} {z} 1 0 0\n" for x, y, z in SQUARE)
+    (part,) = load_mesh(write(tmp_path / "a.obj", rows + "f 1 2 3\nl 1 2\n"))
+    assert part.ignored == ("l", "v x y z r g b (colours)")
+
+
 def test_obj_without_its_materials(tmp_path: Path) -> None:
     file = write(tmp_path / "a.obj", "mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n")
     assert load_mesh(file, materials=False)[0].material is None

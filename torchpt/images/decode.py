@@ -118,8 +118,12 @@ def pixels_of(source: Path | EncodedImage, max_pixels: int) -> Pixels:
         if kind in FLOAT_FORMATS or deep:
             return _through_oiio(source, label, kind, "uint16" if deep else "float", max_pixels)
         return _through_pillow(source, label, kind, max_pixels)
+    except AssetError:
+        raise
     except OSError as error:
         raise AssetError(label, f"cannot be read ({error.strerror or error})") from None
+    except Exception as problem:  # SyntaxError, ValueError, struct.error, zlib.error, text that is no UTF-8, ...
+        raise AssetError(label, f"cannot be read ({_brief(problem)})") from None
 
 
 def _head(source: Path | EncodedImage) -> bytes:
@@ -190,14 +194,9 @@ def _through_pillow(source: Path | EncodedImage, label: str, kind: str, max_pixe
     plugin = {".png": PngImageFile, ".jpg": JpegImageFile, ".jpeg": JpegImageFile, ".bmp": BmpImageFile}
     plugin |= {".tga": TgaImageFile, ".ppm": PpmImageFile, ".pgm": PpmImageFile}
     data = source.read_bytes() if isinstance(source, Path) else source.data
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow warns of odd metadata, of which nothing is used
-            return _pillow_pixels(plugin[kind](BytesIO(data)), label, len(data), max_pixels)
-    except AssetError:
-        raise
-    except Exception as problem:  # decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error, ...
-        raise AssetError(label, f"cannot be read ({_brief(problem)})") from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Pillow warns of odd metadata, of which nothing is used
+        return _pillow_pixels(plugin[kind](BytesIO(data)), label, len(data), max_pixels)
 
 
 def _pillow_pixels(picture: Any, label: str, size: int, max_pixels: int) -> Pixels:

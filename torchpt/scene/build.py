@@ -12,7 +12,7 @@ from torchpt.records import KINDS
 from torchpt.scene.description import Description
 from torchpt.scene.displacement import displaced
 from torchpt.scene.loaders import FileMaterial, MeshPart, load_mesh, unit_cube
-from torchpt.scene.materials import MATERIALS, Diffuse, Material, read_material, slot_of
+from torchpt.scene.materials import MATERIALS, Diffuse, check_material, read_material, slot_of
 from torchpt.scene.parts import MaterialSlot, Part
 from torchpt.scene.schema import Cube, Disk, Displacement, Mesh, Rectangle, Shape, Sphere
 from torchpt.scene.texels import Opener
@@ -86,7 +86,8 @@ def _shape_parts(
             if similarity_scale(pose) is None:
                 raise SceneError(f"{prefix}.transform", pose.tolist(), "a transform of uniform scale", description.file)
         parameters[f"{prefix}.to_world"] = pose
-        return [_part(description, shape, prefix, name, number, kind, pose, None, parameters, opener)]
+        slot = _slot(description, shape, prefix, opener)
+        return [_part(shape, prefix, name, number, kind, pose, None, parameters, slot)]
     if isinstance(shape, Cube):
         pieces, source, flat = [unit_cube()], "", True
     elif shape.path is None:
@@ -99,25 +100,20 @@ def _shape_parts(
     if isinstance(shape, Mesh) and shape.displacement is not None:
         pieces = [_displaced(piece, shape.displacement, prefix, opener, source) for piece in pieces]
     labels = _labels([piece.name for piece in pieces])
-    parts = []
+    parts: list[Part] = []
+    known: dict[int, MaterialSlot] = {}
     for piece, label in zip(pieces, labels, strict=True):
         stem = prefix if len(pieces) == 1 else f"{prefix}.{label}"
         parameters[f"{stem}.vertices"] = np.asarray(piece.vertices, np.float64)
         parameters[f"{stem}.to_world"] = pose
-        part = _part(
-            description,
-            shape,
-            stem,
-            name,
-            number,
-            "triangle",
-            pose,
-            piece,
-            parameters,
-            opener,
-            flat=flat,
-            source=source,
-        )
+        own = piece.material if shape.material is None else None
+        if own is None:
+            slot = _slot(description, shape, stem, opener)
+        elif id(own) in known:  # parts of one material share its row and its textures
+            slot = known[id(own)]
+        else:
+            slot = known[id(own)] = _own_slot(own, prefix, f"{stem}.material", source, opener)
+        part = _part(shape, stem, name, number, "triangle", pose, piece, parameters, slot, flat=flat, source=source)
         parts.append(part)
     if all(len(part.faces) == 0 for part in parts if part.faces is not None):
         problem = "every face is degenerate (without area)"
@@ -161,8 +157,36 @@ def _labels(names: list[str]) -> list[str]:
     return labels
 
 
+def _slot(description: Description, shape: Shape, prefix: str, opener: Opener) -> MaterialSlot:
+    """The material that the scene gives a shape, or the grey of one that has none."""
+    given, known = shape.material, description.materials
+    if isinstance(given, str):
+        return slot_of(known[given], f"materials.{given}", known, opener)
+    return slot_of(Diffuse() if given is None else given, f"{prefix}.material", known, opener)
+
+
+def _unbuilt(own: FileMaterial) -> tuple[str, ...]:
+    """Keys of a file's material that are left out: emission that a texture gives cannot be rendered yet."""
+    lit = isinstance(own.material.get("emission"), dict)
+    return tuple(key for key in own.material if key.startswith("emission")) if lit else ()
+
+
+def _own_slot(own: FileMaterial, prefix: str, key: str, source: str, opener: Opener) -> MaterialSlot:
+    """A mesh file's own material.
+
+    Raises:
+        AssetError: something that a material cannot have; it names the file and the material.
+    """
+    try:
+        entry = {name: value for name, value in own.material.items() if name not in _unbuilt(own)}
+        material = read_material(entry, key, MATERIALS, None)
+        check_material(material, key, {}, {}, None)
+        return slot_of(material, key, {}, opener.sharing(f"{prefix}.textures"))
+    except SceneError as error:
+        raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None
+
+
 def _part(
-    description: Description,
     shape: Shape,
     prefix: str,
     name: str,
@@ -171,24 +195,11 @@ def _part(
     pose: np.ndarray,
     piece: MeshPart | None,
     parameters: dict[str, np.ndarray],
-    opener: Opener,
+    slot: MaterialSlot,
     *,
     flat: bool = True,
     source: str = "",
 ) -> Part:
-    own = piece.material if piece is not None else None
-    if isinstance(shape.material, str):
-        slot = slot_of(
-            description.materials[shape.material], f"materials.{shape.material}", description.materials, opener
-        )
-    elif shape.material is not None:
-        slot = slot_of(shape.material, f"{prefix}.material", description.materials, opener)
-    else:
-        made, shared = (
-            _own_material(own, f"{prefix}.material", source),
-            opener.sharing(f"shapes.{name}.textures", source),
-        )
-        slot = slot_of(made, f"{prefix}.material", description.materials, shared)
     _declare(slot, parameters)
     emission, names = shape.emission, (f"shapes.{name}.emission",)
     if emission is None and slot.emission is not None:
@@ -214,19 +225,16 @@ def _part(
         smooth=not flat,
         dropped=dropped,
         source=source,
-        ignored=tuple(piece.ignored) + (tuple(own.ignored) if own is not None else ()) if piece is not None else (),
+        ignored=_ignored(piece),
     )
 
 
-def _own_material(own: FileMaterial | None, key: str, source: str) -> Material:
-    """The material of a mesh file, or the grey of a mesh without one."""
-    if own is None:
-        return Diffuse()
-    try:
-        return read_material(own.material, key, MATERIALS, None)
-    except SceneError as error:
-        problem = str(error).removeprefix(f"{key}.").removeprefix(f"{key}: ")
-        raise AssetError(source, f"material {own.name[:80]!r}: {problem}") from None
+def _ignored(piece: MeshPart | None) -> tuple[str, ...]:
+    """What of a mesh file is not used."""
+    if piece is None:
+        return ()
+    own = piece.material
+    return piece.ignored if own is None else (*piece.ignored, *own.ignored, *_unbuilt(own))
 
 
 def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:

@@ -75,11 +75,11 @@ class Opener:
         assert isinstance(texture, Checkerboard)
         return self._checkerboard(slot, texture, name, channel, key)
 
-    def sharing(self, prefix: str, source: str) -> Callable[[Slot, str], Reading]:
+    def sharing(self, prefix: str) -> Callable[[Slot, str], Reading]:
         """The same for the materials of a mesh file, whose images are named after themselves and shared.
 
-        Raises:
-            AssetError: what is wrong with a texture, by the mesh file's name.
+        Args:
+            prefix: dotted name before theirs.
         """
 
         def opened(slot: Slot, key: str) -> Reading:
@@ -92,10 +92,7 @@ class Opener:
                 if label not in known:
                     known[label] = stem if stem not in known.values() else f"{stem}_{len(known)}"
                 name = f"{prefix}.{known[label]}"
-            try:
-                return self._opened(slot, texture, name, None, key)
-            except SceneError as error:
-                raise AssetError(source, str(error)) from None
+            return self._opened(slot, texture, name, None, key)
 
         return opened
 

@@ -39,6 +39,7 @@ class Materials:
     def __init__(self, document: Document) -> None:
         self.document = document
         self.images: dict[int, str | EncodedImage] = {}
+        self.known: dict[tuple[int, bool], tuple[FileMaterial, Rgb | None]] = {}
 
     def of(
         self, number: Any, colors: NDArray[np.float64] | None
@@ -53,12 +54,16 @@ class Materials:
             if colors is None:
                 return None, None
             return FileMaterial("vertex colors", {"type": "diffuse", "reflectance": {"type": "vertex_color"}}), colors
-        rules = _Rules(self, self.document.item("materials", number), number)
-        material = rules.material(colors is not None)
-        if colors is not None and rules.tinted:
-            colors = colors * np.array(rules.base)
-        name = str(rules.block.get("name") or f"material{number}")[:80]
-        return FileMaterial(name, material, tuple(dict.fromkeys(rules.ignored))), colors
+        key = (number, colors is not None)
+        block = self.document.item("materials", number)
+        if key not in self.known:  # the same object for every primitive that has it
+            rules = _Rules(self, block, number)
+            material = rules.material(colors is not None)
+            name = str(block.get("name") or f"material{number}")[:80]
+            found = FileMaterial(name, material, tuple(dict.fromkeys(rules.ignored)))
+            self.known[key] = found, rules.base if rules.tinted else None
+        found, tint = self.known[key]
+        return found, colors if colors is None or tint is None else colors * np.array(tint)
 
     def image(self, number: Any) -> str | EncodedImage:
         """An image of the document: a path, or the bytes that lie in the document."""
@@ -178,13 +183,13 @@ class _Rules:
             material["opacity"] = alpha
 
     def relief(self, material: dict[str, Any]) -> None:
-        """The normal map; its scale is one of x and y."""
-        info = self.block.get("normalTexture")
-        if info is not None:
-            scale = self.number(info, "scale", 1.0, 1e6, -1e6)
-            normals = self.texture(self.block, "normalTexture", scale, None)
-            if normals is not None:
-                material["normal_map"] = normals
+        """The normal map."""
+        normals = self.texture(self.block, "normalTexture", 1.0, None)
+        if normals is None:
+            return
+        material["normal_map"] = normals
+        if self.number(self.block["normalTexture"], "scale", 1.0, 1e6, -1e6) != 1.0:
+            self.ignored.append("normalTexture.scale")
 
     def glow(self, material: dict[str, Any]) -> None:
         """EmissiveFactor times its picture times KHR_materials_emissive_strength."""

@@ -219,7 +219,8 @@ class _Rules:
         found = self.maps[kind]
         stem = PurePath(self.files[kind]).stem.lower()
         if kind == "norm" or "normal" in stem or stem.endswith(("_n", "_nrm", "_nor", "_norm")):
-            material["normal_map"] = self._image(kind, found.bump, None)
+            material["normal_map"] = self._image(kind, 1.0, None)
+            self.ignored += [f"{found.key} -bm"] * (found.bump != 1.0)
         else:
             material["bump_map"] = self._image(kind, found.bump, found.channel or "luminance")
 

@@ -147,8 +147,11 @@ def _numbers(text: _Text, key: str, columns: int, path: Path) -> NDArray[np.floa
             pass  # the loop below finds the line
     result = np.zeros((len(rows), columns))
     for index, (number, row) in enumerate(zip(text.lines[key], rows, strict=True)):
+        found = row.partition("#")[0].split()
+        if key == "v" and len(found) >= 7:
+            text.ignored.append("v x y z r g b (colours)")
         try:
-            values = [float(word) for word in row.partition("#")[0].split()[1:width]]
+            values = [float(word) for word in found[1:width]]
         except ValueError:
             values = []
         if len(values) != columns and not (key == "vt" and len(values) == 1):
