@@ -20,13 +20,16 @@ if TYPE_CHECKING:
 
 __all__ = [
     "KINDS",
+    "QUADRICS",
     "BsdfSample",
+    "Copies",
     "Geometry",
     "Hit",
     "Interaction",
     "LightSample",
     "Lights",
     "PathState",
+    "Quadrics",
     "Shadow",
     "World",
     "joined",
@@ -35,7 +38,9 @@ __all__ = [
 ]
 
 #: Primitive kinds in the order in which a :class:`Geometry` stores them.
-KINDS = ("triangle", "rectangle", "disk", "sphere")
+KINDS = ("triangle", "rectangle", "disk", "sphere", "quadric")
+#: Surfaces of a quadric in its own space, in the order of their codes (:mod:`torchpt.shapes.quadrics`).
+QUADRICS = ("ellipsoid", "cylinder", "cone")
 
 
 @dataclass(frozen=True)
@@ -44,24 +49,62 @@ class Geometry:
 
     A planar primitive is the affine map ``p = p0 + u (p1 - p0) + v (p2 - p0)``: a triangle holds ``u, v >= 0, u + v <= 1``,
     a rectangle (parallelogram) ``0 <= u, v <= 1``, a disk (ellipse) ``u^2 + v^2 <= 1`` about its centre ``p0``.
-    A sphere has its centre in ``p0`` and its radius in ``p1[0]``.
+    A sphere has its centre in ``p0`` and its radius in ``p1[0]``. A quadric is a surface of :data:`QUADRICS` in its own space
+    under the affine map ``p = p0 + x e1 + y e2 + z e3``, kept in float64 beside the others.
 
     Attributes:
         p0: ``(3, P)``.
-        p1: ``(3, P)``.
-        p2: ``(3, P)``.
-        counts: how many triangles, rectangles, disks and spheres; stored in that order.
+        p1: ``(3, P)``; of a quadric its ``e1``.
+        p2: ``(3, P)``; of a quadric its ``e2``.
+        counts: how many primitives of each of :data:`KINDS`; stored in that order.
+        quadrics: ``(13, Q)`` float64: ``p0 e1 e2 e3`` and the code of the surface; None where there are none.
+        copies: ``(15, I)`` float64: three rows of the map from a mesh to its copy, the first triangle of that mesh, how many it
+            has, and the id of the copy's first primitive; None where there are no instances. A copy's primitives exist by
+            their ids alone, which follow those of all others.
     """
 
     p0: Tensor
     p1: Tensor
     p2: Tensor
-    counts: tuple[int, int, int, int]
+    counts: tuple[int, int, int, int, int]
+    quadrics: Tensor | None = None
+    copies: Tensor | None = None
 
     @property
     def size(self) -> int:
-        """Number of primitives P."""
+        """Number of primitives P, copies not counted."""
         return sum(self.counts)
+
+
+@dataclass(frozen=True)
+class Quadrics:
+    """What lanes gather of a quadric beside ``World.p0, e1, e2``: one column a quadric."""
+
+    code: Tensor  # (Q,) int64 index into QUADRICS
+    e3: Tensor  # (3, Q)
+    n1: Tensor  # (3, Q) columns of the cofactor matrix of (e1, e2, e3), turned to the front; their common scale is free
+    n2: Tensor  # (3, Q)
+    n3: Tensor  # (3, Q)
+    reach: Tensor  # (3, Q) largest coordinate magnitudes that enter a point's sum, see World.bound
+
+
+@dataclass(frozen=True)
+class Copies:
+    """Instances of meshes: column 0 is the identity, that of all that is no copy; column k belongs to copy k - 1.
+
+    What is kept by primitive splits in two: its place on a mesh, looked up by :attr:`Interaction.prim`, and what a copy has of
+    its own (material, opacity, object id), by :attr:`Interaction.slot`: rows after the P of the primitives, one a copy.
+    """
+
+    start: Tensor  # (I + 1,) int64 id of the copy's first primitive
+    first: Tensor  # (I + 1,) int64 first triangle of its mesh
+    x: Tensor  # (3, I + 1) columns of the linear map
+    y: Tensor  # (3, I + 1)
+    z: Tensor  # (3, I + 1)
+    move: Tensor  # (3, I + 1)
+    nx: Tensor  # (3, I + 1) columns of its cofactor matrix, turned to the front; their scale is free
+    ny: Tensor  # (3, I + 1)
+    nz: Tensor  # (3, I + 1)
 
 
 @dataclass(frozen=True)
@@ -76,46 +119,70 @@ class Lights:
     e2: Tensor  # (3, K)
     normal: Tensor  # (3, K) unit, the side that emits
     flip: Tensor  # (K,) -1 where a sphere emits inward
-    area: Tensor  # (K,)
+    area: Tensor  # (K,); of a quadric its own space's area times |det|, see torchpt.lights.quadric
     bound: Tensor  # (K,) see World.bound
     radiance: Tensor  # (3, K)
     opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
     environment: Tensor | None  # (3,) radiance that comes from outside
-    row_of_prim: Tensor | None  # (P,) int64, -1 where a primitive does not emit; None where none does
+    row_of_prim: Tensor | None  # (P + I,) int64, -1 where a primitive does not emit; None where none does
+    quadric: Tensor | None = (
+        None  # (K,) int64 column of World.quadrics, 0 for the other kinds; None where no quadric emits
+    )
+    quadrics: Quadrics | None = None  # World.quadrics where a quadric emits
 
 
 @dataclass(frozen=True)
 class World:
-    """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``."""
+    """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``.
 
-    counts: tuple[int, int, int, int]  # as in Geometry
+    P primitives, and I copies (see :class:`Copies`).
+    """
+
+    counts: tuple[int, int, int, int, int]  # as in Geometry
     p0: Tensor  # (3, P)
     e1: Tensor  # (3, P)
     e2: Tensor  # (3, P)
-    normal: Tensor  # (3, P) unit geometric normal; zero for spheres
+    normal: Tensor  # (3, P) unit geometric normal; zero for spheres, without meaning for quadrics
     bound: Tensor  # (P,) sum |n_i| max |p_i| over the primitive: scales the rounding of its plane
     flip: Tensor | None  # (P,) orientation of spheres
     normals: tuple[Tensor, Tensor, Tensor] | None  # (3, P) shading normals at the corners, where any are smooth
-    tangents: (
-        Tensor | None
-    )  # (3, P) how p moves with texture coordinate u; zero: any direction will do. Of a sphere the
-    # vector whose cross product with the normal it is. None where no frame needs it
+    #: (3, P) how p moves with texture coordinate u; zero: any direction will do. Of a sphere the vector whose cross product
+    #: with the normal it is. None where no frame needs it.
+    tangents: Tensor | None
     bitangents: Tensor | None  # (3, P) the same for v; of a sphere (pi r, 0, 0). None without bump maps
     uvs: tuple[Tensor, Tensor, Tensor] | None  # (2, P) texture coordinates at the corners; None without textures
     axes: tuple[Tensor, Tensor, Tensor] | None  # (3, S) unit x, y, z of the spheres; None without textures or spheres
     mirrored: Tensor | None  # (P,) bool: disks whose u and v are swapped; None where none are, or none matter
     colors: tuple[Tensor, Tensor, Tensor] | None  # (3, P) at the corners, where vertex colours are read
-    opacity: Tensor | None  # (P,) chance that a ray meets the surface; None where it always does
-    material: Tensor  # (P,) int64 row in the parameters of its model
-    key: Tensor  # (P + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
+    opacity: Tensor | None  # (P + I,) chance that a ray meets the surface; None where it always does
+    material: Tensor  # (P + I,) int64 row in the parameters of its model
+    key: Tensor  # (P + I + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
     models: tuple[Bsdf, ...]  # the BSDFs present
     bsdfs: tuple[Parameters, ...]  # stacked parameters of each model; where it has a look, as its materials were given
     looks: tuple[Look | None, ...]  # textures of each model; None where it has none
     textures: Atlas | None  # None where no image is read
     veils: Veils | None  # textures of opacity; None where there are none
     two_sided: tuple[Tensor | None, ...]  # (M,) bool for the rows of each model; None where all are
-    object_id: Tensor  # (P,) int64, order of the shape in the scene
+    object_id: Tensor  # (P + I,) int64, order of the shape in the scene
     lights: Lights | None  # None where nothing emits
+    quadrics: Quadrics | None = None  # None where there are none
+    copies: Copies | None = None  # None where there are no instances
+
+    def slot(self, prim: Tensor) -> Tensor:
+        """Rows ``(N,)`` of what copies have of their own, for ids of primitives as the search gives them; -1 stays."""
+        if self.copies is None:
+            return prim
+        import torch
+
+        copy = self.copy(prim)
+        return torch.where(copy > 0, copy + (len(self.bound) - 1), prim)
+
+    def copy(self, prim: Tensor) -> Tensor:
+        """Columns ``(N,)`` of ``copies`` for ids of primitives as the search gives them."""
+        import torch
+
+        assert self.copies is not None
+        return torch.searchsorted(self.copies.start[1:], prim, right=True)
 
 
 @dataclass(frozen=True)
@@ -123,7 +190,7 @@ class Hit:
     """What the search found."""
 
     t: Tensor  # (N,) in units of |d|
-    prim: Tensor  # (N,) int64, -1 for a miss
+    prim: Tensor  # (N,) int64, -1 for a miss; of a copy beyond P, see Copies
     u: Tensor  # (N,)
     v: Tensor  # (N,)
     chance: Tensor | None = (
@@ -140,9 +207,12 @@ class Interaction:
     ns: Tensor  # (3, N) unit shading normal
     tangent: Tensor | None  # (3, N) along u, neither unit nor orthogonal; None where no frame needs it
     bitangent: Tensor | None  # (3, N) along v; None without bump maps
-    prim: Tensor  # (N,)
+    prim: Tensor  # (N,) below P: of a copy the triangle of its mesh
+    slot: Tensor  # (N,) row of what a copy has of its own; else prim
+    bound: Tensor | None  # (N,) in place of World.bound at prim; None where that holds everywhere
     u: Tensor  # (N,) of the primitive's own parametrization
     v: Tensor  # (N,)
+    own: Tensor | None  # (3, N) point of a quadric in its own space; None where there are none
 
 
 @dataclass(frozen=True)

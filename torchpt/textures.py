@@ -95,13 +95,13 @@ class Look:
 
 @dataclass(frozen=True)
 class Veils:
-    """Textures of opacity, by primitive: ``bias + factor * value``, and where that counts as 0 or 1.
+    """Textures of opacity, by primitive and copy: ``bias + factor * value``, and where that counts as 0 or 1.
 
     Attributes:
-        nodes: ``(P,)`` int64, -1 where there is none.
-        bias: ``(P,)``.
-        factor: ``(P,)``.
-        cutoff: ``(P,)``, -1 where there is none; None where there is none at all.
+        nodes: ``(P + I,)`` int64, -1 where there is none.
+        bias: ``(P + I,)``.
+        factor: ``(P + I,)``.
+        cutoff: ``(P + I,)``, -1 where there is none; None where there is none at all.
     """
 
     nodes: Tensor

@@ -14,10 +14,10 @@ from torchpt.accel.base import Accel, Hits, choose, operator
 from torchpt.accel.bounds import primitive_bounds
 from torchpt.accel.jit import launch, thread_count
 from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
-from torchpt.accel.tables import prepare
+from torchpt.accel.tables import inverses, prepare
 from torchpt.records import Geometry
 
-__all__ = ["Wide"]
+__all__ = ["Wide", "wide_tree"]
 
 _GRAIN = 512  # rays that repay another thread
 
@@ -42,12 +42,12 @@ class Wide(Accel):
         ids = keep.int().numpy()
         fourth = (geometry.p1 + geometry.p2) - geometry.p0
         corner = torch.cat([geometry.p0, geometry.p1, geometry.p2, fourth]).float().T.contiguous()
-        tree = _wide_tree(boxes, ids)
+        tree = wide_tree(boxes, ids)
         self.depth, self.nodes, self.sah_cost = tree.depth, len(tree.child) // WIDTH, tree.cost
         self.leaves = len(tree.ids) // WIDTH
         tris, full = _leaf_blocks(tree.ids, corner.numpy(), geometry.counts[0])
         arrays = (tree.boxes, tree.child, tris, tree.ids, full)
-        self.tensors = [*(torch.from_numpy(a) for a in arrays), corner, tables.rows]
+        self.tensors = [*(torch.from_numpy(a) for a in arrays), corner, tables.rows, inverses(geometry).T.contiguous()]
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
@@ -75,7 +75,7 @@ class _Built:
         self.boxes, self.child, self.ids, self.depth, self.cost = boxes, child, ids, depth, cost
 
 
-def _wide_tree(boxes: np.ndarray, ids: np.ndarray) -> _Built:
+def wide_tree(boxes: np.ndarray, ids: np.ndarray) -> _Built:
     """Builds over boxes ``(L, 6)``; ids come back as ``(leaves * 8,)``, padded with -1."""
     n = len(ids)
     if n == 0:
@@ -160,5 +160,5 @@ def _(o, d, t_max, tensors, counts, depth, threads):
 
 def _arguments(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> tuple:
     rays = tuple(x.contiguous().numpy() for x in (o, d, t_max))
-    first = (counts[0], counts[0] + counts[1], counts[0] + counts[1] + counts[2])
+    first = tuple(sum(counts[:k]) for k in range(1, len(counts)))
     return (*rays, tuple(x.numpy() for x in tensors), first, depth * (WIDTH - 1) + WIDTH + 1, 1)

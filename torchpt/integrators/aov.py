@@ -35,7 +35,7 @@ def first_hit(
         values: dict[str, Tensor] = {}
         if "albedo" in names:
             uv = surface_uv(world, at) if world.uvs is not None else None
-            parameters = parameters_at(world, model, take(world.material, at.prim), at, uv)
+            parameters = parameters_at(world, model, take(world.material, at.slot), at, uv)
             values["albedo"] = world.models[model].albedo(parameters)
         if "normal" in names:
             values["normal"] = shading_normal(world, model, take(state.d, index), at)
@@ -46,7 +46,7 @@ def first_hit(
         if "position" in names:
             values["position"] = at.p + centre.to(dtype)[:, None]
         if "object_id" in names:
-            values["object_id"] = take(world.object_id, at.prim).to(dtype)[None]
+            values["object_id"] = take(world.object_id, at.slot).to(dtype)[None]
         for name, value in values.items():
             layers[name].scatter_(1, index.expand(len(value), -1), value)
     return layers

@@ -57,7 +57,7 @@ class Search:
         assert self._world.opacity is not None
         missed = hit.prim < 0
         there = replace(hit, prim=hit.prim.clamp_min(0), t=torch.where(missed, 0.0, hit.t))
-        opacity = take(self._world.opacity, there.prim)
+        opacity = take(self._world.opacity, self._world.slot(there.prim))
         if self._world.veils is not None:
             opacity = opacity * self._veil(self._world.veils, o, d, there)
         return torch.where(missed, miss, opacity)
@@ -65,12 +65,13 @@ class Search:
     def _veil(self, veils: Veils, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
         """What textures make of the opacity ``(N,)`` at hits, none of them a miss."""
         assert self._world.textures is not None
-        node = take(veils.nodes, hit.prim)
+        slot = self._world.slot(hit.prim)
+        node = take(veils.nodes, slot)
         uv = surface_uv(self._world, interact(self._world, o, d, hit))
         value = look_up(self._world.textures, node.clamp_min(0), uv, False)
-        value = torch.addcmul(take(veils.bias, hit.prim), take(veils.factor, hit.prim), value)
+        value = torch.addcmul(take(veils.bias, slot), take(veils.factor, slot), value)
         if veils.cutoff is not None:
-            cutoff = take(veils.cutoff, hit.prim)
+            cutoff = take(veils.cutoff, slot)
             value = torch.where(cutoff < 0, value, (value >= cutoff).to(value.dtype))
         return torch.where(node < 0, 1.0, value)
 

@@ -57,7 +57,7 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction) -> Surface
         d: directions ``(3, N)`` of the rays that came.
         at: the points.
     """
-    model, row = world.models[number], take(world.material, at.prim)
+    model, row = world.models[number], take(world.material, at.slot)
     look = world.looks[number]
     uv = None if look is None or world.uvs is None else surface_uv(world, at)
     ns, side, shown, relief = at.ns, None, None, None
@@ -111,7 +111,7 @@ def shading_normal(world: World, number: int, d: Tensor, at: Interaction) -> Ten
     look = world.looks[number]
     if look is None or (look.normal is None and look.bump is None):
         return at.ns
-    uv, row = surface_uv(world, at), take(world.material, at.prim)
+    uv, row = surface_uv(world, at), take(world.material, at.slot)
     side = torch.copysign(torch.ones_like(d[0]), -dot(d, at.ns))
     return _mapped(world, look, row, uv, d, at, side)[0].n * side
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchpt.errors import AssetError, SceneError
-from torchpt.math.transforms import similarity_scale
+from torchpt.math.transforms import is_singular, similarity_scale
 from torchpt.records import KINDS
 from torchpt.scene.description import Description
 from torchpt.scene.displacement import displaced
 from torchpt.scene.loaders import FileMaterial, MeshPart, load_mesh, unit_cube
 from torchpt.scene.materials import MATERIALS, Diffuse, check_material, read_material, slot_of
-from torchpt.scene.parts import MaterialSlot, Part
-from torchpt.scene.schema import Cube, Disk, Displacement, Mesh, Rectangle, Shape, Sphere
+from torchpt.scene.parts import Copy, MaterialSlot, Part
+from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
 from torchpt.scene.texels import Opener
 
 __all__ = ["Built", "build_parts"]
@@ -32,12 +32,14 @@ class Built:
         parameters: arrays by dotted name, float64.
         centre: ``(3,)`` float64, subtracted from all positions.
         environment: dotted name of the constant environment's radiance, or None.
+        copies: instances of parts.
     """
 
     parts: tuple[Part, ...]
     parameters: dict[str, np.ndarray]
     centre: np.ndarray
     environment: str | None
+    copies: tuple[Copy, ...] = ()
 
 
 def build_parts(description: Description) -> Built:
@@ -51,7 +53,12 @@ def build_parts(description: Description) -> Built:
     parts: list[Part] = []
     opener = Opener(description.textures, description.resolve, parameters, description.file)
     for number, (name, shape) in enumerate(description.shapes.items(), 1):
-        parts += _shape_parts(description, name, shape, number, parameters, opener)
+        if not isinstance(shape, Instance):
+            parts += _shape_parts(description, name, shape, number, parameters, opener)
+    copies: list[Copy] = []
+    for number, (name, shape) in enumerate(description.shapes.items(), 1):
+        if isinstance(shape, Instance):
+            copies += _copies(description, name, shape, number, parts, parameters, opener)
     for name, material in description.materials.items():
         _declare(slot_of(material, f"materials.{name}", description.materials, opener), parameters)
     if len(description.lights) > 1:
@@ -64,7 +71,41 @@ def build_parts(description: Description) -> Built:
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
     parameters["camera.fov"] = np.asarray(description.camera.fov, np.float64)
     parts.sort(key=lambda part: KINDS.index(part.kind))
-    return Built(tuple(parts), parameters, _centre(parts), environment)
+    return Built(tuple(parts), parameters, _centre(parts, copies), environment, tuple(copies))
+
+
+def _copies(
+    description: Description,
+    name: str,
+    shape: Instance,
+    number: int,
+    parts: list[Part],
+    parameters: dict[str, np.ndarray],
+    opener: Opener,
+) -> list[Copy]:
+    """An instance, as one copy of each part of its mesh."""
+    key, file = f"shapes.{name}", description.file
+    mesh = description.shapes.get(shape.of)
+    if not isinstance(mesh, Mesh | Cube):
+        names = [other for other, value in description.shapes.items() if isinstance(value, Mesh | Cube)]
+        known = f" ({', '.join(names[:8])}{', ...' if len(names) > 8 else ''})" if names else " (there is none)"
+        raise SceneError(f"{key}.of", shape.of, f"the name of a mesh among the shapes{known}", file)
+    parameters[f"{key}.to_world"] = shape.to_world()
+    found = []
+    for part in (part for part in parts if part.shape == shape.of):
+        slot = part.material
+        if isinstance(shape.material, str):
+            slot = slot_of(
+                description.materials[shape.material], f"materials.{shape.material}", description.materials, opener
+            )
+        elif shape.material is not None:
+            slot = slot_of(shape.material, f"{key}.material", description.materials, opener)
+        if slot.emission is not None:
+            raise SceneError(f"{key}.material", slot.name, "a material that does not emit: an instance cannot", file)
+        _declare(slot, parameters)
+        flip = shape.flip_normals != part.flip
+        found.append(Copy(key, name, number, part.name, slot, flip, parameters[f"{key}.to_world"]))
+    return found
 
 
 def _declare(slot: MaterialSlot, parameters: dict[str, np.ndarray]) -> None:
@@ -77,17 +118,22 @@ def _shape_parts(
     prefix = f"shapes.{name}"
     pose = shape.to_world()
     if not isinstance(shape, Mesh | Cube):
-        kind = {Sphere: "sphere", Rectangle: "rectangle", Disk: "disk"}[type(shape)]
-        if isinstance(shape, Sphere):
-            pose = pose @ np.array(
-                [[shape.radius, 0, 0, shape.center[0]], [0, shape.radius, 0, shape.center[1]],
-                 [0, 0, shape.radius, shape.center[2]], [0, 0, 0, 1]]
-            )  # fmt: skip
-            if similarity_scale(pose) is None:
-                raise SceneError(f"{prefix}.transform", pose.tolist(), "a transform of uniform scale", description.file)
+        if isinstance(shape, Sphere | Cylinder | Cone):
+            with np.errstate(over="ignore", invalid="ignore"):
+                pose = pose @ shape.own()
+            if is_singular(pose):
+                raise SceneError(
+                    prefix, pose.tolist(), "a shape whose sizes differ by less than 1e12", description.file
+                )
         parameters[f"{prefix}.to_world"] = pose
         slot = _slot(description, shape, prefix, opener)
-        return [_part(shape, prefix, name, number, kind, pose, None, parameters, slot)]
+        return [
+            _part(
+                shape, prefix, name, number, kind, pose if local is None else pose @ local, None, parameters, slot,
+                local=local, quadric=quadric, label=label,
+            )
+            for kind, quadric, local, label in _surfaces(shape, pose)
+        ]  # fmt: skip
     if isinstance(shape, Cube):
         pieces, source, flat = [unit_cube()], "", True
     elif shape.path is None:
@@ -145,6 +191,24 @@ def _displaced(piece: MeshPart, wish: Displacement, prefix: str, opener: Opener,
     return displaced(piece, lambda uvs: wish.scale * heights(uvs), wish.subdivisions)
 
 
+#: From the unit disk to the caps of a cylinder's and a cone's own space, facing outward.
+_TOP = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
+_BOTTOM = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _surfaces(shape: Shape, pose: np.ndarray) -> list[tuple[str, str, np.ndarray | None, str]]:
+    """The primitives of an analytic shape: kind, quadric, placement before the shape's own, and name within the shape."""
+    if isinstance(shape, Sphere):
+        return (
+            [("sphere", "", None, "")] if similarity_scale(pose) is not None else [("quadric", "ellipsoid", None, "")]
+        )
+    if not isinstance(shape, Cylinder | Cone):
+        return [({Rectangle: "rectangle", Disk: "disk"}[type(shape)], "", None, "")]
+    caps = {"bottom": _BOTTOM} if isinstance(shape, Cone) else {"bottom": _BOTTOM, "top": _TOP}
+    side = [("quadric", shape.type, None, "side" if shape.capped else "")]
+    return side + ([("disk", "", local, name) for name, local in caps.items()] if shape.capped else [])
+
+
 def _labels(names: list[str]) -> list[str]:
     """Distinct labels without dots for the pieces of a mesh."""
     labels: list[str] = []
@@ -199,6 +263,9 @@ def _part(
     *,
     flat: bool = True,
     source: str = "",
+    local: np.ndarray | None = None,
+    quadric: str = "",
+    label: str = "",
 ) -> Part:
     _declare(slot, parameters)
     emission, names = shape.emission, (f"shapes.{name}.emission",)
@@ -217,6 +284,9 @@ def _part(
         emission_names=names if emission is not None else (),
         flip=shape.flip_normals,
         to_world=pose,
+        local=local,
+        quadric=quadric,
+        piece=label,
         vertices=None if piece is None else piece.vertices,
         faces=faces,
         normals=None if piece is None or flat else piece.normals,
@@ -248,15 +318,23 @@ def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
     return np.ascontiguousarray(piece.faces[solid]), int((~solid).sum())
 
 
-def _centre(parts: list[Part]) -> np.ndarray:
+def _centre(parts: list[Part], copies: list[Copy]) -> np.ndarray:
     """Where the origin goes: the middle of a scene that lies far off, else where it is."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    boxes: dict[str, np.ndarray] = {}
+    placed = []
     for part in parts:
+        points = corners
         if part.vertices is not None and part.faces is not None:
             points = part.vertices[part.faces.reshape(-1)]  # vertices of no face have no say
-        else:
-            points = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        world = points @ part.to_world[:3, :3].T + part.to_world[:3, 3]
+            if len(points):
+                half, middle = 0.5 * np.ptp(points, axis=0), 0.5 * (points.max(0) + points.min(0))
+                boxes[part.name] = middle + corners * half
+        placed.append((points, part.to_world))
+    placed += [(boxes[copy.of], copy.to_world) for copy in copies if copy.of in boxes]
+    for points, to_world in placed:
+        world = points @ to_world[:3, :3].T + to_world[:3, 3]
         if len(world):
             low, high = np.minimum(low, world.min(0)), np.maximum(high, world.max(0))
     if not np.isfinite(low).all():

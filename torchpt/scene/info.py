@@ -22,7 +22,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     shapes: dict[str, Any] = {}
     for part in built.parts:
         count = len(part.faces) if part.faces is not None else 1
-        row: dict[str, Any] = {"kind": part.kind, "primitives": count, "material": part.material.name}
+        row: dict[str, Any] = {"kind": part.quadric or part.kind, "primitives": count, "material": part.material.name}
         if part.emission is not None:
             row["emission"] = list(part.emission)
         if part.source:
@@ -35,7 +35,13 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
             row["normals"] = (
                 "face" if not part.smooth else "computed, smooth" if part.normals is None else "from the file"
             )
-        shapes[part.name.removeprefix("shapes.")] = row
+        shapes[part.name.removeprefix("shapes.") + (f".{part.piece}" if part.piece else "")] = row
+    for copy in built.copies:
+        shapes[copy.name.removeprefix("shapes.")] = {
+            "kind": "instance",
+            "of": copy.of.removeprefix("shapes."),
+            "material": copy.material.name,
+        }
     memory = sum(x.numel() * x.element_size() for x in tensors_of(world))
     made: dict[str, Any] = {
         "accel": accel.describe(),
@@ -52,6 +58,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "scene": {
             "file": description.file,
             "primitives": {kind: n for kind, n in zip(KINDS, world.counts, strict=True) if n},
+            **({"instances": len(built.copies)} if built.copies else {}),
             "parameters": len(built.parameters),
         },
         "shapes": shapes,
@@ -81,6 +88,8 @@ def _left_out(world: World, settings: Settings) -> list[str]:
         absent.append("refraction (no index along paths)")
     if not any(model.lobed for model in world.models):
         absent.append("choice among lobes")
+    if world.copies is None:
+        absent.append("instances")
     if lights is None:
         absent.append("light sampling and MIS (nothing emits)")
     else:

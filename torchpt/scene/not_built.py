@@ -9,7 +9,6 @@ from __future__ import annotations
 __all__ = ["AOVS", "KEYS", "TYPES"]
 
 _POSE = ("origin", "target", "up", "to_world")
-_SHAPE = ("material", "transform", "emission", "flip_normals")
 
 #: kind of thing -> its types that are not built -> the keys each of them takes beside ``type``.
 TYPES: dict[str, dict[str, tuple[str, ...]]] = {
@@ -22,11 +21,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
     "integrator": {
         "ibl": ("strict",),
         "bdpt": ("max_depth", "rr_depth", "rr_prob", "clamp", "strict"),
-    },
-    "shape": {
-        "cylinder": ("center", "radius", "height", "capped", *_SHAPE),
-        "cone": ("apex", "height", "slope", "capped", *_SHAPE),
-        "instance": ("of", *_SHAPE),
     },
     "light": {
         "envmap": ("path", "scale", "transform"),

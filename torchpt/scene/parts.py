@@ -9,7 +9,7 @@ import numpy as np
 from torchpt.bsdfs import Bsdf
 from torchpt.textures import Node
 
-__all__ = ["MaterialSlot", "Part", "Reading", "Value", "VertexColors"]
+__all__ = ["Copy", "MaterialSlot", "Part", "Reading", "Value", "VertexColors"]
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,9 @@ class Part:
         emission_names: dotted names of that radiance and, where it has one, of its strength.
         flip: whether the normals are turned around.
         to_world: ``(4, 4)`` float64.
+        local: ``(4, 4)`` float64 applied before the parameter ``to_world``, or None; where several parts share that.
+        quadric: which of ``records.QUADRICS``, or "".
+        piece: its name within its shape, where the shape has several under one name.
         vertices: ``(V, 3)`` float64 in the file's own space; None for analytic shapes.
         faces: ``(F, 3)`` int64.
         normals: ``(V, 3)`` from the file, or None.
@@ -111,6 +114,9 @@ class Part:
     emission_names: tuple[str, ...]
     flip: bool
     to_world: np.ndarray
+    local: np.ndarray | None = None
+    quadric: str = ""
+    piece: str = ""
     vertices: np.ndarray | None = None
     faces: np.ndarray | None = None
     normals: np.ndarray | None = None
@@ -120,3 +126,26 @@ class Part:
     dropped: int = 0
     source: str = ""
     ignored: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Copy:
+    """An instance of one part of a mesh, whose triangles it shares.
+
+    Attributes:
+        name: dotted prefix of its parameters, e.g. ``shapes.third_bunny``.
+        shape: name of the instance in the scene.
+        object_id: order of the instance in the scene, from 1.
+        of: the part's name.
+        material: its material.
+        flip: whether the normals are turned around, compared with the part's.
+        to_world: ``(4, 4)`` float64, in place of the part's own.
+    """
+
+    name: str
+    shape: str
+    object_id: int
+    of: str
+    material: MaterialSlot
+    flip: bool
+    to_world: np.ndarray
