@@ -24,7 +24,7 @@ from torchpt.records import Geometry
 def mesh_geometry(vertices: np.ndarray, faces: np.ndarray) -> Geometry:
     """Triangles of a mesh, ``(V, 3)`` and ``(F, 3)``."""
     corners = [torch.from_numpy(np.ascontiguousarray(vertices[faces[:, k]].T, np.float32)) for k in range(3)]
-    return Geometry(corners[0], corners[1], corners[2], (len(faces), 0, 0, 0))
+    return Geometry(corners[0], corners[1], corners[2], (len(faces), 0, 0, 0, 0))
 
 
 def box() -> Geometry:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "KINDS",
+    "QUADRICS",
     "BsdfSample",
     "Geometry",
     "Hit",
@@ -26,6 +27,7 @@ __all__ = [
     "LightSample",
     "Lights",
     "PathState",
+    "Quadrics",
     "Shadow",
     "World",
     "joined",
@@ -34,7 +36,9 @@ __all__ = [
 ]
 
 #: Primitive kinds in the order in which a :class:`Geometry` stores them.
-KINDS = ("triangle", "rectangle", "disk", "sphere")
+KINDS = ("triangle", "rectangle", "disk", "sphere", "quadric")
+#: Surfaces of a quadric in its own space, in the order of their codes (:mod:`torchpt.shapes.quadrics`).
+QUADRICS = ("ellipsoid", "cylinder", "cone")
 
 
 @dataclass(frozen=True)
@@ -43,24 +47,39 @@ class Geometry:
 
     A planar primitive is the affine map ``p = p0 + u (p1 - p0) + v (p2 - p0)``: a triangle holds ``u, v >= 0, u + v <= 1``,
     a rectangle (parallelogram) ``0 <= u, v <= 1``, a disk (ellipse) ``u^2 + v^2 <= 1`` about its centre ``p0``.
-    A sphere has its centre in ``p0`` and its radius in ``p1[0]``.
+    A sphere has its centre in ``p0`` and its radius in ``p1[0]``. A quadric is a surface of :data:`QUADRICS` in its own space
+    under the affine map ``p = p0 + x e1 + y e2 + z e3``, kept in float64 beside the others.
 
     Attributes:
         p0: ``(3, P)``.
-        p1: ``(3, P)``.
-        p2: ``(3, P)``.
-        counts: how many triangles, rectangles, disks and spheres; stored in that order.
+        p1: ``(3, P)``; of a quadric its ``e1``.
+        p2: ``(3, P)``; of a quadric its ``e2``.
+        counts: how many primitives of each of :data:`KINDS`; stored in that order.
+        quadrics: ``(13, Q)`` float64: ``p0 e1 e2 e3`` and the code of the surface; None where there are none.
     """
 
     p0: Tensor
     p1: Tensor
     p2: Tensor
-    counts: tuple[int, int, int, int]
+    counts: tuple[int, int, int, int, int]
+    quadrics: Tensor | None = None
 
     @property
     def size(self) -> int:
         """Number of primitives P."""
         return sum(self.counts)
+
+
+@dataclass(frozen=True)
+class Quadrics:
+    """What lanes gather of a quadric beside ``World.p0, e1, e2``: one column a quadric."""
+
+    code: Tensor  # (Q,) int64 index into QUADRICS
+    e3: Tensor  # (3, Q)
+    n1: Tensor  # (3, Q) columns of the cofactor matrix of (e1, e2, e3), turned to the front; their common scale is free
+    n2: Tensor  # (3, Q)
+    n3: Tensor  # (3, Q)
+    reach: Tensor  # (3, Q) largest coordinate magnitudes that enter a point's sum, see World.bound
 
 
 @dataclass(frozen=True)
@@ -75,23 +94,27 @@ class Lights:
     e2: Tensor  # (3, K)
     normal: Tensor  # (3, K) unit, the side that emits
     flip: Tensor  # (K,) -1 where a sphere emits inward
-    area: Tensor  # (K,)
+    area: Tensor  # (K,); of a quadric its own space's area times |det|, see torchpt.lights.quadric
     bound: Tensor  # (K,) see World.bound
     radiance: Tensor  # (3, K)
     opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
     environment: Tensor | None  # (3,) radiance that comes from outside
     row_of_prim: Tensor | None  # (P,) int64, -1 where a primitive does not emit; None where none does
+    quadric: Tensor | None = (
+        None  # (K,) int64 column of World.quadrics, 0 for the other kinds; None where no quadric emits
+    )
+    quadrics: Quadrics | None = None  # World.quadrics where a quadric emits
 
 
 @dataclass(frozen=True)
 class World:
     """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``."""
 
-    counts: tuple[int, int, int, int]  # as in Geometry
+    counts: tuple[int, int, int, int, int]  # as in Geometry
     p0: Tensor  # (3, P)
     e1: Tensor  # (3, P)
     e2: Tensor  # (3, P)
-    normal: Tensor  # (3, P) unit geometric normal; zero for spheres
+    normal: Tensor  # (3, P) unit geometric normal; zero for spheres, without meaning for quadrics
     bound: Tensor  # (P,) sum |n_i| max |p_i| over the primitive: scales the rounding of its plane
     flip: Tensor | None  # (P,) orientation of spheres
     normals: tuple[Tensor, Tensor, Tensor] | None  # (3, P) shading normals at the corners, where any are smooth
@@ -104,6 +127,7 @@ class World:
     two_sided: tuple[Tensor | None, ...]  # (M,) bool for the rows of each model; None where all are
     object_id: Tensor  # (P,) int64, order of the shape in the scene
     lights: Lights | None  # None where nothing emits
+    quadrics: Quadrics | None = None  # None where there are none
 
 
 @dataclass(frozen=True)

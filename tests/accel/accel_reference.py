@@ -9,7 +9,8 @@ from torchpt.records import Geometry
 def geometry(p0, p1, p2, counts):
     """A Geometry from (P, 3) arrays."""
     a, b, c = (torch.tensor(np.asarray(p, np.float32).reshape(-1, 3).T.copy()) for p in (p0, p1, p2))
-    return Geometry(a, b, c, counts)
+    n = [*counts, 0][:5]
+    return Geometry(a, b, c, (n[0], n[1], n[2], n[3], n[4]))
 
 
 def triangles(vertices, faces):
@@ -63,7 +64,7 @@ def search(g, o, d, t_max):
     """Every ray against every primitive in float64: t, prim, margin (how far the decision was from an edge)."""
     p0, p1, p2 = (p.double().numpy() for p in (g.p0, g.p1, g.p2))
     o, d, t_max = o.double().numpy(), d.double().numpy(), t_max.double().numpy()
-    n_tri, n_rect, n_disk, _ = g.counts
+    n_tri, n_rect, n_disk, *_ = g.counts
     best, prim, margin = t_max.copy(), np.full(o.shape[1], -1), np.full(o.shape[1], np.inf)
     with np.errstate(all="ignore"):
         for k in range(g.size):

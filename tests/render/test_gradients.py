@@ -78,6 +78,20 @@ def test_gradcheck_geometry(name):
     assert checked(scene, (name,), integrator={"type": "direct", "strategy": "light"})
 
 
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "cone"])
+def test_gradcheck_quadrics(kind):
+    # As a light over the floor, and as what the camera sees of it; wide open, so that nothing is hidden or seen edge-on.
+    shape = {"type": kind, "emission": [5, 4, 3], "flip_normals": True}
+    shape |= {"capped": False} if kind != "sphere" else {}
+    place = [
+        {"scale": [4, 5, 6]},
+        {"rotate": {"axis": [1, 0, 0], "angle": 10}},
+        {"translate": [0.2, 3 if kind == "cone" else 0, 0.1]},
+    ]
+    scene = torchpt.load({**ROOM, "shapes": {**only("floor")["shapes"], "bowl": {**shape, "transform": place}}}, "cpu")
+    assert checked(scene, ("shapes.bowl.to_world",), integrator={"type": "direct", "strategy": "light"})
+
+
 def test_gradcheck_smooth_normals():
     bent = {
         **ROOM["shapes"]["floor"],

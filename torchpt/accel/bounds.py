@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.records import Geometry
+from torchpt.records import QUADRICS, Geometry
 
 __all__ = ["primitive_bounds", "surface"]
 
@@ -16,25 +16,37 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     The margin (relative to coordinates and size) keeps rays that run exactly within a face of a box, and hits that a
     leaf test accepts by rounding, inside it.
 
-    A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse reaches ``sqrt(e1^2 + e2^2)`` from
-    its centre on each axis.
+    A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse reaches ``sqrt(e1^2 + e2^2)`` from its centre on each axis,
+    an ellipsoid ``sqrt(e1^2 + e2^2 + e3^2)``; a cylinder is the hull of two ellipses, a cone that of one and its apex.
     """
     p0, p1, p2 = geometry.p0.double(), geometry.p1.double(), geometry.p2.double()
-    n_tri, n_rect, n_disk, _ = geometry.counts
+    n_tri, n_rect, n_disk, n_ball, _ = geometry.counts
     low, high = torch.minimum(torch.minimum(p0, p1), p2), torch.maximum(torch.maximum(p0, p1), p2)
-    a, b, c = n_tri, n_tri + n_rect, n_tri + n_rect + n_disk
+    a, b, c, q = n_tri, n_tri + n_rect, n_tri + n_rect + n_disk, n_tri + n_rect + n_disk + n_ball
     # the float32 sum is the corner that the searches see
     fourth = ((geometry.p1 + geometry.p2) - geometry.p0)[:, a:b].double()
     low[:, a:b], high[:, a:b] = torch.minimum(low[:, a:b], fourth), torch.maximum(high[:, a:b], fourth)
     reach = ((p1 - p0)[:, b:c].square() + (p2 - p0)[:, b:c].square()).sqrt()
-    reach = torch.cat([reach, p1[:1, c:].abs().expand(3, -1)], 1)
-    low[:, b:], high[:, b:] = p0[:, b:] - reach, p0[:, b:] + reach
+    reach = torch.cat([reach, p1[:1, c:q].abs().expand(3, -1)], 1)
+    low[:, b:q], high[:, b:q] = p0[:, b:q] - reach, p0[:, b:q] + reach
+    if geometry.quadrics is not None:
+        low[:, q:], high[:, q:] = _quadric_bounds(geometry.quadrics)
     margin = 2.0**-22 * (torch.maximum(low.abs(), high.abs()) + (high - low).amax(0))
     low, high = low - margin, high + margin
     down, up = low.float(), high.float()
     down = torch.where(down.double() > low, torch.nextafter(down, torch.full_like(down, -torch.inf)), down)
     up = torch.where(up.double() < high, torch.nextafter(up, torch.full_like(up, torch.inf)), up)
     return down.contiguous(), up.contiguous()
+
+
+def _quadric_bounds(table: Tensor) -> tuple[Tensor, Tensor]:
+    centre, e1, e2, e3, code = table[0:3], table[3:6], table[6:9], table[9:12], table[12]
+    ball, cone = code == QUADRICS.index("ellipsoid"), code == QUADRICS.index("cone")
+    ring = e1.square() + e2.square()
+    reach = torch.where(ball, ring + e3.square(), ring).sqrt()
+    far = torch.where(ball, 0.0, e3)  # where the other end lies
+    end = torch.where(cone, 0.0, reach)
+    return torch.minimum(-reach, far - end) + centre, torch.maximum(reach, far + end) + centre
 
 
 def surface(low: Tensor, high: Tensor) -> Tensor:

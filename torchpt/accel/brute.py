@@ -17,7 +17,7 @@ from torch import Tensor
 from torchpt.accel import kernels_brute as kernels
 from torchpt.accel.base import Accel, Hits, choose, operator
 from torchpt.accel.jit import launch, thread_count
-from torchpt.accel.tables import extent, prepare, tolerances
+from torchpt.accel.tables import extent, inverses, prepare, tolerances
 from torchpt.errors import SceneError
 from torchpt.records import Geometry
 
@@ -54,11 +54,12 @@ class Brute(Accel):
         if not eligible(geometry):
             raise SceneError("render.accel", "brute", "numba or torch (this scene's scales are too mixed for brute)")
         size, tables = extent(geometry), prepare(geometry)
-        planar = geometry.size - geometry.counts[3]
+        planar, round_ = sum(geometry.counts[:3]), sum(geometry.counts[:4])
         table = torch.cat([tables.rows64, tolerances(tables.rows64, size)[:, None]], 1)[:planar]
         self.table = table.float().contiguous()
-        balls = torch.cat([geometry.p0[:, planar:], geometry.p1[:1, planar:]]).T.double()
-        self.spheres = torch.where(tables.area[planar:, None], balls, torch.nan).contiguous()
+        balls = torch.cat([geometry.p0, geometry.p1[:1]])[:, planar:round_].T.double()
+        self.spheres = torch.where(tables.area[planar:round_, None], balls, torch.nan).contiguous()
+        self.quadrics = inverses(geometry).T.contiguous()
         self.counts = list(geometry.counts)
         self.extent = size
         self.threads = thread_count(threads)
@@ -66,12 +67,12 @@ class Brute(Accel):
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
         return choose(_intersect, _intersect_operator)(
-            o, d, t_max, self.table, self.spheres, self.counts, self.extent, self.threads
+            o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, self.threads
         )
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
         return choose(_occluded, _occluded_operator)(
-            o, d, t_max, self.table, self.spheres, self.counts, self.extent, self.threads
+            o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, self.threads
         )
 
     def describe(self) -> dict[str, Any]:
@@ -84,17 +85,25 @@ class Brute(Accel):
             "leaves": 0,
             "sah_cost": float(primitives),
             "depth": 0,
-            "bytes": self.table.nbytes + self.spheres.nbytes,
+            "bytes": self.table.nbytes + self.spheres.nbytes + self.quadrics.nbytes,
             "build_seconds": self.build_seconds,
         }
 
 
 def _intersect(
-    o: Tensor, d: Tensor, t_max: Tensor, table: Tensor, spheres: Tensor, counts: list[int], extent: float, threads: int
+    o: Tensor,
+    d: Tensor,
+    t_max: Tensor,
+    table: Tensor,
+    spheres: Tensor,
+    quadrics: Tensor,
+    counts: list[int],
+    extent: float,
+    threads: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     t, prim, u, v = (torch.empty_like(t_max) for _ in range(4))
     prim = torch.empty_like(t_max, dtype=torch.int32)
-    args = _arguments(o, d, t_max, table, spheres, counts, extent)
+    args = _arguments(o, d, t_max, table, spheres, quadrics, counts, extent)
     blocks = -(-t_max.shape[0] // kernels.BLOCK)
     launch(
         kernels.intersect,
@@ -111,16 +120,24 @@ _intersect_operator = operator("torchpt::brute_intersect", _intersect)
 
 
 @_intersect_operator.register_fake
-def _(o, d, t_max, table, spheres, counts, extent, threads):
+def _(o, d, t_max, table, spheres, quadrics, counts, extent, threads):
     like = torch.empty_like
     return like(t_max), like(t_max, dtype=torch.int32), like(t_max), like(t_max)
 
 
 def _occluded(
-    o: Tensor, d: Tensor, t_max: Tensor, table: Tensor, spheres: Tensor, counts: list[int], extent: float, threads: int
+    o: Tensor,
+    d: Tensor,
+    t_max: Tensor,
+    table: Tensor,
+    spheres: Tensor,
+    quadrics: Tensor,
+    counts: list[int],
+    extent: float,
+    threads: int,
 ) -> Tensor:
     blocked = torch.empty_like(t_max, dtype=torch.bool)
-    args = _arguments(o, d, t_max, table, spheres, counts, extent)
+    args = _arguments(o, d, t_max, table, spheres, quadrics, counts, extent)
     blocks = -(-t_max.shape[0] // kernels.BLOCK)
     launch(kernels.occluded, kernels.occluded_parallel, blocks, threads, _GRAIN, (*args, blocked.numpy()))
     return blocked
@@ -130,12 +147,28 @@ _occluded_operator = operator("torchpt::brute_occluded", _occluded)
 
 
 @_occluded_operator.register_fake
-def _(o, d, t_max, table, spheres, counts, extent, threads):
+def _(o, d, t_max, table, spheres, quadrics, counts, extent, threads):
     return torch.empty_like(t_max, dtype=torch.bool)
 
 
 def _arguments(
-    o: Tensor, d: Tensor, t_max: Tensor, table: Tensor, spheres: Tensor, counts: list[int], extent: float
+    o: Tensor,
+    d: Tensor,
+    t_max: Tensor,
+    table: Tensor,
+    spheres: Tensor,
+    quadrics: Tensor,
+    counts: list[int],
+    extent: float,
 ) -> tuple:
     rays = tuple(x.contiguous().numpy() for x in (o, d, t_max))
-    return (*rays, table.numpy(), spheres.numpy(), counts[0], counts[1], counts[2], np.float32(extent))
+    return (
+        *rays,
+        table.numpy(),
+        spheres.numpy(),
+        quadrics.numpy(),
+        counts[0],
+        counts[1],
+        counts[2],
+        np.float32(extent),
+    )

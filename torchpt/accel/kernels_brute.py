@@ -8,6 +8,7 @@ import numpy as np
 from numba import prange
 
 from torchpt.accel.jit import jit
+from torchpt.accel.kernels_quadric import quadric_hit
 from torchpt.accel.kernels_sphere import sphere_distance
 
 __all__ = ["BLOCK", "intersect", "intersect_parallel", "occluded", "occluded_parallel"]
@@ -124,6 +125,21 @@ def _sphere(ball, prim, w):
         _keep((t > _ZERO) & (t < w[_T + i]), t, prim, w, i)
 
 
+@jit()
+def _bent(quadrics, k, w, i):
+    """``t, u, v`` of ray i at a quadric."""
+    ox, oy, oz, dx, dy, dz = w[_OX + i], w[_OY + i], w[_OZ + i], w[_DX + i], w[_DY + i], w[_DZ + i]
+    return quadric_hit(quadrics, k, ox, oy, oz, dx, dy, dz)
+
+
+@jit()
+def _quadric(quadrics, k, prim, w):
+    for i in range(BLOCK):
+        if w[_T + i] > _ZERO:
+            t, _, _ = _bent(quadrics, k, w, i)
+            _keep((t > _ZERO) & (t < w[_T + i]), t, prim, w, i)
+
+
 @jit(fastmath=_FAST)
 def _shade_triangle(row, w):
     r = _unpack(row)
@@ -153,6 +169,14 @@ def _shade_sphere(ball, w):
     for i in range(BLOCK):
         t = _ball(ball, w, i)
         w[_T + i] = _DEAD if (t > _ZERO) & (t < w[_T + i]) else w[_T + i]
+
+
+@jit()
+def _shade_quadric(quadrics, k, w):
+    for i in range(BLOCK):
+        if w[_T + i] > _ZERO:
+            t, _, _ = _bent(quadrics, k, w, i)
+            w[_T + i] = _DEAD if (t > _ZERO) & (t < w[_T + i]) else w[_T + i]
 
 
 @jit()
@@ -195,7 +219,16 @@ def _store(block, table, triangles, rectangles, w, t, prim, u, v):
 
 
 @jit()
-def intersect(first, last, o, d, t_max, table, balls, triangles, rectangles, disks, extent, t, prim, u, v):
+def _store_quadrics(block, quadrics, first, w, prim, u, v):
+    """Writes the parameters of a block's hits on quadrics, which come with the distance."""
+    start = block * BLOCK
+    for i in range(min(BLOCK, prim.shape[0] - start)):
+        if prim[start + i] >= first:
+            _, u[start + i], v[start + i] = _bent(quadrics, prim[start + i] - first, w, i)
+
+
+@jit()
+def intersect(first, last, o, d, t_max, table, balls, quadrics, triangles, rectangles, disks, extent, t, prim, u, v):
     """Nearest hits of the blocks ``first <= b < last``; ascending ids and a strict comparison settle ties."""
     w = np.empty(9 * BLOCK, np.float32)
     for block in range(first, last):
@@ -209,19 +242,25 @@ def intersect(first, last, o, d, t_max, table, balls, triangles, rectangles, dis
                 _disk(table[p], np.float32(p), w)
             for p in range(balls.shape[0]):
                 _sphere(balls[p], np.float32(p + table.shape[0]), w)
+            for p in range(quadrics.shape[0]):
+                _quadric(quadrics, p, np.float32(p + table.shape[0] + balls.shape[0]), w)
         _store(block, table, triangles, rectangles, w, t, prim, u, v)
+        if quadrics.shape[0] > 0:
+            _store_quadrics(block, quadrics, table.shape[0] + balls.shape[0], w, prim, u, v)
 
 
 @jit(parallel=True)
-def intersect_parallel(chunks, items, o, d, t_max, table, balls, triangles, rectangles, disks, extent, t, prim, u, v):
+def intersect_parallel(
+    chunks, items, o, d, t_max, table, balls, quadrics, triangles, rectangles, disks, extent, t, prim, u, v
+):
     """:func:`intersect` over equal chunks of the blocks, one a thread."""
     for c in prange(chunks):
         a, b = c * items // chunks, (c + 1) * items // chunks
-        intersect(a, b, o, d, t_max, table, balls, triangles, rectangles, disks, extent, t, prim, u, v)
+        intersect(a, b, o, d, t_max, table, balls, quadrics, triangles, rectangles, disks, extent, t, prim, u, v)
 
 
 @jit()
-def _shade(table, balls, triangles, rectangles, w):
+def _shade(table, balls, quadrics, triangles, rectangles, w):
     """Marks the blocked rays of a block as dead; stops once none is left."""
     for p in range(table.shape[0]):
         if p < triangles:
@@ -234,10 +273,12 @@ def _shade(table, balls, triangles, rectangles, w):
             return
     for p in range(balls.shape[0]):
         _shade_sphere(balls[p], w)
+    for p in range(quadrics.shape[0]):
+        _shade_quadric(quadrics, p, w)
 
 
 @jit()
-def occluded(first, last, o, d, t_max, table, balls, triangles, rectangles, disks, extent, blocked):
+def occluded(first, last, o, d, t_max, table, balls, quadrics, triangles, rectangles, disks, extent, blocked):
     """Whether the rays of the blocks ``first <= b < last`` hit anything."""
     w = np.empty(9 * BLOCK, np.float32)
     alive = np.empty(BLOCK, np.bool_)
@@ -246,14 +287,16 @@ def occluded(first, last, o, d, t_max, table, balls, triangles, rectangles, disk
         for i in range(BLOCK):
             alive[i] = w[_T + i] > _ZERO
         if not _all_dead(w):
-            _shade(table, balls, triangles, rectangles, w)
+            _shade(table, balls, quadrics, triangles, rectangles, w)
         for i in range(min(BLOCK, t_max.shape[0] - block * BLOCK)):
             blocked[block * BLOCK + i] = alive[i] and w[_T + i] < _ZERO
 
 
 @jit(parallel=True)
-def occluded_parallel(chunks, items, o, d, t_max, table, balls, triangles, rectangles, disks, extent, blocked):
+def occluded_parallel(
+    chunks, items, o, d, t_max, table, balls, quadrics, triangles, rectangles, disks, extent, blocked
+):
     """:func:`occluded` over equal chunks of the blocks, one a thread."""
     for c in prange(chunks):
         a, b = c * items // chunks, (c + 1) * items // chunks
-        occluded(a, b, o, d, t_max, table, balls, triangles, rectangles, disks, extent, blocked)
+        occluded(a, b, o, d, t_max, table, balls, quadrics, triangles, rectangles, disks, extent, blocked)

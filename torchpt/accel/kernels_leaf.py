@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from torchpt.accel.jit import jit
+from torchpt.accel.kernels_quadric import quadric_hit
 from torchpt.accel.kernels_sphere import sphere_distance
 
 __all__ = ["distance", "setup"]
@@ -38,13 +39,15 @@ def _sheared(corner, prim, k, kx, ky, kz, px, py, pz, sx, sy, sz):
 
 
 @jit()
-def distance(prim, corner, rows, n1, n2, n3, o, d, kx, ky, kz, sx, sy, sz):
+def distance(prim, corner, rows, quadrics, n1, n2, n3, n4, o, d, kx, ky, kz, sx, sy, sz):
     """``t, u, v`` of ray ``o, d`` (tuples) at a primitive; ``t`` is NaN where it misses.
 
-    ``corner`` is ``(P, 12)``: p0, p1, p2 and a rectangle's fourth corner; ``n1, n2, n3`` are the ids of the first
-    rectangle, disk and sphere; the axes and the shear come from :func:`setup`.
+    ``corner`` is ``(P, 12)``: p0, p1, p2 and a rectangle's fourth corner; ``n1`` to ``n4`` are the ids of the
+    first rectangle, disk, sphere and quadric; the axes and the shear come from :func:`setup`.
     """
     if prim >= n3:
+        if prim >= n4:
+            return quadric_hit(quadrics, prim - n4, o[0], o[1], o[2], d[0], d[1], d[2])
         t = sphere_distance(
             o[0], o[1], o[2], d[0], d[1], d[2], corner[prim, 0], corner[prim, 1], corner[prim, 2],
             np.float64(corner[prim, 3]),

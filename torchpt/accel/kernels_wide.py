@@ -97,8 +97,8 @@ def _finite(a, b, c):
 @jit()
 def _trace(first, last, o, d, t_max, tree, kinds, room, unit, any_hit, out_t, out_prim, out_u, out_v):
     """The nearest hits of a range of rays, or for each any hit's primitive alone."""
-    boxes, child, leaves, ids, full, corner, rows = tree
-    n1, n2, n3 = kinds
+    boxes, child, leaves, ids, full, corner, rows, quadrics = tree
+    n1, n2, n3, n4 = kinds
     stack, entry = np.empty(room, np.int32), np.empty(room, np.float32)
     near = np.empty(WIDTH, np.float32)
     for i in range(first, last):
@@ -126,7 +126,7 @@ def _trace(first, last, o, d, t_max, tree, kinds, room, unit, any_hit, out_t, ou
             while left != 0:
                 q = ids[leaf * WIDTH + _LOWEST[left]]
                 left &= left - np.int32(1)
-                t, u, v = distance(q, corner, rows, n1, n2, n3, p, r, kx, ky, kz, sx, sy, sz)
+                t, u, v = distance(q, corner, rows, quadrics, n1, n2, n3, n4, p, r, kx, ky, kz, sx, sy, sz)
                 if t > _ZERO and (t < best or (t == best and q < prim)):
                     best, prim, best_u, best_v = t, q, u, v
                     if any_hit:

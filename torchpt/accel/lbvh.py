@@ -12,7 +12,7 @@ from torchpt.accel import traverse
 from torchpt.accel.base import Accel, Hits, choose, operator
 from torchpt.accel.bounds import primitive_bounds, surface
 from torchpt.accel.radix import Tree, build_tree
-from torchpt.accel.tables import prepare
+from torchpt.accel.tables import inverses, prepare
 from torchpt.records import Geometry
 
 __all__ = ["Lbvh"]
@@ -33,13 +33,14 @@ class Lbvh(Accel):
         self.counts = list(geometry.counts)
         self.corners = torch.cat([geometry.p0, geometry.p1, geometry.p2]).float()
         self.rows = tables.rows.T.contiguous()
+        self.quadrics = inverses(geometry)
         keep = torch.nonzero(tables.area)[:, 0]
         low, high = primitive_bounds(geometry)
         self.tree = build_tree(low[:, keep], high[:, keep], keep)
         self.build_seconds = time.perf_counter() - start
 
     def _tensors(self) -> list[Tensor]:
-        return [self.corners, self.rows, self.tree.children, self.tree.boxes, self.tree.order]
+        return [self.corners, self.rows, self.quadrics, self.tree.children, self.tree.boxes, self.tree.order]
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
         return choose(_intersect, _intersect_operator)(o, d, t_max, self._tensors(), self.counts, self.tree.depth)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Rays", "distances", "prepare_rays"]
+__all__ = ["Rays", "distances", "prepare_rays", "quadric"]
 
 
 class Rays(NamedTuple):
@@ -51,7 +51,7 @@ def prepare_rays(o: Tensor, d: Tensor) -> Rays:
 
 
 def distances(
-    rays: Rays, prim: Tensor, corners: Tensor, rows: Tensor, counts: list[int]
+    rays: Rays, prim: Tensor, corners: Tensor, rows: Tensor, quadrics: Tensor, counts: list[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Where ray k meets primitive ``prim[k]``.
 
@@ -60,6 +60,7 @@ def distances(
         prim: ``(N,)`` int64 primitive ids.
         corners: ``(9, P)`` float32: p0, p1, p2.
         rows: ``(12, P)`` float32, see :mod:`torchpt.accel.tables`.
+        quadrics: ``(13, Q)`` float64, see :func:`torchpt.accel.tables.inverses`.
         counts: primitives of each kind.
 
     Returns:
@@ -84,6 +85,11 @@ def distances(
         ball = prim >= balls
         t = torch.where(ball, _sphere(o, d, corner), t)
         u, v = u.masked_fill(ball, 0.0), v.masked_fill(ball, 0.0)
+    if counts[4]:
+        first = balls + counts[3]
+        curved = prim >= first
+        found = quadric(o, d, quadrics[:, (prim - first).clamp(min=0)])
+        t, u, v = (torch.where(curved, a, b) for a, b in zip(found, (t, u, v), strict=True))
     return t, u, v
 
 
@@ -131,3 +137,58 @@ def _sphere(o: Tensor, d: Tensor, corner: Tensor) -> Tensor:
     far = q / a
     low, high = torch.minimum(near, far), torch.maximum(near, far)
     return torch.where(low > 0, low, high).float()
+
+
+def quadric(o: Tensor, d: Tensor, row: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Nearest positive ``t`` on quadrics, and ``u, v`` that tell the point: float32, NaN and whatever for misses.
+
+    In its own space a surface is ``x^2 + y^2 + k w^2 = r``: the unit sphere (k = 1, r = 1, w = z), the cylinder about z
+    (k = 0, r = 1) and the cone with its apex at z = 1 (k = -1, r = 0, w = z - 1), the last two for ``0 <= z <= 1``. Half the
+    discriminant of a ray ``f + t e`` is, by Lagrange's identity for that form, ``r a - (k (m_x^2 + m_y^2) + m_z^2)`` with
+    ``m = f x e``: no difference of large squares. The roots come from ``q = b + sign(b) sqrt`` (Haines et al., Ray Tracing
+    Gems ch. 7), all in float64.
+
+    ``v`` is z on a cylinder or cone, and ``u`` the way along the square ``|x| + |y| = 1`` from +x, in [-2, 2]; on an
+    ellipsoid they are octahedral (Cigolle et al., "A Survey of Efficient Representations for Independent Unit Vectors",
+    JCGT 2014). Both are algebraic, so that backends agree, and are read by :func:`torchpt.shapes.quadrics.place`.
+
+    Args:
+        o: origins ``(3, N)``.
+        d: directions ``(3, N)``.
+        row: ``(13, N)`` float64 world to own space, and the code.
+    """
+    px, py, pz = o.double().unbind(0)
+    rx, ry, rz = d.double().unbind(0)
+    fx = row[0] * px + row[1] * py + row[2] * pz + row[3]
+    fy = row[4] * px + row[5] * py + row[6] * pz + row[7]
+    fz = row[8] * px + row[9] * py + row[10] * pz + row[11]
+    ex = row[0] * rx + row[1] * ry + row[2] * rz
+    ey = row[4] * rx + row[5] * ry + row[6] * rz
+    ez = row[8] * rx + row[9] * ry + row[10] * rz
+    code = row[12]
+    bend, ball, cone = 1.0 - code, code == 0, code == 2
+    level = (~cone).double()
+    low, high = torch.where(ball, -torch.inf, 0.0), torch.where(ball, torch.inf, 1.0)
+    wz = torch.where(cone, fz - 1.0, fz)
+    a = ex * ex + ey * ey + bend * (ez * ez)
+    b = -(fx * ex + fy * ey + bend * (wz * ez))
+    c = fx * fx + fy * fy + bend * (wz * wz) - level
+    mx, my, mz = fy * ez - wz * ey, wz * ex - fx * ez, fx * ey - fy * ex
+    root = (level * a - (bend * (mx * mx + my * my) + mz * mz)).sqrt()
+    q = b + torch.where(b >= 0, root, -root)
+    t1, t2 = c / q, q / a
+    z1, z2 = fz + t1 * ez, fz + t2 * ez
+    ok1 = (t1 > 0) & (t1 < torch.inf) & (z1 >= low) & (z1 <= high)
+    ok2 = (t2 > 0) & (t2 < torch.inf) & (z2 >= low) & (z2 <= high)
+    t = torch.where(ok1 & ~(ok2 & (t2 < t1)), t1, t2)
+    x, y, z = fx + t * ex, fy + t * ey, fz + t * ez
+    ring = x.abs() + y.abs()
+    cosine = torch.where(ring > 0, x.abs() / ring, 1.0)
+    u = torch.where(x >= 0, 1.0 - cosine, 1.0 + cosine) * torch.copysign(torch.ones_like(y), y)
+    size = x.abs() + y.abs() + z.abs()
+    p, q = x / size, y / size
+    fold_p = (1.0 - q.abs()) * torch.copysign(torch.ones_like(p), p)
+    fold_q = (1.0 - p.abs()) * torch.copysign(torch.ones_like(q), q)
+    u = torch.where(ball, torch.where(z < 0, fold_p, p), u)
+    v = torch.where(ball, torch.where(z < 0, fold_q, q), z)
+    return torch.where(ok1 | ok2, t, torch.nan).float(), u.float(), v.float()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpt.records import Geometry
 
-__all__ = ["ROUNDING", "Tables", "extent", "prepare", "tolerances"]
+__all__ = ["ROUNDING", "Tables", "extent", "inverses", "prepare", "tolerances"]
 
 #: 32 units of float32 rounding. The affine test of a primitive errs by at most 16 of them times the magnitudes that
 #: enter (see :func:`tolerances`); the other half covers grazing rays, where ``n . d`` itself is uncertain.
@@ -26,7 +26,7 @@ class Tables(NamedTuple):
     """Per-primitive numbers.
 
     Attributes:
-        rows: ``(P, 12)`` float32: ``n c a ca b cb``; zeros for spheres and for primitives without area.
+        rows: ``(P, 12)`` float32: ``n c a ca b cb``; zeros for spheres, quadrics and primitives without area.
         rows64: the same in float64, not rounded.
         area: ``(P,)`` bool: the primitive can be hit.
     """
@@ -50,25 +50,48 @@ def prepare(geometry: Geometry) -> Tables:
     e1, e2 = p1 - p0, p2 - p0
     cross = torch.linalg.cross(e1, e2, dim=0)
     length = cross.square().sum(0).sqrt()
-    planar = torch.arange(geometry.size, device=p0.device) < geometry.size - geometry.counts[3]
+    first, balls = sum(geometry.counts[:3]), sum(geometry.counts[:4])
+    number = torch.arange(geometry.size, device=p0.device)
+    planar = number < first
     n = cross / length
     a = torch.linalg.cross(e2, n, dim=0) / length
     b = torch.linalg.cross(n, e1, dim=0) / length
     rows = torch.cat([r for x in (n, a, b) for r in (x, -(x * p0).sum(0, keepdim=True))])
     good = planar & (length > 0) & torch.isfinite(rows.float()).all(0)
     rows = torch.where(good, rows, 0.0)
-    round_ = ~planar & torch.isfinite(p0).all(0) & (p1[0].abs() > 0) & torch.isfinite(p1[0])
+    round_ = ~planar & (number < balls) & torch.isfinite(p0).all(0) & (p1[0].abs() > 0) & torch.isfinite(p1[0])
+    if geometry.quadrics is not None:
+        round_[balls:] = torch.isfinite(inverses(geometry)).all(0)
     return Tables(rows.float().T.contiguous(), rows.T, good | round_)
+
+
+def inverses(geometry: Geometry) -> Tensor:
+    """World to own space of the quadrics ``(13, Q)`` float64: three affine rows, and the code; NaN where there is none.
+
+    Searches intersect quadrics in their own space and in float64: however thin, sheared or distant one is, a ray that
+    leaves it knows its side.
+    """
+    table = geometry.quadrics
+    if table is None:
+        return torch.zeros(13, 0, dtype=torch.float64, device=geometry.p0.device)
+    p0, e1, e2, e3 = table[0:3], table[3:6], table[6:9], table[9:12]
+    faces = (torch.linalg.cross(a, b, dim=0) for a, b in ((e2, e3), (e3, e1), (e1, e2)))
+    det = (e1 * torch.linalg.cross(e2, e3, dim=0)).sum(0)
+    rows = [row for n in faces for row in (n / det, -(n * p0).sum(0, keepdim=True) / det)]
+    return torch.cat([*rows, table[12:]])
 
 
 def extent(geometry: Geometry) -> float:
     """Largest absolute coordinate of the scene (at least the smallest normal float32)."""
     if geometry.size == 0:
         return 1.0
-    planar = geometry.size - geometry.counts[3]
+    planar, round_ = sum(geometry.counts[:3]), sum(geometry.counts[:4])
     points = torch.stack([p[:, :planar] for p in (geometry.p0, geometry.p1, geometry.p2)]).abs()
-    balls = geometry.p0[:, planar:].abs() + geometry.p1[0, planar:].abs()
+    balls = geometry.p0[:, planar:round_].abs() + geometry.p1[0, planar:round_].abs()
     both = torch.cat([points.reshape(-1), balls.reshape(-1)])
+    if geometry.quadrics is not None:
+        reach = geometry.quadrics[:12].abs().reshape(4, 3, -1).sum(0)
+        both = torch.cat([both, reach.reshape(-1).float()])
     both = both[torch.isfinite(both)]
     return max(float(both.max()) if both.numel() else 1.0, 2.0**-126)
 

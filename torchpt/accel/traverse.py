@@ -49,7 +49,7 @@ class _Wave:
     def __init__(
         self, o: Tensor, d: Tensor, t_max: Tensor, lanes: Tensor, tensors: list[Tensor], counts: list[int], depth: int
     ) -> None:
-        self.corners, self.rows, self.children, self.boxes, self.order = tensors
+        self.corners, self.rows, self.quadrics, self.children, self.boxes, self.order = tensors
         self.counts = counts
         self.lanes = lanes
         self.rays = prepare_rays(o[:, lanes], d[:, lanes])
@@ -121,7 +121,7 @@ class _Wave:
 
     def _test(self, lanes: Tensor, any_hit: bool) -> None:
         prim = self.order[~self.node[lanes]].long()
-        t, u, v = distances(self.rays.take(lanes), prim, self.corners, self.rows, self.counts)
+        t, u, v = distances(self.rays.take(lanes), prim, self.corners, self.rows, self.quadrics, self.counts)
         best = self.t[lanes]
         better = (t > 0) & ((t < best) | ((t == best) & (prim < self.prim[lanes])))
         won = lanes[better]

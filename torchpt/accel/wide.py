@@ -14,7 +14,7 @@ from torchpt.accel.base import Accel, Hits, choose, operator
 from torchpt.accel.bounds import primitive_bounds
 from torchpt.accel.jit import launch, thread_count
 from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
-from torchpt.accel.tables import prepare
+from torchpt.accel.tables import inverses, prepare
 from torchpt.records import Geometry
 
 __all__ = ["Wide"]
@@ -47,7 +47,7 @@ class Wide(Accel):
         self.leaves = len(tree.ids) // WIDTH
         tris, full = _leaf_blocks(tree.ids, corner.numpy(), geometry.counts[0])
         arrays = (tree.boxes, tree.child, tris, tree.ids, full)
-        self.tensors = [*(torch.from_numpy(a) for a in arrays), corner, tables.rows]
+        self.tensors = [*(torch.from_numpy(a) for a in arrays), corner, tables.rows, inverses(geometry).T.contiguous()]
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
@@ -160,5 +160,5 @@ def _(o, d, t_max, tensors, counts, depth, threads):
 
 def _arguments(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> tuple:
     rays = tuple(x.contiguous().numpy() for x in (o, d, t_max))
-    first = (counts[0], counts[0] + counts[1], counts[0] + counts[1] + counts[2])
+    first = tuple(sum(counts[:k]) for k in range(1, len(counts)))
     return (*rays, tuple(x.numpy() for x in tensors), first, depth * (WIDTH - 1) + WIDTH + 1, 1)

@@ -3,7 +3,7 @@
     sample(lights, x, choice, u) -> LightSample     a point on the lights seen from x
     emitted(lights, prim, ...) -> radiance, pdf     what a ray that hit an emitter by chance brings
 
-One kind a file: ``area`` (triangle, rectangle, disk), ``sphere``, ``constant``.
+One kind a file: ``area`` (triangle, rectangle, disk), ``sphere``, ``quadric``, ``constant``.
 """
 
 from __future__ import annotations

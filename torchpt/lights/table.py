@@ -11,9 +11,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lights import area, constant, sphere
+from torchpt.lights import area, constant, quadric, sphere
 from torchpt.math.vectors import dot, safe_reciprocal, take
-from torchpt.records import Interaction, Lights, LightSample
+from torchpt.records import Interaction, Lights, LightSample, Quadrics
 
 __all__ = ["emitted", "environment", "sample"]
 
@@ -25,6 +25,14 @@ def _rows(lights: Lights, row: Tensor | None) -> Lights:
     names = ("p0", "e1", "e2", "normal", "flip", "area", "bound", "radiance")
     covered = None if lights.opacity is None else take(lights.opacity, row)
     return replace(lights, opacity=covered, **{name: take(getattr(lights, name), row) for name in names})
+
+
+def _quadrics(lights: Lights, row: Tensor | None) -> Quadrics:
+    """What quadrics need beside the table, at ``row``."""
+    assert lights.quadric is not None and lights.quadrics is not None
+    column = lights.quadric if row is None else take(lights.quadric, row)
+    table = lights.quadrics
+    return Quadrics(*(take(getattr(table, name), column) for name in ("code", "e3", "n1", "n2", "n3", "reach")))
 
 
 def _is(lights: Lights, kind: str, row: Tensor | None) -> Tensor | None:
@@ -57,6 +65,7 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
     at = _rows(lights, row)
     target: Tensor | None = None
     normal: Tensor | None = None
+    bent: Quadrics | None = None
     for kind in lights.kinds:
         if kind == "constant":
             continue
@@ -65,6 +74,9 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
             # Detached: from a moving reference point the same spot on the light is held, as on planar lights.
             spot, facing = sphere.sample(x.detach(), at.p0.detach(), at.e1[0].detach(), at.flip, u)
             spot = at.p0 + (spot - at.p0).detach() * (at.e1[0] / at.e1[0].detach())
+        elif kind == "quadric":
+            bent = _quadrics(lights, row)
+            spot, facing = quadric.point(at.p0, at.e1, at.e2, bent, u)
         else:
             spot, facing = area.point(at.p0, at.e1, at.e2, area.WARPS[kind](u)), at.normal
         target, normal = _pick(mask, spot, target), _pick(mask, facing, normal)
@@ -75,7 +87,12 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
     to = target - x
     square = dot(to, to)
     wi = to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
-    inverse = area.inverse_pdf(normal, at.area, wi, square)
+    size, bound = at.area, at.bound
+    if bent is not None:
+        mask = _is(lights, "quadric", row)
+        size = _pick(mask, quadric.world_area(size, at.e1, at.e2, bent.e3, normal), size)
+        bound = _pick(mask, dot(normal.detach().abs(), bent.reach), bound)
+    inverse = area.inverse_pdf(normal, size, wi, square)
     if "sphere" in lights.kinds:
         ball = sphere.inverse_pdf(x.detach(), at.p0.detach(), at.e1[0].detach(), normal, wi.detach(), square.detach())
         # In area measure the derivative of a sphere's share is that of the planar form.
@@ -87,7 +104,7 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
         inverse = inverse / probability
     # Where the light is not seen the weight is 0, and the density has no say.
     pdf = safe_reciprocal(inverse.detach())
-    target = torch.addcmul(target, normal, at.bound * offset)
+    target = torch.addcmul(target, normal, bound * offset)
     radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
     here = LightSample(wi, target, None, radiance.expand_as(wi), pdf, inverse)
     if "constant" not in lights.kinds:
@@ -129,7 +146,11 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Ten
     table = _rows(lights, row)
     with torch.no_grad():
         to = at.p - x
-        inverse = area.inverse_pdf(at.ng, table.area, wi, dot(to, to))
+        size = table.area
+        if "quadric" in lights.kinds:
+            found = quadric.world_area(size, table.e1, table.e2, _quadrics(lights, row).e3, at.ng)
+            size = _pick(_is(lights, "quadric", row), found, size)
+        inverse = area.inverse_pdf(at.ng, size, wi, dot(to, to))
         if "sphere" in lights.kinds:
             ball = sphere.inverse_pdf(x, table.p0, table.e1[0], at.ng, wi, dot(to, to))
             inverse = _pick(_is(lights, "sphere", row), ball, inverse)

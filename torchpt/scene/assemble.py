@@ -15,10 +15,11 @@ from torch import Tensor
 from torchpt.bsdfs import Bsdf, Diffuse, Parameters, stacked
 from torchpt.errors import SceneError
 from torchpt.math.distributions import Discrete
-from torchpt.math.vectors import cross, dot, luminance, normalize
-from torchpt.records import KINDS, Geometry, Lights, World
+from torchpt.math.vectors import affine, cross, dot, luminance, normalize
+from torchpt.records import KINDS, QUADRICS, Geometry, Lights, Quadrics, World
 from torchpt.scene.parts import Part
 from torchpt.scene.surfaces import Surface, surface_of
+from torchpt.shapes import quadrics
 from torchpt.shapes.normals import smooth_normals
 
 __all__ = ["Corners", "assemble", "corners_of"]
@@ -32,12 +33,15 @@ class Corners:
     p1: Tensor
     p2: Tensor
     normals: tuple[Tensor, Tensor, Tensor] | None
+    frame: Tensor | None = None  # (12, 1) float64: p0 e1 e2 e3 of a quadric
 
 
 def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dtype: torch.dtype) -> Corners:
     """Place a part in the world, moved by ``-centre (3,)`` (float64)."""
     # The move is folded into the pose in float64, before anything is rounded to the lanes' dtype.
     pose = parameters[f"{part.name}.to_world"].double()
+    if part.local is not None:
+        pose = pose @ torch.from_numpy(part.local).to(pose.device)
     linear, move = pose[:3, :3], pose[:3, 3:4] - centre[:, None]
     if part.kind == "sphere":
         radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)
@@ -45,6 +49,9 @@ def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dty
         p1 = torch.stack((radius, zero, zero))[:, None]
         return Corners(move.to(dtype), p1.to(dtype), torch.zeros_like(move).to(dtype), None)
     x, y = linear[:, 0:1], linear[:, 1:2]
+    if part.kind == "quadric":
+        frame = torch.cat((move, x, y, linear[:, 2:3]))
+        return Corners(move.to(dtype), x.to(dtype), y.to(dtype), None, frame)
     if bool(torch.linalg.det(linear.detach()) < 0):
         x, y = y, x  # mirrored, a flat shape still faces where its own +z goes, as in Mitsuba
     if part.kind == "rectangle":  # Mitsuba's unit shape [-1, 1]^2 from its lower corner
@@ -106,7 +113,7 @@ def assemble(
             torch.tensor(sizes, dtype=torch.int64, device=device),
         )
 
-    ball = counts[3] > 0
+    ball = counts[3] + counts[4] > 0
     first_sphere = sum(counts[:3])
     p0, p1, p2 = (joined([getattr(c, name) for c in corners]) for name in ("p0", "p1", "p2"))
     planar = (torch.arange(p0.shape[1], device=device) < first_sphere) if ball else None
@@ -128,6 +135,9 @@ def assemble(
     bound = dot(normal.detach().abs(), _largest(p0, e1, e2).detach())
     if planar is not None:
         bound = torch.where(planar, bound, (p0.abs().sum(0) + 2.0 * e1[0].abs()).detach())
+    frames = [c.frame for c in corners if c.frame is not None]
+    frame = torch.cat(frames, 1) if frames else None
+    curved = None if frame is None else _quadrics([part for part in parts if part.kind == "quadric"], frame, dtype)
 
     slots = {part.material.name: part.material for part in parts}
     surfaces = {name: surface_of(slot, parameters, dtype) for name, slot in slots.items()}
@@ -137,11 +147,29 @@ def assemble(
     keys = emissive * len(models) + spread([models.index(surfaces[part.material.name].model) for part in parts])
     key = torch.cat((torch.full((1,), 2 * len(models), device=device), keys)).to(torch.uint8)
     lights = _lights(
-        parts, sizes, parameters, environment, p0, e1, e2, normal, bound, sign, face, opacity, emissive, dtype
+        parts,
+        sizes,
+        parameters,
+        environment,
+        p0,
+        e1,
+        e2,
+        normal,
+        bound,
+        sign,
+        face,
+        opacity,
+        emissive,
+        frame,
+        curved,
+        dtype,
     )
     # The search gets the corners themselves: rebuilt from edges, neighbours would no longer share them to the bit.
     q0, q1, q2 = (x.detach().to(torch.float32).contiguous() for x in (p0, p1, p2))
-    size = (counts[0], counts[1], counts[2], counts[3])
+    size = (counts[0], counts[1], counts[2], counts[3], counts[4])
+    table = None
+    if curved is not None and frame is not None:
+        table = torch.cat((frame, curved.code[None].double())).detach()
     world = World(
         counts=size,
         p0=p0,
@@ -149,7 +177,7 @@ def assemble(
         e2=e2,
         normal=normal,
         bound=bound,
-        flip=sign if ball else None,
+        flip=sign if counts[3] else None,
         normals=normals,
         tangents=_tangents(parts, corners, parameters) if any(model.anisotropic for model in models) else None,
         opacity=opacity,
@@ -160,8 +188,38 @@ def assemble(
         two_sided=two_sided,
         object_id=spread([part.object_id for part in parts]),
         lights=lights,
+        quadrics=curved,
     )
-    return world, Geometry(q0, q1, q2, size)
+    return world, Geometry(q0, q1, q2, size, table)
+
+
+def _quadrics(parts: Sequence[Part], frames: Tensor, dtype: torch.dtype) -> Quadrics:
+    """What lanes need of quadrics, from frames ``(12, Q)``; in float64 until it is their normals' directions."""
+    p0, e1, e2, e3 = frames[0:3], frames[3:6], frames[6:9], frames[9:12]
+    faces = [cross(e2, e3), cross(e3, e1), cross(e1, e2)]
+    front = torch.tensor([-1.0 if part.flip else 1.0 for part in parts], dtype=p0.dtype, device=p0.device)
+    front = front * torch.sign(dot(e1, faces[0]).detach())
+    scale = torch.stack(faces).detach().abs().amax((0, 1))
+    n1, n2, n3 = ((n * (front / scale)).to(dtype) for n in faces)
+    reach = (p0.abs() + e1.abs() + e2.abs() + e3.abs()).detach().to(dtype)
+    code = torch.tensor([QUADRICS.index(part.quadric) for part in parts], dtype=torch.int64, device=p0.device)
+    return Quadrics(code, e3.to(dtype), n1, n2, n3, reach)
+
+
+def _quadric_area(code: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Areas ``(Q,)`` float64 of quadrics: their own space's times ``|det|``, and (by quadrature, detached) the world's."""
+    e1, e2, e3 = frames[3:6], frames[6:9], frames[9:12]
+    own = torch.tensor(quadrics.AREAS, dtype=torch.float64, device=e1.device)[code]
+    det = dot(e1, cross(e2, e3)).abs()
+    faces = [n.detach() for n in (cross(e2, e3), cross(e3, e1), cross(e1, e2))]
+    grid = (torch.arange(16, dtype=torch.float64, device=e1.device) + 0.5) / 16
+    spots = torch.cartesian_prod(grid, grid)
+    total = torch.zeros_like(own)
+    for spot in spots:
+        n = quadrics.normal(code, quadrics.sample(code, spot[:, None].expand(2, len(own))))
+        grown = affine(faces[0] * n[0], faces[1], n[1], faces[2], n[2])
+        total += (dot(grown, grown) / dot(n, n)).sqrt()
+    return own * det, own * total / len(spots)
 
 
 def _largest(p0: Tensor, e1: Tensor, e2: Tensor) -> Tensor:
@@ -212,6 +270,8 @@ def _tangents(parts: Sequence[Part], corners: Sequence[Corners], parameters: Map
         if part.kind == "sphere":
             linear = parameters[f"{part.name}.to_world"][:3, :3].to(c.p0)
             found.append(normalize(linear[:, 2:3]))
+        elif part.kind == "quadric":
+            found.append(torch.zeros_like(c.p0))  # it varies over the surface
         elif part.kind != "triangle":
             found.append(c.p1 - c.p0)
         elif part.uvs is None:
@@ -246,6 +306,8 @@ def _lights(
     face: Tensor,
     opacity: Tensor | None,
     emissive: Tensor,
+    frame: Tensor | None,
+    curved: Quadrics | None,
     dtype: torch.dtype,
 ) -> Lights | None:
     rows = (emissive == 0).nonzero().squeeze(1)
@@ -254,7 +316,7 @@ def _lights(
     device = p0.device
     glowing = [(part, n) for part, n in zip(parts, sizes, strict=True) if part.emission is not None]
     kinds = tuple(kind for kind in KINDS if any(part.kind == kind and n for part, n in glowing))
-    scale = {"triangle": 0.5, "rectangle": 1.0, "disk": math.pi, "sphere": 0.0}
+    scale = {"triangle": 0.5, "rectangle": 1.0, "disk": math.pi, "sphere": 0.0, "quadric": 0.0}
     counts = torch.tensor([n for _, n in glowing], dtype=torch.int64, device=device)
     of_kind = torch.tensor([KINDS.index(part.kind) for part, _ in glowing], dtype=torch.int64, device=device)
     of_kind = torch.repeat_interleave(of_kind, counts)
@@ -266,14 +328,25 @@ def _lights(
     radiance = [_emission(part, parameters, dtype)[:, None].expand(3, n) for part, n in glowing]
     radiance = torch.cat(radiance, 1) if radiance else torch.zeros(3, 0, dtype=dtype, device=device)
     seen = None if opacity is None else opacity.index_select(0, rows)
-    power = (luminance(radiance.detach().double().abs()) * area.detach().double()) * math.pi
+    whole, column = area.detach().double(), None
+    if frame is not None and curved is not None and "quadric" in kinds:
+        bent = of_kind == KINDS.index("quadric")
+        first = len(p0[0]) - len(curved.code)
+        column = torch.where(bent, rows - first, 0)
+        own, world_area = _quadric_area(curved.code, frame)
+        area = torch.where(bent, own.to(dtype).index_select(0, column), area)
+        whole = torch.where(bent, world_area.index_select(0, column), whole)
+    power = (luminance(radiance.detach().double().abs()) * whole) * math.pi
     if seen is not None:
         power = power * seen.detach().double()
     kind = torch.tensor([kinds.index(k) if k in kinds else 0 for k in KINDS], device=device)[of_kind]
     extra = [bound.index_select(0, rows), sign.index_select(0, rows)]
     if environment is not None:
         # A row of its own, whose surface is never read; its flux through the sphere about the scene, 4 pi^2 R^2 L.
-        low, high = (p0 - e1.abs() - e2.abs()).double(), (p0 + e1.abs() + e2.abs()).double()
+        half = e1.abs() + e2.abs()
+        if curved is not None:
+            half = torch.cat((half[:, : -len(curved.code)], half[:, -len(curved.code) :] + curved.e3.abs()), 1)
+        low, high = (p0 - half).double(), (p0 + half).double()
         reach = (high.amax(1) - low.amin(1)).norm() * 0.5 if p0.shape[1] else torch.ones((), device=device)
         flux = 4.0 * math.pi**2 * reach.detach() ** 2 * luminance(environment.detach().double().abs())
         power = torch.cat((power, flux.reshape(1)))
@@ -282,6 +355,7 @@ def _lights(
         blank = torch.zeros(3, 1, dtype=dtype, device=device)
         q0, q1, q2, qn = (torch.cat((x, blank), 1) for x in (q0, q1, q2, qn))
         area, *extra = (torch.cat((x, torch.ones(1, dtype=dtype, device=device))) for x in (area, *extra))
+        column = None if column is None else torch.cat((column, torch.zeros_like(column[:1])))
         radiance = torch.cat((radiance, environment.to(dtype)[:, None]), 1)
         seen = None if seen is None else torch.cat((seen, torch.ones_like(area[:1])))
     index = None
@@ -304,4 +378,6 @@ def _lights(
         opacity=seen,
         environment=None if environment is None else environment.to(dtype),
         row_of_prim=index,
+        quadric=column,
+        quadrics=None if column is None else curved,
     )

@@ -8,13 +8,13 @@ import numpy as np
 
 from torchpt.bsdfs import Diffuse
 from torchpt.errors import AssetError, SceneError
-from torchpt.math.transforms import similarity_scale
+from torchpt.math.transforms import is_singular, similarity_scale
 from torchpt.records import KINDS
 from torchpt.scene.description import Description
 from torchpt.scene.loaders import MeshPart, load_mesh, unit_cube
 from torchpt.scene.materials import slot_of
 from torchpt.scene.parts import MaterialSlot, Part
-from torchpt.scene.schema import Cube, Disk, Mesh, Rectangle, Shape, Sphere
+from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Mesh, Rectangle, Shape, Sphere
 
 __all__ = ["Built", "build_parts"]
 
@@ -76,16 +76,21 @@ def _shape_parts(
     prefix = f"shapes.{name}"
     pose = shape.to_world()
     if not isinstance(shape, Mesh | Cube):
-        kind = {Sphere: "sphere", Rectangle: "rectangle", Disk: "disk"}[type(shape)]
-        if isinstance(shape, Sphere):
-            pose = pose @ np.array(
-                [[shape.radius, 0, 0, shape.center[0]], [0, shape.radius, 0, shape.center[1]],
-                 [0, 0, shape.radius, shape.center[2]], [0, 0, 0, 1]]
-            )  # fmt: skip
-            if similarity_scale(pose) is None:
-                raise SceneError(f"{prefix}.transform", pose.tolist(), "a transform of uniform scale", description.file)
+        if isinstance(shape, Sphere | Cylinder | Cone):
+            with np.errstate(over="ignore", invalid="ignore"):
+                pose = pose @ shape.own()
+            if is_singular(pose):
+                raise SceneError(
+                    prefix, pose.tolist(), "a shape whose sizes differ by less than 1e12", description.file
+                )
         parameters[f"{prefix}.to_world"] = pose
-        return [_part(description, shape, prefix, name, number, kind, pose, None, parameters)]
+        return [
+            _part(
+                description, shape, prefix, name, number, kind, pose if local is None else pose @ local, None, parameters,
+                local=local, quadric=quadric, label=label,
+            )
+            for kind, quadric, local, label in _surfaces(shape, pose)
+        ]  # fmt: skip
     if isinstance(shape, Cube):
         pieces, source, flat = [unit_cube()], "", True
     elif shape.path is None:
@@ -113,6 +118,24 @@ def _shape_parts(
     return parts
 
 
+#: From the unit disk to the caps of a cylinder's and a cone's own space, facing outward.
+_TOP = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]])
+_BOTTOM = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _surfaces(shape: Shape, pose: np.ndarray) -> list[tuple[str, str, np.ndarray | None, str]]:
+    """The primitives of an analytic shape: kind, quadric, placement before the shape's own, and name within the shape."""
+    if isinstance(shape, Sphere):
+        return (
+            [("sphere", "", None, "")] if similarity_scale(pose) is not None else [("quadric", "ellipsoid", None, "")]
+        )
+    if not isinstance(shape, Cylinder | Cone):
+        return [({Rectangle: "rectangle", Disk: "disk"}[type(shape)], "", None, "")]
+    caps = {"bottom": _BOTTOM} if isinstance(shape, Cone) else {"bottom": _BOTTOM, "top": _TOP}
+    side = [("quadric", shape.type, None, "side" if shape.capped else "")]
+    return side + ([("disk", "", local, name) for name, local in caps.items()] if shape.capped else [])
+
+
 def _labels(names: list[str]) -> list[str]:
     """Distinct labels without dots for the pieces of a mesh."""
     labels: list[str] = []
@@ -138,6 +161,9 @@ def _part(
     *,
     flat: bool = True,
     source: str = "",
+    local: np.ndarray | None = None,
+    quadric: str = "",
+    label: str = "",
 ) -> Part:
     own = piece.material if piece is not None else None
     if isinstance(shape.material, str):
@@ -172,6 +198,9 @@ def _part(
         emission_names=names if emission is not None else (),
         flip=shape.flip_normals,
         to_world=pose,
+        local=local,
+        quadric=quadric,
+        piece=label,
         vertices=None if piece is None else piece.vertices,
         faces=faces,
         normals=None if piece is None or flat else piece.normals,

@@ -22,7 +22,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     shapes: dict[str, Any] = {}
     for part in built.parts:
         count = len(part.faces) if part.faces is not None else 1
-        row: dict[str, Any] = {"kind": part.kind, "primitives": count, "material": part.material.name}
+        row: dict[str, Any] = {"kind": part.quadric or part.kind, "primitives": count, "material": part.material.name}
         if part.emission is not None:
             row["emission"] = list(part.emission)
         if part.source:
@@ -35,7 +35,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
             row["normals"] = (
                 "face" if not part.smooth else "computed, smooth" if part.normals is None else "from the file"
             )
-        shapes[part.name.removeprefix("shapes.")] = row
+        shapes[part.name.removeprefix("shapes.") + (f".{part.piece}" if part.piece else "")] = row
     memory = sum(x.numel() * x.element_size() for x in tensors_of(world))
     made: dict[str, Any] = {
         "accel": accel.describe(),

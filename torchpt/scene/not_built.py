@@ -29,8 +29,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
         "vertex_color": (),
     },
     "shape": {
-        "cylinder": ("center", "radius", "height", "capped", *_SHAPE),
-        "cone": ("apex", "height", "slope", "capped", *_SHAPE),
         "instance": ("of", *_SHAPE),
     },
     "light": {

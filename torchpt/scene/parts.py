@@ -68,6 +68,9 @@ class Part:
         emission_names: dotted names of that radiance and, where it has one, of its strength.
         flip: whether the normals are turned around.
         to_world: ``(4, 4)`` float64.
+        local: ``(4, 4)`` float64 applied before the parameter ``to_world``, or None; where several parts share that.
+        quadric: which of ``records.QUADRICS``, or "".
+        piece: its name within its shape, where the shape has several under one name.
         vertices: ``(V, 3)`` float64 in the file's own space; None for analytic shapes.
         faces: ``(F, 3)`` int64.
         normals: ``(V, 3)`` from the file, or None.
@@ -87,6 +90,9 @@ class Part:
     emission_names: tuple[str, ...]
     flip: bool
     to_world: np.ndarray
+    local: np.ndarray | None = None
+    quadric: str = ""
+    piece: str = ""
     vertices: np.ndarray | None = None
     faces: np.ndarray | None = None
     normals: np.ndarray | None = None

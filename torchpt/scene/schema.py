@@ -29,7 +29,7 @@ from torchpt.scene.validate import Model
 
 __all__ = [
     "CAMERAS", "FOV_AXES", "LIGHTS", "SHAPES",
-    "ConstantLight", "Cube", "Disk", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
+    "Cone", "ConstantLight", "Cube", "Cylinder", "Disk", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
 ]  # fmt: skip
 
 FOV_AXES = ("x", "y", "diagonal", "smaller", "larger")
@@ -170,13 +170,62 @@ class Sphere(Shape):
     center: Vec3 = (0.0, 0.0, 0.0)
     radius: Annotated[float, number_field("a number > 0", lambda x: x > 0)] = 1.0
 
-    @model_validator(mode="after")
-    def _round(self) -> Sphere:
-        if self.transform is not None and transforms.similarity_scale(self.transform) is None:
-            raise wrong(
-                "a transform that keeps a sphere round (uniform scale)", self.transform.tolist(), ("transform",)
-            )
-        return self
+    def own(self) -> NDArray[np.float64]:
+        """The unit sphere to this one before its transform, ``(4, 4)``."""
+        return _placed(self.center, (self.radius, self.radius, self.radius), np.eye(3))
+
+
+def _placed(origin: Any, size: tuple[float, float, float], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * size
+    matrix[:3, 3] = origin
+    return matrix
+
+
+#: z to y, by a turn about x: the axis of cylinders and cones lies along their own z.
+_UPRIGHT = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+class Cylinder(Shape):
+    """An analytic cylinder about an axis along y, ``center`` half-way up, before the transform.
+
+    Attributes:
+        capped: closed by two disks.
+    """
+
+    type: Literal["cylinder"] = "cylinder"
+    center: Vec3 = (0.0, 0.0, 0.0)
+    radius: Annotated[float, number_field("a number > 0", lambda x: x > 0)] = 1.0
+    height: Annotated[float, number_field("a number > 0", lambda x: x > 0)] = 1.0
+    capped: Flag = True
+
+    def own(self) -> NDArray[np.float64]:
+        """The cylinder ``x^2 + y^2 = 1, 0 <= z <= 1`` to this one before its transform, ``(4, 4)``."""
+        bottom = np.subtract(self.center, (0.0, 0.5 * self.height, 0.0))
+        return _placed(bottom, (self.radius, self.radius, self.height), _UPRIGHT)
+
+
+class Cone(Shape):
+    """An analytic cone with its axis along y, before the transform.
+
+    Attributes:
+        apex: its tip.
+        height: from the tip to the base along y: the base lies below the tip where it is negative.
+        slope: radius over distance from the tip, along the axis: the base's radius is ``slope |height|``.
+        capped: closed by a disk.
+    """
+
+    type: Literal["cone"] = "cone"
+    apex: Vec3 = (0.0, 0.0, 0.0)
+    height: Annotated[float, number_field("a number other than 0", lambda x: x != 0)] = -1.0
+    slope: Annotated[float, number_field("a number > 0", lambda x: x > 0)] = 1.0
+    capped: Flag = True
+
+    def own(self) -> NDArray[np.float64]:
+        """The cone ``x^2 + y^2 = (1 - z)^2, 0 <= z <= 1`` to this one before its transform, ``(4, 4)``."""
+        turn = _UPRIGHT if self.height < 0 else _UPRIGHT * [[1.0], [-1.0], [-1.0]]
+        base, length = np.add(self.apex, (0.0, self.height, 0.0)), abs(self.height)
+        return _placed(base, (self.slope * length, self.slope * length, length), turn)
 
 
 class Rectangle(Shape):
@@ -211,5 +260,7 @@ SHAPES: dict[str, type[Shape]] = {
     "rectangle": Rectangle,
     "disk": Disk,
     "cube": Cube,
+    "cylinder": Cylinder,
+    "cone": Cone,
 }
 LIGHTS: dict[str, type[ConstantLight]] = {"constant": ConstantLight}

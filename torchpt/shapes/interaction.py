@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import affine, cross, dot, normalize, take
 from torchpt.records import Hit, Interaction, World
+from torchpt.shapes import quadrics
 
 __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
 
@@ -49,13 +50,12 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
     """
     prim, u, v = hit.prim, hit.u, hit.v
     p0, e1, e2 = take(world.p0, prim), take(world.e1, prim), take(world.e2, prim)
-    triangles, spheres = world.counts[0], world.counts[3]
-    first_sphere = len(world.bound) - spheres
-    ball = prim >= first_sphere if spheres else None
+    triangles, ball, curved = world.counts[0], _spheres(world, prim), _quadrics(world, prim)
     if slide:
         u, v = _slide(o, d, p0, e1, e2)
-        if ball is not None:
-            u, v = torch.where(ball, 0.0, u), torch.where(ball, 0.0, v)
+    for other in (ball, curved):
+        if other is not None:
+            u, v = torch.where(other, 0.0, u), torch.where(other, 0.0, v)
     p = affine(p0, e1, u, e2, v)
     ng = take(world.normal, prim)
     if ball is not None:
@@ -66,12 +66,37 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         outward = normalize(torch.where(ball, o + d * t - p0, torch.ones_like(p)))
         p = torch.where(ball, p0 + outward * radius, p)
         ng = torch.where(ball, outward * take(world.flip, prim), ng)
+    own = None
+    if curved is not None:
+        table = quadrics.rows(world, prim)
+        own = quadrics.place(table.code, torch.where(curved, hit.u, 0.0), torch.where(curved, hit.v, 0.0))
+        if slide:
+            own = torch.where(curved, quadrics.slide(table, p0, e1, o, d, hit.t, own), own)
+        p = torch.where(curved, affine(p0 + e1 * own[0], e2, own[1], table.e3, own[2]), p)
+        ng = torch.where(curved, quadrics.outward(table, own), ng)
     ns = ng
     if world.normals is not None:
         ns = normalize(_blend(world.normals, prim, u, v))
         if triangles < len(world.bound):
             ns = torch.where(prim < triangles, ns, ng)
-    return Interaction(p, ng, ns, _tangent(world, prim, u, v, e1, e2, ng), prim)
+    tangent = _tangent(world, prim, u, v, e1, e2, ng)
+    if tangent is not None and curved is not None and own is not None:
+        tangent = torch.where(curved, quadrics.tangent(e1, e2, own), tangent)
+    return Interaction(p, ng, ns, tangent, prim)
+
+
+def _spheres(world: World, prim: Tensor) -> Tensor | None:
+    """Which of the primitives are spheres; None where the scene has none."""
+    if not world.counts[3]:
+        return None
+    first = sum(world.counts[:3])
+    found = prim >= first
+    return found if not world.counts[4] else found & (prim < first + world.counts[3])
+
+
+def _quadrics(world: World, prim: Tensor) -> Tensor | None:
+    """Which of the primitives are quadrics; None where the scene has none."""
+    return prim >= sum(world.counts[:4]) if world.counts[4] else None
 
 
 def _tangent(world: World, prim: Tensor, u: Tensor, v: Tensor, e1: Tensor, e2: Tensor, ng: Tensor) -> Tensor | None:
@@ -79,13 +104,12 @@ def _tangent(world: World, prim: Tensor, u: Tensor, v: Tensor, e1: Tensor, e2: T
     if world.tangents is None:
         return None
     tangent = take(world.tangents, prim)
-    triangles, rectangles, disks, spheres = world.counts
-    if spheres:
-        first = len(world.bound) - spheres
-        tangent = torch.where(prim >= first, cross(tangent, ng), tangent)
-    if disks:
-        first = triangles + rectangles
-        tangent = torch.where((prim >= first) & (prim < first + disks), e1 * u + e2 * v, tangent)
+    ball = _spheres(world, prim)
+    if ball is not None:
+        tangent = torch.where(ball, cross(tangent, ng), tangent)
+    if world.counts[2]:
+        first = world.counts[0] + world.counts[1]
+        tangent = torch.where((prim >= first) & (prim < first + world.counts[2]), e1 * u + e2 * v, tangent)
     return tangent
 
 
@@ -104,7 +128,8 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
     Args:
         world: the scene's tensors, with gradients.
         x: where the ray left, differentiable ``(3, N)``.
-        hit: what it found; the point is held at ``u, v`` of its primitive (on a sphere: at its normal).
+        hit: what it found; the point is held at ``u, v`` of its primitive (on a sphere: at its normal,
+            on a quadric: at its place in its own space).
         wi: the traced direction ``(3, N)``; kept for misses.
 
     Returns:
@@ -116,13 +141,17 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
     p0, e1, e2 = take(world.p0, prim), take(world.e1, prim), take(world.e2, prim)
     y = affine(p0, e1, hit.u, e2, hit.v)
     area = cross(e1, e2)
-    spheres = world.counts[3]
-    if spheres:
-        ball = prim >= len(world.bound) - spheres
+    ball, curved = _spheres(world, prim), _quadrics(world, prim)
+    if ball is not None:
         radius = torch.where(ball, e1[0], 1.0)
         outward = normalize((x + wi * torch.where(missed, 0.0, hit.t) - p0).detach())
         y = torch.where(ball, p0 + outward * radius, y)
         area = torch.where(ball, outward * (radius * radius), area)
+    if curved is not None:
+        table = quadrics.rows(world, prim)
+        own = quadrics.place(table.code, torch.where(curved, hit.u, 0.0), torch.where(curved, hit.v, 0.0))
+        y = torch.where(curved, affine(p0 + e1 * own[0], e2, own[1], table.e3, own[2]), y)
+        area = torch.where(curved, quadrics.direction(table, quadrics.normal(table.code, own)), area)
     offset = torch.where(missed, wi, y - x)
     square = dot(offset, offset)
     direction = offset / square.sqrt()
@@ -139,5 +168,8 @@ def offset_origin(world: World, at: Interaction, w: Tensor) -> Tensor:
 
     Waechter and Binder (*A Fast and Robust Method for Avoiding Self-Intersection*, Ray Tracing Gems, 2019) for the idea.
     """
-    step = take(world.bound, at.prim) * OFFSET
+    bound, curved = take(world.bound, at.prim), _quadrics(world, at.prim)
+    if curved is not None:  # a bound at the point itself: a needle is far thinner than it is long
+        bound = torch.where(curved, dot(at.ng.detach().abs(), quadrics.rows(world, at.prim).reach), bound)
+    step = bound * OFFSET
     return torch.addcmul(at.p, at.ng, torch.copysign(step, dot(w, at.ng)))
