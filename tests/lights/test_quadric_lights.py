@@ -29,7 +29,7 @@ SHAPES: dict[str, dict[str, Any]] = {
         "transform": [
             {"scale": [-1, 1, 1.5]},
             {"rotate": {"axis": [1, 0, 0], "angle": 30}},
-            {"translate": [0.2, 2, 1]},
+            {"translate": [1.6, 0, 1]},
         ],
     },
     "tube seen from within": {"type": "cylinder", "radius": 1.5, "height": 4, "capped": False, "flip_normals": True},
