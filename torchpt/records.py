@@ -21,6 +21,7 @@ __all__ = [
     "KINDS",
     "QUADRICS",
     "BsdfSample",
+    "Copies",
     "Geometry",
     "Hit",
     "Interaction",
@@ -56,6 +57,9 @@ class Geometry:
         p2: ``(3, P)``; of a quadric its ``e2``.
         counts: how many primitives of each of :data:`KINDS`; stored in that order.
         quadrics: ``(13, Q)`` float64: ``p0 e1 e2 e3`` and the code of the surface; None where there are none.
+        copies: ``(15, I)`` float64: three rows of the map from a mesh to its copy, the first triangle of that mesh, how many it
+            has, and the id of the copy's first primitive; None where there are no instances. A copy's primitives exist by
+            their ids alone, which follow those of all others.
     """
 
     p0: Tensor
@@ -63,10 +67,11 @@ class Geometry:
     p2: Tensor
     counts: tuple[int, int, int, int, int]
     quadrics: Tensor | None = None
+    copies: Tensor | None = None
 
     @property
     def size(self) -> int:
-        """Number of primitives P."""
+        """Number of primitives P, copies not counted."""
         return sum(self.counts)
 
 
@@ -80,6 +85,25 @@ class Quadrics:
     n2: Tensor  # (3, Q)
     n3: Tensor  # (3, Q)
     reach: Tensor  # (3, Q) largest coordinate magnitudes that enter a point's sum, see World.bound
+
+
+@dataclass(frozen=True)
+class Copies:
+    """Instances of meshes: column 0 is the identity, that of all that is no copy; column k belongs to copy k - 1.
+
+    What is kept by primitive splits in two: its place on a mesh, looked up by :attr:`Interaction.prim`, and what a copy has of
+    its own (material, opacity, object id), by :attr:`Interaction.slot`: rows after the P of the primitives, one a copy.
+    """
+
+    start: Tensor  # (I + 1,) int64 id of the copy's first primitive
+    first: Tensor  # (I + 1,) int64 first triangle of its mesh
+    x: Tensor  # (3, I + 1) columns of the linear map
+    y: Tensor  # (3, I + 1)
+    z: Tensor  # (3, I + 1)
+    move: Tensor  # (3, I + 1)
+    nx: Tensor  # (3, I + 1) columns of its cofactor matrix, turned to the front; their scale is free
+    ny: Tensor  # (3, I + 1)
+    nz: Tensor  # (3, I + 1)
 
 
 @dataclass(frozen=True)
@@ -99,7 +123,7 @@ class Lights:
     radiance: Tensor  # (3, K)
     opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
     environment: Tensor | None  # (3,) radiance that comes from outside
-    row_of_prim: Tensor | None  # (P,) int64, -1 where a primitive does not emit; None where none does
+    row_of_prim: Tensor | None  # (P + I,) int64, -1 where a primitive does not emit; None where none does
     quadric: Tensor | None = (
         None  # (K,) int64 column of World.quadrics, 0 for the other kinds; None where no quadric emits
     )
@@ -108,7 +132,10 @@ class Lights:
 
 @dataclass(frozen=True)
 class World:
-    """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``."""
+    """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``.
+
+    P primitives, and I copies (see :class:`Copies`).
+    """
 
     counts: tuple[int, int, int, int, int]  # as in Geometry
     p0: Tensor  # (3, P)
@@ -119,15 +146,32 @@ class World:
     flip: Tensor | None  # (P,) orientation of spheres
     normals: tuple[Tensor, Tensor, Tensor] | None  # (3, P) shading normals at the corners, where any are smooth
     tangents: Tensor | None  # (3, P) along u where any material is anisotropic; of a sphere its axis, zero: any will do
-    opacity: Tensor | None  # (P,) chance that a ray meets the surface; None where it always does
-    material: Tensor  # (P,) int64 row in the parameters of its model
-    key: Tensor  # (P + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
+    opacity: Tensor | None  # (P + I,) chance that a ray meets the surface; None where it always does
+    material: Tensor  # (P + I,) int64 row in the parameters of its model
+    key: Tensor  # (P + I + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
     models: tuple[Bsdf, ...]  # the BSDFs present
     bsdfs: tuple[Parameters, ...]  # stacked parameters of each model
     two_sided: tuple[Tensor | None, ...]  # (M,) bool for the rows of each model; None where all are
-    object_id: Tensor  # (P,) int64, order of the shape in the scene
+    object_id: Tensor  # (P + I,) int64, order of the shape in the scene
     lights: Lights | None  # None where nothing emits
     quadrics: Quadrics | None = None  # None where there are none
+    copies: Copies | None = None  # None where there are no instances
+
+    def slot(self, prim: Tensor) -> Tensor:
+        """Rows ``(N,)`` of what copies have of their own, for ids of primitives as the search gives them; -1 stays."""
+        if self.copies is None:
+            return prim
+        import torch
+
+        copy = self.copy(prim)
+        return torch.where(copy > 0, copy + (len(self.bound) - 1), prim)
+
+    def copy(self, prim: Tensor) -> Tensor:
+        """Columns ``(N,)`` of ``copies`` for ids of primitives as the search gives them."""
+        import torch
+
+        assert self.copies is not None
+        return torch.searchsorted(self.copies.start[1:], prim, right=True)
 
 
 @dataclass(frozen=True)
@@ -135,7 +179,7 @@ class Hit:
     """What the search found."""
 
     t: Tensor  # (N,) in units of |d|
-    prim: Tensor  # (N,) int64, -1 for a miss
+    prim: Tensor  # (N,) int64, -1 for a miss; of a copy beyond P, see Copies
     u: Tensor  # (N,)
     v: Tensor  # (N,)
     chance: Tensor | None = (
@@ -151,7 +195,9 @@ class Interaction:
     ng: Tensor  # (3, N) unit geometric normal, on the shape's own outside
     ns: Tensor  # (3, N) unit shading normal
     tangent: Tensor | None  # (3, N) along u, neither unit nor orthogonal; None where nothing is anisotropic
-    prim: Tensor  # (N,)
+    prim: Tensor  # (N,) below P: of a copy the triangle of its mesh
+    slot: Tensor  # (N,) row of what a copy has of its own; else prim
+    bound: Tensor | None  # (N,) in place of World.bound at prim; None where that holds everywhere
 
 
 @dataclass(frozen=True)

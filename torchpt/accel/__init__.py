@@ -6,6 +6,8 @@ One contract (:class:`~torchpt.accel.base.Accel`), three backends:
 - ``numba`` (CPU): a wide tree built by the surface area heuristic.
 - ``torch`` (any device, the reference): a linear BVH built and traversed by tensor operations.
 
+Instances of meshes are a second level above the last two (``instances.py``, ``wide_instances.py``).
+
 Nothing here imports numba until a numba backend is built.
 """
 
@@ -41,25 +43,32 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None) ->
     if kind not in KINDS:
         raise SceneError("render.accel", kind, " | ".join(KINDS))
     on_cpu = geometry.p0.device.type == "cpu"
+    if geometry.copies is not None and kind == "brute":
+        raise SceneError("render.accel", kind, "numba or torch (this scene has instances)")
     if kind == "auto":
         kind = _choose(geometry) if on_cpu else "torch"
     if kind == "torch":
+        from torchpt.accel.instances import Instanced
         from torchpt.accel.lbvh import Lbvh
 
-        return Lbvh(geometry)
+        return Lbvh(geometry) if geometry.copies is None else Instanced(geometry, Lbvh(geometry))
     if not on_cpu:
         raise SceneError("render.accel", kind, f"torch (this scene is on {geometry.p0.device.type})")
     if kind == "brute":
         from torchpt.accel.brute import Brute
 
         return Brute(geometry, threads)
+    if geometry.copies is not None:
+        from torchpt.accel.wide_instances import WideInstanced
+
+        return WideInstanced(geometry, threads)
     from torchpt.accel.wide import Wide
 
     return Wide(geometry, threads)
 
 
 def _choose(geometry: Geometry) -> str:
-    if geometry.size > BRUTE_LIMIT:
+    if geometry.size > BRUTE_LIMIT or geometry.copies is not None:
         return "numba"
     from torchpt.accel.brute import eligible
 

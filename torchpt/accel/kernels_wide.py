@@ -9,13 +9,16 @@ from torchpt.accel.jit import jit
 from torchpt.accel.kernels_build import WIDTH
 from torchpt.accel.kernels_leaf import distance, setup
 
-__all__ = ["intersect", "intersect_parallel", "occluded", "occluded_parallel"]
+__all__ = [
+    "LOWEST", "SLACK", "children", "finite", "inside", "push",
+    "intersect", "intersect_parallel", "occluded", "occluded_parallel",
+]  # fmt: skip
 
-_SLACK = np.float32(1.0 + 2.0**-20)  # as in torchpt.accel.traverse
+SLACK = np.float32(1.0 + 2.0**-20)  # as in torchpt.accel.traverse
 _INF = np.float32(np.inf)
 _ZERO = np.float32(0.0)
 #: Place of the lowest set bit of a byte.
-_LOWEST = np.array([0, *((k & -k).bit_length() - 1 for k in range(1, 1 << WIDTH))], np.int32)
+LOWEST = np.array([0, *((k & -k).bit_length() - 1 for k in range(1, 1 << WIDTH))], np.int32)
 
 
 @jit(forceinline=True)
@@ -35,7 +38,7 @@ def _larger(a, b):
 
 
 @jit(forceinline=True)
-def _children(boxes, node, o, inverse, best, near, unit):
+def children(boxes, node, o, inverse, best, near, unit):
     """Entry distances of a node's eight boxes; returns one bit for each that is met before ``best``."""
     base = node * 6 * WIDTH
     met = np.int32(0)
@@ -45,18 +48,18 @@ def _children(boxes, node, o, inverse, best, near, unit):
         ay, by = (boxes[_at(i + WIDTH)] - o[1]) * inverse[1], (boxes[_at(i + 4 * WIDTH)] - o[1]) * inverse[1]
         az, bz = (boxes[_at(i + 2 * WIDTH)] - o[2]) * inverse[2], (boxes[_at(i + 5 * WIDTH)] - o[2]) * inverse[2]
         a = _larger(_larger(_smaller(ax, bx), _smaller(ay, by)), _larger(_smaller(az, bz), _ZERO))
-        b = _smaller(_smaller(_larger(ax, bx), _larger(ay, by)), _smaller(_larger(az, bz), best)) * _SLACK
+        b = _smaller(_smaller(_larger(ax, bx), _larger(ay, by)), _smaller(_larger(az, bz), best)) * SLACK
         near[k] = a
         met |= (np.int32(1) << np.int32(k)) if (a <= b) & (a < _INF) else np.int32(0)
     return met
 
 
 @jit(forceinline=True)
-def _push(child, node, met, near, stack, entry, top):
+def push(child, node, met, near, stack, entry, top):
     """Puts the boxes that were met on the stack, the nearest on top."""
     bottom = top
     while met != 0:
-        k = _LOWEST[met]
+        k = LOWEST[met]
         met &= met - np.int32(1)
         a = near[k]
         j = top
@@ -69,7 +72,7 @@ def _push(child, node, met, near, stack, entry, top):
 
 
 @jit(forceinline=True)
-def _inside(corners, leaf, px, py, pz, kx, ky, kz, sx, sy, unit):
+def inside(corners, leaf, px, py, pz, kx, ky, kz, sx, sy, unit):
     """One bit for each of a leaf's eight triangles that the ray's line crosses."""
     base = leaf * 9 * WIDTH
     crossed = np.int32(0)
@@ -90,7 +93,8 @@ def _inside(corners, leaf, px, py, pz, kx, ky, kz, sx, sy, unit):
 
 
 @jit(forceinline=True)
-def _finite(a, b, c):
+def finite(a, b, c):
+    """Whether three numbers are all finite."""
     return a * _ZERO + b * _ZERO + c * _ZERO == _ZERO
 
 
@@ -105,7 +109,7 @@ def _trace(first, last, o, d, t_max, tree, kinds, room, unit, any_hit, out_t, ou
         p, r, best = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i]), t_max[i]
         prim, best_u, best_v = np.int32(-1), _ZERO, _ZERO
         top = 0
-        if best > _ZERO and _finite(p[0], p[1], p[2]) and _finite(r[0], r[1], r[2]):
+        if best > _ZERO and finite(p[0], p[1], p[2]) and finite(r[0], r[1], r[2]):
             stack[0], entry[0] = 0, _ZERO
             top = 1
         kx, ky, kz, sx, sy, sz, ix, iy, iz = setup(r[0], r[1], r[2])
@@ -113,18 +117,18 @@ def _trace(first, last, o, d, t_max, tree, kinds, room, unit, any_hit, out_t, ou
         while top > 0:
             top -= 1
             node = stack[top]
-            if entry[top] > best * _SLACK:
+            if entry[top] > best * SLACK:
                 continue
             if node >= 0:
-                met = _children(boxes, node, p, (ix, iy, iz), best, near, unit)
-                top = _push(child, node, met, near, stack, entry, top)
+                met = children(boxes, node, p, (ix, iy, iz), best, near, unit)
+                top = push(child, node, met, near, stack, entry, top)
                 continue
             leaf = ~node
             left = full[leaf]
             if left < 0:
-                left = _inside(leaves, leaf, px, py, pz, kx, ky, kz, sx, sy, unit)
+                left = inside(leaves, leaf, px, py, pz, kx, ky, kz, sx, sy, unit)
             while left != 0:
-                q = ids[leaf * WIDTH + _LOWEST[left]]
+                q = ids[leaf * WIDTH + LOWEST[left]]
                 left &= left - np.int32(1)
                 t, u, v = distance(q, corner, rows, quadrics, n1, n2, n3, n4, p, r, kx, ky, kz, sx, sy, sz)
                 if t > _ZERO and (t < best or (t == best and q < prim)):

@@ -17,7 +17,7 @@ from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
 from torchpt.accel.tables import inverses, prepare
 from torchpt.records import Geometry
 
-__all__ = ["Wide"]
+__all__ = ["Wide", "wide_tree"]
 
 _GRAIN = 512  # rays that repay another thread
 
@@ -42,7 +42,7 @@ class Wide(Accel):
         ids = keep.int().numpy()
         fourth = (geometry.p1 + geometry.p2) - geometry.p0
         corner = torch.cat([geometry.p0, geometry.p1, geometry.p2, fourth]).float().T.contiguous()
-        tree = _wide_tree(boxes, ids)
+        tree = wide_tree(boxes, ids)
         self.depth, self.nodes, self.sah_cost = tree.depth, len(tree.child) // WIDTH, tree.cost
         self.leaves = len(tree.ids) // WIDTH
         tris, full = _leaf_blocks(tree.ids, corner.numpy(), geometry.counts[0])
@@ -75,7 +75,7 @@ class _Built:
         self.boxes, self.child, self.ids, self.depth, self.cost = boxes, child, ids, depth, cost
 
 
-def _wide_tree(boxes: np.ndarray, ids: np.ndarray) -> _Built:
+def wide_tree(boxes: np.ndarray, ids: np.ndarray) -> _Built:
     """Builds over boxes ``(L, 6)``; ids come back as ``(leaves * 8,)``, padded with -1."""
     n = len(ids)
     if n == 0:

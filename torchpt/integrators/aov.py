@@ -34,7 +34,7 @@ def first_hit(
         at = interact(world, take(state.o, index), take(state.d, index), found)
         values: dict[str, Tensor] = {}
         if "albedo" in names:
-            parameters = bsdfs.gather(world.bsdfs[model], take(world.material, at.prim))
+            parameters = bsdfs.gather(world.bsdfs[model], take(world.material, at.slot))
             values["albedo"] = world.models[model].albedo(parameters)
         if "normal" in names:
             values["normal"] = at.ns
@@ -43,7 +43,7 @@ def first_hit(
         if "position" in names:
             values["position"] = at.p + centre.to(dtype)[:, None]
         if "object_id" in names:
-            values["object_id"] = take(world.object_id, at.prim).to(dtype)[None]
+            values["object_id"] = take(world.object_id, at.slot).to(dtype)[None]
         for name, value in values.items():
             layers[name].scatter_(1, index.expand(len(value), -1), value)
     return layers

@@ -111,7 +111,7 @@ def partition(world: World, hit: Hit) -> tuple[Ends, list[tuple[int, Tensor]]]:
         Which lanes hit an emitter or nothing, and for each model present its number and lanes.
     """
     models = len(world.models)
-    keys, order = torch.sort(take(world.key, hit.prim + 1), stable=True)
+    keys, order = torch.sort(take(world.key, world.slot(hit.prim) + 1), stable=True)
     bounds = torch.searchsorted(keys, torch.arange(2 * models + 1, dtype=keys.dtype, device=keys.device)).tolist()
     bounds.append(len(order))
     groups = []

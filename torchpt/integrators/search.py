@@ -52,7 +52,7 @@ class Search:
     def _opacity(self, hit: Hit, miss: float) -> Tensor:
         """Opacity ``(N,)`` of what was hit; ``miss`` where nothing was."""
         assert self._world.opacity is not None
-        return torch.where(hit.prim < 0, miss, take(self._world.opacity, hit.prim.clamp_min(0)))
+        return torch.where(hit.prim < 0, miss, take(self._world.opacity, self._world.slot(hit.prim).clamp_min(0)))
 
     @torch.no_grad()
     def _beyond(self, o: Tensor, d: Tensor, hit: Hit) -> Tensor:

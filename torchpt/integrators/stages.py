@@ -151,7 +151,7 @@ def bounce(
 
 def _surface(world: World, number: int, state: PathState, at: Interaction) -> Surface:
     """Resolve the material at the surface points."""
-    model, row = world.models[number], take(world.material, at.prim)
+    model, row = world.models[number], take(world.material, at.slot)
     ns, side, shown = at.ns, None, None
     if not model.transmits:
         side = torch.copysign(torch.ones_like(ns[0]), -dot(state.d, ns).detach())

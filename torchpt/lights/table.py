@@ -142,7 +142,7 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Ten
         Radiance ``(3, N)``, zero from behind, and the density ``(N,)`` with which :func:`sample` would have drawn ``wi``.
     """
     assert lights.row_of_prim is not None
-    row = take(lights.row_of_prim, at.prim) if len(lights.area) > 1 else None
+    row = take(lights.row_of_prim, at.slot) if len(lights.area) > 1 else None
     table = _rows(lights, row)
     with torch.no_grad():
         to = at.p - x

@@ -16,8 +16,8 @@ from torchpt.bsdfs import Bsdf, Diffuse, Parameters, stacked
 from torchpt.errors import SceneError
 from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import affine, cross, dot, luminance, normalize
-from torchpt.records import KINDS, QUADRICS, Geometry, Lights, Quadrics, World
-from torchpt.scene.parts import Part
+from torchpt.records import KINDS, QUADRICS, Copies, Geometry, Lights, Quadrics, World
+from torchpt.scene.parts import Copy, Part
 from torchpt.scene.surfaces import Surface, surface_of
 from torchpt.shapes import quadrics
 from torchpt.shapes.normals import smooth_normals
@@ -89,6 +89,7 @@ def assemble(
     environment: Tensor | None,
     centre: Tensor,
     dtype: torch.dtype,
+    copies: Sequence[Copy] = (),
 ) -> tuple[World, Geometry]:
     """The world of ``parts`` under ``parameters``, and what the search sees of it.
 
@@ -98,6 +99,7 @@ def assemble(
         environment: radiance ``(3,)`` of a constant environment, or None.
         centre: ``(3,)`` float64 that becomes the origin.
         dtype: of the lanes.
+        copies: instances of parts.
     """
     device = centre.device
     corners = [corners_of(part, parameters, centre, dtype) for part in parts]
@@ -108,10 +110,14 @@ def assemble(
         return torch.cat(pieces, -1) if pieces else torch.zeros(3, 0, dtype=dtype, device=device)
 
     def spread(values: list[int]) -> Tensor:
+        """One value a part, and where given one a copy, as rows by primitive and copy."""
+        spans = sizes + [1] * (len(values) - len(sizes))
         return torch.repeat_interleave(
             torch.tensor(values, dtype=torch.int64, device=device),
-            torch.tensor(sizes, dtype=torch.int64, device=device),
+            torch.tensor(spans, dtype=torch.int64, device=device),
         )
+
+    owners: list[Part | Copy] = [*parts, *copies]
 
     ball = counts[3] + counts[4] > 0
     first_sphere = sum(counts[:3])
@@ -139,12 +145,12 @@ def assemble(
     frame = torch.cat(frames, 1) if frames else None
     curved = None if frame is None else _quadrics([part for part in parts if part.kind == "quadric"], frame, dtype)
 
-    slots = {part.material.name: part.material for part in parts}
+    slots = {owner.material.name: owner.material for owner in owners}
     surfaces = {name: surface_of(slot, parameters, dtype) for name, slot in slots.items()}
-    models, rows, tables, two_sided = _materials(parts, surfaces, device)
-    opacity = _opacity(parts, surfaces, sizes, dtype, device)
-    emissive = spread([int(part.emission is None) for part in parts])  # 0 where it emits
-    keys = emissive * len(models) + spread([models.index(surfaces[part.material.name].model) for part in parts])
+    models, rows, tables, two_sided = _materials(owners, surfaces, device)
+    opacity = _opacity(owners, surfaces, sizes + [1] * len(copies), dtype, device)
+    emissive = spread([int(part.emission is None) for part in parts] + [1] * len(copies))  # 0 where it emits
+    keys = emissive * len(models) + spread([models.index(surfaces[owner.material.name].model) for owner in owners])
     key = torch.cat((torch.full((1,), 2 * len(models), device=device), keys)).to(torch.uint8)
     lights = _lights(
         parts,
@@ -164,6 +170,7 @@ def assemble(
         curved,
         dtype,
     )
+    maps = _copy_maps(parts, sizes, copies, parameters, centre) if copies else None
     # The search gets the corners themselves: rebuilt from edges, neighbours would no longer share them to the bit.
     q0, q1, q2 = (x.detach().to(torch.float32).contiguous() for x in (p0, p1, p2))
     size = (counts[0], counts[1], counts[2], counts[3], counts[4])
@@ -186,11 +193,54 @@ def assemble(
         models=models,
         bsdfs=tables,
         two_sided=two_sided,
-        object_id=spread([part.object_id for part in parts]),
+        object_id=spread([owner.object_id for owner in owners]),
         lights=lights,
         quadrics=curved,
+        copies=None if maps is None else _copies(maps, copies, dtype),
     )
-    return world, Geometry(q0, q1, q2, size, table)
+    return world, Geometry(q0, q1, q2, size, table, None if maps is None else maps.detach())
+
+
+#: Ids of primitives are int32 in the searches.
+MOST_PRIMITIVES = 2**31 - 1
+
+
+def _copy_maps(
+    parts: Sequence[Part], sizes: list[int], copies: Sequence[Copy], parameters: Mapping[str, Tensor], centre: Tensor
+) -> Tensor:
+    """Where copies lie relative to their meshes: ``(15, I)`` float64, see :class:`~torchpt.records.Geometry`."""
+    first, at = {}, 0
+    for part, n in zip(parts, sizes, strict=True):
+        first[part.name], at = (at, n), at + n
+    if at + sum(first[copy.of][1] for copy in copies) > MOST_PRIMITIVES:
+        raise SceneError(
+            "shapes", at + sum(first[c.of][1] for c in copies), "at most 2^31 - 1 primitives, copies included"
+        )
+    back = {name: torch.linalg.inv(parameters[f"{name}.to_world"].double()) for name in {copy.of for copy in copies}}
+    shift = torch.eye(4, dtype=torch.float64, device=centre.device)
+    shift[:3, 3] = centre
+    columns = []
+    for copy in copies:
+        start, n = first[copy.of]
+        pose = parameters[f"{copy.name}.to_world"].double()
+        matrix = (torch.linalg.inv(shift) @ pose @ back[copy.of] @ shift)[:3]
+        columns.append(torch.cat((matrix.reshape(-1), matrix.new_tensor([start, n, at]))))
+        at += n
+    return torch.stack(columns, 1)
+
+
+def _copies(maps: Tensor, copies: Sequence[Copy], dtype: torch.dtype) -> Copies:
+    """What lanes need of copies, the identity first."""
+    same = torch.eye(3, 4, dtype=torch.float64, device=maps.device).reshape(-1)
+    maps = torch.cat((torch.cat((same, same.new_zeros(3)))[:, None], maps), 1)
+    x, y, z, move = (maps[k:12:4] for k in range(4))
+    faces = [cross(y, z), cross(z, x), cross(x, y)]
+    front = torch.tensor([1.0] + [-1.0 if copy.flip else 1.0 for copy in copies], dtype=x.dtype, device=x.device)
+    front = front * torch.sign(dot(x, faces[0]).detach())
+    scale = torch.stack(faces).detach().abs().amax((0, 1))
+    nx, ny, nz = ((n * (front / scale)).to(dtype) for n in faces)
+    first, start = maps[12].detach().to(torch.int64), maps[14].detach().to(torch.int64)
+    return Copies(start, first, x.to(dtype), y.to(dtype), z.to(dtype), move.to(dtype), nx, ny, nz)
 
 
 def _quadrics(parts: Sequence[Part], frames: Tensor, dtype: torch.dtype) -> Quadrics:
@@ -232,7 +282,7 @@ MOST_MODELS = 120
 
 
 def _materials(
-    parts: Sequence[Part], surfaces: Mapping[str, Surface], device: torch.device
+    parts: Sequence[Part | Copy], surfaces: Mapping[str, Surface], device: torch.device
 ) -> tuple[tuple[Bsdf, ...], list[int], tuple[Parameters, ...], tuple[Tensor | None, ...]]:
     """Models present, the row of each part in its model, the stacked parameters, and which rows are two-sided."""
     models = tuple(dict.fromkeys(surfaces[part.material.name].model for part in parts)) or (Diffuse(),)
@@ -253,7 +303,11 @@ def _materials(
 
 
 def _opacity(
-    parts: Sequence[Part], surfaces: Mapping[str, Surface], sizes: list[int], dtype: torch.dtype, device: torch.device
+    parts: Sequence[Part | Copy],
+    surfaces: Mapping[str, Surface],
+    sizes: list[int],
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> Tensor | None:
     """The chance ``(P,)`` that a ray meets a primitive; None where it always does."""
     if all(surface.opacity is None for surface in surfaces.values()):

@@ -13,8 +13,8 @@ from torchpt.records import KINDS
 from torchpt.scene.description import Description
 from torchpt.scene.loaders import MeshPart, load_mesh, unit_cube
 from torchpt.scene.materials import slot_of
-from torchpt.scene.parts import MaterialSlot, Part
-from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Mesh, Rectangle, Shape, Sphere
+from torchpt.scene.parts import Copy, MaterialSlot, Part
+from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Instance, Mesh, Rectangle, Shape, Sphere
 
 __all__ = ["Built", "build_parts"]
 
@@ -32,12 +32,14 @@ class Built:
         parameters: arrays by dotted name, float64.
         centre: ``(3,)`` float64, subtracted from all positions.
         environment: dotted name of the constant environment's radiance, or None.
+        copies: instances of parts.
     """
 
     parts: tuple[Part, ...]
     parameters: dict[str, np.ndarray]
     centre: np.ndarray
     environment: str | None
+    copies: tuple[Copy, ...] = ()
 
 
 def build_parts(description: Description) -> Built:
@@ -50,7 +52,12 @@ def build_parts(description: Description) -> Built:
     parameters: dict[str, np.ndarray] = {}
     parts: list[Part] = []
     for number, (name, shape) in enumerate(description.shapes.items(), 1):
-        parts += _shape_parts(description, name, shape, number, parameters)
+        if not isinstance(shape, Instance):
+            parts += _shape_parts(description, name, shape, number, parameters)
+    copies: list[Copy] = []
+    for number, (name, shape) in enumerate(description.shapes.items(), 1):
+        if isinstance(shape, Instance):
+            copies += _copies(description, name, shape, number, parts, parameters)
     for name, material in description.materials.items():
         _declare(slot_of(material, f"materials.{name}", description.materials), parameters)
     if len(description.lights) > 1:
@@ -63,7 +70,38 @@ def build_parts(description: Description) -> Built:
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
     parameters["camera.fov"] = np.asarray(description.camera.fov, np.float64)
     parts.sort(key=lambda part: KINDS.index(part.kind))
-    return Built(tuple(parts), parameters, _centre(parts), environment)
+    return Built(tuple(parts), parameters, _centre(parts, copies), environment, tuple(copies))
+
+
+def _copies(
+    description: Description,
+    name: str,
+    shape: Instance,
+    number: int,
+    parts: list[Part],
+    parameters: dict[str, np.ndarray],
+) -> list[Copy]:
+    """An instance, as one copy of each part of its mesh."""
+    key, file = f"shapes.{name}", description.file
+    mesh = description.shapes.get(shape.of)
+    if not isinstance(mesh, Mesh | Cube):
+        names = [other for other, value in description.shapes.items() if isinstance(value, Mesh | Cube)]
+        known = f" ({', '.join(names[:8])}{', ...' if len(names) > 8 else ''})" if names else " (there is none)"
+        raise SceneError(f"{key}.of", shape.of, f"the name of a mesh among the shapes{known}", file)
+    parameters[f"{key}.to_world"] = shape.to_world()
+    found = []
+    for part in (part for part in parts if part.shape == shape.of):
+        slot = part.material
+        if isinstance(shape.material, str):
+            slot = slot_of(description.materials[shape.material], f"materials.{shape.material}", description.materials)
+        elif shape.material is not None:
+            slot = slot_of(shape.material, f"{key}.material", description.materials)
+        if slot.emission is not None:
+            raise SceneError(f"{key}.material", slot.name, "a material that does not emit: an instance cannot", file)
+        _declare(slot, parameters)
+        flip = shape.flip_normals != part.flip
+        found.append(Copy(key, name, number, part.name, slot, flip, parameters[f"{key}.to_world"]))
+    return found
 
 
 def _declare(slot: MaterialSlot, parameters: dict[str, np.ndarray]) -> None:
@@ -223,15 +261,23 @@ def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
     return np.ascontiguousarray(piece.faces[solid]), int((~solid).sum())
 
 
-def _centre(parts: list[Part]) -> np.ndarray:
+def _centre(parts: list[Part], copies: list[Copy]) -> np.ndarray:
     """Where the origin goes: the middle of a scene that lies far off, else where it is."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    boxes: dict[str, np.ndarray] = {}
+    placed = []
     for part in parts:
+        points = corners
         if part.vertices is not None and part.faces is not None:
             points = part.vertices[part.faces.reshape(-1)]  # vertices of no face have no say
-        else:
-            points = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        world = points @ part.to_world[:3, :3].T + part.to_world[:3, 3]
+            if len(points):
+                half, middle = 0.5 * np.ptp(points, axis=0), 0.5 * (points.max(0) + points.min(0))
+                boxes[part.name] = middle + corners * half
+        placed.append((points, part.to_world))
+    placed += [(boxes[copy.of], copy.to_world) for copy in copies if copy.of in boxes]
+    for points, to_world in placed:
+        world = points @ to_world[:3, :3].T + to_world[:3, 3]
         if len(world):
             low, high = np.minimum(low, world.min(0)), np.maximum(high, world.max(0))
     if not np.isfinite(low).all():

@@ -36,6 +36,12 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
                 "face" if not part.smooth else "computed, smooth" if part.normals is None else "from the file"
             )
         shapes[part.name.removeprefix("shapes.") + (f".{part.piece}" if part.piece else "")] = row
+    for copy in built.copies:
+        shapes[copy.name.removeprefix("shapes.")] = {
+            "kind": "instance",
+            "of": copy.of.removeprefix("shapes."),
+            "material": copy.material.name,
+        }
     memory = sum(x.numel() * x.element_size() for x in tensors_of(world))
     made: dict[str, Any] = {
         "accel": accel.describe(),
@@ -49,6 +55,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "scene": {
             "file": description.file,
             "primitives": {kind: n for kind, n in zip(KINDS, world.counts, strict=True) if n},
+            **({"instances": len(built.copies)} if built.copies else {}),
             "parameters": len(built.parameters),
         },
         "shapes": shapes,
@@ -78,6 +85,8 @@ def _left_out(world: World, settings: Settings) -> list[str]:
         absent.append("refraction (no index along paths)")
     if not any(model.lobed for model in world.models):
         absent.append("choice among lobes")
+    if world.copies is None:
+        absent.append("instances")
     if lights is None:
         absent.append("light sampling and MIS (nothing emits)")
     else:

@@ -9,7 +9,6 @@ from __future__ import annotations
 __all__ = ["AOVS", "KEYS", "TYPES"]
 
 _POSE = ("origin", "target", "up", "to_world")
-_SHAPE = ("material", "transform", "emission", "flip_normals")
 
 #: kind of thing -> its types that are not built -> the keys each of them takes beside ``type``.
 TYPES: dict[str, dict[str, tuple[str, ...]]] = {
@@ -27,9 +26,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
         "image": ("path", "wrap", "filter", "colorspace", "scale", "uv_transform", "channel"),
         "checkerboard": ("color0", "color1", "scale", "uv_transform"),
         "vertex_color": (),
-    },
-    "shape": {
-        "instance": ("of", *_SHAPE),
     },
     "light": {
         "envmap": ("path", "scale", "transform"),

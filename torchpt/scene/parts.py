@@ -8,7 +8,7 @@ import numpy as np
 
 from torchpt.bsdfs import Bsdf
 
-__all__ = ["MaterialSlot", "Part"]
+__all__ = ["Copy", "MaterialSlot", "Part"]
 
 
 @dataclass(frozen=True)
@@ -101,3 +101,26 @@ class Part:
     dropped: int = 0
     source: str = ""
     ignored: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Copy:
+    """An instance of one part of a mesh, whose triangles it shares.
+
+    Attributes:
+        name: dotted prefix of its parameters, e.g. ``shapes.third_bunny``.
+        shape: name of the instance in the scene.
+        object_id: order of the instance in the scene, from 1.
+        of: the part's name.
+        material: its material.
+        flip: whether the normals are turned around, compared with the part's.
+        to_world: ``(4, 4)`` float64, in place of the part's own.
+    """
+
+    name: str
+    shape: str
+    object_id: int
+    of: str
+    material: MaterialSlot
+    flip: bool
+    to_world: np.ndarray

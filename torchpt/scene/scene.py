@@ -193,7 +193,7 @@ class Scene:
 
     def _assemble(self, params: Mapping[str, Tensor], dtype: torch.dtype) -> tuple[World, Geometry]:
         environment = params[self._built.environment] if self._built.environment else None
-        return assemble(self._built.parts, params, environment, self._centre, dtype)
+        return assemble(self._built.parts, params, environment, self._centre, dtype, self._built.copies)
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""

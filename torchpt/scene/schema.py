@@ -29,7 +29,7 @@ from torchpt.scene.validate import Model
 
 __all__ = [
     "CAMERAS", "FOV_AXES", "LIGHTS", "SHAPES",
-    "Cone", "ConstantLight", "Cube", "Cylinder", "Disk", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
+    "Cone", "ConstantLight", "Cube", "Cylinder", "Disk", "Instance", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
 ]  # fmt: skip
 
 FOV_AXES = ("x", "y", "diagonal", "smaller", "larger")
@@ -228,6 +228,30 @@ class Cone(Shape):
         return _placed(base, (self.slope * length, self.slope * length, length), turn)
 
 
+def _of(value: Any) -> Any:
+    if isinstance(value, str) and value:
+        return value
+    raise wrong("the name of a mesh among the shapes")
+
+
+class Instance(Shape):
+    """Another place of a mesh, whose triangles it shares.
+
+    Attributes:
+        of: the mesh's name; its own transform does not count here.
+        material: None takes the mesh's.
+    """
+
+    type: Literal["instance"] = "instance"
+    of: Annotated[str, PlainValidator(_of)]
+
+    @model_validator(mode="after")
+    def _dark(self) -> Instance:
+        if self.emission is not None:
+            raise wrong("no emission on an instance (a mesh of its own can shine)", self.emission, ("emission",))
+        return self
+
+
 class Rectangle(Shape):
     """The square ``[-1, 1]^2`` in the xy plane with normal +z, then transformed."""
 
@@ -262,5 +286,6 @@ SHAPES: dict[str, type[Shape]] = {
     "cube": Cube,
     "cylinder": Cylinder,
     "cone": Cone,
+    "instance": Instance,
 }
 LIGHTS: dict[str, type[ConstantLight]] = {"constant": ConstantLight}

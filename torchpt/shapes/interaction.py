@@ -10,11 +10,13 @@ The search is free of gradients. Here the point comes from the primitive's own c
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+
 import torch
 from torch import Tensor
 
 from torchpt.math.vectors import affine, cross, dot, normalize, take
-from torchpt.records import Hit, Interaction, World
+from torchpt.records import Copies, Hit, Interaction, World
 from torchpt.shapes import quadrics
 
 __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
@@ -33,9 +35,46 @@ def _slide(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple[Te
     return dot(tvec, pvec) * inverse, dot(d, cross(tvec, e1)) * inverse
 
 
-def _blend(corners: tuple[Tensor, Tensor, Tensor], prim: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    n0, n1, n2 = (take(n, prim) for n in corners)
-    return affine(n0 * (1.0 - u - v), n1, u, n2, v)
+@dataclass(frozen=True)
+class _Place:
+    """Where primitives lie: what interactions need of them before a point is chosen."""
+
+    prim: Tensor  # (N,) below P
+    p0: Tensor  # (3, N)
+    e1: Tensor  # (3, N)
+    e2: Tensor  # (3, N)
+    copies: Copies | None  # columns (., N) where the scene has copies
+    copied: Tensor | None  # (N,) bool: which are copies
+    reach: Tensor | None  # (3, N) coordinate magnitudes that enter a point's sum, where the scene has copies
+
+    def moved(self, w: Tensor) -> Tensor:
+        """Vectors ``(3, N)`` of a mesh as those of its copy."""
+        assert self.copies is not None
+        return _linear(self.copies, w)
+
+    def turned(self, n: Tensor) -> Tensor:
+        """Unit normals ``(3, N)`` of a mesh as those of its copy."""
+        assert self.copies is not None and self.copied is not None
+        turned = affine(self.copies.nx * n[0], self.copies.ny, n[1], self.copies.nz, n[2])
+        return torch.where(self.copied, normalize(turned), n)
+
+
+def _linear(copies: Copies, w: Tensor) -> Tensor:
+    return affine(copies.x * w[0], copies.y, w[1], copies.z, w[2])
+
+
+def _placed(world: World, prim: Tensor) -> _Place:
+    """Places of primitives by ids as the search gives them, none of them a miss."""
+    if world.copies is None:
+        return _Place(prim, take(world.p0, prim), take(world.e1, prim), take(world.e2, prim), None, None, None)
+    column = world.copy(prim)
+    table = Copies(*(take(getattr(world.copies, field.name), column) for field in fields(Copies)))
+    prim = prim - table.start + table.first
+    p0, e1, e2 = take(world.p0, prim), take(world.e1, prim), take(world.e2, prim)
+    size = (p0.abs() + e1.abs() + e2.abs()).detach()
+    reach = affine(table.x.abs() * size[0], table.y.abs(), size[1], table.z.abs(), size[2]) + table.move.abs()
+    p0, e1, e2 = _linear(table, p0) + table.move, _linear(table, e1), _linear(table, e2)
+    return _Place(prim, p0, e1, e2, table, column > 0, reach.detach())
 
 
 def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) -> Interaction:
@@ -48,8 +87,8 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         hit: from the search.
         slide: re-intersect the ray with the plane, so that the point follows ``o``, ``d`` and the geometry.
     """
-    prim, u, v = hit.prim, hit.u, hit.v
-    p0, e1, e2 = take(world.p0, prim), take(world.e1, prim), take(world.e2, prim)
+    place = _placed(world, hit.prim)
+    prim, p0, e1, e2, u, v = place.prim, place.p0, place.e1, place.e2, hit.u, hit.v
     triangles, ball, curved = world.counts[0], _spheres(world, prim), _quadrics(world, prim)
     if slide:
         u, v = _slide(o, d, p0, e1, e2)
@@ -57,7 +96,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         if other is not None:
             u, v = torch.where(other, 0.0, u), torch.where(other, 0.0, v)
     p = affine(p0, e1, u, e2, v)
-    ng = take(world.normal, prim)
+    ng = take(world.normal, prim) if place.copies is None else place.turned(take(world.normal, prim))
     if ball is not None:
         assert world.flip is not None
         radius = torch.where(ball, e1[0], 1.0)
@@ -66,6 +105,9 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         outward = normalize(torch.where(ball, o + d * t - p0, torch.ones_like(p)))
         p = torch.where(ball, p0 + outward * radius, p)
         ng = torch.where(ball, outward * take(world.flip, prim), ng)
+    bound = None
+    if place.copied is not None and place.reach is not None:
+        bound = torch.where(place.copied, dot(ng.detach().abs(), place.reach), take(world.bound, prim))
     own = None
     if curved is not None:
         table = quadrics.rows(world, prim)
@@ -74,15 +116,23 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
             own = torch.where(curved, quadrics.slide(table, p0, e1, o, d, hit.t, own), own)
         p = torch.where(curved, affine(p0 + e1 * own[0], e2, own[1], table.e3, own[2]), p)
         ng = torch.where(curved, quadrics.outward(table, own), ng)
+        # At the point itself: a needle is far thinner than it is long.
+        other = take(world.bound, prim) if bound is None else bound
+        bound = torch.where(curved, dot(ng.detach().abs(), table.reach), other)
     ns = ng
     if world.normals is not None:
-        ns = normalize(_blend(world.normals, prim, u, v))
+        corners = [take(n, prim) for n in world.normals]
+        if place.copies is not None:
+            corners = [place.turned(n) for n in corners]
+        ns = normalize(affine(corners[0] * (1.0 - u - v), corners[1], u, corners[2], v))
         if triangles < len(world.bound):
             ns = torch.where(prim < triangles, ns, ng)
     tangent = _tangent(world, prim, u, v, e1, e2, ng)
+    if tangent is not None and place.copied is not None:
+        tangent = torch.where(place.copied, place.moved(tangent), tangent)
     if tangent is not None and curved is not None and own is not None:
         tangent = torch.where(curved, quadrics.tangent(e1, e2, own), tangent)
-    return Interaction(p, ng, ns, tangent, prim)
+    return Interaction(p, ng, ns, tangent, prim, world.slot(hit.prim), bound)
 
 
 def _spheres(world: World, prim: Tensor) -> Tensor | None:
@@ -137,8 +187,8 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
         solid angle to the surface, ``|cos| dA / r^2``.
     """
     missed = hit.prim < 0
-    prim = hit.prim.clamp_min(0)
-    p0, e1, e2 = take(world.p0, prim), take(world.e1, prim), take(world.e2, prim)
+    place = _placed(world, hit.prim.clamp_min(0))
+    prim, p0, e1, e2 = place.prim, place.p0, place.e1, place.e2
     y = affine(p0, e1, hit.u, e2, hit.v)
     area = cross(e1, e2)
     ball, curved = _spheres(world, prim), _quadrics(world, prim)
@@ -168,8 +218,5 @@ def offset_origin(world: World, at: Interaction, w: Tensor) -> Tensor:
 
     Waechter and Binder (*A Fast and Robust Method for Avoiding Self-Intersection*, Ray Tracing Gems, 2019) for the idea.
     """
-    bound, curved = take(world.bound, at.prim), _quadrics(world, at.prim)
-    if curved is not None:  # a bound at the point itself: a needle is far thinner than it is long
-        bound = torch.where(curved, dot(at.ng.detach().abs(), quadrics.rows(world, at.prim).reach), bound)
-    step = bound * OFFSET
+    step = (take(world.bound, at.prim) if at.bound is None else at.bound) * OFFSET
     return torch.addcmul(at.p, at.ng, torch.copysign(step, dot(w, at.ng)))
