@@ -10,8 +10,16 @@ from torchpt.accel.kernels_build import WIDTH
 from torchpt.accel.kernels_leaf import distance, setup
 
 __all__ = [
-    "LOWEST", "SLACK", "children", "finite", "inside", "push",
-    "intersect", "intersect_parallel", "occluded", "occluded_parallel",
+    "LOWEST",
+    "SLACK",
+    "children",
+    "finite",
+    "inside",
+    "intersect",
+    "intersect_parallel",
+    "occluded",
+    "occluded_parallel",
+    "push",
 ]  # fmt: skip
 
 SLACK = np.float32(1.0 + 2.0**-20)  # as in torchpt.accel.traverse
