@@ -108,9 +108,9 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
     bound = None
     if place.copied is not None and place.reach is not None:
         bound = torch.where(place.copied, dot(ng.detach().abs(), place.reach), take(world.bound, prim))
-    own = None
+    own, bent = None, None
     if curved is not None:
-        table = quadrics.rows(world, prim)
+        bent = table = quadrics.rows(world, prim)
         own = quadrics.place(table.code, torch.where(curved, hit.u, 0.0), torch.where(curved, hit.v, 0.0))
         if slide:
             own = torch.where(curved, quadrics.slide(table, p0, e1, o, d, hit.t, own), own)
@@ -130,8 +130,8 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
     tangent = _tangent(world, prim, u, v, e1, e2, ng)
     if tangent is not None and place.copied is not None:
         tangent = torch.where(place.copied, place.moved(tangent), tangent)
-    if tangent is not None and curved is not None and own is not None:
-        tangent = torch.where(curved, quadrics.tangent(e1, e2, own), tangent)
+    if tangent is not None and curved is not None and bent is not None and own is not None:
+        tangent = torch.where(curved, quadrics.tangents(bent.code, e1, e2, bent.e3, own)[0], tangent)
     return Interaction(p, ng, ns, tangent, prim, world.slot(hit.prim), bound)
 
 

@@ -27,7 +27,7 @@ __all__ = [
     "sample",
     "slide",
     "surface_uv",
-    "tangent",
+    "tangents",
     "uv_at",
 ]
 
@@ -79,9 +79,24 @@ def outward(table: Quadrics, q: Tensor) -> Tensor:
     return normalize(direction(table, normal(table.code, q)))
 
 
-def tangent(e1: Tensor, e2: Tensor, q: Tensor) -> Tensor:
-    """Derivatives ``(3, N)`` of the world's point along the azimuth about z."""
-    return e2 * q[0] - e1 * q[1]
+def tangents(code: Tensor, e1: Tensor, e2: Tensor, e3: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+    """How points of the world move with their texture coordinates, ``dp/du`` and ``dp/dv (3, N)``; zero at a pole or tip.
+
+    Args:
+        code: ``(N,)``.
+        e1: ``(3, N)`` of the map.
+        e2: ``(3, N)``.
+        e3: ``(3, N)``.
+        q: points in their own space ``(3, N)``.
+    """
+    square = q[0] * q[0] + q[1] * q[1]
+    some = square > 0
+    side = torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)
+    x, y = (torch.where(some, q[k] / torch.where(some, side, 1.0), 0.0) for k in (0, 1))
+    ball, cone = code == _ELLIPSOID, code == _CONE
+    inward = torch.where(ball, -math.pi * q[2], torch.where(cone, 1.0, 0.0))
+    up = torch.where(ball, -math.pi * side, 1.0)
+    return (e2 * q[0] - e1 * q[1]) * (2.0 * math.pi), affine(e3 * up, e1, -x * inward, e2, -y * inward)
 
 
 def surface_uv(code: Tensor, q: Tensor) -> Tensor:
