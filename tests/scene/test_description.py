@@ -11,6 +11,7 @@ import pytest
 
 from torchpt import paths
 from torchpt.errors import AssetError, NotBuiltError, SceneError
+from torchpt.scene.build import build_parts
 from torchpt.scene.description import read_description, scene_names, settings
 from torchpt.scene.materials import Diffuse
 from torchpt.scene.schema import Mesh, Perspective, Sphere
@@ -135,7 +136,7 @@ BAD: dict[str, tuple[dict[str, Any], str, str]] = {  # name -> scene, key, part 
 def test_bad_input_is_one_line_that_names_the_key(name: str) -> None:
     source, key, part = BAD[name]
     with pytest.raises(SceneError) as caught:
-        read_description(source)
+        build_parts(read_description(source))
     assert not isinstance(caught.value, NotBuiltError)
     assert caught.value.key == key
     assert part in str(caught.value)

@@ -189,6 +189,28 @@ def test_points_follow_their_rays_and_transforms(name):
     assert torch.autograd.gradcheck(lambda m: point(o, d, m), wide, eps=1e-5, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["sphere", "tube", "funnel"])
+def test_tangents_are_the_inverse_of_how_texture_coordinates_change(name):
+    scene, _, _ = scene_of(name, "sheared")
+    world, _ = scene.world(torch.float64)
+    assert world.quadrics is not None
+    n = 2000
+    code = world.quadrics.code.expand(n)
+    own = quadrics.sample(code, torch.rand(2, n, generator=torch.Generator().manual_seed(2), dtype=torch.float64))
+    e1, e2, e3 = (x.expand(3, n) for x in (world.e1, world.e2, world.quadrics.e3))
+    inverse = torch.linalg.inv(torch.cat((world.e1, world.e2, world.quadrics.e3), 1))
+    p = (e1 * own[0] + e2 * own[1] + e3 * own[2]).requires_grad_()
+    u, v = quadrics.surface_uv(code, inverse @ p)
+    slopes = [torch.autograd.grad(x.sum(), p, retain_graph=True)[0] for x in (u, v)]
+    table = quadrics.rows(world, torch.zeros(n, dtype=torch.int64))
+    moves = quadrics.tangent(e1, e2, own), quadrics.bitangent(table, e1, e2, own)
+    for i, slope in enumerate(slopes):
+        for j, move in enumerate(moves):
+            torch.testing.assert_close((slope * move).sum(0), torch.full((n,), float(i == j), dtype=torch.float64))
+    normal = quadrics.outward(table, own)
+    assert all((dot(normal, move) / move.norm(dim=0)).abs().max() < 1e-9 for move in moves)
+
+
 @pytest.mark.mitsuba
 @pytest.mark.parametrize("name", ["cylinder", "disk"])
 def test_mitsubas_cylinder_and_disk(name):
