@@ -25,35 +25,44 @@ def surface_uv(world: World, at: Interaction) -> Tensor:
     assert world.uvs is not None
     a, b, c = (take(x, at.prim) for x in world.uvs)
     uv = torch.addcmul(torch.addcmul(a * (1.0 - at.u - at.v), b, at.u), c, at.v)
+    flat = world.counts[0] + world.counts[1]
+    if flat == len(world.bound):
+        return uv
+    x, y, z, level = _own(world, at)
+    square = torch.addcmul(x * x, y, y)
+    some = square > 0
+    across = torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)
+    turn = azimuth(x, y) * (0.5 / math.pi)
+    disk = level == 0
+    first = torch.where(disk, across, turn)
+    # On sides the height, on balls the angle from the pole.
+    second = torch.where(disk, turn, torch.where(level > 1, azimuth(z, across) * (1.0 / math.pi), z))
+    return torch.where(at.prim >= flat, torch.stack((first, second)), uv)
+
+
+def _own(world: World, at: Interaction) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points ``x, y, z (N,)`` of round shapes in their own space, and 0 on disks, 1 on sides, 2 on balls."""
     triangles, rectangles, disks, spheres, curved = world.counts
-    if disks:
-        first = triangles + rectangles
-        disk = (at.prim >= first) & (at.prim < first + disks)
-        square = torch.where(disk, at.u * at.u + at.v * at.v, 0.0)
-        some = square > 0
-        radius = torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)
-        x, y = at.u, at.v
-        if world.mirrored is not None:
-            turned = take(world.mirrored, at.prim)
-            x, y = torch.where(turned, y, x), torch.where(turned, x, y)
-        polar = torch.stack((radius, azimuth(x, y) * (0.5 / math.pi)))
-        uv = torch.where(disk, polar, uv)
+    x, y, z, level = at.u, at.v, torch.zeros_like(at.u), torch.zeros_like(at.prim)
+    if world.mirrored is not None:
+        turned = take(world.mirrored, at.prim)
+        x, y = torch.where(turned, y, x), torch.where(turned, x, y)
     if spheres:
         assert world.axes is not None
         first = triangles + rectangles + disks
         ball = (at.prim >= first) & (at.prim < first + spheres)
         row = (at.prim - first).clamp(0, spheres - 1)
         away = at.p - take(world.p0, at.prim)
-        x, y, z = (dot(take(axis, row), away) for axis in world.axes)
-        square = x * x + y * y
-        some = square > 0
-        across = torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)
-        uv = torch.where(ball, torch.stack((azimuth(x, y) * (0.5 / math.pi), azimuth(z, across) * (1.0 / math.pi))), uv)
+        axes = [dot(take(axis, row), away) for axis in world.axes]
+        x, y, z = (torch.where(ball, axis, other) for axis, other in zip(axes, (x, y, z), strict=True))
+        level = torch.where(ball, 2, level)
     if curved:
         assert at.own is not None
-        here = quadrics.surface_uv(quadrics.rows(world, at.prim).code, at.own)
-        uv = torch.where(at.prim >= len(world.bound) - curved, here, uv)
-    return uv
+        other = at.prim >= len(world.bound) - curved
+        x, y, z = (torch.where(other, own, value) for own, value in zip(at.own, (x, y, z), strict=True))
+        code = quadrics.rows(world, at.prim).code
+        level = torch.where(other, torch.where(code == 0, 2, 1), level)
+    return x, y, z, level
 
 
 def vertex_colors(world: World, at: Interaction) -> Tensor:
