@@ -306,8 +306,9 @@ def test_damaged_meshes(tmp_path: Path, ending: str) -> None:
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_damaged_images(tmp_path: Path, name: str) -> None:
+def test_damaged_images(tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]) -> None:
     run_images(tmp_path, name, 2, 50)
+    assert capfd.readouterr() == ("", "")  # decoders are silent
 
 
 @pytest.mark.slow
@@ -320,8 +321,9 @@ def test_many_damaged_meshes(tmp_path: Path, ending: str, seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10, 14))
 @pytest.mark.parametrize("name", IMAGES)
-def test_many_damaged_images(tmp_path: Path, name: str, seed: int) -> None:
+def test_many_damaged_images(tmp_path: Path, name: str, seed: int, capfd: pytest.CaptureFixture[str]) -> None:
     run_images(tmp_path, name, seed, 400)
+    assert capfd.readouterr() == ("", "")
 
 
 def declared(folder: Path) -> list[Path]:
