@@ -69,6 +69,37 @@ def test_png_of_sixteen_bits(colour: int, channels: int) -> None:
     np.testing.assert_array_equal(image.values, array.astype(np.float32) / np.float32(65535))
 
 
+def test_a_damaged_png_of_sixteen_bits_is_one_line_and_silent(capfd: pytest.CaptureFixture[str]) -> None:
+    """libpng would write to the process's standard error."""
+    rows = b"".join(b"\0" + bytes(30) for _ in range(3))
+    whole = png(5, 3, 16, 2, rows).data
+    stray = whole.replace(b"IDAT", b"IDAX", 1)
+    cases = {
+        "truncated": whole[:-20],
+        "checksum of a chunk IDAT": whole[:50] + b"\xff" + whole[51:],
+        "unknown filter": png(5, 3, 16, 2, b"\x07" + rows[1:]).data,
+        "93 bytes of pixels declared, got 31": png(5, 3, 16, 2, rows[:31]).data,
+        "93 bytes of pixels declared, got 0": stray,
+    }
+    for problem, data in cases.items():
+        with pytest.raises(AssetError, match=f"a.png: cannot be read .*{problem}"):
+            read_texels(EncodedImage("a.png", data, "png"))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_interlaced_png_of_sixteen_bits(tmp_path: Path) -> None:
+    """Adam7: the passes of a picture of one colour hold as many pixels as the picture."""
+    width, height = 5, 3
+    passes = [(1, 1), (1, 1), (0, 0), (1, 1), (3, 1), (2, 2), (5, 1)]  # columns, rows
+    value = struct.pack(">3H", 1000, 2000, 3000)
+    rows = b"".join(b"\0" + columns * value for columns, count in passes for _ in range(count))
+    data = png(width, height, 16, 2, rows).data
+    head = data[16:28] + b"\1"
+    data = data[:16] + head + struct.pack(">I", zlib.crc32(b"IHDR" + head)) + data[33:]
+    image = read_texels(EncodedImage("a.png", data, "png"))
+    np.testing.assert_allclose(image.values * 65535, np.broadcast_to([1000, 2000, 3000], (3, 5, 3)), rtol=1e-6)
+
+
 def test_png_with_palette(tmp_path: Path) -> None:
     image = read_texels(png(2, 1, 8, 3, b"\0\0\1", bytes([255, 0, 51, 0, 102, 255])))
     np.testing.assert_allclose(image.values, [[[1, 0, 0.2], [0, 0.4, 1]]], atol=1e-6)

@@ -306,8 +306,9 @@ def test_damaged_meshes(tmp_path: Path, ending: str) -> None:
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_damaged_images(tmp_path: Path, name: str) -> None:
+def test_damaged_images(tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]) -> None:
     run_images(tmp_path, name, 2, 50)
+    assert capfd.readouterr() == ("", "")  # decoders are silent
 
 
 @pytest.mark.slow
@@ -320,8 +321,9 @@ def test_many_damaged_meshes(tmp_path: Path, ending: str, seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10, 14))
 @pytest.mark.parametrize("name", IMAGES)
-def test_many_damaged_images(tmp_path: Path, name: str, seed: int) -> None:
+def test_many_damaged_images(tmp_path: Path, name: str, seed: int, capfd: pytest.CaptureFixture[str]) -> None:
     run_images(tmp_path, name, seed, 400)
+    assert capfd.readouterr() == ("", "")
 
 
 def declared(folder: Path) -> list[Path]:
@@ -338,6 +340,17 @@ def declared(folder: Path) -> list[Path]:
     meshes = [{"primitives": [{"attributes": {"POSITION": 0}}]}]
     base = {"nodes": [{"mesh": 0}], "meshes": meshes, "bufferViews": [{"buffer": 0, "byteLength": 4 * many}]}
     rows = {"indices": {"bufferView": 0, "componentType": 5125}, "values": {"bufferView": 0}}
+    index = np.zeros(1_000_000, "<u1").tobytes()  # one face, again and again, in nodes again and again
+    often = {
+        "nodes": [{"mesh": 0}] * 2000,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "mode": 5}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3},
+            {"bufferView": 1, "componentType": 5121, "type": "SCALAR", "count": len(index)},
+        ],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteLength": len(index)}],
+        "buffers": [{"byteLength": len(index)}],
+    }
     png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 8000, 8000, 8, 6, 0, 0, 0))
     files: dict[str, bytes] = {
         "a.ply": head.format("ascii", many, 1).encode(),
@@ -350,6 +363,7 @@ def declared(folder: Path) -> list[Path]:
             {**base, "accessors": [{**accessor, "bufferView": 0}], "buffers": [{"byteLength": 4 * many}]}, b""
         ),
         "c.glb": glb({**base, "accessors": [{**accessor, "sparse": {"count": many, **rows}}], "buffers": [{}]}, b""),
+        "d.glb": glb(often, index),
         "a.png": png + chunk(b"IDAT", zlib.compress(b"\0")),
         "b.png": png[:24] + b"\x10" + png[25:],
         "a.tga": struct.pack("<BBBHHBHHHHBB", 0, 0, 10, 0, 0, 0, 0, 0, 8000, 8000, 32, 0),

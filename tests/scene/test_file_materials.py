@@ -62,6 +62,13 @@ def test_an_obj_shows_its_picture_upright(tmp_path: Path) -> None:
     np.testing.assert_allclose(middles(image), 0.5 * colors, atol=0.02)
 
 
+def test_options_of_an_mtl_map_count_v_from_the_bottom(tmp_path: Path) -> None:
+    """v' = v / 2 + 1 / 2: the picture's upper half, twice as tall."""
+    colors = quarters(tmp_path)
+    image = shoot(obj(tmp_path, "Kd 1 1 1\nmap_Kd -s 1 0.5 1 -o 0 0.5 a b.png"))
+    np.testing.assert_allclose(middles(image), colors[[0, 0]], atol=0.02)
+
+
 def test_the_scenes_material_wins_over_the_files(tmp_path: Path) -> None:
     file = obj(tmp_path, "map_Kd gone.png")
     with pytest.raises(AssetError, match=r"a\.mtl: line 2: the image file 'gone.png' is missing"):
@@ -121,6 +128,16 @@ def test_a_gltf_shows_its_picture_upright(tmp_path: Path) -> None:
     np.testing.assert_allclose(image, colors, atol=0.02)
     principled = middles(shoot(_gltf(tmp_path)))
     assert (principled[colors == 1] > 0.7).all() and (principled[colors == 0] < 0.15).all()
+
+
+def test_a_texture_transform_turns_the_picture_clockwise(tmp_path: Path) -> None:
+    """As KHR_texture_transform says of a rotation of the coordinates by 90 degrees, here brought back over the square."""
+    colors = quarters(tmp_path)
+    (tmp_path / "a b.png").rename(tmp_path / "picture.png")
+    turned = {"KHR_texture_transform": {"rotation": np.pi / 2, "offset": [0, 1]}}
+    pbr = {"baseColorTexture": {"index": 0, "extensions": turned}}
+    file = _gltf(tmp_path, pbrMetallicRoughness=pbr, extensions={"KHR_materials_unlit": {}})
+    np.testing.assert_allclose(middles(shoot(file)), np.rot90(colors, -1), atol=0.02)
 
 
 def test_alpha_of_the_base_colour_covers(tmp_path: Path) -> None:

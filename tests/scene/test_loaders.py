@@ -329,12 +329,12 @@ MALFORMED: dict[str, tuple[str, str | bytes, str]] = {
     ),
     "glb sparse": (
         "a.glb",
-        square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 4, "sparse": {}}]),
+        square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 4, "sparse": {}}] * 2),
         "malformed glTF",
     ),
     "glb zeros": (
         "a.glb",
-        square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 10**9, "sparse": {}}]),
+        square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 10**9, "sparse": {}}] * 2),
         "declares 1000000000 rows without data",
     ),
     "glb draco": ("a.glb", square_glb(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
+from torchpt.images.png import plain_png
 
 __all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "existing", "pixels_of"]
 
@@ -114,9 +115,14 @@ def pixels_of(source: Path | EncodedImage, max_pixels: int) -> Pixels:
             known = " ".join(READABLE)
             raise AssetError(label, f"unknown kind of image {kind.strip('.')!r}; known: {known}")
         # byte 24 of a PNG: bits a value; byte 25: what they mean. Pillow keeps 8 bits of 16-bit colours.
-        deep = kind == ".png" and data[24:26] in (b"\x10\x02", b"\x10\x04", b"\x10\x06")
-        if kind in FLOAT_FORMATS or deep:
-            return _through_oiio(source, label, kind, "uint16" if deep else "float", max_pixels)
+        if kind == ".png" and data[24:26] in (b"\x10\x02", b"\x10\x04", b"\x10\x06"):
+            whole = source.read_bytes() if isinstance(source, Path) else source.data
+            width, height = (int.from_bytes(whole[at : at + 4], "big") for at in (16, 20))
+            _check_size(label, width, height, 4, max_pixels, len(whole))
+            source = EncodedImage(label, plain_png(whole), "png")
+            return _through_oiio(source, label, kind, "uint16", max_pixels)
+        if kind in FLOAT_FORMATS:
+            return _through_oiio(source, label, kind, "float", max_pixels)
         return _through_pillow(source, label, kind, max_pixels)
     except AssetError:
         raise
@@ -133,12 +139,15 @@ def _head(source: Path | EncodedImage) -> bytes:
         return file.read(32)
 
 
-def _check_size(label: str, width: int, height: int, channels: int, max_pixels: int) -> None:
+def _check_size(label: str, width: int, height: int, channels: int, max_pixels: int, size: int | None = None) -> None:
+    """Refuse what is too large, or (of formats that the bound holds for) more than ``size`` bytes can stand for."""
     if width < 1 or height < 1 or channels < 1:
         raise AssetError(label, f"has no pixels ({width} x {height}, {channels} channels)")
     if width * height > max_pixels or width * height * channels > _CHANNELS * max_pixels:
         limit = f"{max_pixels / 2**20:g} Mpixel" if max_pixels >= 2**20 else f"{max_pixels} pixels"
         raise AssetError(label, f"{width} x {height} pixels, {channels} channels: more than {limit} are not read")
+    if size is not None and width * height > _PIXELS_PER_BYTE * size:
+        raise AssetError(label, f"cannot be read ({width} x {height} pixels declared in {size} bytes)")
 
 
 def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: str, max_pixels: int) -> Pixels:
@@ -201,9 +210,7 @@ def _through_pillow(source: Path | EncodedImage, label: str, kind: str, max_pixe
 
 def _pillow_pixels(picture: Any, label: str, size: int, max_pixels: int) -> Pixels:
     width, height = picture.size
-    _check_size(label, width, height, len(picture.getbands()), max_pixels)
-    if width * height > _PIXELS_PER_BYTE * size:
-        raise AssetError(label, f"cannot be read ({width} x {height} pixels declared in {size} bytes)")
+    _check_size(label, width, height, len(picture.getbands()), max_pixels, size)
     if picture.mode not in _MODES:
         raise AssetError(label, f"colours stored as {picture.mode} are not read; expected grey or RGB")
     if "transparency" in picture.info and picture.mode in ("1", "L", "P", "RGB"):

@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 from torchpt.errors import AssetError
 from torchpt.scene.loaders.gltf_document import Document
 from torchpt.scene.loaders.gltf_material import MATERIAL_EXTENSIONS, Materials
-from torchpt.scene.loaders.mesh_part import MAX_VERTICES, FileMaterial, MeshPart, transformed
+from torchpt.scene.loaders.mesh_part import FileMaterial, MeshPart, transformed
 
 __all__ = ["load_gltf"]
 
 _READ = {*MATERIAL_EXTENSIONS, "KHR_texture_transform", "KHR_mesh_quantization"}
 _ATTRIBUTES = ("POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0")
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+#: Vertices or faces, whichever are more, that the nodes of a file may come to (a larger file may hold as many as bytes).
+MOST_PLACED = 20_000_000
 
 
 def load_gltf(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
@@ -32,7 +34,7 @@ def load_gltf(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     """
     document = Document(path, data)
     try:
-        return _Scene(document).parts(materials)
+        return _Scene(document, len(data)).parts(materials)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         text = str(error).replace("\n", " ")[:100]
         raise AssetError(path, f"malformed glTF ({type(error).__name__}: {text})") from None
@@ -41,8 +43,10 @@ def load_gltf(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
 class _Scene:
     """The nodes of one document."""
 
-    def __init__(self, document: Document) -> None:
+    def __init__(self, document: Document, size: int) -> None:
         self.document, self.json, self.path = document, document.json, document.path
+        # Nodes may place one mesh many times: a small file must not ask for any amount of memory.
+        self.most = max(MOST_PLACED, size)
         self.materials = Materials(document)
 
     def parts(self, materials: bool) -> list[MeshPart]:
@@ -54,20 +58,27 @@ class _Scene:
         elsewhere = ("KHR_materials_", "KHR_texture_", "EXT_texture_")
         used = [str(name) for name in (*self.json.get("extensionsUsed", []), *self.json.get("extensions", {}))]
         left_out += [name for name in used if name not in _READ and not name.startswith(elsewhere)]
-        parts, total = [], 0
-        for node, matrix in self.nodes():
-            if "mesh" not in node:
-                continue
+        placed = [(node, matrix) for node, matrix in self.nodes() if "mesh" in node]
+        total = 0
+        for node, _ in placed:
+            total += sum(map(self.size, self.document.item("meshes", node["mesh"])["primitives"]))
+            if total > self.most:
+                raise AssetError(self.path, f"more than {self.most} vertices or faces once nodes are placed")
+        parts = []
+        for node, matrix in placed:
             mesh = self.document.item("meshes", node["mesh"])
             for number, primitive in enumerate(mesh["primitives"]):
                 part = self.primitive(mesh, node, number, primitive, materials, left_out)
-                if part is None:
-                    continue
-                total += len(part.vertices)
-                if total > MAX_VERTICES:
-                    raise AssetError(self.path, f"more than {MAX_VERTICES} vertices once nodes are placed")
-                parts.append(transformed(part, matrix))
+                if part is not None:
+                    parts.append(transformed(part, matrix))
         return parts
+
+    def size(self, primitive: dict[str, Any]) -> int:
+        """Vertices or faces of a primitive, whichever are more, as declared; what is alone too much its accessor refuses."""
+        named = [primitive["attributes"]["POSITION"]] + [primitive[key] for key in ("indices",) if key in primitive]
+        counts = [self.document.item("accessors", number).get("count") for number in named]
+        counts = [count if type(count) is int and 0 < count <= self.most else 0 for count in counts]
+        return max(counts[0], counts[-1] // (3 if primitive.get("mode", _TRIANGLES) == _TRIANGLES else 1))
 
     def nodes(self) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
         """Every node of the scene with its world matrix."""

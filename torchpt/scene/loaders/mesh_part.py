@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from torchpt.errors import AssetError
 from torchpt.scene.loaders.normals import smooth_normals
 
-__all__ = ["MAX_VERTICES", "FileMaterial", "MeshPart", "checked", "corners_of_polygons", "transformed"]
+__all__ = ["FileMaterial", "MeshPart", "checked", "corners_of_polygons", "transformed"]
 
-MAX_VERTICES = 200_000_000
 _LARGEST = float(np.finfo(np.float32).max)
 
 Rgb = tuple[float, float, float]
