@@ -262,7 +262,7 @@ class PathState:
     eta: Tensor | None = None  # (N,) index of refraction here over that at the camera; None where nothing refracts
 
 
-R = TypeVar("R", PathState, Hit)
+R = TypeVar("R", PathState, Hit, Quadrics, Copies)
 
 
 def rows(record: R, index: Tensor) -> R:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpt.lights import area, constant, quadric, sphere
 from torchpt.math.vectors import dot, safe_reciprocal, take
-from torchpt.records import Interaction, Lights, LightSample, Quadrics
+from torchpt.records import Interaction, Lights, LightSample, Quadrics, rows
 
 __all__ = ["emitted", "environment", "sample"]
 
@@ -31,8 +31,7 @@ def _quadrics(lights: Lights, row: Tensor | None) -> Quadrics:
     """What quadrics need beside the table, at ``row``."""
     assert lights.quadric is not None and lights.quadrics is not None
     column = lights.quadric if row is None else take(lights.quadric, row)
-    table = lights.quadrics
-    return Quadrics(*(take(getattr(table, name), column) for name in ("code", "e3", "n1", "n2", "n3", "reach")))
+    return rows(lights.quadrics, column)
 
 
 def _is(lights: Lights, kind: str, row: Tensor | None) -> Tensor | None:

@@ -11,13 +11,13 @@ The search is free of gradients. Here the point comes from the primitive's own c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchpt.math.vectors import affine, cross, dot, normalize, take
-from torchpt.records import Copies, Hit, Interaction, World
+from torchpt.records import Copies, Hit, Interaction, World, rows
 from torchpt.shapes import quadrics
 
 __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
@@ -69,7 +69,7 @@ def _placed(world: World, prim: Tensor) -> _Place:
     if world.copies is None:
         return _Place(prim, take(world.p0, prim), take(world.e1, prim), take(world.e2, prim), None, None, None)
     column = world.copy(prim)
-    table = Copies(*(take(getattr(world.copies, field.name), column) for field in fields(Copies)))
+    table = rows(world.copies, column)
     prim = prim - table.start + table.first
     p0, e1, e2 = take(world.p0, prim), take(world.e1, prim), take(world.e2, prim)
     size = (p0.abs() + e1.abs() + e2.abs()).detach()

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from torchpt.math.angles import azimuth
-from torchpt.math.vectors import affine, dot, normalize, take
+from torchpt.math.vectors import affine, dot, normalize
 from torchpt.math.warps import uniform_sphere
 from torchpt.records import QUADRICS, Quadrics, World
+from torchpt.records import rows as columns
 
 __all__ = [
     "AREAS",
@@ -40,8 +41,7 @@ def rows(world: World, prim: Tensor) -> Quadrics:
     """The columns ``(., N)`` of primitives ``prim (N,)``; any where one is no quadric."""
     assert world.quadrics is not None
     index = (prim - sum(world.counts[:4])).clamp_min(0)
-    table = world.quadrics
-    return Quadrics(*(take(getattr(table, name), index) for name in ("code", "e3", "n1", "n2", "n3", "reach")))
+    return columns(world.quadrics, index)
 
 
 def place(code: Tensor, u: Tensor, v: Tensor) -> Tensor:
