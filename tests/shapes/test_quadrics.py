@@ -146,6 +146,12 @@ def test_rays_leave_on_their_own_side(name, placed):
             assert (again[1] >= 0).float().mean() > (0.98 if placed == "sliver" else 0.999)  # closed, but for rims
 
 
+@pytest.mark.parametrize("shape", [{"type": "cylinder", "radius": 1e-20}, {"type": "cone", "slope": 1e20}])
+def test_sizes_beyond_doubles_are_refused(shape):
+    with pytest.raises(torchpt.SceneError, match=r"shapes.s.*1e12"):
+        torchpt.load({"camera": CAMERA, "shapes": {"s": shape}}, device="cpu")
+
+
 def test_bounds_are_tight():
     """Boxes touch what they hold: no ray through a surface is lost, and no wall of a box is far from it."""
     from torchpt.accel.bounds import primitive_bounds
