@@ -34,8 +34,7 @@ UV = {"scale": [2.0, 1.5], "rotate": 30.0, "translate": [0.2, 0.1]}
 
 @pytest.fixture(scope="module")
 def mitsuba() -> Any:
-    import mitsuba
-
+    mitsuba = pytest.importorskip("mitsuba")
     mitsuba.set_variant("llvm_ad_rgb")
     return mitsuba
 
