@@ -143,6 +143,8 @@ def _rgb(colour: Any) -> dict[str, Any]:
 
 
 def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]:
+    if part.glow is not None:
+        raise NoCounterpartError(f"{part.name}: emission by a texture is not converted")
     if part.emission is not None and _passing(part.material) != 1.0:
         raise NoCounterpartError(f"{part.name}: Mitsuba's lights shine in full whatever their opacity")
     shape: dict[str, Any] = {"bsdf": bsdf(part.material, lambda node: _bitmap(mitsuba, scene, node))}
@@ -152,8 +154,10 @@ def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]
             raise NoCounterpartError(f"{part.name}: anisotropic, and no uv to agree on a tangent")
         _write_part(file, scene, part)
         shape |= {"type": "ply", "filename": str(file), "face_normals": not part.smooth}
+    elif part.kind == "quadric" and part.quadric != "cylinder":
+        raise NoCounterpartError(f"{part.name}: Mitsuba has no {part.quadric}")
     else:
-        shape |= {"type": part.kind, "to_world": _transform(mitsuba, part.to_world)}
+        shape |= {"type": part.quadric or part.kind, "to_world": _transform(mitsuba, part.to_world)}
     if part.flip:
         shape["flip_normals"] = True
     if part.emission is not None:

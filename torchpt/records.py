@@ -129,6 +129,7 @@ class Lights:
         None  # (K,) int64 column of World.quadrics, 0 for the other kinds; None where no quadric emits
     )
     quadrics: Quadrics | None = None  # World.quadrics where a quadric emits
+    prim: Tensor | None = None  # (K,) int64 the primitive; None where no texture says how much it emits
 
 
 @dataclass(frozen=True)
@@ -162,6 +163,7 @@ class World:
     looks: tuple[Look | None, ...]  # textures of each model; None where it has none
     textures: Atlas | None  # None where no image is read
     veils: Veils | None  # textures of opacity; None where there are none
+    glows: Tensor | None  # (P + I,) int64 node of the texture of emission, -1 where there is none; None where none is
     two_sided: tuple[Tensor | None, ...]  # (M,) bool for the rows of each model; None where all are
     object_id: Tensor  # (P + I,) int64, order of the shape in the scene
     lights: Lights | None  # None where nothing emits
@@ -235,6 +237,7 @@ class LightSample:
     radiance: Tensor  # (3, N), zero where the draw failed
     pdf: Tensor  # (N,) in solid angle, with the choice of the light, detached
     weight: Tensor  # (N,) = 1 / pdf, differentiable in the geometry
+    at: Interaction | None = None  # the point itself, without tangents; None where no texture asks for it
 
 
 @dataclass(frozen=True)

@@ -403,7 +403,6 @@ TEXTURES: dict[str, tuple[dict[str, Any], str, str]] = {
     ),
 }
 LATER: dict[str, tuple[dict[str, Any], str]] = {
-    "emission": ({"type": "diffuse", "emission": IMAGE}, "emission"),
     "compensation": ({"type": "roughconductor", "alpha": IMAGE, "energy_compensation": True}, "alpha"),
     "a table": ({"type": "roughplastic", "roughness": IMAGE}, "roughness"),
     "an inner opacity": (

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
+from torchpt.integrators.surfaces import veil
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import Dimension, Draws, salts
-from torchpt.shapes import interact, offset_origin, surface_uv
-from torchpt.textures import Veils, look_up
+from torchpt.shapes import interact, offset_origin
 
 __all__ = ["Search"]
 
@@ -59,21 +59,8 @@ class Search:
         there = replace(hit, prim=hit.prim.clamp_min(0), t=torch.where(missed, 0.0, hit.t))
         opacity = take(self._world.opacity, self._world.slot(there.prim))
         if self._world.veils is not None:
-            opacity = opacity * self._veil(self._world.veils, o, d, there)
+            opacity = opacity * veil(self._world, interact(self._world, o, d, there))
         return torch.where(missed, miss, opacity)
-
-    def _veil(self, veils: Veils, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
-        """What textures make of the opacity ``(N,)`` at hits, none of them a miss."""
-        assert self._world.textures is not None
-        slot = self._world.slot(hit.prim)
-        node = take(veils.nodes, slot)
-        uv = surface_uv(self._world, interact(self._world, o, d, hit))
-        value = look_up(self._world.textures, node.clamp_min(0), uv, False)
-        value = torch.addcmul(take(veils.bias, slot), take(veils.factor, slot), value)
-        if veils.cutoff is not None:
-            cutoff = take(veils.cutoff, slot)
-            value = torch.where(cutoff < 0, value, (value >= cutoff).to(value.dtype))
-        return torch.where(node < 0, 1.0, value)
 
     @torch.no_grad()
     def _beyond(self, o: Tensor, d: Tensor, hit: Hit) -> Tensor:

@@ -16,11 +16,11 @@ from torch import Tensor
 from torchpt import lights
 from torchpt.cameras import Perspective
 from torchpt.film import Filter
-from torchpt.integrators.surfaces import Surface, surface_at
+from torchpt.integrators.surfaces import Surface, glow, surface_at, veil
 from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import dot, largest, take
 from torchpt.math.warps import uniform_hemisphere, uniform_sphere
-from torchpt.records import BsdfSample, Hit, Interaction, PathState, Shadow, World, rows
+from torchpt.records import BsdfSample, Hit, Interaction, LightSample, PathState, Shadow, World, rows
 from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import interact, offset_origin, reattach
 from torchpt.shapes.interaction import OFFSET
@@ -77,6 +77,8 @@ def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -
     o, d = take(state.o, index), take(state.d, index)
     at = interact(world, o, d, rows(hit, index), slide)
     radiance, pdf = lights.emitted(world.lights, o, at, d)
+    if world.glows is not None:
+        radiance = radiance * glow(world, at)
     return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
 
 
@@ -165,7 +167,7 @@ def shade(
         weight = weight * surface.shown
     if surface.relief is not None:
         weight = weight * surface.relief.shadowing(light.wi)
-    radiance = state.throughput * reflected * light.radiance * weight
+    radiance = state.throughput * reflected * _shining(world, light) * weight
     o = offset_origin(world, at, light.wi)
     d = light.target - o
     lit = largest(radiance.detach().abs()) > 0
@@ -174,6 +176,18 @@ def shade(
         d = torch.where(light.distant, light.wi, d)
         t_max = torch.where(light.distant & lit, math.inf, t_max)
     return surface, Shadow(o, d, t_max, radiance)
+
+
+def _shining(world: World, light: LightSample) -> Tensor:
+    """Radiance ``(3, N)`` of the points on lights, textures of emission and opacity included."""
+    if light.at is None:
+        return light.radiance
+    share = torch.ones_like(light.radiance)
+    if world.glows is not None:
+        share = share * glow(world, light.at)
+    if world.veils is not None:
+        share = share * veil(world, light.at)
+    return light.radiance * (share if light.distant is None else torch.where(light.distant, 1.0, share))
 
 
 def _leaning(world: World, model: int) -> bool:

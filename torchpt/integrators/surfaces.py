@@ -15,7 +15,7 @@ from torchpt.records import Interaction, World
 from torchpt.shapes import surface_uv, vertex_colors
 from torchpt.textures import Look, Pick, look_up, slope
 
-__all__ = ["Surface", "parameters_at", "shading_normal", "surface_at"]
+__all__ = ["Surface", "glow", "parameters_at", "shading_normal", "surface_at", "veil"]
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,27 @@ def _read(world: World, pick: Pick, row: Tensor, at: Interaction, uv: Tensor | N
         return colors[pick.channel] if pick.channel >= 0 else luminance(colors)
     assert world.textures is not None and uv is not None
     return look_up(world.textures, take(pick.nodes, row), uv, pick.channel is None)
+
+
+def veil(world: World, at: Interaction) -> Tensor:
+    """What textures make of the opacity ``(N,)`` of surfaces; 1 where they have no such texture."""
+    assert world.textures is not None and world.veils is not None
+    veils = world.veils
+    node = take(veils.nodes, at.slot)
+    value = look_up(world.textures, node.clamp_min(0), surface_uv(world, at), False)
+    value = torch.addcmul(take(veils.bias, at.slot), take(veils.factor, at.slot), value)
+    if veils.cutoff is not None:
+        cutoff = take(veils.cutoff, at.slot)
+        value = torch.where(cutoff < 0, value, (value >= cutoff).to(value.dtype))
+    return torch.where(node < 0, 1.0, value)
+
+
+def glow(world: World, at: Interaction) -> Tensor:
+    """What textures make of the emission of surfaces ``(3, N)``; 1 where they have no such texture."""
+    assert world.textures is not None and world.glows is not None
+    node = take(world.glows, at.slot)
+    value = look_up(world.textures, node.clamp_min(0), surface_uv(world, at), True)
+    return torch.where(node < 0, 1.0, value)
 
 
 def shading_normal(world: World, number: int, d: Tensor, at: Interaction) -> Tensor:

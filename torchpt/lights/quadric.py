@@ -13,13 +13,18 @@ from torchpt.math.vectors import affine, dot
 from torchpt.records import Quadrics
 from torchpt.shapes import quadrics
 
-__all__ = ["point", "world_area"]
+__all__ = ["own_point", "point", "world_area"]
 
 
 def point(p0: Tensor, e1: Tensor, e2: Tensor, table: Quadrics, u: Tensor) -> tuple[Tensor, Tensor]:
     """Points ``(3, N)`` on the emitters and the emitting side's unit normals there."""
-    own = quadrics.sample(table.code, u)
+    own = own_point(table, u)
     return affine(p0 + e1 * own[0], e2, own[1], table.e3, own[2]), quadrics.outward(table, own)
+
+
+def own_point(table: Quadrics, u: Tensor) -> Tensor:
+    """The points ``(3, N)`` of :func:`point` in the surface's own space."""
+    return quadrics.sample(table.code, u)
 
 
 def world_area(area: Tensor, e1: Tensor, e2: Tensor, e3: Tensor, normal: Tensor) -> Tensor:

@@ -65,6 +65,7 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
     target: Tensor | None = None
     normal: Tensor | None = None
     bent: Quadrics | None = None
+    place = torch.zeros_like(u)
     for kind in lights.kinds:
         if kind == "constant":
             continue
@@ -77,7 +78,9 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
             bent = _quadrics(lights, row)
             spot, facing = quadric.point(at.p0, at.e1, at.e2, bent, u)
         else:
-            spot, facing = area.point(at.p0, at.e1, at.e2, area.WARPS[kind](u)), at.normal
+            here = area.WARPS[kind](u)
+            spot, facing = area.point(at.p0, at.e1, at.e2, here), at.normal
+            place = _pick(mask, here, place)
         target, normal = _pick(mask, spot, target), _pick(mask, facing, normal)
 
     if target is None or normal is None:  # nothing but the environment
@@ -103,9 +106,10 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
         inverse = inverse / probability
     # Where the light is not seen the weight is 0, and the density has no say.
     pdf = safe_reciprocal(inverse.detach())
+    spot = None if lights.prim is None else _spot(lights, row, target, normal, place, bent, u)
     target = torch.addcmul(target, normal, bound * offset)
     radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
-    here = LightSample(wi, target, None, radiance.expand_as(wi), pdf, inverse)
+    here = LightSample(wi, target, None, radiance.expand_as(wi), pdf, inverse, spot)
     if "constant" not in lights.kinds:
         return here
     distant = _is(lights, "constant", row)
@@ -118,7 +122,18 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
         radiance=torch.where(distant, there.radiance, here.radiance),
         pdf=torch.where(distant, there.pdf, here.pdf),
         weight=torch.where(distant, there.weight, here.weight),
+        at=spot,
     )
+
+
+def _spot(
+    lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, place: Tensor, bent: Quadrics | None, u: Tensor
+) -> Interaction:
+    """The point on the light as textures ask for it; of the environment any."""
+    assert lights.prim is not None
+    prim = lights.prim.expand(p.shape[1]) if row is None else take(lights.prim, row)
+    own = None if bent is None else quadric.own_point(bent, u)
+    return Interaction(p, normal, normal, None, None, prim, prim, None, place[0], place[1], own)
 
 
 def _environment_sample(lights: Lights, wi: Tensor, probability: Tensor | float) -> LightSample:

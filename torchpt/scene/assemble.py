@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -185,6 +185,14 @@ def assemble(
         curved,
         dtype,
     )
+    shown = [part for part in parts if part.emission is not None]
+    if lights is not None and any(part.glow or surfaces[part.material.name].cover for part in shown):
+        prim = (emissive == 0).nonzero().squeeze(1)
+        rest = prim.new_zeros(len(lights.area) - len(prim))  # the environment's
+        lights = replace(lights, prim=torch.cat((prim, rest)))
+    glows = None
+    if any(part.glow is not None for part in parts):
+        glows = spread([-1 if part.glow is None else nodes[part.glow] for part in parts] + [-1] * len(copies))
     maps = _copy_maps(parts, sizes, copies, parameters, centre) if copies else None
     # The search gets the corners themselves: rebuilt from edges, neighbours would no longer share them to the bit.
     q0, q1, q2 = (x.detach().to(torch.float32).contiguous() for x in (p0, p1, p2))
@@ -210,6 +218,7 @@ def assemble(
         looks=looks,
         textures=atlas_of(list(nodes), images_of(list(nodes), parameters), dtype, device) if nodes else None,
         veils=_veils(owners, surfaces, nodes, wide, dtype, device),
+        glows=glows,
         two_sided=two_sided,
         object_id=spread([owner.object_id for owner in owners]),
         lights=lights,
@@ -523,7 +532,18 @@ def _colors(part: Part, c: Corners) -> tuple[Tensor, Tensor, Tensor]:
 def _emission(part: Part, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> Tensor:
     """Radiance ``(3,)`` of a part that emits."""
     radiance, *strength = (parameters[name].to(dtype) for name in part.emission_names)
+    if part.glow is not None:
+        return radiance.expand(3)  # the strength alone: the texture's share is looked up
     return radiance if not strength else radiance * strength[0]
+
+
+def _mean_glow(part: Part, parameters: Mapping[str, Tensor]) -> float:
+    """Mean luminance of the texture that a part shines by; 1 without."""
+    if part.glow is None:
+        return 1.0
+    image = images_of([part.glow], parameters)[part.glow.texels].detach().double()
+    color = image[..., :3].mean((0, 1)) if image.shape[2] >= 3 else image[..., 0].mean().expand(3)
+    return float(luminance((color * color.new_tensor(part.glow.scale)).abs()))
 
 
 def _lights(
@@ -570,7 +590,12 @@ def _lights(
         own, world_area = _quadric_area(curved.code, frame)
         area = torch.where(bent, own.to(dtype).index_select(0, column), area)
         whole = torch.where(bent, world_area.index_select(0, column), whole)
-    power = (luminance(radiance.detach().double().abs()) * whole) * math.pi
+    if any(part.glow is not None for part, _ in glowing):
+        shares = [_mean_glow(part, parameters) for part, _ in glowing]
+        share_of = torch.repeat_interleave(torch.tensor(shares, dtype=torch.float64, device=device), counts)
+    else:
+        share_of = 1.0
+    power = (share_of * luminance(radiance.detach().double().abs()) * whole) * math.pi
     if seen is not None:
         power = power * seen.detach().double()
     kind = torch.tensor([kinds.index(k) if k in kinds else 0 for k in KINDS], device=device)[of_kind]

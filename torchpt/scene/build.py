@@ -16,6 +16,7 @@ from torchpt.scene.materials import MATERIALS, Diffuse, check_material, read_mat
 from torchpt.scene.parts import Copy, MaterialSlot, Part
 from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
 from torchpt.scene.texels import Opener
+from torchpt.textures import Node
 
 __all__ = ["Built", "build_parts"]
 
@@ -229,12 +230,6 @@ def _slot(description: Description, shape: Shape, prefix: str, opener: Opener) -
     return slot_of(Diffuse() if given is None else given, f"{prefix}.material", known, opener)
 
 
-def _unbuilt(own: FileMaterial) -> tuple[str, ...]:
-    """Keys of a file's material that are left out: emission that a texture gives cannot be rendered yet."""
-    lit = isinstance(own.material.get("emission"), dict)
-    return tuple(key for key in own.material if key.startswith("emission")) if lit else ()
-
-
 def _own_slot(own: FileMaterial, prefix: str, key: str, source: str, opener: Opener) -> MaterialSlot:
     """A mesh file's own material.
 
@@ -242,8 +237,7 @@ def _own_slot(own: FileMaterial, prefix: str, key: str, source: str, opener: Ope
         AssetError: something that a material cannot have; it names the file and the material.
     """
     try:
-        entry = {name: value for name, value in own.material.items() if name not in _unbuilt(own)}
-        material = read_material(entry, key, MATERIALS, None)
+        material = read_material(own.material, key, MATERIALS, None)
         check_material(material, key, {}, {}, None)
         return slot_of(material, key, {}, opener.sharing(f"{prefix}.textures"))
     except SceneError as error:
@@ -269,7 +263,10 @@ def _part(
 ) -> Part:
     _declare(slot, parameters)
     emission, names = shape.emission, (f"shapes.{name}.emission",)
-    if emission is None and slot.emission is not None:
+    glow = slot.emission if emission is None and isinstance(slot.emission, Node) else None
+    if glow is not None:
+        emission, names = (1.0, 1.0, 1.0), (f"{slot.name}.emission_strength",)
+    elif emission is None and isinstance(slot.emission, tuple):
         emission, names = slot.emission, (f"{slot.name}.emission", f"{slot.name}.emission_strength")
     if emission is not None and names[0] not in parameters:
         parameters[names[0]] = np.asarray(emission, np.float64)
@@ -282,6 +279,7 @@ def _part(
         material=slot,
         emission=emission,
         emission_names=names if emission is not None else (),
+        glow=glow,
         flip=shape.flip_normals,
         to_world=pose,
         local=local,
@@ -304,7 +302,7 @@ def _ignored(piece: MeshPart | None) -> tuple[str, ...]:
     if piece is None:
         return ()
     own = piece.material
-    return piece.ignored if own is None else (*piece.ignored, *own.ignored, *_unbuilt(own))
+    return piece.ignored if own is None else (*piece.ignored, *own.ignored)
 
 
 def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:

@@ -24,7 +24,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         count = len(part.faces) if part.faces is not None else 1
         row: dict[str, Any] = {"kind": part.quadric or part.kind, "primitives": count, "material": part.material.name}
         if part.emission is not None:
-            row["emission"] = list(part.emission)
+            row["emission"] = list(part.emission) if part.glow is None else "a texture"
         if part.source:
             row["file"] = part.source
         if part.dropped:

@@ -501,6 +501,9 @@ class Custom(Material):
         return {key: getattr(self, key) for key in self.model.parameters}
 
 
+#: Slots that the colours of vertices cannot give.
+_IMAGED = ("opacity", "emission", "normal_map", "bump_map")
+
 MATERIALS: dict[str, type[Material]] = {
     "diffuse": Diffuse,
     "phong": Phong,
@@ -623,7 +626,7 @@ def slot_of(
         two_sided=material.two_sided,
         opacity=opened(material.opacity, "opacity"),
         alpha_cutoff=material.alpha_cutoff,
-        emission=material.emission if isinstance(material.emission, tuple) else None,
+        emission=opened(material.emission, "emission"),
         emission_strength=material.emission_strength,
         normal_map=opened(material.normal_map, "normal_map"),
         bump_map=opened(material.bump_map, "bump_map"),
@@ -677,11 +680,9 @@ def check_material(
         if isinstance(found.texture, Named) and found.texture.texture not in textures:
             known = ", ".join(textures) or "none is defined"
             raise SceneError(f"{key}.{slot}.texture", found.texture.texture, f"the name of a texture ({known})", file)
-        if slot == "emission":
-            raise NotBuiltError(f"{key}.{slot}", "a texture", "a colour", file)
         texture = textures[found.texture.texture] if isinstance(found.texture, Named) else found.texture
         sheer = slot == "weight" and any(isinstance(item, Null) for item in _materials(material, materials))
-        if isinstance(texture, VertexColor) and (slot in ("opacity", "normal_map", "bump_map") or sheer):
+        if isinstance(texture, VertexColor) and (slot in _IMAGED or sheer):
             raise SceneError(f"{key}.{slot}", "vertex_color", "an image, or a number", file)
     if not isinstance(material, Blend):
         compensated = getattr(material, "energy_compensation", False)

@@ -48,7 +48,7 @@ class MaterialSlot:
     two_sided: bool = True
     opacity: float | Node = 1.0
     alpha_cutoff: float | None = None
-    emission: tuple[float, float, float] | None = None
+    emission: tuple[float, float, float] | Node | None = None
     emission_strength: float = 1.0
     normal_map: Node | None = None
     bump_map: Node | None = None
@@ -72,7 +72,7 @@ class MaterialSlot:
 
     def readings(self) -> list[Reading]:
         """Its textures, those of inner materials included."""
-        mine = [*self.values.values(), self.opacity, self.normal_map, self.bump_map]
+        mine = [*self.values.values(), self.opacity, self.emission, self.normal_map, self.bump_map]
         found: list[Reading] = [value for value in mine if isinstance(value, Node | VertexColors)]
         return [*found, *(reading for inner in self.inner for reading in inner.readings())]
 
@@ -87,7 +87,8 @@ class Part:
         object_id: order of the shape in the scene, from 1.
         kind: one of ``records.KINDS``.
         material: its material.
-        emission: radiance, or None where it does not emit.
+        emission: radiance, or None where it does not emit; where a texture gives it, what that is multiplied by.
+        glow: the texture, or None.
         emission_names: dotted names of that radiance and, where it has one, of its strength.
         flip: whether the normals are turned around.
         to_world: ``(4, 4)`` float64.
@@ -121,6 +122,7 @@ class Part:
     faces: np.ndarray | None = None
     normals: np.ndarray | None = None
     uvs: np.ndarray | None = None
+    glow: Node | None = None
     colors: np.ndarray | None = None
     smooth: bool = False
     dropped: int = 0
