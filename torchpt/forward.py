@@ -158,7 +158,7 @@ def make_wave(
     attached: bool = False,
 ) -> Wave:
     """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``."""
-    world, geometry = scene.world(dtype, params)
+    world, geometry = scene.world(dtype, params, "uv" in settings.film.aovs)
     threads = None if settings.render.threads == "auto" else int(settings.render.threads)
     moved = any(name.startswith("shapes.") and name.endswith((".vertices", ".to_world")) for name in params or {})
     accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
@@ -319,7 +319,8 @@ class Run:
         variance = None if aov else self.film.variance()
         if aov and self.names:
             shown = layers[self.names[0]]
-            image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else shown
+            blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, 3 - shown.shape[2])
+            image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else torch.cat((shown, blank), -1)
         if "variance" in self.settings.film.aovs:
             layers["variance"] = torch.full_like(image, torch.inf) if variance is None else variance.to(self.dtype)
         clamped = None

@@ -180,3 +180,15 @@ def test_gradients_reach_texels_and_colours(png: str):
     assert float((texels.grad * step).sum() * 2) == pytest.approx(
         float(high - low), rel=2e-2
     )  # which lobe is drawn moves too
+
+
+def test_the_uv_layer_needs_no_texture():
+    shapes = {"s": {"type": "rectangle"}}
+    found = torchpt.load({"camera": {**CAMERA, "fov": 20}, "shapes": shapes})
+    film = {"width": 64, "height": 64, "filter": "box", "aovs": ["uv"]}
+    image = torchpt.render(found, spp=16, film=film, integrator="aov")
+    across = torch.tan(torch.tensor(10 * torch.pi / 180)) * 4 * ((torch.arange(64) + 0.5) / 32 - 1)
+    expected = (across + 1) / 2
+    assert torch.allclose(image[..., 0], expected.expand(64, 64), atol=4e-3)
+    assert torch.allclose(image[..., 1], (1 - expected)[:, None].expand(64, 64), atol=4e-3)
+    assert float(image[..., 2].abs().max()) == 0

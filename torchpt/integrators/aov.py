@@ -15,7 +15,7 @@ from torchpt.shapes import interact, surface_uv
 __all__ = ["CHANNELS", "first_hit"]
 
 #: Layers and how many channels each has. A miss is 0 in all of them.
-CHANNELS = {"albedo": 3, "normal": 3, "depth": 1, "position": 3, "object_id": 1}
+CHANNELS = {"albedo": 3, "normal": 3, "depth": 1, "position": 3, "uv": 2, "object_id": 1}
 
 
 def first_hit(

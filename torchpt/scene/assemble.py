@@ -102,6 +102,7 @@ def assemble(
     centre: Tensor,
     dtype: torch.dtype,
     copies: Sequence[Copy] = (),
+    uv: bool = False,
 ) -> tuple[World, Geometry]:
     """The world of ``parts`` under ``parameters``, and what the search sees of it.
 
@@ -112,6 +113,7 @@ def assemble(
         centre: ``(3,)`` float64 that becomes the origin.
         dtype: of the lanes.
         copies: instances of parts.
+        uv: whether texture coordinates are wanted even if no texture reads them.
     """
     device = centre.device
     corners = [corners_of(part, parameters, centre, dtype) for part in parts]
@@ -209,7 +211,7 @@ def assemble(
         bound=bound,
         flip=sign if counts[3] else None,
         normals=normals,
-        **_charts(parts, corners, sizes, parameters, slots, models),
+        **_charts(parts, corners, sizes, parameters, slots, models, uv),
         opacity=opacity,
         material=spread([rows[owner.material.name][1] for owner in owners]),
         key=key,
@@ -448,22 +450,23 @@ def _charts(
     parameters: Mapping[str, Tensor],
     slots: Mapping[str, MaterialSlot],
     models: Sequence[Bsdf],
+    uv: bool,
 ) -> dict[str, Any]:
     """What of :class:`World` says where a point lies on its surface, each thing only where something reads it."""
     readings = [reading for slot in slots.values() for reading in slot.readings()]
     bumpy = any(slot.bump_map is not None for slot in slots.values())
     framed = bumpy or any(slot.normal_map is not None for slot in slots.values()) or any(m.anisotropic for m in models)
-    imaged = any(isinstance(reading, Node) for reading in readings)
+    imaged = uv or any(isinstance(reading, Node) for reading in readings)
     coloured = any(isinstance(reading, VertexColors) for reading in readings)
     pairs = list(zip(parts, corners, strict=True))
     uvs = [_uvs(part, c) for part, c in pairs] if imaged or framed else []
     found: dict[str, Any] = dict.fromkeys(("tangents", "bitangents", "uvs", "axes", "mirrored", "colors"))
     if framed:
-        moves = [_moves(part, c, uv, parameters) for (part, c), uv in zip(pairs, uvs, strict=True)]
+        moves = [_moves(part, c, corner, parameters) for (part, c), corner in zip(pairs, uvs, strict=True)]
         found["tangents"] = torch.cat([move[0] for move in moves], 1)
         found["bitangents"] = torch.cat([move[1] for move in moves], 1) if bumpy else None
     if imaged:
-        found["uvs"] = tuple(torch.cat([uv[k] for uv in uvs], 1) for k in range(3))
+        found["uvs"] = tuple(torch.cat([corner[k] for corner in uvs], 1) for k in range(3))
         balls = [parameters[f"{part.name}.to_world"][:3, :3] for part in parts if part.kind == "sphere"]
         if balls:
             dtype = corners[0].p0.dtype

@@ -6,7 +6,7 @@ are listed so that a misspelt key is still named as unknown.
 
 from __future__ import annotations
 
-__all__ = ["AOVS", "KEYS", "TYPES"]
+__all__ = ["KEYS", "TYPES"]
 
 _POSE = ("origin", "target", "up", "to_world")
 
@@ -36,6 +36,3 @@ KEYS: dict[str, dict[str, object]] = {
     "sampler": {"adaptive": False},
     "render": {"time_limit": None, "target_error": None, "checkpoint": None, "resume": False},
 }
-
-#: Layers that are not built.
-AOVS: tuple[str, ...] = ("uv",)

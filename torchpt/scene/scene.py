@@ -91,7 +91,7 @@ class Scene:
         }
         self._centre = torch.from_numpy(self._built.centre).to(device)
         self._lock = threading.RLock()
-        self._worlds: dict[torch.dtype, tuple[World, Geometry]] = {}
+        self._worlds: dict[tuple[torch.dtype, bool], tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._state: dict[str, tuple[Tensor, int]] = {}
 
@@ -151,16 +151,21 @@ class Scene:
                         f"params.{name}", matrix.tolist(), "a transform that keeps a sphere round (uniform scale)"
                     )
 
-    def world(self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None) -> tuple[World, Geometry]:
-        """The tensors that lanes gather from, and what the search sees; made once for the scene's own parameters."""
+    def world(
+        self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False
+    ) -> tuple[World, Geometry]:
+        """The tensors that lanes gather from, and what the search sees; made once for the scene's own parameters.
+
+        ``uv``: with texture coordinates, whether or not a texture reads them.
+        """
         if params:
-            return self._assemble(self.merged(params), dtype)
+            return self._assemble(self.merged(params), dtype, uv)
         with self._lock:
             self._refresh()
-            if dtype not in self._worlds:
+            if (dtype, uv) not in self._worlds:
                 with torch.no_grad():
-                    self._worlds[dtype] = self._assemble(self.params, dtype)
-            return self._worlds[dtype]
+                    self._worlds[dtype, uv] = self._assemble(self.params, dtype, uv)
+            return self._worlds[dtype, uv]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
         """A search structure: built for ``geometry``, or kept for the scene's own."""
@@ -191,9 +196,9 @@ class Scene:
         threads = None if settings.render.threads == "auto" else int(settings.render.threads)
         return describe(self.description, self._built, world, self.accel(settings.render.accel, threads), settings)
 
-    def _assemble(self, params: Mapping[str, Tensor], dtype: torch.dtype) -> tuple[World, Geometry]:
+    def _assemble(self, params: Mapping[str, Tensor], dtype: torch.dtype, uv: bool) -> tuple[World, Geometry]:
         environment = params[self._built.environment] if self._built.environment else None
-        return assemble(self._built.parts, params, environment, self._centre, dtype, self._built.copies)
+        return assemble(self._built.parts, params, environment, self._centre, dtype, self._built.copies, uv)
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""

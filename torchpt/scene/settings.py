@@ -79,10 +79,6 @@ def _aovs(value: Any) -> tuple[str, ...]:
     for index, name in enumerate(names):
         if name not in AOVS or name in names[:index]:
             raise wrong(f"a list of different ones of {', '.join(AOVS)}", name, (index,))
-    for index, name in enumerate(names):
-        if name in not_built.AOVS:
-            built = ", ".join(other for other in AOVS if other not in not_built.AOVS)
-            raise wrong(built, name, (index,), not_built=True)
     return tuple(names)
 
 
