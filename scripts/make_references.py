@@ -28,6 +28,7 @@ SCENES = {
     "veach_mis": (72, 48, 2),
     "material_row": (96, 32, 64),
     "studio": (72, 48, 64),
+    "shapes_and_maps": (72, 45, 64),
 }
 FOLDER = Path(__file__).resolve().parent.parent / "tests" / "references"
 
@@ -52,7 +53,7 @@ def main() -> None:
 
 def reference(mitsuba: Any, name: str, seeds: int, spp: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Mean ``(H, W, 3)`` over ``seeds`` pictures and the variance of that mean."""
-    scene = comparable(name)
+    scene = torchpt.load(name, device="cpu") if name.startswith("cornell") else comparable(name)
     width, height, depth = SCENES[name]
     film = {"width": width, "height": height, "filter": "box"}
     integrator = {"type": "path", "max_depth": depth, "rr_depth": 5}

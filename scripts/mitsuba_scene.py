@@ -10,12 +10,12 @@ import ctypes.util
 import importlib
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import yaml
 
 import torchpt
 from torchpt.math.vectors import cross, dot
@@ -107,20 +107,21 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
 
 
 def comparable(name: str) -> Scene:
-    """A scene of ``configs/scene`` without the shapes whose material Mitsuba cannot express."""
+    """A scene of ``configs/scene`` without what Mitsuba cannot express, and without meshes that not every machine has."""
     scene = torchpt.load(name, device="cpu")
-    lacking = set()
+    lacking = {
+        shape for shape, value in scene.description.shapes.items() if len(getattr(value, "path", None) or ()) > 1
+    }
     for part in scene.parts.parts:
         try:
+            _kind(part)
             bsdf(part.material, lambda _: {})
         except NoCounterpartError:
             lacking.add(part.shape)
     if not lacking:
         return scene
-    assert scene.description.file is not None
-    raw = yaml.safe_load(Path(scene.description.file).read_text(encoding="utf-8"))
-    raw["shapes"] = {shape: value for shape, value in raw["shapes"].items() if shape not in lacking}
-    return torchpt.load(raw, device="cpu")
+    shapes = {shape: value for shape, value in scene.description.shapes.items() if shape not in lacking}
+    return Scene(replace(scene.description, shapes=shapes), scene.device)
 
 
 def _film(film: Film) -> dict[str, Any]:
@@ -154,16 +155,21 @@ def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]
             raise NoCounterpartError(f"{part.name}: anisotropic, and no uv to agree on a tangent")
         _write_part(file, scene, part)
         shape |= {"type": "ply", "filename": str(file), "face_normals": not part.smooth}
-    elif part.kind == "quadric" and part.quadric != "cylinder":
-        raise NoCounterpartError(f"{part.name}: Mitsuba has no {part.quadric}")
     else:
-        shape |= {"type": part.quadric or part.kind, "to_world": _transform(mitsuba, part.to_world)}
+        shape |= {"type": _kind(part), "to_world": _transform(mitsuba, part.to_world)}
     if part.flip:
         shape["flip_normals"] = True
     if part.emission is not None:
         strength = part.material.emission_strength if len(part.emission_names) > 1 else 1.0
         shape["emitter"] = {"type": "area", "radiance": _rgb(strength * np.array(part.emission))}
     return shape
+
+
+def _kind(part: Part) -> str:
+    """Mitsuba's name of a part's kind."""
+    if part.kind == "quadric" and part.quadric != "cylinder":
+        raise NoCounterpartError(f"{part.name}: Mitsuba has no {part.quadric}")
+    return part.quadric or part.kind
 
 
 def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
