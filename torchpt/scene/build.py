@@ -325,7 +325,9 @@ def _centre(parts: list[Part], copies: list[Copy]) -> np.ndarray:
     for part in parts:
         points = corners
         if part.vertices is not None and part.faces is not None:
-            points = part.vertices[part.faces.reshape(-1)]  # vertices of no face have no say
+            used = np.zeros(len(part.vertices), bool)
+            used[part.faces.reshape(-1)] = True
+            points = part.vertices[used]  # vertices of no face have no say
             if len(points):
                 half, middle = 0.5 * np.ptp(points, axis=0), 0.5 * (points.max(0) + points.min(0))
                 boxes[part.name] = middle + corners * half
