@@ -165,7 +165,7 @@ def test_vertex_colours_of_a_ply(tmp_path: Path) -> None:
 def test_info_names_what_is_left_out(tmp_path: Path) -> None:
     quarters(tmp_path)
     made = torchpt.load(scene(obj(tmp_path, "Kd 1 1 1\nmap_Ke a b.png\nTf 0 1 0\nillum 4\nrefl x.png")), device="cpu")
-    assert made.info(settings(made.description))["shapes"]["m"]["ignored_in_file"] == ["refl", "Tf", "emission"]
+    assert made.info(settings(made.description))["shapes"]["m"]["ignored_in_file"] == ["refl", "Tf"]
 
 
 @pytest.mark.parametrize(

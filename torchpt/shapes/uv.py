@@ -56,8 +56,7 @@ def _own(world: World, at: Interaction) -> tuple[Tensor, Tensor, Tensor, Tensor]
         axes = [dot(take(axis, row), away) for axis in world.axes]
         x, y, z = (torch.where(ball, axis, other) for axis, other in zip(axes, (x, y, z), strict=True))
         level = torch.where(ball, 2, level)
-    if curved:
-        assert at.own is not None
+    if curved and at.own is not None:  # a point on lights of other kinds has none
         other = at.prim >= len(world.bound) - curved
         x, y, z = (torch.where(other, own, value) for own, value in zip(at.own, (x, y, z), strict=True))
         code = quadrics.rows(world, at.prim).code
