@@ -39,7 +39,8 @@ MANY_SAMPLES = 256
 #: A pass never holds more samples a pixel than this.
 LARGEST_PASS = 64
 
-#: From this many camera paths on ``compile: auto`` compiles: a cold start takes a minute, and saves a quarter of the rest.
+#: From this many camera paths a BSDF model on ``compile: auto`` compiles: a cold start takes a minute each, and saves a
+#: quarter of the rest.
 COMPILE_REPAYS = 200_000_000
 
 _compiled: WeakKeyDictionary[Scene, dict[Plan, CompiledStages]] = WeakKeyDictionary()
@@ -193,7 +194,7 @@ def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, own: boo
         mode = (
             "on"
             if own
-            and work >= COMPILE_REPAYS
+            and work >= COMPILE_REPAYS * len(world.models)  # each has graphs of its own
             and plan.dtype == torch.float32
             and not scene.own_models  # code of the user's own may hold what cannot be compiled
             and can_compile(scene.device)
