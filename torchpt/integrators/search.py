@@ -6,8 +6,6 @@ straight to the search.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -56,11 +54,13 @@ class Search:
         """Opacity ``(N,)`` of what rays ``o, d`` hit; ``miss`` where they hit nothing."""
         assert self._world.opacity is not None
         missed = hit.prim < 0
-        there = replace(hit, prim=hit.prim.clamp_min(0), t=torch.where(missed, 0.0, hit.t))
-        opacity = take(self._world.opacity, self._world.slot(there.prim))
-        if self._world.veils is not None:
-            opacity = opacity * veil(self._world, interact(self._world, o, d, there))
-        return torch.where(missed, miss, opacity)
+        slot = self._world.slot(hit.prim).clamp_min(0)
+        opacity = torch.where(missed, miss, take(self._world.opacity, slot))
+        if self._world.veils is None:
+            return opacity
+        veiled = (~missed & (take(self._world.veils.nodes, slot) >= 0)).nonzero().squeeze(1)
+        at = interact(self._world, take(o, veiled), take(d, veiled), rows(hit, veiled))
+        return opacity.index_copy(0, veiled, take(opacity, veiled) * veil(self._world, at))
 
     @torch.no_grad()
     def _beyond(self, o: Tensor, d: Tensor, hit: Hit) -> Tensor:

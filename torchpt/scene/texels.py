@@ -43,6 +43,7 @@ class Opener:
     ) -> None:
         self._textures, self._resolve, self._parameters, self.file = textures, resolve, parameters, file
         self.files: dict[str, Texels] = {}
+        self._nodes: dict[str, Reading] = {}  # of materials, which many shapes may share
         #: What the texels of a parameter mean; a number slot and a colour slot may read the same image differently.
         self._decoded: dict[str, bool] = {}
         self._shared: dict[str, dict[str, str]] = {}
@@ -54,6 +55,11 @@ class Opener:
             SceneError: a channel that is not there, a value that the slot does not accept.
             AssetError: an image that is missing or malformed.
         """
+        if key not in self._nodes:
+            self._nodes[key] = self._found(slot, key)
+        return self._nodes[key]
+
+    def _found(self, slot: Slot, key: str) -> Reading:
         texture = slot.texture
         if isinstance(texture, Named):
             return self._opened(
@@ -99,7 +105,7 @@ class Opener:
     def values(self, slot: Slot, key: str) -> Callable[[np.ndarray], np.ndarray]:
         """A number texture as a function from texture coordinates ``(V, 2)`` to values ``(V,)``, float64."""
         before = dict(self._parameters)
-        node = self(slot, key)
+        node = self._found(slot, key)
         if not isinstance(node, Node):
             raise SceneError(key, "vertex_color", "an image or a checkerboard", self.file)
         images = images_of([node], {name: torch.from_numpy(value) for name, value in self._parameters.items()})
@@ -179,8 +185,8 @@ class Opener:
         self, values: np.ndarray, slot: Slot, key: str, label: str, scale: tuple[float, float, float] = _ONE
     ) -> None:
         """Refuse texels that the slot does not accept."""
-        low, high = float(values.min()) * max(scale), float(values.max()) * max(scale)
-        low, high = min(low, high, float(values.max()) * min(scale)), max(low, high)
+        ends = [float(end) * factor for end in (values.min(), values.max()) for factor in scale]
+        low, high = min(ends), max(ends)
         if low >= slot.low - 1e-6 and high <= slot.high * (1 + 1e-6):
             return
         where = f" in the texels of {label}" if label else ""
