@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["Accel", "Hits", "choose", "operator"]
+__all__ = ["Accel", "Hits"]
 
 #: ``t`` (N,) float32, ``prim`` (N,) int32, ``u`` (N,), ``v`` (N,).
 Hits = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -49,13 +48,3 @@ class Accel(ABC):
 
 def _rays(o: Tensor, d: Tensor, t_max: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return tuple(x.detach().to(torch.float32).contiguous() for x in (o, d, t_max))  # type: ignore[return-value]
-
-
-def operator(name: str, function: Callable[..., Any]) -> Any:
-    """``function`` as an operator of torch, which compiled graphs call without tracing into it."""
-    return torch.library.custom_op(name, function, mutates_args=())
-
-
-def choose(function: Callable[..., Any], operator: Any) -> Callable[..., Any]:
-    """The operator inside a compiled graph; outside the function itself: the first call of an operator costs seconds."""
-    return operator if torch.compiler.is_compiling() else function

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import kernels_brute as kernels
-from torchpt.accel.base import Accel, Hits, choose, operator
-from torchpt.accel.jit import launch, thread_count
+from torchpt.accel.base import Accel, Hits
 from torchpt.accel.tables import extent, inverses, prepare, tolerances
 from torchpt.errors import SceneError
+from torchpt.native.jit import launch, thread_count
+from torchpt.native.operators import choose, operator
 from torchpt.records import Geometry
 
 __all__ = ["MAX_TOLERANCE", "Brute", "eligible"]

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numba import prange
 
-from torchpt.accel.jit import jit
 from torchpt.accel.kernels_quadric import quadric_hit
 from torchpt.accel.kernels_sphere import sphere_distance
+from torchpt.native.jit import jit
 
 __all__ = ["BLOCK", "intersect", "intersect_parallel", "occluded", "occluded_parallel"]
 

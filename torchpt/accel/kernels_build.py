@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchpt.accel.jit import jit
+from torchpt.native.jit import jit
 
 __all__ = ["WIDTH", "build_binary", "collapse"]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from torchpt.accel.jit import jit
 from torchpt.accel.kernels_build import WIDTH
 from torchpt.accel.kernels_leaf import distance, setup
 from torchpt.accel.kernels_wide import LOWEST, SLACK, children, finite, inside, push
+from torchpt.native.jit import jit
 
 __all__ = ["trace", "trace_parallel"]
 

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from torchpt.accel.jit import jit
 from torchpt.accel.kernels_quadric import quadric_hit
 from torchpt.accel.kernels_sphere import sphere_distance
+from torchpt.native.jit import jit
 
 __all__ = ["distance", "setup"]
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from torchpt.accel.jit import jit
+from torchpt.native.jit import jit
 
 __all__ = ["quadric_hit"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from torchpt.accel.jit import jit
 from torchpt.accel.kernels_build import WIDTH
 from torchpt.accel.kernels_leaf import distance, setup
+from torchpt.native.jit import jit
 
 __all__ = [
     "LOWEST",

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import traverse
-from torchpt.accel.base import Accel, Hits, choose, operator
+from torchpt.accel.base import Accel, Hits
 from torchpt.accel.bounds import primitive_bounds, surface
 from torchpt.accel.radix import Tree, build_tree
 from torchpt.accel.tables import inverses, prepare
+from torchpt.native.operators import choose, operator
 from torchpt.records import Geometry
 
 __all__ = ["Lbvh"]

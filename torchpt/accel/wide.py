@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import kernels_wide as kernels
-from torchpt.accel.base import Accel, Hits, choose, operator
+from torchpt.accel.base import Accel, Hits
 from torchpt.accel.bounds import primitive_bounds
-from torchpt.accel.jit import launch, thread_count
 from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
 from torchpt.accel.tables import inverses, prepare
+from torchpt.native.jit import launch, thread_count
+from torchpt.native.operators import choose, operator
 from torchpt.records import Geometry
 
 __all__ = ["Wide", "wide_tree"]

@@ -12,9 +12,9 @@ from torch import Tensor
 from torchpt.accel import kernels_instances as kernels
 from torchpt.accel.base import Accel, Hits
 from torchpt.accel.instances import CopyTables
-from torchpt.accel.jit import launch, thread_count
 from torchpt.accel.kernels_build import WIDTH
 from torchpt.accel.wide import Wide, wide_tree
+from torchpt.native.jit import launch, thread_count
 from torchpt.records import Geometry
 
 __all__ = ["WideInstanced"]

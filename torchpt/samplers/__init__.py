@@ -13,7 +13,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from torchpt.accel.base import choose, operator
+from torchpt.native.operators import choose, operator
 from torchpt.samplers import independent, sobol
 from torchpt.samplers.dimensions import Dimension, salt
 from torchpt.samplers.hashing import as_int32, mix, mix_int

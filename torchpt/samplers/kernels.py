@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.accel.jit import jit, launch, thread_count
+from torchpt.native.jit import jit, launch, thread_count
 
 __all__ = ["draw"]
 
