@@ -159,7 +159,7 @@ def make_wave(
     attached: bool = False,
 ) -> Wave:
     """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``."""
-    world, geometry = scene.world(dtype, params, "uv" in settings.film.aovs)
+    world, geometry = scene.world(dtype, params, "uv" in settings.film.aovs, settings.light_choice)
     threads = None if settings.render.threads == "auto" else int(settings.render.threads)
     moved = any(name.startswith("shapes.") and name.endswith((".vertices", ".to_world")) for name in params or {})
     accel = scene.accel(settings.render.accel, threads, geometry if moved else None)

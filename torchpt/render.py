@@ -192,7 +192,7 @@ def _differentiable_chunks(
 
     def radiance(span: tuple[int, int, int, int], *tensors: Tensor) -> Tensor:
         given = {**plain, **dict(zip(wanted, tensors, strict=True))}
-        world, _ = scene.world(dtype, given)
+        world, _ = scene.world(dtype, given, choice=settings.light_choice)
         camera = scene.camera(settings.film, scene.merged(given), dtype)
         stages = Stages(still.stages.plan, world)
         values, _ = replace(still, stages=stages, camera=camera).radiance(*span)

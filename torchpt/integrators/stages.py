@@ -76,7 +76,9 @@ def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -
     assert world.lights is not None
     o, d = take(state.o, index), take(state.d, index)
     at = interact(world, o, d, rows(hit, index), slide)
-    radiance, pdf = lights.emitted(world.lights, o, at, d)
+    # Where lights are chosen by place the density is that at the vertex itself, which is not quite where the ray begins.
+    x = o if state.p is None else take(state.p, index)
+    radiance, pdf = lights.emitted(world.lights, x, at, d, None if state.n is None else take(state.n, index))
     if world.glows is not None:
         radiance = radiance * glow(world, at)
     return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
@@ -152,8 +154,13 @@ def shade(
         return surface, None
     table = world.lights
     draws = Draws(plan.sampler, state.key, salts)
-    choice = None if table.choice is None else draws.one(Dimension.LIGHT_CHOICE)
-    light = lights.sample(table, at.p, choice, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET)
+    which = None
+    if lights.local(table):
+        which = lights.fine(draws.two(Dimension.LIGHT_CHOICE))
+    elif table.choice is not None:
+        which = draws.one(Dimension.LIGHT_CHOICE)
+    n = None if kind.transmits else surface.frame.n
+    light = lights.sample(table, at.p, which, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET, n)
     wi = surface.frame.to_local(light.wi)
     weight = light.weight
     if plan.strategy == "mis":
@@ -291,4 +298,8 @@ def scatter(
         key=state.key,
         eta=eta,
     )
+    if state.p is not None:
+        n = torch.zeros_like(at.p) if kind.transmits else frame.n
+        # Copies: no two tensors of a state share memory.
+        after = replace(after, p=at.p.detach().clone(), n=n.detach().clone())
     return after, hit

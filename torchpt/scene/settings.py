@@ -29,6 +29,8 @@ Survival = Annotated[
     float | None, number_field("null or a number, 0 < rr_prob <= 1", lambda x: 0 < x <= 1, optional=True)
 ]
 
+LightChoice = Annotated[str, choice("auto", "uniform", "power", "tree")]
+
 
 class BoxFilter(Model):
     """The pixel's own square (radius 0.5 pixels)."""
@@ -136,6 +138,7 @@ class PathIntegrator(Model):
         rr_depth: the depth from which Russian roulette may end a path.
         rr_prob: a constant survival probability, or None (by throughput).
         strategy: how light is found: mis, bsdf, light, uniform (hemisphere).
+        light_choice: which light is sampled: all alike (uniform), by power, by the light tree, or as many lights ask (auto).
         clamp: largest contribution of a sample, or None.
         strict: whether a sample that is not finite is an error.
     """
@@ -145,6 +148,7 @@ class PathIntegrator(Model):
     rr_depth: Annotated[int, integer(1, 2**31 - 1)] = 5
     rr_prob: Survival = None
     strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
+    light_choice: LightChoice = "auto"
     clamp: Clamp = None
     strict: Flag = False
 
@@ -160,6 +164,7 @@ class DirectIntegrator(Model):
 
     type: Literal["direct"] = "direct"
     strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
+    light_choice: LightChoice = "auto"
     clamp: Clamp = None
     strict: Flag = False
 
@@ -222,6 +227,11 @@ class Settings(Model):
     integrator: PathIntegrator | DirectIntegrator | AovIntegrator = PathIntegrator()
     sampler: Sampler = Sampler()
     render: Render = Render()
+
+    @property
+    def light_choice(self) -> str:
+        """How a light is chosen; where no light is sampled it does not matter."""
+        return getattr(self.integrator, "light_choice", "auto")
 
 
 _TYPED: dict[str, tuple[dict[str, type[Any]], str]] = {
