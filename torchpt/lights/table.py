@@ -170,7 +170,8 @@ def _at_points(lights: Lights, at: Lights, row: Tensor | None, x: Tensor, probab
 
 def _from_afar(lights: Lights, at: Lights, row: Tensor | None, u: Tensor, probability: Tensor | float) -> LightSample:
     wi: Tensor | None = None
-    pdf = weight = torch.empty(0)
+    pdf: Tensor | None = None
+    weight: Tensor | None = None
     if "constant" in lights.kinds:
         wi = constant.sample(u).to(at.radiance.dtype)
         pdf, weight = (torch.full_like(wi[0], value) for value in (1.0 / constant.INVERSE_PDF, constant.INVERSE_PDF))
@@ -179,7 +180,7 @@ def _from_afar(lights: Lights, at: Lights, row: Tensor | None, u: Tensor, probab
         one = torch.ones_like(u[0], dtype=at.radiance.dtype)
         wi = _pick(mask, (-at.normal).expand(3, u.shape[1]), wi)
         pdf, weight = _pick(mask, one * torch.inf, pdf), _pick(mask, one, weight)
-    assert wi is not None
+    assert wi is not None and pdf is not None and weight is not None
     return LightSample(wi, wi, None, at.radiance.expand_as(wi), pdf * probability, weight / probability)
 
 

@@ -24,10 +24,12 @@ from torchpt.scene.description import Description, read_description, settings
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
 
-__all__ = ["INDICES", "Scene", "device_of", "load"]
+__all__ = ["INDICES", "MOVING", "Scene", "device_of", "load"]
 
 #: Parameters that say where things are, in the scene's own coordinates.
 PLACES = (".vertices", ".to_world", ".position", ".target")
+#: Parameters of lights that move shadows.
+MOVING = (".position", ".direction")
 #: Parameters that are amounts of light.
 AMOUNTS = (".emission", ".radiance", ".intensity", ".irradiance")
 #: Parameters of materials that are indices of refraction.
