@@ -459,12 +459,12 @@ def write_ply(path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32
 
 #: Colours of the lanterns' paper: radiance.
 PAPER = {
-    "amber": (13.0, 4.5, 0.9),
-    "gold": (11.0, 7.0, 1.6),
-    "rose": (12.0, 1.6, 2.4),
-    "jade": (1.2, 8.5, 3.5),
-    "azure": (1.2, 4.0, 13.0),
-    "pearl": (8.0, 7.4, 6.6),
+    "amber": (52.0, 18.0, 3.6),
+    "gold": (44.0, 28.0, 6.4),
+    "rose": (48.0, 6.4, 9.6),
+    "jade": (4.8, 34.0, 14.0),
+    "azure": (4.8, 16.0, 52.0),
+    "pearl": (32.0, 30.0, 26.0),
 }
 
 

@@ -12,7 +12,8 @@ from trials import coarse, film_of, shoot, spread, z_limit
 
 import torchpt
 from torchpt import lights
-from torchpt.errors import SceneError
+from torchpt.errors import EdgeWarning, SceneError
+from torchpt.integrators.compiled import can_compile
 from torchpt.lights.bounds import bounds_of
 from torchpt.lights.choice import MANY, ByTree, draw, probability
 from torchpt.math.distributions import Discrete
@@ -180,8 +181,70 @@ def test_the_picture_does_not_depend_on_the_choice(strategy):
     pictures = {}
     for way in ("tree", "power"):
         wish = {"max_depth": 4, "strategy": strategy, "light_choice": way}
-        pictures[way] = [shoot(scene, 24, seed, "sobol", wish, film_of(24)).image for seed in range(8)]
+        pictures[way] = [shoot(scene, 16, seed, "sobol", wish, film_of(18)).image for seed in range(8)]
     (a, va), (b, vb) = (spread([coarse(image, 6) for image in pictures[way]]) for way in pictures)
     z = (a - b) / (va + vb).clamp_min(1e-20).sqrt()
     assert float(z.abs().max()) < 1.5 * z_limit(z.numel())  # variances from eight pictures each
     assert float(a.mean()) == pytest.approx(float(b.mean()), rel=0.02)
+
+
+#: Thirty points over a floor, and where one pixel sees it.
+PLACES = torch.randn(30, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64).abs() * 2 + 0.3
+POWERS = torch.exp(torch.randn(30, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
+
+
+def floor_under_points() -> dict[str, Any]:
+    points = {
+        f"p{k}": {"type": "point", "position": PLACES[k].tolist(), "intensity": [float(POWERS[k])] * 3}
+        for k in range(30)
+    }
+    tilt = {"rotate": {"axis": [1, 0, 0], "angle": -90}}
+    return {
+        "camera": {"origin": [0, 3, -2], "target": [0, 0, 0], "fov": 0.01},
+        "film": film_of(1),
+        "integrator": {"type": "direct"},
+        "lights": points,
+        "shapes": {
+            "floor": {"type": "rectangle", "transform": [tilt], "material": {"type": "diffuse", "reflectance": 0.6}}
+        },
+    }
+
+
+def test_a_floor_under_many_points_and_its_derivatives():
+    """Against the closed form: sum of I cos / r^2, and its derivative by the height and the intensity of one light."""
+    scene = torchpt.load(floor_under_points(), device="cpu")
+    table = scene.world(torch.float32)[0].lights
+    assert table is not None and isinstance(table.choice, ByTree)
+    places, powers = PLACES.clone().requires_grad_(), POWERS.clone().requires_grad_()
+    expected = (0.6 / math.pi * powers * places[:, 1] / (places * places).sum(1) ** 1.5).sum()
+    expected.backward()
+    assert places.grad is not None and powers.grad is not None
+    strongest = int((POWERS * PLACES[:, 1] / (PLACES * PLACES).sum(1) ** 1.5).argmax())
+    names = (f"lights.p{strongest}.position", f"lights.p{strongest}.intensity")
+    params = {name: scene.params[name].clone().requires_grad_() for name in names}
+    with pytest.warns(EdgeWarning):
+        picture = torchpt.render(scene, params=params, spp=1024, compile=False, film={"filter": "box"})
+    picture[0, 0, 0].backward()
+    assert float(picture.detach()[0, 0, 0]) == pytest.approx(float(expected.detach()), rel=5e-3)
+    position, intensity = (params[name].grad for name in names)
+    assert position is not None and intensity is not None
+    torch.testing.assert_close(
+        position.double(), places.grad[strongest], rtol=0.05, atol=0.02 * float(expected.detach())
+    )
+    assert float(intensity[0]) == pytest.approx(float(powers.grad[strongest]), rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not can_compile(torch.device("cpu")), reason="needs a C++ compiler")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's own, while compiling
+def test_compiled_stages_choose_by_the_tree_too():
+    description = every_kind()
+    for shape in description["shapes"].values():
+        shape.pop("material", None)  # one model is enough
+    scene = torchpt.load(description, device="cpu")
+    eager, compiled = (
+        shoot(scene, 32, 5, "sobol", {"max_depth": 3}, film_of(32), compile=mode).image for mode in ("off", "on")
+    )
+    close = torch.isclose(eager, compiled, rtol=1e-3, atol=1e-4).all(-1)
+    assert close.float().mean() > 0.9
+    assert float(compiled.mean()) == pytest.approx(float(eager.mean()), rel=5e-3)
