@@ -7,6 +7,7 @@ write the same result twice, so nothing needs to know of them. (Under gradients 
 
 from __future__ import annotations
 
+import copy
 import shutil
 import types
 from collections.abc import Callable
@@ -33,12 +34,16 @@ def can_compile(device: torch.device) -> bool:
 
 
 class Stages:
-    """The stages, eager: always complete and correct."""
+    """The stages, eager: always complete and correct.
+
+    Attributes:
+        lens: how large a pixel is in the world, see :func:`torchpt.integrators.surfaces.spot_at`; None where nothing asks.
+    """
 
     compiled = False
 
-    def __init__(self, plan: Plan, world: World) -> None:
-        self.plan, self.world = plan, world
+    def __init__(self, plan: Plan, world: World, lens: Tensor | None = None) -> None:
+        self.plan, self.world, self.lens = plan, world, lens
 
     def generate(
         self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
@@ -66,7 +71,7 @@ class Stages:
         salts: Tensor,
     ) -> tuple[PathState, Hit | None, Shadow | None]:
         """See :func:`torchpt.integrators.stages.bounce`."""
-        return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
+        return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, self.lens)
 
 
 class CompiledStages(Stages):
@@ -78,8 +83,8 @@ class CompiledStages(Stages):
 
     compiled = True
 
-    def __init__(self, plan: Plan, world: World) -> None:
-        super().__init__(plan, world)
+    def __init__(self, plan: Plan, world: World, lens: Tensor | None = None) -> None:
+        super().__init__(plan, world, lens)
         if not can_compile(world.p0.device):
             raise RenderError("render.compile: on needs a C++ compiler (g++ or clang++) for the CPU; none was found")
         # Only lanes vary in number; a scene's tables do not.
@@ -87,6 +92,14 @@ class CompiledStages(Stages):
             torch._dynamo.mark_static(table)
         self.graphs: dict[str, int] = {}
         self._made: dict[tuple[Any, ...], Callable[..., Any]] = {}
+
+    def through(self, lens: Tensor | None) -> CompiledStages:
+        """The same graphs for another camera."""
+        if lens is not None:
+            torch._dynamo.mark_static(lens)
+        found = copy.copy(self)
+        found.lens = lens
+        return found
 
     def generate(
         self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
@@ -123,12 +136,12 @@ class CompiledStages(Stages):
         """See :func:`torchpt.integrators.stages.bounce`."""
 
         def stage(
-            state: PathState, hit: Hit, index: Tensor, salts: Tensor
+            state: PathState, hit: Hit, index: Tensor, salts: Tensor, lens: Tensor | None
         ) -> tuple[PathState, Hit | None, Shadow | None]:
-            return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
+            return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, lens)
 
         name = f"bounce {self.world.models[model]}"
-        return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts)
+        return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts, self.lens)
 
     def _get(self, name: str, variant: tuple[Any, ...], stage: Callable[..., Any]) -> Callable[..., Any]:
         """The compiled form of ``stage``, made once for each variant."""

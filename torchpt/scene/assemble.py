@@ -383,9 +383,13 @@ def _look(
 ) -> Look:
     """The textures of materials of one form."""
 
-    def numbers(column: list[Node | None]) -> Tensor | None:
-        found = [nodes[node] for node in column if node is not None]
-        return torch.tensor(found, device=device) if found else None
+    def image(column: Sequence[Node]) -> Pick:
+        numbers = torch.tensor([nodes[node] for node in column], device=device)
+        return Pick(numbers, column[0].channel, any(node.filtered for node in column))
+
+    def relief(column: list[Node | None]) -> Pick | None:
+        found = [node for node in column if node is not None]
+        return image(found) if found else None
 
     def pick(column: list[Any]) -> Any:
         first = column[0]
@@ -393,10 +397,15 @@ def _look(
             return {key: pick([item[key] for item in column]) for key in first}
         if isinstance(first, VertexColors):
             return Pick(None, first.channel)
-        return Pick(numbers(column), first.channel)
+        return image(column)
 
     readings = pick([surface.readings for surface in surfaces])
-    return Look(readings, numbers([slot.normal_map for slot in slots]), numbers([slot.bump_map for slot in slots]))
+    return Look(
+        readings,
+        relief([slot.normal_map for slot in slots]),
+        relief([slot.bump_map for slot in slots]),
+        any(isinstance(r, Node) and r.filtered for slot in slots for r in slot.readings()),
+    )
 
 
 def _veils(
@@ -454,7 +463,9 @@ def _charts(
 ) -> dict[str, Any]:
     """What of :class:`World` says where a point lies on its surface, each thing only where something reads it."""
     readings = [reading for slot in slots.values() for reading in slot.readings()]
+    # Filtered look-ups ask how large a surface's texels are.
     bumpy = any(slot.bump_map is not None for slot in slots.values())
+    bumpy = bumpy or any(isinstance(reading, Node) and reading.filtered for reading in readings)
     framed = bumpy or any(slot.normal_map is not None for slot in slots.values()) or any(m.anisotropic for m in models)
     imaged = uv or any(isinstance(reading, Node) for reading in readings)
     coloured = any(isinstance(reading, VertexColors) for reading in readings)

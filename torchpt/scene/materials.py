@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from torchpt.scene.parts import MaterialSlot, Reading
 from torchpt.scene.presets import INDICES, METALS, metal
 from torchpt.scene.textures import Named, Slot, Texture, VertexColor, slot_value
 from torchpt.scene.validate import Model, select
+from torchpt.textures import Node
 
 __all__ = [
     "MATERIALS", "Blend", "BlinnPhong", "Conductor", "Custom", "Dielectric", "Diffuse", "Material", "Microfacet",
@@ -503,6 +505,8 @@ class Custom(Material):
 
 #: Slots that the colours of vertices cannot give.
 _IMAGED = ("opacity", "emission", "normal_map", "bump_map")
+#: What is read at points, without regard to how large a pixel is: light and cut-outs are the same for every ray.
+_POINTS = ("opacity", "emission")
 
 MATERIALS: dict[str, type[Material]] = {
     "diffuse": Diffuse,
@@ -617,7 +621,8 @@ def slot_of(
         model = material.bsdf()
 
     def opened(value: Any, key: str) -> Any:
-        return resolve(value, f"{name}.{key}") if resolve is not None and isinstance(value, Slot) else value
+        found = resolve(value, f"{name}.{key}") if resolve is not None and isinstance(value, Slot) else value
+        return replace(found, filtered=False) if key in _POINTS and isinstance(found, Node) else found
 
     return MaterialSlot(
         model=model,
@@ -684,6 +689,9 @@ def check_material(
         sheer = slot == "weight" and any(isinstance(item, Null) for item in _materials(material, materials))
         if isinstance(texture, VertexColor) and (slot in _IMAGED or sheer):
             raise SceneError(f"{key}.{slot}", "vertex_color", "an image, or a number", file)
+        if (slot in _POINTS or sheer) and getattr(found.texture, "filter", "") == "trilinear":
+            expected = f"nearest or bilinear, as {slot} is read at points"
+            raise SceneError(f"{key}.{slot}.filter", "trilinear", expected, file)
     if not isinstance(material, Blend):
         compensated = getattr(material, "energy_compensation", False)
         fixed = tuple(material.values()) if compensated else material.bsdf().tabulated
