@@ -111,12 +111,14 @@ class Look:
         readings: :class:`Pick` by parameter, nested as the parameters are.
         normal: normals in the surface's own frame, or None.
         bump: heights, or None.
+        strength: ``(R,)`` how far those normals lean, as a factor; None where it is 1.
         filtered: static; whether any texture here filters.
     """
 
     readings: dict[str, Any]
     normal: Pick | None
     bump: Pick | None
+    strength: Tensor | None = None
     filtered: bool = False
 
 

@@ -25,6 +25,11 @@ from torchpt.records import Hit, PathState, Shadow, World, tensors_of
 
 __all__ = ["CompiledStages", "Stages", "can_compile"]
 
+#: Inductor writes what is used more than once out again for each use, unless it took more operations than this. Indices into
+#: textures and the frames of maps are long chains in which each step uses the one before twice: beyond its own 50 that is
+#: 2^50 visits, and compilation does not end. Of scenes without textures the default makes the faster code.
+REALIZE = 10
+
 Search = Callable[[PathState], Hit]
 
 
@@ -155,9 +160,13 @@ class CompiledStages(Stages):
         from torch._inductor.compile_fx import compile_fx
         from torch.fx.experimental import _config
 
+        options: dict[str, Any] = {"assert_indirect_indexing": False}
+        if self.world.textures is not None:
+            options["realize_opcount_threshold"] = REALIZE
+
         def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Any:
             self.graphs[name] = self.graphs.get(name, 0) + 1
-            return compile_fx(graph, inputs, config_patches={"assert_indirect_indexing": False})
+            return compile_fx(graph, inputs, config_patches=options)
 
         config: Any = _config  # its `patch` is put there at run time
         # A code object of its own: dynamo counts graphs by code, and those of another scene are no business of this one.

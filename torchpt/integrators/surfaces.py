@@ -199,6 +199,9 @@ def _mapped(
     if look.normal is not None:
         local = _read(world, look.normal, row, at, spot) * 2.0 - 1.0
         x, y, z = local[0], local[1], local[2].clamp_min(1e-3)
+        if look.strength is not None:
+            strength = take(look.strength, row)
+            x, y = x * strength, y * strength
     else:
         assert look.bump is not None and look.bump.nodes is not None and at.bitangent is not None
         footprint = spot.footprint if look.bump.filtered else None

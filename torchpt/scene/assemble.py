@@ -162,7 +162,7 @@ def assemble(
     slots = {owner.material.name: owner.material for owner in owners}
     surfaces = {name: surface_of(slot, parameters, dtype) for name, slot in slots.items()}
     nodes = _nodes(slots.values())
-    kinds, rows, tables, looks, two_sided = _materials(slots, surfaces, nodes, device)
+    kinds, rows, tables, looks, two_sided = _materials(slots, surfaces, nodes, parameters, dtype, device)
     models = tuple(model for model, _ in kinds)
     wide = sizes + [1] * len(copies)
     opacity = _opacity(owners, surfaces, wide, dtype, device)
@@ -321,7 +321,12 @@ Kind = tuple[Bsdf, Any]
 
 
 def _materials(
-    slots: Mapping[str, MaterialSlot], surfaces: Mapping[str, Surface], nodes: Mapping[Node, int], device: torch.device
+    slots: Mapping[str, MaterialSlot],
+    surfaces: Mapping[str, Surface],
+    nodes: Mapping[Node, int],
+    parameters: Mapping[str, Tensor],
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> tuple[
     tuple[Kind, ...],
     dict[str, tuple[int, int]],
@@ -346,7 +351,13 @@ def _materials(
             looks.append(None)
         else:
             tables.append(stacked([_tabulated(model, surfaces[name].values) for name in names]))
-            looks.append(_look([slots[name] for name in names], [surfaces[name] for name in names], nodes, device))
+            look = _look([slots[name] for name in names], [surfaces[name] for name in names], nodes, device)
+            strong = [f"{name}.normal_strength" for name in names]
+            if any(name in parameters for name in strong):
+                one = torch.ones((), dtype=dtype, device=device)
+                strengths = [parameters[name].to(one) if name in parameters else one for name in strong]
+                look = replace(look, strength=torch.stack(strengths))
+            looks.append(look)
         both = [slots[name].two_sided for name in names]
         sides.append(None if all(both) else torch.tensor(both, device=device))
     return tuple(groups), rows, tuple(tables), tuple(looks), tuple(sides)
@@ -404,7 +415,7 @@ def _look(
         readings,
         relief([slot.normal_map for slot in slots]),
         relief([slot.bump_map for slot in slots]),
-        any(isinstance(r, Node) and r.filtered for slot in slots for r in slot.readings()),
+        filtered=any(isinstance(r, Node) and r.filtered for slot in slots for r in slot.readings()),
     )
 
 

@@ -118,6 +118,7 @@ class Material(Model):
         emission: radiance leaving the front side, linear RGB.
         emission_strength: factor of it.
         normal_map: shading normals in the surface's own frame, ``2 c - 1`` of the colours c.
+        normal_strength: factor of how far the map's normals lean.
         bump_map: heights along the normal, in the scene's units, whose slope tilts the shading normal.
     """
 
@@ -127,6 +128,7 @@ class Material(Model):
     emission: MaybeColor = None
     emission_strength: Annotated[float, scalar(0.0)] = 1.0
     normal_map: Annotated[Slot | None, PlainValidator(_normals)] = None
+    normal_strength: Annotated[float, scalar(0.0)] = 1.0
     bump_map: Annotated[Slot | None, PlainValidator(_heights)] = None
 
     @model_validator(mode="after")
@@ -136,6 +138,8 @@ class Material(Model):
             raise wrong("an opacity beside alpha_cutoff", self.alpha_cutoff, ("alpha_cutoff",))
         if self.normal_map is not None and self.bump_map is not None:
             raise wrong("either normal_map or bump_map, not both", self.bump_map, ("bump_map",))
+        if "normal_strength" in given and self.normal_map is None:
+            raise wrong("a normal_map beside normal_strength", self.normal_strength, ("normal_strength",))
         if "emission_strength" in given and self.emission is None:
             raise wrong("an emission beside emission_strength", self.emission_strength, ("emission_strength",))
         return self
@@ -634,6 +638,7 @@ def slot_of(
         emission=opened(material.emission, "emission"),
         emission_strength=material.emission_strength,
         normal_map=opened(material.normal_map, "normal_map"),
+        normal_strength=material.normal_strength,
         bump_map=opened(material.bump_map, "bump_map"),
         inner=inner,
     )

@@ -13,6 +13,7 @@ import torch
 from torchpt.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
+from torchpt.images.decode import MAX_PIXELS
 from torchpt.math.transforms import uv_matrix
 from torchpt.scene.parts import Reading, VertexColors
 from torchpt.scene.textures import CHANNELS, Checkerboard, Image, Named, Slot, Texture, VertexColor
@@ -143,9 +144,10 @@ class Opener:
         else:
             source = self._resolve(texture.path, f"{name}.path")
             label = str(source)
-        if label not in self.files:
-            self.files[label] = read_texels(source)
-        found = self.files[label]
+        most = MAX_PIXELS if texture.max_pixels is None else texture.max_pixels
+        found = self.files.get(label)
+        if found is None or found.values.shape[0] * found.values.shape[1] > most:
+            found = self.files[label] = read_texels(source, most)
         alpha = not slot.coloured and channel == "a"  # which is never encoded
         colour = texture.colorspace == "srgb" or (texture.colorspace == "auto" and (alpha or not slot.linear))
         decode = found.eight_bit and colour

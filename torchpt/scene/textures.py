@@ -15,7 +15,7 @@ from pydantic import PlainValidator
 from torchpt.errors import SceneError
 from torchpt.images import EncodedImage
 from torchpt.math.transforms import uv_matrix
-from torchpt.scene.fields import choice, color, number_field, pair, wrong
+from torchpt.scene.fields import choice, color, integer, number_field, pair, wrong
 from torchpt.scene.validate import Model, check_keys, select
 from torchpt.textures import WRAPS
 
@@ -80,6 +80,7 @@ class Image(Texture):
         colorspace: of an image with 8 bits a value. ``auto``: sRGB where it gives a colour, linear where it gives a number.
         scale: factor of the values.
         channel: which of them a number takes.
+        max_pixels: larger images are refused; None: 64 Mpixel.
         uv_transform: applied to texture coordinates.
     """
 
@@ -90,6 +91,7 @@ class Image(Texture):
     colorspace: Annotated[str, choice("auto", "srgb", "linear")] = "auto"
     scale: Annotated[Rgb, color(None)] = (1.0, 1.0, 1.0)
     channel: Annotated[str | None, choice(*CHANNELS)] = None
+    max_pixels: Annotated[int | None, integer(1, 2**34, also=(None,))] = None
     uv_transform: Uv = UvTransform()
 
 
