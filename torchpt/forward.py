@@ -14,6 +14,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from torchpt.cameras import Perspective
 from torchpt.errors import RenderError
 from torchpt.film import Film, Filter
 from torchpt.integrators import Wave
@@ -26,7 +27,17 @@ from torchpt.samplers import Sampler
 from torchpt.scene import Scene
 from torchpt.scene.settings import AovIntegrator, DirectIntegrator, GaussianFilter, PathIntegrator, Settings
 
-__all__ = ["BYTES_PER_LANE", "Progress", "Rendering", "Run", "chunks_of", "lanes_for", "limited_threads", "make_wave"]
+__all__ = [
+    "BYTES_PER_LANE",
+    "Progress",
+    "Rendering",
+    "Run",
+    "chunks_of",
+    "lanes_for",
+    "lens_of",
+    "limited_threads",
+    "make_wave",
+]
 
 #: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
 LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
@@ -173,11 +184,12 @@ def make_wave(
         limits = Limits(2, 3)
         plan = Plan(settings.sampler.type, integrator.strategy, None, dtype, tape, attached)
     spp = settings.render.spp
+    camera = scene.camera(film, scene.merged(params), dtype)
     return Wave(
-        stages=_stages(scene, settings, plan, world, own=not params),
+        stages=_stages(scene, settings, plan, world, lens_of(world, camera), own=not params),
         limits=limits,
         accel=accel,
-        camera=scene.camera(film, scene.merged(params), dtype),
+        camera=camera,
         filter=Filter(film.filter.type, film.filter.radius, stddev, scene.device),
         sampler=Sampler(settings.sampler.type, settings.render.seed, min(spp, 4 if spp >= MANY_SAMPLES else 2)),
         crop=film.crop or (0, 0, film.width, film.height),
@@ -185,7 +197,12 @@ def make_wave(
     )
 
 
-def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, own: bool) -> Stages:
+def lens_of(world: World, camera: Perspective) -> Tensor | None:
+    """What textures filtered by the pixel's footprint need of the camera; None where there are none."""
+    return camera.lens() if world.textures is not None and world.textures.pyramids is not None else None
+
+
+def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, lens: Tensor | None, own: bool) -> Stages:
     """Eager or compiled stages; compiled ones are kept with the scene, unless the world is not the scene's ``own``."""
     mode = settings.render.compile
     if mode == "auto":
@@ -201,13 +218,13 @@ def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, own: boo
             else "off"
         )
     if mode == "off" or plan.tape or torch.is_grad_enabled():
-        return Stages(plan, world)
+        return Stages(plan, world, lens)
     if not own:
-        return CompiledStages(plan, world)
+        return CompiledStages(plan, world, lens)
     kept = _compiled.setdefault(scene, {})
     if plan not in kept or kept[plan].world is not world:
         kept[plan] = CompiledStages(plan, world)
-    return kept[plan]
+    return kept[plan].through(lens)
 
 
 def _passes(spp: int, randomizations: int) -> Iterator[tuple[int, int]]:

@@ -13,7 +13,17 @@ from torch import Tensor
 
 from torchpt import adjoint as adjoints
 from torchpt.errors import EdgeWarning, SceneError
-from torchpt.forward import BYTES_PER_LANE, Progress, Rendering, Run, chunks_of, lanes_for, limited_threads, make_wave
+from torchpt.forward import (
+    BYTES_PER_LANE,
+    Progress,
+    Rendering,
+    Run,
+    chunks_of,
+    lanes_for,
+    lens_of,
+    limited_threads,
+    make_wave,
+)
 from torchpt.integrators.compiled import Stages
 from torchpt.scene import Scene
 from torchpt.scene.description import settings as complete
@@ -194,7 +204,7 @@ def _differentiable_chunks(
         given = {**plain, **dict(zip(wanted, tensors, strict=True))}
         world, _ = scene.world(dtype, given, choice=settings.light_choice)
         camera = scene.camera(settings.film, scene.merged(given), dtype)
-        stages = Stages(still.stages.plan, world)
+        stages = Stages(still.stages.plan, world, lens_of(world, camera))
         values, _ = replace(still, stages=stages, camera=camera).radiance(*span)
         values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
         if clamp is not None:

@@ -71,5 +71,5 @@ class Wave:
         state = self.rays(first_pixel, pixels, first_sample, samples)
         plan, world = self.stages.plan, self.stages.world
         search = Search(self.accel, world, plan.sampler, plan.dtype)
-        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype)
+        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.lens)
         return {name: value.view(len(value), samples, pixels) for name, value in found.items()}
