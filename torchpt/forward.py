@@ -173,13 +173,14 @@ def make_wave(
         limits = Limits(2, 3)
         plan = Plan(settings.sampler.type, integrator.strategy, None, dtype, tape, attached)
     spp = settings.render.spp
+    randomizations = min(spp, 4 if spp >= MANY_SAMPLES else 2)
     return Wave(
         stages=_stages(scene, settings, plan, world, own=not params),
         limits=limits,
         accel=accel,
         camera=scene.camera(film, scene.merged(params), dtype),
         filter=Filter(film.filter.type, film.filter.radius, stddev, scene.device),
-        sampler=Sampler(settings.sampler.type, settings.render.seed, min(spp, 4 if spp >= MANY_SAMPLES else 2)),
+        sampler=Sampler(settings.sampler.type, settings.render.seed, randomizations, spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.centre,
     )

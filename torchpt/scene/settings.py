@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import PlainValidator, model_validator
 
 from torchpt.errors import SceneError
+from torchpt.samplers import KINDS
 from torchpt.scene import not_built
 from torchpt.scene.fields import Flag, choice, integer, memory_size, number_field, wrong
 from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_not_built, select
@@ -177,10 +178,15 @@ INTEGRATORS: dict[str, type[Any]] = {"path": PathIntegrator, "direct": DirectInt
 class Sampler(Model):
     """Where sample points come from."""
 
-    type: Literal["sobol", "independent"] = "sobol"
+    type: Literal["sobol", "independent", "stratified", "hammersley", "zsobol"] = "sobol"
+
+    @property
+    def needs_count(self) -> bool:
+        """Whether ``render.spp`` must be known before the first sample, so that nothing else may end a render."""
+        return KINDS[self.type].NEEDS_COUNT
 
 
-SAMPLERS: dict[str, type[Sampler]] = {"sobol": Sampler, "independent": Sampler}
+SAMPLERS: dict[str, type[Sampler]] = dict.fromkeys(KINDS, Sampler)
 
 _DEVICE = re.compile(r"(auto|cpu|cuda|cuda:[0-9]{1,3})\Z")
 
@@ -271,6 +277,8 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
             inner = [_set(part.get("filter"), "film.filter", name) for part, name in ((below, file), (above, None))]
             raw["filter"] = _overlay("filter", *inner)
         try:
+            if block == "render":
+                _open_end(raw, blocks["sampler"])
             blocks[block] = _block(block, raw)
         except SceneError as error:
             blame = None if _given(overrides, error.key) else file
@@ -280,6 +288,15 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
             "film.aovs", list(blocks["film"].aovs), "no variance where integrator is aov (it carries no light)", file
         )
     return Settings.model_construct(**blocks)
+
+
+def _open_end(raw: Mapping[str, Any], sampler: Sampler) -> None:
+    """Raises where something else than ``spp`` is to end a render whose points depend on their number."""
+    for name in ("time_limit", "target_error"):
+        if sampler.needs_count and raw.get(name) is not None:
+            free = ", ".join(kind for kind, module in KINDS.items() if not module.NEEDS_COUNT)
+            expected = f"null where sampler is {sampler.type}, whose points depend on how many there are (free of it: {free})"
+            raise SceneError(dotted("render", name), raw[name], expected)
 
 
 def _given(overrides: Mapping[str, Any], key: str) -> bool:
