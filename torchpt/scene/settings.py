@@ -16,7 +16,7 @@ from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_
 
 __all__ = [
     "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter",
-    "Integrator", "PathIntegrator", "Render", "Sampler", "Settings", "merge",
+    "Integrator", "MitchellFilter", "PathIntegrator", "Render", "Sampler", "Settings", "TentFilter", "merge",
 ]  # fmt: skip
 
 AOVS = ("albedo", "normal", "depth", "position", "uv", "object_id", "variance")
@@ -25,6 +25,7 @@ MAX_SIDE = 65_536
 MAX_PIXELS = 2**28
 
 Positive = Annotated[float, number_field("a number > 0", lambda x: x > 0)]
+Share = Annotated[float, number_field("a number in 0..1", lambda x: 0 <= x <= 1)]
 Clamp = Annotated[float | None, number_field("null or a number > 0", lambda x: x > 0, optional=True)]
 Survival = Annotated[
     float | None, number_field("null or a number, 0 < rr_prob <= 1", lambda x: 0 < x <= 1, optional=True)
@@ -40,6 +41,26 @@ class BoxFilter(Model):
     def radius(self) -> float:
         """Half the width in pixels."""
         return 0.5
+
+
+class TentFilter(Model):
+    """A triangle that falls to zero at ``radius`` pixels, as Mitsuba's."""
+
+    type: Literal["tent"] = "tent"
+    radius: Positive = 1.0
+
+
+class MitchellFilter(Model):
+    """Mitchell and Netravali's cubic, two pixels wide, with Mitsuba's names; its lobes are negative where ``C`` > 0."""
+
+    type: Literal["mitchell"] = "mitchell"
+    B: Share = 1 / 3
+    C: Share = 1 / 3
+
+    @property
+    def radius(self) -> float:
+        """Half the width in pixels."""
+        return 2.0
 
 
 class GaussianFilter(Model):
@@ -58,8 +79,10 @@ class GaussianFilter(Model):
         return raw
 
 
-Filter = BoxFilter | GaussianFilter
-FILTERS: dict[str, type[Any]] = {"gaussian": GaussianFilter, "box": BoxFilter}
+Filter = BoxFilter | TentFilter | GaussianFilter | MitchellFilter
+FILTERS: dict[str, type[Any]] = {
+    "gaussian": GaussianFilter, "box": BoxFilter, "tent": TentFilter, "mitchell": MitchellFilter,
+}  # fmt: skip
 
 
 def _crop(value: Any) -> tuple[int, int, int, int] | None:
@@ -92,7 +115,7 @@ def _gamma(value: Any) -> float | str:
 
 
 def _filter(value: Any) -> Any:
-    if isinstance(value, BoxFilter | GaussianFilter):
+    if isinstance(value, Filter):
         return value
     raise wrong("a filter")
 
@@ -109,7 +132,7 @@ class Film(Model):
 
     width: Annotated[int, integer(1, MAX_SIDE)] = 512
     height: Annotated[int, integer(1, MAX_SIDE)] = 512
-    filter: Annotated[BoxFilter | GaussianFilter, PlainValidator(_filter)] = GaussianFilter()
+    filter: Annotated[Filter, PlainValidator(_filter)] = GaussianFilter()
     crop: Annotated[tuple[int, int, int, int] | None, PlainValidator(_crop)] = None
     aovs: Annotated[tuple[str, ...], PlainValidator(_aovs)] = ()
     exposure: Annotated[float, number_field("a number of stops in -64..64", lambda x: abs(x) <= 64)] = 0.0
@@ -295,7 +318,9 @@ def _open_end(raw: Mapping[str, Any], sampler: Sampler) -> None:
     for name in ("time_limit", "target_error"):
         if sampler.needs_count and raw.get(name) is not None:
             free = ", ".join(kind for kind, module in KINDS.items() if not module.NEEDS_COUNT)
-            expected = f"null where sampler is {sampler.type}, whose points depend on how many there are (free of it: {free})"
+            expected = (
+                f"null where sampler is {sampler.type}, whose points depend on how many there are (free of it: {free})"
+            )
             raise SceneError(dotted("render", name), raw[name], expected)
 
 
