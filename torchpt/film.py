@@ -65,7 +65,8 @@ class Filter:
         cdf = np.concatenate(([0.0], np.cumsum(np.abs(weight))))
         inverse = np.interp(np.linspace(0.0, 1.0, _CELLS + 1), cdf / cdf[-1], x)
         self._inverse = torch.from_numpy(inverse.astype(np.float32)).to(device)
-        # The negative lobes are the outermost: a share of the numbers at either end of [0, 1), whole steps of 2^-24.
+        # The negative lobes are the outermost, each with a share of the numbers, in whole steps of 2^-24. Both are drawn by
+        # the lowest numbers: the fewer ends of intervals, the more evenly stratified points share them out.
         self._lobe = round(float(np.abs(weight[: 1 << 15]).dot(weight[: 1 << 15] < 0)) / cdf[-1] * _STEPS) / _STEPS
         self.signed = self._lobe > 0
 
@@ -77,6 +78,8 @@ class Filter:
             t = 2.0 * u - 1.0
             return torch.copysign(1.0 - (1.0 - t.abs()).sqrt(), t) * self.radius
         assert self._inverse is not None
+        if self.signed:
+            u = torch.where(u < self._lobe, u + (1.0 - self._lobe), u - self._lobe)
         place = u * float(_CELLS)
         cell = place.to(torch.int64)
         low = torch.take(self._inverse, cell)
@@ -84,9 +87,9 @@ class Filter:
 
     def weight(self, u: Tensor) -> Tensor:
         """Weights ``(N,)`` of samples at the offsets of ``u (2, N)``, of a filter that is ``signed``."""
-        negative = (u < self._lobe) | (u >= 1.0 - self._lobe)
+        negative = u < 2.0 * self._lobe
         norm = 1.0 / (1.0 - 4.0 * self._lobe)
-        return torch.where(negative[0] ^ negative[1], -norm * norm, norm * norm).to(u.dtype)
+        return norm * norm * (1.0 - 2.0 * (negative[0] ^ negative[1]).to(u.dtype))
 
 
 class Film:
