@@ -54,7 +54,7 @@ def save(out: Path, name: str, picture: Tensor) -> None:
 def samplers(out: Path) -> None:
     """Sobol' and independent points at 128 samples a pixel: part of a soft shadow."""
     scene = torchpt.load(SHADOWS, device="cpu")
-    film = {"width": 320, "height": 320, "filter": "box", "crop": [150, 110, 110, 90]}
+    film = {"width": 320, "height": 320, "filter": "box", "crop": [130, 165, 110, 85]}
     pictures = [torchpt.render(scene, spp=128, film=film, sampler=kind) for kind in ("sobol", "independent")]
     save(out, "sampler_sobol_independent.png", beside(pictures, 3))
 
