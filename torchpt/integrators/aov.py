@@ -12,10 +12,12 @@ from torchpt.math.vectors import take
 from torchpt.records import PathState, World, rows
 from torchpt.shapes import interact, surface_uv
 
-__all__ = ["CHANNELS", "first_hit"]
+__all__ = ["CHANNELS", "NAMES", "first_hit"]
 
 #: Layers and how many channels each has. A miss is 0 in all of them.
 CHANNELS = {"albedo": 3, "normal": 3, "depth": 1, "position": 3, "uv": 2, "object_id": 1}
+#: Layers that name things: a pixel shows what its first sample met, since names have no average.
+NAMES = ("object_id",)
 
 
 def first_hit(
