@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.errors import RenderError
 from torchpt.film import Filter
 from torchpt.integrators import stages
@@ -40,9 +40,7 @@ class Stages:
     def __init__(self, plan: Plan, world: World) -> None:
         self.plan, self.world = plan, world
 
-    def generate(
-        self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
-    ) -> PathState:
+    def generate(self, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
         """See :func:`torchpt.integrators.stages.generate`."""
         return stages.generate(self.plan, camera, filter, x, y, key, salts)
 
@@ -88,17 +86,15 @@ class CompiledStages(Stages):
         self.graphs: dict[str, int] = {}
         self._made: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
-    def generate(
-        self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
-    ) -> PathState:
+    def generate(self, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
         """See :func:`torchpt.integrators.stages.generate`."""
         if len(x) % 16:  # the last chunk of a film: once a pass, not worth a graph
             return super().generate(camera, filter, x, y, key, salts)
 
-        def stage(camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+        def stage(camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
             return stages.generate(self.plan, camera, filter, x, y, key, salts)
 
-        variant = (camera.width, camera.height, camera.fov_axis, filter.kind, filter.radius)
+        variant = (*camera.kind(), filter.kind, filter.radius)
         return self._get("generate", variant, stage)(camera, filter, x, y, key, salts)
 
     def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.surfaces import Surface, glow, surface_at, veil
 from torchpt.math.mis import power_heuristic
@@ -57,12 +57,12 @@ class Plan:
     attached: bool  # whether they are wanted with respect to geometry
 
 
-def generate(
-    plan: Plan, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
-) -> PathState:
-    """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter."""
-    place = filter.offset(Draws(plan.sampler, key, salts).two(Dimension.PIXEL)).to(plan.dtype)
-    o, d = camera.rays(x + 0.5 + place[0], y + 0.5 + place[1])
+def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+    """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter (and on the lens, where there is one)."""
+    draws = Draws(plan.sampler, key, salts)
+    place = filter.offset(draws.two(Dimension.PIXEL)).to(plan.dtype)
+    lens = draws.two(Dimension.LENS).to(plan.dtype) if camera.lens else None
+    o, d = camera.rays(x + 0.5 + place[0], y + 0.5 + place[1], lens)
     n = d.shape[1]
     ones = torch.ones_like(d)
     everywhere = torch.full((n,), math.inf, dtype=plan.dtype, device=d.device)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators import aov
 from torchpt.integrators.compiled import Stages
@@ -38,7 +38,7 @@ class Wave:
     stages: Stages
     limits: Limits | None
     accel: Accel
-    camera: Perspective
+    camera: Camera
     filter: Filter
     sampler: Sampler
     crop: tuple[int, int, int, int]
