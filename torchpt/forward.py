@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.errors import RenderError
 from torchpt.film import Film, Filter
 from torchpt.integrators import Wave
@@ -41,9 +41,9 @@ __all__ = [
     "Run",
     "chunks_of",
     "lanes_for",
-    "lens_of",
     "limited_threads",
     "make_wave",
+    "pixel_of",
 ]
 
 #: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
@@ -196,7 +196,7 @@ def make_wave(
     camera = scene.camera(film, scene.merged(params), dtype)
     randomizations = min(spp, 4 if spp >= MANY_SAMPLES else 2)
     return Wave(
-        stages=_stages(scene, settings, plan, world, lens_of(world, camera), own=not params),
+        stages=_stages(scene, settings, plan, world, pixel_of(world, camera), own=not params),
         limits=limits,
         accel=accel,
         camera=camera,
@@ -207,12 +207,12 @@ def make_wave(
     )
 
 
-def lens_of(world: World, camera: Perspective) -> Tensor | None:
+def pixel_of(world: World, camera: Camera) -> Tensor | None:
     """What textures filtered by the pixel's footprint need of the camera; None where there are none."""
-    return camera.lens() if world.textures is not None and world.textures.pyramids is not None else None
+    return camera.pixel() if world.textures is not None and world.textures.pyramids is not None else None
 
 
-def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, lens: Tensor | None, own: bool) -> Stages:
+def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: Tensor | None, own: bool) -> Stages:
     """Eager or compiled stages; compiled ones are kept with the scene, unless the world is not the scene's ``own``."""
     mode = settings.render.compile
     if mode == "auto":
@@ -228,13 +228,13 @@ def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, lens: Te
             else "off"
         )
     if mode == "off" or plan.tape or torch.is_grad_enabled():
-        return Stages(plan, world, lens)
+        return Stages(plan, world, pixel)
     if not own:
-        return CompiledStages(plan, world, lens)
+        return CompiledStages(plan, world, pixel)
     kept = _compiled.setdefault(scene, {})
     if plan not in kept or kept[plan].world is not world:
         kept[plan] = CompiledStages(plan, world)
-    return kept[plan].through(lens)
+    return kept[plan].through(pixel)
 
 
 def _passes(spp: int, randomizations: int) -> Iterator[tuple[int, int]]:

@@ -20,9 +20,9 @@ from torchpt.forward import (
     Run,
     chunks_of,
     lanes_for,
-    lens_of,
     limited_threads,
     make_wave,
+    pixel_of,
 )
 from torchpt.integrators.compiled import Stages
 from torchpt.scene import Scene
@@ -204,7 +204,7 @@ def _differentiable_chunks(
         given = {**plain, **dict(zip(wanted, tensors, strict=True))}
         world, _ = scene.world(dtype, given, choice=settings.light_choice)
         camera = scene.camera(settings.film, scene.merged(given), dtype)
-        stages = Stages(still.stages.plan, world, lens_of(world, camera))
+        stages = Stages(still.stages.plan, world, pixel_of(world, camera))
         values, _ = replace(still, stages=stages, camera=camera).radiance(*span)
         values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
         if clamp is not None:

@@ -270,7 +270,7 @@ def test_live(scene, tmp_path, monkeypatch):
     from mitsuba_scene import convert, load_mitsuba
 
     mitsuba = load_mitsuba("scalar_rgb")
-    loaded = torchpt.load(LIVE.get(scene, scene), device="cpu")
+    loaded = torchpt.load(LIVE[scene] if scene in LIVE else scene, device="cpu")
     film = {**film_of(48), "filter": "box"}
     wishes = settings(loaded.description, {"film": film, "integrator": {"type": "path", **KEYS}, "render": {"spp": 32}})
     theirs = mitsuba.load_dict(convert(mitsuba, loaded, wishes, tmp_path))

@@ -27,12 +27,12 @@ def first_hit(
     state: PathState,
     centre: Tensor,
     dtype: torch.dtype,
-    lens: Tensor | None = None,
+    pixel: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """The layers ``names``, each ``(C, N)``, for camera rays ``state``.
 
     ``albedo`` is the material's reflectance, ``normal`` the shading normal in the world, ``depth`` the distance from the
-    camera, ``object_id`` the order of the shape in the scene, from 1. ``lens``: see ``surfaces.spot_at``.
+    camera, ``object_id`` the order of the shape in the scene, from 1. ``pixel``: see ``surfaces.spot_at``.
     """
     hit = search.nearest(state, 1)
     layers = {name: torch.zeros(CHANNELS[name], len(hit.t), dtype=dtype, device=centre.device) for name in names}
@@ -40,7 +40,7 @@ def first_hit(
     for model, index in groups:
         found = rows(hit, index)
         at = interact(world, take(state.o, index), take(state.d, index), found)
-        spot = spot_at(world, model, at, lens)
+        spot = spot_at(world, model, at, pixel)
         values: dict[str, Tensor] = {}
         if "albedo" in names:
             parameters = parameters_at(world, model, take(world.material, at.slot), at, spot)

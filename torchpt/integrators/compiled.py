@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.errors import RenderError
 from torchpt.film import Filter
 from torchpt.integrators import stages
@@ -42,17 +42,15 @@ class Stages:
     """The stages, eager: always complete and correct.
 
     Attributes:
-        lens: how large a pixel is in the world, see :func:`torchpt.integrators.surfaces.spot_at`; None where nothing asks.
+        pixel: how large a pixel is in the world, see :func:`torchpt.integrators.surfaces.spot_at`; None where nothing asks.
     """
 
     compiled = False
 
-    def __init__(self, plan: Plan, world: World, lens: Tensor | None = None) -> None:
-        self.plan, self.world, self.lens = plan, world, lens
+    def __init__(self, plan: Plan, world: World, pixel: Tensor | None = None) -> None:
+        self.plan, self.world, self.pixel = plan, world, pixel
 
-    def generate(
-        self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
-    ) -> PathState:
+    def generate(self, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
         """See :func:`torchpt.integrators.stages.generate`."""
         return stages.generate(self.plan, camera, filter, x, y, key, salts)
 
@@ -76,7 +74,9 @@ class Stages:
         salts: Tensor,
     ) -> tuple[PathState, Hit | None, Shadow | None]:
         """See :func:`torchpt.integrators.stages.bounce`."""
-        return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, self.lens)
+        return stages.bounce(
+            self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, self.pixel
+        )
 
 
 class CompiledStages(Stages):
@@ -88,8 +88,8 @@ class CompiledStages(Stages):
 
     compiled = True
 
-    def __init__(self, plan: Plan, world: World, lens: Tensor | None = None) -> None:
-        super().__init__(plan, world, lens)
+    def __init__(self, plan: Plan, world: World, pixel: Tensor | None = None) -> None:
+        super().__init__(plan, world, pixel)
         if not can_compile(world.p0.device):
             raise RenderError("render.compile: on needs a C++ compiler (g++ or clang++) for the CPU; none was found")
         # Only lanes vary in number; a scene's tables do not.
@@ -98,25 +98,23 @@ class CompiledStages(Stages):
         self.graphs: dict[str, int] = {}
         self._made: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
-    def through(self, lens: Tensor | None) -> CompiledStages:
+    def through(self, pixel: Tensor | None) -> CompiledStages:
         """The same graphs for another camera."""
-        if lens is not None:
-            torch._dynamo.mark_static(lens)
+        if pixel is not None:
+            torch._dynamo.mark_static(pixel)
         found = copy.copy(self)
-        found.lens = lens
+        found.pixel = pixel
         return found
 
-    def generate(
-        self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
-    ) -> PathState:
+    def generate(self, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
         """See :func:`torchpt.integrators.stages.generate`."""
         if len(x) % 16:  # the last chunk of a film: once a pass, not worth a graph
             return super().generate(camera, filter, x, y, key, salts)
 
-        def stage(camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+        def stage(camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
             return stages.generate(self.plan, camera, filter, x, y, key, salts)
 
-        variant = (camera.width, camera.height, camera.fov_axis, filter.kind, filter.radius)
+        variant = (*camera.kind(), filter.kind, filter.radius)
         return self._get("generate", variant, stage)(camera, filter, x, y, key, salts)
 
     def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
@@ -141,12 +139,12 @@ class CompiledStages(Stages):
         """See :func:`torchpt.integrators.stages.bounce`."""
 
         def stage(
-            state: PathState, hit: Hit, index: Tensor, salts: Tensor, lens: Tensor | None
+            state: PathState, hit: Hit, index: Tensor, salts: Tensor, pixel: Tensor | None
         ) -> tuple[PathState, Hit | None, Shadow | None]:
-            return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, lens)
+            return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, pixel)
 
         name = f"bounce {self.world.models[model]}"
-        return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts, self.lens)
+        return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts, self.pixel)
 
     def _get(self, name: str, variant: tuple[Any, ...], stage: Callable[..., Any]) -> Callable[..., Any]:
         """The compiled form of ``stage``, made once for each variant."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.surfaces import Surface, glow, surface_at, veil
 from torchpt.math.mis import power_heuristic
@@ -57,12 +57,12 @@ class Plan:
     attached: bool  # whether they are wanted with respect to geometry
 
 
-def generate(
-    plan: Plan, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
-) -> PathState:
-    """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter."""
-    place = filter.offset(Draws(plan.sampler, key, salts).two(Dimension.PIXEL)).to(plan.dtype)
-    o, d = camera.rays(x + 0.5 + place[0], y + 0.5 + place[1])
+def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+    """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter (and on the lens, where there is one)."""
+    draws = Draws(plan.sampler, key, salts)
+    place = filter.offset(draws.two(Dimension.PIXEL)).to(plan.dtype)
+    lens = draws.two(Dimension.LENS).to(plan.dtype) if camera.lens else None
+    o, d = camera.rays(x + 0.5 + place[0], y + 0.5 + place[1], lens)
     n = d.shape[1]
     ones = torch.ones_like(d)
     everywhere = torch.full((n,), math.inf, dtype=plan.dtype, device=d.device)
@@ -113,7 +113,7 @@ def bounce(
     hit: Hit,
     index: Tensor,
     salts: Tensor,
-    lens: Tensor | None = None,
+    pixel: Tensor | None = None,
 ) -> tuple[PathState, Hit | None, Shadow | None]:
     """One vertex of the paths at ``index``, all of which hit surfaces of one BSDF model.
 
@@ -128,7 +128,7 @@ def bounce(
         hit: of the whole wave.
         index: lanes concerned ``(n,)``.
         salts: names of this depth's dimensions.
-        lens: see :func:`torchpt.integrators.surfaces.spot_at`.
+        pixel: see :func:`torchpt.integrators.surfaces.spot_at`.
 
     Returns:
         The state of the ``n`` paths with their next rays, the next hits where they had to be found already, and the shadow
@@ -138,7 +138,7 @@ def bounce(
     at = interact(world, here.o, here.d, met, slide)
     if met.chance is not None:
         here = replace(here, throughput=here.throughput * met.chance)
-    surface, shadow = shade(plan, world, model, here, at, salts, lens)
+    surface, shadow = shade(plan, world, model, here, at, salts, pixel)
     after, found = scatter(plan, world, model, here, at, surface, salts, roulette, search)
     return after, found, shadow
 
@@ -150,14 +150,14 @@ def shade(
     state: PathState,
     at: Interaction,
     salts: Tensor,
-    lens: Tensor | None,
+    pixel: Tensor | None,
 ) -> tuple[Surface, Shadow | None]:
     """Resolve the material at the surface points and sample a light for each.
 
     Returns:
         The surface, and the shadow rays (None where no light is sampled).
     """
-    surface, kind = surface_at(world, model, state.d, at, lens), world.models[model]
+    surface, kind = surface_at(world, model, state.d, at, pixel), world.models[model]
     if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
         return surface, None
     table = world.lights

@@ -29,37 +29,37 @@ class Spot:
     footprint: Tensor | None  # (N,) area in texture coordinates; None: they are read at points
 
 
-def spot_at(world: World, number: int, at: Interaction, lens: Tensor | None) -> Spot | None:
+def spot_at(world: World, number: int, at: Interaction, pixel: Tensor | None) -> Spot | None:
     """Where the textures of model ``number`` are read; None where it reads no image.
 
     Args:
         world: the scene's tensors.
         number: of the model.
         at: the points.
-        lens: how large a pixel is in the world, see :meth:`torchpt.cameras.Perspective.lens`; None: a point.
+        pixel: how large a pixel is in the world, see :meth:`torchpt.cameras.Camera.pixel`; None: a point.
     """
     look = world.looks[number]
     if look is None or world.uvs is None:
         return None
-    wide = look.filtered and lens is not None
-    return Spot(surface_uv(world, at), _footprint(at, lens) if wide and lens is not None else None)
+    wide = look.filtered and pixel is not None
+    return Spot(surface_uv(world, at), _footprint(at, pixel) if wide and pixel is not None else None)
 
 
-def _footprint(at: Interaction, lens: Tensor) -> Tensor:
+def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
     """Area ``(N,)`` in texture coordinates of what a pixel covers of the surface; 0 where it has no coordinates.
 
     Every vertex of a path counts as if the camera saw it directly (Pharr, Jakob, Humphreys, *Physically Based Rendering*,
     4th edition, 10.1.3). Of the ellipse that a pixel is on the surface, the area: filters here are round.
     """
     assert at.tangent is not None and at.bitangent is not None
-    away = torch.addcmul(lens[0:3, None], at.p, lens[3], value=-1)
+    away = torch.addcmul(pixel[0:3, None], at.p, pixel[3], value=-1)
     square = dot(away, away)
     cosine = dot(normalize(away), at.ng).abs().clamp_min(_SLANT)
     across = cross(at.tangent, at.bitangent)
     stretch = dot(across, across)  # of the area, squared
     some = stretch > 0
     stretch = torch.where(some, torch.where(some, stretch, 1.0).sqrt(), torch.inf)
-    return square * (lens[4] * lens[4]) / (cosine * stretch)
+    return square * (pixel[4] * pixel[4]) / (cosine * stretch)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Surface:
     relief: Relief | None  # None where no map bends the normals
 
 
-def surface_at(world: World, number: int, d: Tensor, at: Interaction, lens: Tensor | None = None) -> Surface:
+def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Tensor | None = None) -> Surface:
     """Resolve the material at surface points.
 
     Args:
@@ -100,11 +100,11 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, lens: Tens
         number: of the model that all of them have.
         d: directions ``(3, N)`` of the rays that came.
         at: the points.
-        lens: see :func:`spot_at`.
+        pixel: see :func:`spot_at`.
     """
     model, row = world.models[number], take(world.material, at.slot)
     look = world.looks[number]
-    spot = spot_at(world, number, at, lens)
+    spot = spot_at(world, number, at, pixel)
     ns, side, shown, relief = at.ns, None, None, None
     if not model.transmits:
         side = torch.copysign(torch.ones_like(ns[0]), -dot(d, ns).detach())

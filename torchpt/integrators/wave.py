@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators import aov
 from torchpt.integrators.compiled import Stages
@@ -38,7 +38,7 @@ class Wave:
     stages: Stages
     limits: Limits | None
     accel: Accel
-    camera: Perspective
+    camera: Camera
     filter: Filter
     sampler: Sampler
     crop: tuple[int, int, int, int]
@@ -78,7 +78,7 @@ class Wave:
         state = self.rays(first_pixel, pixels, first_sample, samples)
         plan, world = self.stages.plan, self.stages.world
         search = Search(self.accel, world, plan.sampler, plan.dtype)
-        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.lens)
+        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel)
         if self.filter.signed:
             weight = self._weight(state)
             found = {name: value if name in aov.NAMES else value * weight for name, value in found.items()}

@@ -65,7 +65,8 @@ def build_parts(description: Description) -> Built:
         _declare(slot_of(material, f"materials.{name}", description.materials, opener), parameters)
     sources = _sources(description, parameters)
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
-    parameters["camera.fov"] = np.asarray(description.camera.fov, np.float64)
+    for name, number in description.camera.numbers().items():
+        parameters[f"camera.{name}"] = np.asarray(number, np.float64)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     return Built(tuple(parts), parameters, _centre(parts, copies), sources, tuple(copies))
 

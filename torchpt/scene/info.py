@@ -8,6 +8,7 @@ from torchpt import bsdfs
 from torchpt.accel import Accel
 from torchpt.lights.choice import ByTree
 from torchpt.records import KINDS, Lights, World, tensors_of
+from torchpt.scene.schema import ThinLens
 from torchpt.scene.settings import Settings
 
 if TYPE_CHECKING:
@@ -58,13 +59,14 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     return {
         "scene": {
             "file": description.file,
+            "camera": type(description.camera).__name__.lower(),
             "primitives": {kind: n for kind, n in zip(KINDS, world.counts, strict=True) if n},
             **({"instances": len(built.copies)} if built.copies else {}),
             "parameters": len(built.parameters),
         },
         "shapes": shapes,
         "built": made,
-        "left_out": _left_out(world, settings),
+        "left_out": _left_out(description, world, settings),
         "settings": settings.model_dump(mode="json", warnings=False),
     }
 
@@ -79,7 +81,7 @@ def _lights(lights: Lights) -> dict[str, Any]:
     return found
 
 
-def _left_out(world: World, settings: Settings) -> list[str]:
+def _left_out(description: Description, world: World, settings: Settings) -> list[str]:
     """Features this scene does not need, for which there is no object, no tensor and no instruction."""
     lights = world.lights
     absent = [f"{kind} primitives" for kind, n in zip(KINDS, world.counts, strict=True) if not n]
@@ -115,6 +117,8 @@ def _left_out(world: World, settings: Settings) -> list[str]:
         absent += [f"sampling of {kind} lights" for kind in KINDS if kind not in lights.kinds]
     if settings.film.filter.type == "box":
         absent.append("filter table (box)")
+    if not isinstance(description.camera, ThinLens):
+        absent.append("places on a lens (all is in focus)")
     integrator = settings.integrator
     if getattr(integrator, "clamp", None) is None:
         absent.append("clamp")

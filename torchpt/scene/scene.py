@@ -14,10 +14,11 @@ from torch import Tensor
 from torchpt import accel as search
 from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera, Orthographic, Perspective, ThinLens
 from torchpt.errors import RenderError, SceneError
 from torchpt.math.transforms import is_singular, similarity_scale
 from torchpt.records import Geometry, World
+from torchpt.scene import schema
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
 from torchpt.scene.description import Description, read_description, settings
@@ -151,6 +152,11 @@ class Scene:
             raise SceneError(f"params.{name}", value.tolist(), "a direction other than [0, 0, 0]")
         if name.endswith((".cutoff_angle", ".beam_width")) and not 0 < float(value) <= 180:
             raise SceneError(f"params.{name}", float(value), "an angle in degrees, 0 < angle <= 180")
+        kind, _, key = name.partition(".")
+        if kind == "camera" and key in schema.CAMERA_NUMBERS:
+            expected, accepted = schema.CAMERA_NUMBERS[key]
+            if not accepted(float(value)):
+                raise SceneError(f"params.{name}", float(value), expected)
         if name.endswith(".to_world"):
             matrix = value.double().cpu().numpy()
             if is_singular(matrix):
@@ -188,18 +194,20 @@ class Scene:
                 self._accels[kind, threads] = search.build(own, kind, threads)
             return self._accels[kind, threads]
 
-    def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Perspective:
+    def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
         """The camera on a film of a given size, in the lanes' coordinates."""
         pose = params["camera.to_world"].double()
         shift = torch.zeros(4, 4, dtype=torch.float64, device=self.device)
         shift[:3, 3] = self._centre
-        return Perspective(
-            (pose - shift).to(dtype),
-            params["camera.fov"].to(dtype),
-            self.description.camera.fov_axis,
-            film.width,
-            film.height,
-        )
+        kind = self.description.camera
+        number: dict[str, Any] = {name: params[f"camera.{name}"].to(dtype) for name in kind.numbers()}
+        placed: dict[str, Any] = {"to_world": (pose - shift).to(dtype), "width": film.width, "height": film.height}
+        if isinstance(kind, schema.Orthographic):
+            return Orthographic(**placed, extent=number["width"])
+        if isinstance(kind, schema.ThinLens):
+            return ThinLens(**placed, **number, fov_axis=kind.fov_axis, blades=kind.blades)
+        assert isinstance(kind, schema.Perspective)
+        return Perspective(**placed, **number, fov_axis=kind.fov_axis)
 
     def info(self, settings: Settings) -> dict[str, Any]:
         """What the scene holds, what was built for it and what was left out."""

@@ -12,7 +12,7 @@ from torchpt.errors import SceneError
 from torchpt.samplers import KINDS
 from torchpt.scene import not_built
 from torchpt.scene.fields import Flag, choice, integer, memory_size, number_field, wrong
-from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_not_built, select
+from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_foreign, refuse_not_built, select
 
 __all__ = [
     "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter",
@@ -348,7 +348,7 @@ def _block(block: str, raw: dict[str, Any]) -> Model:
     if block in _TYPED:
         table, default = _TYPED[block]
         if block == "integrator":
-            _useless(raw, table, default)
+            refuse_foreign(block, table, raw, default, None)
         return select(block, table, raw, block, None, default)
     if block == "film":
         if "filter" in raw:
@@ -358,18 +358,3 @@ def _block(block: str, raw: dict[str, Any]) -> Model:
     check_keys({k: v for k, v in raw.items() if k not in later}, Render.model_fields, block, what, None)
     rest = refuse_not_built(raw, later, block, ", ".join(Render.model_fields), None)
     return construct(Render, rest, block, None, what)
-
-
-def _useless(raw: Mapping[str, Any], table: Mapping[str, type[Model]], default: str) -> None:
-    """Raises for a key of another integrator: it would be accepted and do nothing."""
-    kind = raw.get("type", default)
-    if kind not in table:
-        return
-    own = table[kind].model_fields
-    for name, value in raw.items():
-        owners = [other for other, model in table.items() if name in model.model_fields]
-        if name not in own and owners:
-            expected = (
-                f"only keys that the {kind} integrator reads ({', '.join(own)}); {name} belongs to {', '.join(owners)}"
-            )
-            raise SceneError(dotted("integrator", name), value, expected)
