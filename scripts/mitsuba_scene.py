@@ -22,7 +22,7 @@ from torchpt.math.vectors import cross, dot
 from torchpt.scene import Scene
 from torchpt.scene.assemble import corners_of
 from torchpt.scene.parts import MaterialSlot, Part, VertexColors
-from torchpt.scene.settings import Film, PathIntegrator, Settings
+from torchpt.scene.settings import Film, Filter, PathIntegrator, Settings
 from torchpt.scene.texels import images_of
 from torchpt.textures import Node
 
@@ -131,8 +131,13 @@ def _film(film: Film) -> dict[str, Any]:
         "height": film.height,
         "pixel_format": "rgb",
         "component_format": "float32",
-        "rfilter": {"type": "box"} if film.filter.type == "box" else {"type": "gaussian", "stddev": film.filter.stddev},
+        "rfilter": _rfilter(film.filter),
     }
+
+
+def _rfilter(filter: Filter) -> dict[str, Any]:
+    # Mitsuba's gaussian has no radius of its own: it is four deviations, as ours is where none is given.
+    return {key: value for key, value in filter.model_dump().items() if key != "radius" or filter.type == "tent"}
 
 
 def _transform(mitsuba: Any, matrix: np.ndarray) -> Any:
