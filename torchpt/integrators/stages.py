@@ -113,6 +113,7 @@ def bounce(
     hit: Hit,
     index: Tensor,
     salts: Tensor,
+    lens: Tensor | None = None,
 ) -> tuple[PathState, Hit | None, Shadow | None]:
     """One vertex of the paths at ``index``, all of which hit surfaces of one BSDF model.
 
@@ -127,6 +128,7 @@ def bounce(
         hit: of the whole wave.
         index: lanes concerned ``(n,)``.
         salts: names of this depth's dimensions.
+        lens: see :func:`torchpt.integrators.surfaces.spot_at`.
 
     Returns:
         The state of the ``n`` paths with their next rays, the next hits where they had to be found already, and the shadow
@@ -136,20 +138,26 @@ def bounce(
     at = interact(world, here.o, here.d, met, slide)
     if met.chance is not None:
         here = replace(here, throughput=here.throughput * met.chance)
-    surface, shadow = shade(plan, world, model, here, at, salts)
+    surface, shadow = shade(plan, world, model, here, at, salts, lens)
     after, found = scatter(plan, world, model, here, at, surface, salts, roulette, search)
     return after, found, shadow
 
 
 def shade(
-    plan: Plan, world: World, model: int, state: PathState, at: Interaction, salts: Tensor
+    plan: Plan,
+    world: World,
+    model: int,
+    state: PathState,
+    at: Interaction,
+    salts: Tensor,
+    lens: Tensor | None,
 ) -> tuple[Surface, Shadow | None]:
     """Resolve the material at the surface points and sample a light for each.
 
     Returns:
         The surface, and the shadow rays (None where no light is sampled).
     """
-    surface, kind = surface_at(world, model, state.d, at), world.models[model]
+    surface, kind = surface_at(world, model, state.d, at, lens), world.models[model]
     if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
         return surface, None
     table = world.lights

@@ -9,13 +9,14 @@ from typing import Annotated, Any, Literal
 from pydantic import PlainValidator, model_validator
 
 from torchpt.errors import SceneError
+from torchpt.samplers import KINDS
 from torchpt.scene import not_built
 from torchpt.scene.fields import Flag, choice, integer, memory_size, number_field, wrong
 from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_not_built, select
 
 __all__ = [
     "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter",
-    "Integrator", "PathIntegrator", "Render", "Sampler", "Settings", "merge",
+    "Integrator", "MitchellFilter", "PathIntegrator", "Render", "Sampler", "Settings", "TentFilter", "merge",
 ]  # fmt: skip
 
 AOVS = ("albedo", "normal", "depth", "position", "uv", "object_id", "variance")
@@ -24,6 +25,7 @@ MAX_SIDE = 65_536
 MAX_PIXELS = 2**28
 
 Positive = Annotated[float, number_field("a number > 0", lambda x: x > 0)]
+Share = Annotated[float, number_field("a number in 0..1", lambda x: 0 <= x <= 1)]
 Clamp = Annotated[float | None, number_field("null or a number > 0", lambda x: x > 0, optional=True)]
 Survival = Annotated[
     float | None, number_field("null or a number, 0 < rr_prob <= 1", lambda x: 0 < x <= 1, optional=True)
@@ -43,6 +45,26 @@ class BoxFilter(Model):
         return 0.5
 
 
+class TentFilter(Model):
+    """A triangle that falls to zero at ``radius`` pixels, as Mitsuba's."""
+
+    type: Literal["tent"] = "tent"
+    radius: Positive = 1.0
+
+
+class MitchellFilter(Model):
+    """Mitchell and Netravali's cubic, two pixels wide, with Mitsuba's names; its lobes are negative where ``C`` > 0."""
+
+    type: Literal["mitchell"] = "mitchell"
+    B: Share = 1 / 3
+    C: Share = 1 / 3
+
+    @property
+    def radius(self) -> float:
+        """Half the width in pixels."""
+        return 2.0
+
+
 class GaussianFilter(Model):
     """A truncated gaussian, as Mitsuba's: ``exp(-x^2 / 2 stddev^2)`` minus its value at ``radius``, in pixels."""
 
@@ -59,8 +81,10 @@ class GaussianFilter(Model):
         return raw
 
 
-Filter = BoxFilter | GaussianFilter
-FILTERS: dict[str, type[Any]] = {"gaussian": GaussianFilter, "box": BoxFilter}
+Filter = BoxFilter | TentFilter | GaussianFilter | MitchellFilter
+FILTERS: dict[str, type[Any]] = {
+    "gaussian": GaussianFilter, "box": BoxFilter, "tent": TentFilter, "mitchell": MitchellFilter,
+}  # fmt: skip
 
 
 def _crop(value: Any) -> tuple[int, int, int, int] | None:
@@ -93,7 +117,7 @@ def _gamma(value: Any) -> float | str:
 
 
 def _filter(value: Any) -> Any:
-    if isinstance(value, BoxFilter | GaussianFilter):
+    if isinstance(value, Filter):
         return value
     raise wrong("a filter")
 
@@ -110,7 +134,7 @@ class Film(Model):
 
     width: Annotated[int, integer(1, MAX_SIDE)] = 512
     height: Annotated[int, integer(1, MAX_SIDE)] = 512
-    filter: Annotated[BoxFilter | GaussianFilter, PlainValidator(_filter)] = GaussianFilter()
+    filter: Annotated[Filter, PlainValidator(_filter)] = GaussianFilter()
     crop: Annotated[tuple[int, int, int, int] | None, PlainValidator(_crop)] = None
     aovs: Annotated[tuple[str, ...], PlainValidator(_aovs)] = ()
     exposure: Annotated[float, number_field("a number of stops in -64..64", lambda x: abs(x) <= 64)] = 0.0
@@ -182,10 +206,15 @@ INTEGRATORS: dict[str, type[Any]] = {"path": PathIntegrator, "direct": DirectInt
 class Sampler(Model):
     """Where sample points come from."""
 
-    type: Literal["sobol", "independent"] = "sobol"
+    type: Literal["sobol", "independent", "stratified", "hammersley", "zsobol"] = "sobol"
+
+    @property
+    def needs_count(self) -> bool:
+        """Whether ``render.spp`` must be known before the first sample, so that nothing else may end a render."""
+        return KINDS[self.type].NEEDS_COUNT
 
 
-SAMPLERS: dict[str, type[Sampler]] = {"sobol": Sampler, "independent": Sampler}
+SAMPLERS: dict[str, type[Sampler]] = dict.fromkeys(KINDS, Sampler)
 
 _DEVICE = re.compile(r"(auto|cpu|cuda|cuda:[0-9]{1,3})\Z")
 
@@ -281,6 +310,8 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
             inner = [_set(part.get("filter"), "film.filter", name) for part, name in ((below, file), (above, None))]
             raw["filter"] = _overlay("filter", *inner)
         try:
+            if block == "render":
+                _open_end(raw, blocks["sampler"])
             blocks[block] = _block(block, raw)
         except SceneError as error:
             blame = None if _given(overrides, error.key) else file
@@ -290,6 +321,17 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
             "film.aovs", list(blocks["film"].aovs), "no variance where integrator is aov (it carries no light)", file
         )
     return Settings.model_construct(**blocks)
+
+
+def _open_end(raw: Mapping[str, Any], sampler: Sampler) -> None:
+    """Raises where something else than ``spp`` is to end a render whose points depend on their number."""
+    for name in ("time_limit", "target_error"):
+        if sampler.needs_count and raw.get(name) is not None:
+            free = ", ".join(kind for kind, module in KINDS.items() if not module.NEEDS_COUNT)
+            expected = (
+                f"null where sampler is {sampler.type}, whose points depend on how many there are (free of it: {free})"
+            )
+            raise SceneError(dotted("render", name), raw[name], expected)
 
 
 def _given(overrides: Mapping[str, Any], key: str) -> bool:

@@ -54,7 +54,7 @@ def assemble(
     slots = {owner.material.name: owner.material for owner in owners}
     surfaces = {name: surface_of(slot, parameters, dtype) for name, slot in slots.items()}
     nodes = nodes_of(slots.values())
-    kinds, rows, tables, looks, two_sided = materials_of(slots, surfaces, nodes, device)
+    kinds, rows, tables, looks, two_sided = materials_of(slots, surfaces, nodes, parameters, dtype, device)
     models = tuple(model for model, _ in kinds)
     wide = primitives.sizes + [1] * len(copies)
     opacity = opacity_of(owners, surfaces, wide, dtype, device)
