@@ -265,4 +265,6 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
         turn = map.turn
         wi = torch.stack([local[0] * turn[0, k] + local[1] * turn[1, k] + local[2] * turn[2, k] for k in range(3)])
         y = (azimuth(local[1], radius) * ((map.height - 1) / math.pi) - row).clamp(0.0, 1.0)
+    if map.turn.requires_grad:
+        return wi, density, radiance(map, wi)  # which follows the turn
     return wi, density, _mix(corners, x, y) * map.scale
