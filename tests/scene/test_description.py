@@ -168,7 +168,6 @@ def test_bad_input_is_one_line_that_names_the_key(name: str) -> None:
 
 
 LATER: dict[str, tuple[dict[str, Any], str]] = {
-    "light": (scene(lights={"l": {"type": "envmap", "path": "a.exr"}}), "lights.l.type"),
     "adaptive": (scene(sampler={"adaptive": True}), "sampler.adaptive"),
     "integrator": (scene(integrator={"type": "bdpt"}), "integrator.type"),
     "time limit": (scene(render={"time_limit": 10}), "render.time_limit"),

@@ -168,7 +168,8 @@ def shade(
     elif table.choice is not None:
         which = draws.one(Dimension.LIGHT_CHOICE)
     n = None if kind.transmits else surface.frame.n
-    light = lights.sample(table, at.p, which, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET, n)
+    u, mis = draws.two(Dimension.LIGHT).to(plan.dtype), plan.strategy == "mis"
+    light = lights.sample(table, at.p, which, u, OFFSET, n, mis)
     wi = surface.frame.to_local(light.wi)
     weight = light.weight
     if plan.strategy == "mis":

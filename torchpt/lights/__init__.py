@@ -3,8 +3,9 @@
     sample(lights, x, which, u) -> LightSample     a point on the lights seen from x
     emitted(lights, prim, ...) -> radiance, pdf     what a ray that hit an emitter by chance brings
 
-One kind a file: ``area`` (triangle, rectangle, disk), ``sphere``, ``quadric``, ``point``, ``spot``, ``constant``; of a
-directional light there is nothing to compute. Which light is drawn is said in ``choice``: by power, or by the light ``tree``.
+One kind a file: ``area`` (triangle, rectangle, disk), ``sphere``, ``quadric``, ``point``, ``spot``, ``constant``,
+``envmap``; of a directional light there is nothing to compute. Which light is drawn is said in ``choice``: by power, or by
+the light ``tree``.
 """
 
 from __future__ import annotations

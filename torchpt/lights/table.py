@@ -12,7 +12,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lights import area, choice, constant, point, quadric, sphere, spot
+from torchpt.lights import area, choice, constant, envmap, point, quadric, sphere, spot
+from torchpt.lights.envmap import EnvironmentMap
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.records import DISTANT, KINDS, Interaction, Lights, LightSample, Quadrics, rows
 
@@ -48,7 +49,13 @@ def _pick(mask: Tensor | None, a: Tensor, b: Tensor | None) -> Tensor:
 
 
 def sample(
-    lights: Lights, x: Tensor, which: Tensor | None, u: Tensor, offset: float, n: Tensor | None = None
+    lights: Lights,
+    x: Tensor,
+    which: Tensor | None,
+    u: Tensor,
+    offset: float,
+    n: Tensor | None = None,
+    mis: bool = True,
 ) -> LightSample:
     """A point on the lights, seen from ``x (3, N)``.
 
@@ -60,6 +67,7 @@ def sample(
         offset: how far shadow rays stop off the light's surface, in units of ``Lights.bound``.
         n: normals ``(3, N)`` of surfaces that nothing lights from behind, zero for others; None: no such surface. Asked for
             where the choice is local, see :func:`torchpt.lights.choice.local`.
+        mis: whether BSDF sampling shares the work: an environment map then leaves it the dim directions.
     """
     row: Tensor | None = None
     probability: Tensor | float = 1.0
@@ -73,7 +81,7 @@ def sample(
     if near > surfaces:
         drawn = _merged(bare, _at_points(lights, at, row, x, probability), drawn)
     if near < len(lights.kinds):
-        drawn = _merged(distant, _from_afar(lights, at, row, u, probability), drawn)
+        drawn = _merged(distant, _from_afar(lights, at, row, u, probability, mis), drawn)
     assert drawn is not None
     return replace(drawn, distant=distant, bare=bare)
 
@@ -168,20 +176,27 @@ def _at_points(lights: Lights, at: Lights, row: Tensor | None, x: Tensor, probab
     return LightSample(wi, at.p0.expand_as(wi), None, radiance, infinite, inverse / probability)
 
 
-def _from_afar(lights: Lights, at: Lights, row: Tensor | None, u: Tensor, probability: Tensor | float) -> LightSample:
+def _from_afar(
+    lights: Lights, at: Lights, row: Tensor | None, u: Tensor, probability: Tensor | float, mis: bool
+) -> LightSample:
     wi: Tensor | None = None
     pdf: Tensor | None = None
     weight: Tensor | None = None
     if "constant" in lights.kinds:
         wi = constant.sample(u).to(at.radiance.dtype)
         pdf, weight = (torch.full_like(wi[0], value) for value in (1.0 / constant.INVERSE_PDF, constant.INVERSE_PDF))
+    radiance = at.radiance.expand(3, u.shape[1])
+    if isinstance(lights.environment, EnvironmentMap):
+        wi, pdf, light = envmap.sample(lights.environment, u, mis)
+        weight = torch.where(pdf > 0, safe_reciprocal(pdf), 0.0)
+        radiance = _pick(_is(lights, "envmap", row), light, radiance)
     if "directional" in lights.kinds:
         mask = _is(lights, "directional", row)
         one = torch.ones_like(u[0], dtype=at.radiance.dtype)
         wi = _pick(mask, (-at.normal).expand(3, u.shape[1]), wi)
         pdf, weight = _pick(mask, one * torch.inf, pdf), _pick(mask, one, weight)
     assert wi is not None and pdf is not None and weight is not None
-    return LightSample(wi, wi, None, at.radiance.expand_as(wi), pdf * probability, weight / probability)
+    return LightSample(wi, wi, None, radiance, pdf * probability, weight / probability)
 
 
 def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -219,7 +234,11 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | 
 
 
 def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them."""
+    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS."""
     assert lights.environment is not None
-    pdf = torch.full_like(d[0], 1.0 / constant.INVERSE_PDF) * choice.environment(lights.choice)
+    probability = choice.environment(lights.choice)
+    if isinstance(lights.environment, EnvironmentMap):
+        radiance, pdf = envmap.environment(lights.environment, d, mis=True)
+        return radiance, pdf * probability
+    pdf = torch.full_like(d[0], 1.0 / constant.INVERSE_PDF) * probability
     return lights.environment[:, None].expand_as(d), pdf

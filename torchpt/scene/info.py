@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from torchpt import bsdfs
 from torchpt.accel import Accel
 from torchpt.lights.choice import ByTree
+from torchpt.lights.envmap import EnvironmentMap
 from torchpt.records import KINDS, Lights, World, tensors_of
 from torchpt.scene.schema import ThinLens
 from torchpt.scene.settings import Settings
@@ -51,6 +52,10 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "lights": {} if lights is None else _lights(lights),
         "scene_bytes": memory,
     }
+    around = None if lights is None else lights.environment
+    if isinstance(around, EnvironmentMap):
+        compensated = around.compensated is not None
+        made["lights"]["envmap"] = {"texels": [around.width, around.height], "mis_compensation": compensated}
     if world.textures is not None:
         texels = world.textures.texels
         made["textures"] = {"reads": world.textures.places.shape[1], "bytes": texels.numel() * texels.element_size()}
