@@ -14,15 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.lights.solid_angle import LEAST, MOST, OTHER, RECTANGLE, TRIANGLE
 from torchpt.math.angles import SERIES
 from torchpt.native.jit import jit, launch, thread_count
 
-__all__ = ["BLOCK", "LEAST", "MOST", "OTHER", "RECTANGLE", "SKEW", "TRIANGLE", "angles", "sample"]
-
-#: Codes of shapes: a triangle, a rectangle, a parallelogram that is no rectangle, anything else.
-TRIANGLE, RECTANGLE, SKEW, OTHER = 0, 1, 2, 3
-#: Solid angles, in steradians, beyond which lights are sampled by area.
-LEAST, MOST = 3e-4, 2.0 * math.pi - 1e-5
+__all__ = ["BLOCK", "angles", "sample"]
 
 #: Lanes a thread takes at once. The loops over them have this constant trip count, and a flat work table with constant
 #: offsets needs no alias checks: both are what makes them vector code.
