@@ -43,9 +43,19 @@ PLACES = {
 }
 
 
-def code(name: str) -> Tensor:
-    found = {"sliver": TRIANGLE, "strip": RECTANGLE}.get(name, CODES.get(name, OTHER))
-    return torch.tensor([found], dtype=torch.int8)
+def code(name: str) -> int:
+    return {"sliver": TRIANGLE, "strip": RECTANGLE}.get(name, CODES.get(name, OTHER))
+
+
+def kind(name: str) -> str:
+    return "triangle" if code(name) == TRIANGLE else "rectangle"
+
+
+def table(name: str, light: tuple[Tensor, Tensor, Tensor] | None = None, near: float = math.inf) -> Tensor:
+    """Of one light; without a limit of the distance unless told."""
+    found = solid_angle.table_of([kind(name)], *(light or LIGHTS[name]), near)
+    assert found is not None
+    return found
 
 
 def excess(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
@@ -69,7 +79,7 @@ def whole(name: str, x: Tensor) -> float:
 
 
 def drawn(name: str, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    return solid_angle.sample(code(name), *LIGHTS[name], None, x.expand(3, u.shape[1]), u)
+    return solid_angle.sample(table(name), None, x.expand(3, u.shape[1]), u)
 
 
 def uniform(n: int, seed: int = 3) -> Tensor:
@@ -80,7 +90,7 @@ def uniform(n: int, seed: int = 3) -> Tensor:
 @pytest.mark.parametrize("name", list(LIGHTS))
 def test_the_angle_is_the_formulas(name, place):
     x = column(*PLACES[place])
-    angle = solid_angle.angles(code(name), *LIGHTS[name], None, x)
+    angle = solid_angle.angles(table(name), None, x)
     exact = whole(name, x)
     if LEAST < exact < MOST:
         torch.testing.assert_close(float(angle), exact, rtol=1e-8, atol=0)
@@ -91,11 +101,13 @@ def test_the_angle_is_the_formulas(name, place):
 def test_the_angle_of_an_octant_and_of_half_a_cube():
     """Closed forms: three right angles, and a face of a cube seen from its middle."""
     octant = (column(1, 0, 0), column(-1, 1, 0), column(-1, 0, 1))
-    found = solid_angle.angles(code("triangle"), *octant, None, column(0, 0, 0))
+    found = solid_angle.angles(table("triangle", octant), None, column(0, 0, 0))
     assert float(found) == pytest.approx(math.pi / 2, rel=1e-12)
     face = (column(-1, -1, 1), column(2, 0, 0), column(0, 2, 0))
-    for name in ("rectangle", "parallelogram"):
-        found = solid_angle.angles(code(name), *face, None, column(0, 0, 0))
+    for code_ in (RECTANGLE, SKEW):
+        row = table("rectangle", face)
+        row[0, 0] = code_
+        found = solid_angle.angles(row, None, column(0, 0, 0))
         assert float(found) == pytest.approx(4 * math.pi / 6, rel=1e-12)
 
 
@@ -153,9 +165,8 @@ def test_directions_are_uniform(name, place):
     lines = [torch.cat((ends[0], torch.quantile(row, probe), ends[1])) for row in _places(name, scout)]
     expected = _cells(name, (lines[0], lines[1]), x) / whole(name, x) * number
     assert float(expected.sum()) == pytest.approx(number, rel=1e-6)
-    p0, e1, e2 = (a.float() for a in LIGHTS[name])
     points, u = x.float().expand(3, number), uniform(number, 9).float()
-    uv, angle = solid_angle.sample(code(name), p0, e1, e2, None, points, u)
+    uv, angle = solid_angle.sample(table(name), None, points, u)
     assert bool((angle > 0).all())
     st = _places(name, uv.double())
     cell = [
@@ -184,7 +195,7 @@ def test_the_density_integrates_to_one(name):
         by_area = planar(column(0, -1, 0), area, to / square.sqrt(), square)
         for scale in (1.0, 1e-3):  # the second light is too small for its angle
             small = p0 * scale, e1 * scale, e2 * scale
-            angle = solid_angle.angles(code(name), *small, None, column(*PLACES[place]))
+            angle = solid_angle.angles(table(name, small), None, column(*PLACES[place]))
             assert (float(angle) > 0) == (scale == 1)
             here = to if scale == 1 else affine(small[0], small[1], uv[0], small[2], uv[1]) - column(*PLACES[place])
             square = dot(here, here)
@@ -194,7 +205,7 @@ def test_the_density_integrates_to_one(name):
             assert float(density.mean()) == pytest.approx(1, rel=1e-5)
 
 
-def _scatter(n: int, dtype: torch.dtype) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, Tensor, Tensor]:
+def _scatter(n: int, dtype: torch.dtype, near: float = math.inf) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Lights of every shape and size, and points about them at every distance."""
     g = torch.Generator().manual_seed(11)
     k = 64
@@ -206,19 +217,21 @@ def _scatter(n: int, dtype: torch.dtype) -> tuple[Tensor, tuple[Tensor, Tensor, 
     reach = size[row] * 10.0 ** (torch.rand(n, generator=g) * 5 - 3)
     p0 = torch.randn(3, k, generator=g)
     x = p0[:, row] + normalize(torch.randn(3, n, generator=g)) * reach
-    u = torch.rand(2, n, generator=g)
-    return codes.to(torch.int8), (p0.to(dtype), e1.to(dtype), e2.to(dtype)), row, x.to(dtype), u.to(dtype)
+    names = [("triangle", "rectangle", "rectangle", "disk")[code] for code in codes.tolist()]
+    lights = solid_angle.table_of(names, p0, e1, e2, near)
+    assert lights is not None and torch.equal(lights[:, 0].long(), codes)
+    return lights, row, x.to(dtype), torch.rand(2, n, generator=g).to(dtype)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sampling_and_density_switch_together(dtype):
-    codes, table, row, x, u = _scatter(20_000, dtype)
-    uv, angle = solid_angle.sample(codes, *table, row, x, u)
-    assert torch.equal(angle, solid_angle.angles(codes, *table, row, x))
+    lights, row, x, u = _scatter(20_000, dtype)
+    uv, angle = solid_angle.sample(lights, row, x, u)
+    assert torch.equal(angle, solid_angle.angles(lights, row, x))
     some = angle > 0
     assert 0.2 < some.double().mean() < 0.8
     assert LEAST * (1 - 1e-7) <= float(angle[some].min()) and float(angle.max()) <= MOST * (1 + 1e-7)
-    kind = codes[row]
+    kind = lights[row, 0]
     assert not some[kind == OTHER].any() and torch.equal(uv[:, kind == OTHER], u[:, kind == OTHER])
     assert uv.min() >= 0 and uv.max() <= 1 and (uv[0] + uv[1])[kind == TRIANGLE].max() <= 1 + 2e-7
     by_area = (kind == TRIANGLE) & ~some
@@ -227,28 +240,28 @@ def test_sampling_and_density_switch_together(dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_kernel_is_the_tensor_form(dtype):
-    codes, table, row, x, u = _scatter(20_000, dtype)
-    uv, angle = solid_angle.sample(codes, *table, row, x, u)
-    other, of_other = solid_angle.tensor_sample(codes, *table, row, x, u)
+    lights, row, x, u = _scatter(20_000, dtype)
+    uv, angle = solid_angle.sample(lights, row, x, u)
+    other, of_other = solid_angle.tensor_sample(lights, row, x, u)
     torch.testing.assert_close(angle, of_other, rtol=1e-6, atol=0)
     torch.testing.assert_close(uv, other, rtol=1e-6, atol=1e-7 if dtype == torch.float32 else 1e-9)
-    assert torch.equal(solid_angle.tensor_angles(codes, *table, row, x), of_other)
+    assert torch.equal(solid_angle.tensor_angles(lights, row, x), of_other)
 
 
 def test_place_and_threads_do_not_matter():
-    codes, table, row, x, u = _scatter(20_003, torch.float32)
+    lights, row, x, u = _scatter(20_003, torch.float32)
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        uv, angle = solid_angle.sample(codes, *table, row, x, u)
+        uv, angle = solid_angle.sample(lights, row, x, u)
         for threads in (1, 2):
             torch.set_num_threads(threads)
             for first, size in ((0, 20_003), (0, 1), (1, 3), (5, 128), (11, 12_769), (20_000, 3)):
                 part = slice(first, first + size)
-                some, of_some = solid_angle.sample(codes, *table, row[part], x[:, part], u[:, part])
+                some, of_some = solid_angle.sample(lights, row[part], x[:, part], u[:, part])
                 assert torch.equal(some, uv[:, part]) and torch.equal(of_some, angle[part])
-                assert torch.equal(solid_angle.angles(codes, *table, row[part], x[:, part]), angle[part])
-        none, of_none = solid_angle.sample(codes, *table, row[:0], x[:, :0], u[:, :0])
+                assert torch.equal(solid_angle.angles(lights, row[part], x[:, part]), angle[part])
+        none, of_none = solid_angle.sample(lights, row[:0], x[:, :0], u[:, :0])
         assert none.shape == (2, 0) and of_none.shape == (0,)
     finally:
         torch.set_num_threads(before)
@@ -260,9 +273,9 @@ def test_points_in_the_plane_and_lights_without_area_are_sampled_by_area(name):
     spots = [p0, p0 + e1, p0 + e2, p0 + 0.5 * e1, p0 + 0.3 * e1 + 0.3 * e2, p0 - e1, p0 + 3 * e1 + 1e-30]
     u = uniform(256)
     for x in spots:
-        for table in ((p0, e1, e2), (p0, e1, e1 * 0.5), (p0, e1 * 0, e2), (p0, e1 * 0, e2 * 0)):
+        for light in ((p0, e1, e2), (p0, e1, e1 * 0.5), (p0, e1 * 0, e2), (p0, e1 * 0, e2 * 0)):
             for form in (solid_angle.sample, solid_angle.tensor_sample):
-                uv, angle = form(code(name), *table, None, x.expand(3, 256), u)
+                uv, angle = form(table(name, light), None, x.expand(3, 256), u)
                 assert not angle.any()
                 torch.testing.assert_close(uv, uniform_triangle(u) if code(name) == TRIANGLE else u)
 
@@ -273,7 +286,7 @@ def test_the_unit_of_length_does_not_matter(name, scale):
     x, u = column(*PLACES["near"]), uniform(512)
     uv, angle = drawn(name, x, u)
     p0, e1, e2 = (a * scale for a in LIGHTS[name])
-    other, of_other = solid_angle.sample(code(name), p0, e1, e2, None, (x * scale).expand(3, 512), u)
+    other, of_other = solid_angle.sample(table(name, (p0, e1, e2)), None, (x * scale).expand(3, 512), u)
     torch.testing.assert_close(other, uv, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(of_other, angle, rtol=1e-9, atol=0)
 
@@ -294,9 +307,7 @@ def test_triangles_over_a_lambert_floor(row):
     a, b, c = (column(*v) for v in row[:3])
     g = (torch.arange(512, dtype=D) + 0.5) / 512
     u = torch.cartesian_prod(g, g).T.contiguous()
-    uv, angle = solid_angle.sample(
-        code("triangle"), a, b - a, c - a, None, torch.zeros(3, 1, dtype=D).expand_as(u.new_zeros(3, u.shape[1])), u
-    )
+    uv, angle = solid_angle.sample(table("triangle", (a, b - a, c - a)), None, torch.zeros(3, u.shape[1], dtype=D), u)
     wi = normalize(affine(a, b - a, uv[0], c - a, uv[1]))
     radiance = 0.5 / math.pi * float((wi[1].clamp_min(0) * angle).mean())
     assert radiance == pytest.approx(row[3], rel=1e-5)
@@ -365,22 +376,37 @@ def test_behind_the_emitter_there_is_nothing_and_gradients_are_those_of_the_area
     torch.testing.assert_close(slope, torch.tensor([0.5 / 0.4, 0.0, 1.0, 1.0], dtype=D))
 
 
-def test_codes():
-    e1 = torch.tensor([[1.0, 0, 0], [1, 0, 0], [1e3, 0, 0]]).T
-    e2 = torch.tensor([[0.0, 2, 0], [1e-3, 1, 0], [1e-9, 1e-3, 0]]).T
-    assert solid_angle.code_of("rectangle", e1, e2).tolist() == [RECTANGLE, SKEW, RECTANGLE]
-    assert solid_angle.code_of("triangle", e1, e2).tolist() == [TRIANGLE] * 3
-    assert solid_angle.code_of("disk", e1, e2).tolist() == [OTHER] * 3
-    turned = torch.linalg.qr(torch.randn(3, 3, 100, generator=torch.Generator().manual_seed(1)).permute(2, 0, 1))[0]
-    assert (solid_angle.code_of("rectangle", turned[:, 0].T * 7, turned[:, 1].T * 0.1) == RECTANGLE).all()
+def test_beyond_some_radii_lights_are_sampled_by_area():
+    lights, row, x, _ = _scatter(20_000, D, 4.0)
+    whole, *_ = _scatter(20_000, D)
+    distance = torch.linalg.vector_norm(x - lights[row, 2:5].T, dim=0)
+    corners = [lights[:, 5:8], lights[:, 5:8] + lights[:, 8:11], lights[:, 5:8] + lights[:, 11:14]]
+    corners.append(torch.where(lights[:, :1] == TRIANGLE, corners[2], corners[2] + lights[:, 8:11]))
+    radius = torch.stack([torch.linalg.vector_norm(c - lights[:, 2:5], dim=1) for c in corners]).amax(0)
+    within = distance < 4 * radius[row] * (1 - 1e-9)
+    expected = torch.where(within, solid_angle.angles(whole, row, x), 0.0)
+    assert torch.equal(solid_angle.angles(lights, row, x), expected)
+    assert torch.equal(solid_angle.tensor_angles(lights, row, x) > 0, expected > 0)
+    assert 0.1 < (expected > 0).double().mean() < 0.6
+
+
+def test_shapes():
+    e1 = torch.tensor([[1.0, 0, 0], [1, 0, 0], [1e3, 0, 0], [1, 0, 0], [1, 0, 0]]).T
+    e2 = torch.tensor([[0.0, 2, 0], [1e-3, 1, 0], [1e-9, 1e-3, 0], [1, 1, 0], [1, 1, 0]]).T
+    lights = solid_angle.table_of(["rectangle", "rectangle", "rectangle", "triangle", "constant"], e1, e1, e2)
+    assert lights is not None and lights[:, 0].tolist() == [RECTANGLE, SKEW, RECTANGLE, TRIANGLE, OTHER]
+    assert solid_angle.table_of(["disk", "sphere"], e1[:, :2], e1[:, :2], e2[:, :2]) is None
+    turned = torch.linalg.qr(torch.randn(100, 3, 3, generator=torch.Generator().manual_seed(1)))[0]
+    a, b = turned[:, :, 0].T * 7, turned[:, :, 1].T * 0.1
+    lights = solid_angle.table_of(["rectangle"] * 100, a, a, b)
+    assert lights is not None and bool((lights[:, 0] == RECTANGLE).all())
 
 
 def test_a_compiled_graph_calls_the_kernel():
-    codes, table, row, x, u = _scatter(333, torch.float32)
+    lights, row, x, u = _scatter(333, torch.float32)
     sampled = torch.compile(solid_angle.sample, fullgraph=True, dynamic=True, backend="eager")
     found = torch.compile(solid_angle.angles, fullgraph=True, dynamic=True, backend="eager")
-    for a, b in zip(sampled(codes, *table, row, x, u), solid_angle.sample(codes, *table, row, x, u), strict=True):
+    for a, b in zip(sampled(lights, row, x, u), solid_angle.sample(lights, row, x, u), strict=True):
         assert torch.equal(a, b)
-    assert torch.equal(found(codes, *table, row, x), solid_angle.angles(codes, *table, row, x))
-    p0, e1, e2 = (a[:, :1] for a in table)
-    assert torch.equal(found(codes[:1], p0, e1, e2, None, x), solid_angle.angles(codes[:1], p0, e1, e2, None, x))
+    assert torch.equal(found(lights, row, x), solid_angle.angles(lights, row, x))
+    assert torch.equal(found(lights[:1], None, x), solid_angle.angles(lights[:1], None, x))

@@ -26,6 +26,7 @@ BLOCK = 128
 _AX, _AY, _AZ, _EX, _EY, _EZ, _FX, _FY, _FZ, _U, _V, _ANGLE = range(0, 12 * BLOCK, BLOCK)
 _TINY = 1e-300
 _NO_ROW = np.empty(0, np.int64)
+_NO_DRAW = {torch.float32: np.empty((2, 0), np.float32), torch.float64: np.empty((2, 0), np.float64)}
 _S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7 = SERIES
 
 
@@ -156,12 +157,7 @@ def _triangle(w: Any) -> None:
         u, v = w[_U + i], w[_V + i]
         p, hub, q = _arc(half, volume, ab, bc, ca, u, v)
         p, q = _share(p, hub, q, ia, ib, ic)
-        angle = _within(2.0 * half)
-        # By area: Heitz, A Low-Distortion Map Between Triangle and Square, 2019.
-        low = 0.5 * (u if u < v else v)
-        w[_U + i] = p if angle > 0.0 else u - low
-        w[_V + i] = q if angle > 0.0 else v - low
-        w[_ANGLE + i] = angle
+        w[_U + i], w[_V + i], w[_ANGLE + i] = p, q, _within(2.0 * half)
 
 
 @jit(forceinline=True)
@@ -217,10 +213,8 @@ def _rectangle(w: Any) -> None:
         g = h0 + v * (h1 - h0)
         y = g * math.sqrt(dd) * _reciprocal(math.sqrt(max((1.0 - g) * (1.0 + g), 0.0)))
         y = min(max(y, y0), y1)
-        angle = _within(angle)
-        w[_U + i] = (x - x0) * _reciprocal(x1 - x0) if angle > 0.0 else u
-        w[_V + i] = (y - y0) * _reciprocal(y1 - y0) if angle > 0.0 else v
-        w[_ANGLE + i] = angle
+        w[_U + i], w[_V + i] = (x - x0) * _reciprocal(x1 - x0), (y - y0) * _reciprocal(y1 - y0)
+        w[_ANGLE + i] = _within(angle)
 
 
 @jit(forceinline=True)
@@ -262,57 +256,74 @@ def _skew(w: Any) -> None:
             half, first if left else second, pa if left else pb, pb if left else pc, ab if left else bc, inner, v
         )
         p, q = _share(p, hub, q, ia if left else ib, ip, ib if left else ic)
-        angle = _within(2.0 * (ha + hb))
         # Of the first half A and C are the ends of e1 and of e1 + e2, of the second those of e1 + e2 and of e2.
-        s, t = (p + q, q) if left else (p, p + q)
-        w[_U + i] = s if angle > 0.0 else u
-        w[_V + i] = t if angle > 0.0 else v
-        w[_ANGLE + i] = angle
+        w[_U + i], w[_V + i] = (p + q, q) if left else (p, p + q)
+        w[_ANGLE + i] = _within(2.0 * (ha + hb))
+
+
+@jit(forceinline=True)
+def _near(table: Any, k: int, x: Any, y: Any, z: Any) -> bool:
+    a, b, c = table[k, 2] - x, table[k, 3] - y, table[k, 4] - z
+    return a * a + b * b + c * c < table[k, 1]
 
 
 @jit()
-def _load(first: int, kind: int, code: Any, p0: Any, e1: Any, e2: Any, row: Any, x: Any, lane: Any, w: Any) -> int:
-    """Gathers the lanes of one kind in a block; how many they are."""
-    n = 0
-    for j in range(first, min(first + BLOCK, x.shape[1])):
+def _load(table: Any, row: Any, x: Any, lane: Any, n: int, w: Any) -> None:
+    """Gathers lanes into the work table."""
+    for i in range(n):
+        j = lane[i]
         k = row[j] if len(row) > 0 else 0
-        if code[k] == kind:
-            w[_AX + n] = np.float64(p0[0, k]) - np.float64(x[0, j])
-            w[_AY + n] = np.float64(p0[1, k]) - np.float64(x[1, j])
-            w[_AZ + n] = np.float64(p0[2, k]) - np.float64(x[2, j])
-            w[_EX + n], w[_EY + n], w[_EZ + n] = e1[0, k], e1[1, k], e1[2, k]
-            w[_FX + n], w[_FY + n], w[_FZ + n] = e2[0, k], e2[1, k], e2[2, k]
-            lane[n] = j
-            n += 1
-    return n
+        w[_AX + i] = table[k, 5] - x[0, j]
+        w[_AY + i] = table[k, 6] - x[1, j]
+        w[_AZ + i] = table[k, 7] - x[2, j]
+        w[_EX + i], w[_EY + i], w[_EZ + i] = table[k, 8], table[k, 9], table[k, 10]
+        w[_FX + i], w[_FY + i], w[_FZ + i] = table[k, 11], table[k, 12], table[k, 13]
 
 
 @jit()
-def _range(
-    begin: int, end: int, code: Any, p0: Any, e1: Any, e2: Any, row: Any, x: Any, u: Any, uv: Any, angle: Any
-) -> None:
-    w, lane = np.zeros(_ANGLE + BLOCK), np.empty(BLOCK, np.int64)
+def _sort(block: int, table: Any, row: Any, x: Any, lanes: Any, counts: Any) -> None:
+    """Lists a block's lanes by shape, those near their light."""
+    counts[:] = 0
+    for j in range(block * BLOCK, min((block + 1) * BLOCK, x.shape[1])):
+        k = row[j] if len(row) > 0 else 0
+        if _near(table, k, x[0, j], x[1, j], x[2, j]):
+            shape = np.int64(table[k, 0])
+            lanes[shape, counts[shape]] = j
+            counts[shape] += 1
+
+
+@jit()
+def _range(begin: int, end: int, table: Any, row: Any, x: Any, u: Any, uv: Any, angle: Any) -> None:
+    w, lanes, counts = np.zeros(_ANGLE + BLOCK), np.empty((OTHER, BLOCK), np.int64), np.empty(OTHER, np.int64)
     drawn = u.shape[1] > 0
     for block in range(begin, end):
-        first = block * BLOCK
-        for kind in range(OTHER):
-            n = _load(first, kind, code, p0, e1, e2, row, x, lane, w)
+        if drawn:
+            # By area: of triangles Heitz, A Low-Distortion Map Between Triangle and Square, 2019.
+            for j in range(block * BLOCK, min((block + 1) * BLOCK, x.shape[1])):
+                k = row[j] if len(row) > 0 else 0
+                low = min(u[0, j], u[1, j]) * u.dtype.type(0.5 if table[k, 0] == TRIANGLE else 0.0)
+                uv[0, j], uv[1, j] = u[0, j] - low, u[1, j] - low
+        _sort(block, table, row, x, lanes, counts)
+        for shape in range(OTHER):
+            n, lane = counts[shape], lanes[shape]
             if n == 0:
                 continue
+            _load(table, row, x, lane, n, w)
             if drawn:
                 for i in range(n):
                     w[_U + i], w[_V + i] = u[0, lane[i]], u[1, lane[i]]
-                if kind == TRIANGLE:
+                if shape == TRIANGLE:
                     _triangle(w)
-                elif kind == RECTANGLE:
+                elif shape == RECTANGLE:
                     _rectangle(w)
                 else:
                     _skew(w)
                 for i in range(n):
-                    uv[0, lane[i]], uv[1, lane[i]] = w[_U + i], w[_V + i]
-            elif kind == TRIANGLE:
+                    if w[_ANGLE + i] > 0.0:
+                        uv[0, lane[i]], uv[1, lane[i]] = w[_U + i], w[_V + i]
+            elif shape == TRIANGLE:
                 _triangle_angles(w)
-            elif kind == RECTANGLE:
+            elif shape == RECTANGLE:
                 _rectangle_angles(w)
             else:
                 _skew_angles(w)
@@ -321,60 +332,34 @@ def _range(
 
 
 @jit()
-def _serial(
-    first: int,
-    last: int,
-    code: Any,
-    p0: Any,
-    e1: Any,
-    e2: Any,
-    row: Any,
-    x: Any,
-    u: Any,
-    uv: Any,
-    angle: Any,
-) -> None:
-    _range(first, last, code, p0, e1, e2, row, x, u, uv, angle)
+def _serial(first: int, last: int, table: Any, row: Any, x: Any, u: Any, uv: Any, angle: Any) -> None:
+    _range(first, last, table, row, x, u, uv, angle)
 
 
 @jit(parallel=True)
-def _parallel(
-    chunks: int,
-    items: int,
-    code: Any,
-    p0: Any,
-    e1: Any,
-    e2: Any,
-    row: Any,
-    x: Any,
-    u: Any,
-    uv: Any,
-    angle: Any,
-) -> None:
+def _parallel(chunks: int, items: int, table: Any, row: Any, x: Any, u: Any, uv: Any, angle: Any) -> None:
     for chunk in nb.prange(chunks):
-        _range(items * chunk // chunks, items * (chunk + 1) // chunks, code, p0, e1, e2, row, x, u, uv, angle)
+        _range(items * chunk // chunks, items * (chunk + 1) // chunks, table, row, x, u, uv, angle)
 
 
-def _run(code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor, out: tuple[Any, ...]) -> None:
+def _run(table: Tensor, row: Tensor | None, x: Tensor, u: Any, uv: Any, angle: Tensor) -> None:
     n = x.shape[1]
     if n:
         index = _NO_ROW if row is None else row.contiguous().numpy()
-        table = tuple(a.detach().contiguous().numpy() for a in (code, p0, e1, e2))
-        arguments = (*table, index, x.detach().contiguous().numpy(), *out)
+        arguments = (table.contiguous().numpy(), index, x.detach().contiguous().numpy(), u, uv, angle.numpy())
         launch(_serial, _parallel, -(-n // BLOCK), thread_count(None), 32, arguments)
 
 
-def sample(
-    code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor, u: Tensor
-) -> tuple[Tensor, Tensor]:
+def sample(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     """As :func:`torchpt.lights.solid_angle.sample`, on the CPU."""
-    uv, angle = u.detach().clone(memory_format=torch.contiguous_format), torch.zeros_like(x[0])
-    _run(code, p0, e1, e2, row, x, (u.detach().contiguous().numpy(), uv.numpy(), angle.numpy()))
+    u = u.detach().contiguous()
+    uv, angle = torch.empty_like(u), torch.zeros_like(x[0], memory_format=torch.contiguous_format)
+    _run(table, row, x, u.numpy(), uv.numpy(), angle)
     return uv, angle
 
 
-def angles(code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
+def angles(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
     """As :func:`torchpt.lights.solid_angle.angles`, on the CPU."""
-    angle, nothing = torch.zeros_like(x[0]), torch.empty(2, 0, dtype=x.dtype).numpy()
-    _run(code, p0, e1, e2, row, x, (nothing, nothing, angle.numpy()))
+    angle, nothing = torch.zeros_like(x[0], memory_format=torch.contiguous_format), _NO_DRAW[x.dtype]
+    _run(table, row, x, nothing, nothing, angle)
     return angle

@@ -18,26 +18,28 @@ devices use.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from torchpt.math.angles import azimuth
-from torchpt.math.vectors import cross, dot, take
+from torchpt.math.vectors import cross, dot
 from torchpt.math.warps import uniform_triangle
 from torchpt.native.operators import choose, operator
 
 __all__ = [
     "LEAST",
     "MOST",
+    "NEAR",
     "OTHER",
     "RECTANGLE",
     "SKEW",
     "TRIANGLE",
     "angles",
-    "code_of",
     "inverse_pdf",
     "sample",
+    "table_of",
     "tensor_angles",
     "tensor_sample",
 ]
@@ -46,29 +48,46 @@ __all__ = [
 TRIANGLE, RECTANGLE, SKEW, OTHER = 0, 1, 2, 3
 #: Solid angles, in steradians, beyond which lights are sampled by area.
 LEAST, MOST = 3e-4, 2.0 * math.pi - 1e-5
+#: Farther than this from its centre, in units of the radius about it, a light is sampled by area.
+NEAR = 4.0
 #: Cosine of the edges below which a parallelogram is a rectangle: rounding of its corners in float32.
 SQUARE = 1e-6
 
 
-def code_of(kind: str, e1: Tensor, e2: Tensor) -> Tensor:
-    """Codes ``(K,)`` int8 for primitives of one kind with edges ``(3, K)``."""
-    if kind != "rectangle":
-        return torch.full(e1.shape[1:], TRIANGLE if kind == "triangle" else OTHER, dtype=torch.int8, device=e1.device)
-    a, b = e1.detach().double(), e2.detach().double()
-    skew = dot(a, b).abs() > SQUARE * (dot(a, a) * dot(b, b)).sqrt()
-    return torch.where(skew, SKEW, RECTANGLE).to(torch.int8)
-
-
-def sample(
-    code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor, u: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Points on lights, seen from ``x``; nothing of it is differentiable.
+def table_of(kinds: Sequence[str], p0: Tensor, e1: Tensor, e2: Tensor, near: float = NEAR) -> Tensor | None:
+    """What :func:`sample` reads of lights.
 
     Args:
-        code: shapes of the table's rows ``(K,)`` int8, from :func:`code_of`.
+        kinds: of the rows.
         p0: ``(3, K)``.
         e1: ``(3, K)``.
         e2: ``(3, K)``.
+        near: in place of :data:`NEAR`.
+
+    Returns:
+        ``(K, 14)`` float64: the shape's code, the squared distance from which on it is sampled by area, the centre which
+        that is from, ``p0``, ``e1``, ``e2``. None where none of the kinds is sampled by its solid angle.
+    """
+    if not {"triangle", "rectangle"} & set(kinds):
+        return None
+    p, a, b = (x.detach().double() for x in (p0, e1, e2))
+    numbers = {"triangle": TRIANGLE, "rectangle": RECTANGLE}
+    code = torch.tensor([numbers.get(kind, OTHER) for kind in kinds], device=p.device)
+    skew = dot(a, b).abs() > SQUARE * (dot(a, a) * dot(b, b)).sqrt()
+    code = torch.where(skew & (code == RECTANGLE), SKEW, code)
+    share = torch.where(code == TRIANGLE, 1.0 / 3.0, 0.5).double()
+    centre = (a + b) * share
+    corners = [torch.zeros_like(a), a, b, torch.where(code == TRIANGLE, b, a + b)]
+    square = torch.stack([dot(corner - centre, corner - centre) for corner in corners]).amax(0)
+    reach = torch.where(code == OTHER, 0.0, square * near**2)
+    return torch.cat((code.double()[None], reach[None], p + centre, p, a, b)).T.contiguous()
+
+
+def sample(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Points on lights, seen from ``x``; nothing of it is differentiable.
+
+    Args:
+        table: from :func:`table_of`.
         row: of each lane ``(N,)`` int64; None where the table has one row.
         x: reference points ``(3, N)``.
         u: ``(2, N)`` in [0, 1).
@@ -78,18 +97,18 @@ def sample(
         are 0 the point was drawn by area. Rows of other shapes keep ``u``.
     """
     if x.device.type == "cpu":
-        return choose(_sample_on_cpu, _sample_operator)(code, p0, e1, e2, row, x, u)
-    return tensor_sample(code, p0, e1, e2, row, x, u)
+        return choose(_sample_on_cpu, _sample_operator)(table, row, x, u)
+    return tensor_sample(table, row, x, u)
 
 
-def angles(code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
+def angles(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
     """Solid angles ``(N,)`` by which :func:`sample` draws from these lights at ``x``, 0 where it draws by area.
 
     From behind a light fills the same angle; it is the caller who knows which side emits.
     """
     if x.device.type == "cpu":
-        return choose(_angles_on_cpu, _angles_operator)(code, p0, e1, e2, row, x)
-    return tensor_angles(code, p0, e1, e2, row, x)
+        return choose(_angles_on_cpu, _angles_operator)(table, row, x)
+    return tensor_angles(table, row, x)
 
 
 def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
@@ -100,24 +119,24 @@ def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
         by_area: ``area cos / r^2``, 0 behind the emitter. Its derivative is that of the result: the point on the light is
             held, and the integrand over its area is what moves.
     """
+    if not by_area.requires_grad:
+        return torch.where(angle > 0, angle * torch.sign(by_area), by_area)
     value = by_area.detach()
     seen = value > 0
     solid = angle * torch.where(seen, by_area / torch.where(seen, value, 1.0), 0.0)
     return torch.where(angle > 0, solid, by_area)
 
 
-def _sample_on_cpu(
-    code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor, u: Tensor
-) -> tuple[Tensor, Tensor]:
+def _sample_on_cpu(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     from torchpt.lights import kernels_solid
 
-    return kernels_solid.sample(code, p0, e1, e2, row, x, u)
+    return kernels_solid.sample(table, row, x, u)
 
 
-def _angles_on_cpu(code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
+def _angles_on_cpu(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
     from torchpt.lights import kernels_solid
 
-    return kernels_solid.angles(code, p0, e1, e2, row, x)
+    return kernels_solid.angles(table, row, x)
 
 
 _sample_operator = operator("torchpt::solid_angle_sample", _sample_on_cpu)
@@ -125,53 +144,49 @@ _angles_operator = operator("torchpt::solid_angles", _angles_on_cpu)
 
 
 @_sample_operator.register_fake
-def _(code, p0, e1, e2, row, x, u):
+def _(table, row, x, u):
     return torch.empty(2, x.shape[1], dtype=u.dtype, device=x.device), x.new_empty(x.shape[1])
 
 
 @_angles_operator.register_fake
-def _(code, p0, e1, e2, row, x):
+def _(table, row, x):
     return x.new_empty(x.shape[1])
 
 
 @torch.no_grad()
-def tensor_sample(
-    code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor, u: Tensor
-) -> tuple[Tensor, Tensor]:
+def tensor_sample(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     """:func:`sample` by tensor operations."""
-    shape, a, e, f = _seen(code, p0, e1, e2, row, x)
+    shape, near, a, e, f = _seen(table, row, x)
     w = u.double()
     triangle, angle = _triangle(a, e, f, w)
     rectangle, of_rectangle = _rectangle(a, e, f, w)
     skew, of_skew = _skew(a, e, f, w)
-    angle = _of_shape(shape, angle, of_rectangle, of_skew)
+    angle = torch.where(near, _of_shape(shape, angle, of_rectangle, of_skew), 0.0)
     uv = _of_shape(shape, triangle, rectangle, skew)
     by_area = torch.where(shape == TRIANGLE, uniform_triangle(w), w)
     return torch.where(angle > 0, uv, by_area).to(u.dtype), angle.to(x.dtype)
 
 
 @torch.no_grad()
-def tensor_angles(code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
+def tensor_angles(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
     """:func:`angles` by tensor operations."""
-    shape, a, e, f = _seen(code, p0, e1, e2, row, x)
+    shape, near, a, e, f = _seen(table, row, x)
     w = torch.zeros_like(a[:2])
     _, of_triangle = _triangle(a, e, f, w)
-    return _of_shape(shape, of_triangle, _rectangle(a, e, f, w)[1], _skew(a, e, f, w)[1]).to(x.dtype)
+    angle = _of_shape(shape, of_triangle, _rectangle(a, e, f, w)[1], _skew(a, e, f, w)[1])
+    return torch.where(near, angle, 0.0).to(x.dtype)
 
 
-def _seen(
-    code: Tensor, p0: Tensor, e1: Tensor, e2: Tensor, row: Tensor | None, x: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Shape, first corner as seen from ``x``, and edges of each lane, in float64."""
-    if row is not None:
-        code, p0, e1, e2 = (take(table, row) for table in (code, p0, e1, e2))
-    a = p0.double() - x.double()
-    return code.expand(a.shape[1]), a, e1.double().expand_as(a), e2.double().expand_as(a)
+def _seen(table: Tensor, row: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Shape, whether it is near, first corner as seen from ``x``, and edges of each lane, in float64."""
+    lanes = (table if row is None else table[row]).T.expand(14, x.shape[1])
+    away = lanes[2:5] - x.double()
+    near = (lanes[0] != OTHER) & (dot(away, away) < lanes[1])
+    return lanes[0], near, lanes[5:8] - x.double(), lanes[8:11], lanes[11:14]
 
 
 def _of_shape(shape: Tensor, triangle: Tensor, rectangle: Tensor, skew: Tensor) -> Tensor:
-    planar = torch.where(shape == TRIANGLE, triangle, torch.where(shape == RECTANGLE, rectangle, skew))
-    return torch.where(shape == OTHER, 0.0, planar)
+    return torch.where(shape == TRIANGLE, triangle, torch.where(shape == RECTANGLE, rectangle, skew))
 
 
 def _reciprocal(a: Tensor) -> Tensor:
