@@ -153,7 +153,9 @@ def shade(
     table = world.lights
     draws = Draws(plan.sampler, state.key, salts)
     choice = None if table.choice is None else draws.one(Dimension.LIGHT_CHOICE)
-    light = lights.sample(table, at.p, choice, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET)
+    # From where a reflected ray will leave: if it meets a light, that is asked for its density from there.
+    x = offset_origin(world, at, -state.d)
+    light = lights.sample(table, x, choice, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET)
     wi = surface.frame.to_local(light.wi)
     weight = light.weight
     if plan.strategy == "mis":

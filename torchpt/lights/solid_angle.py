@@ -29,6 +29,7 @@ from torchpt.math.warps import uniform_triangle
 from torchpt.native.operators import choose, operator
 
 __all__ = [
+    "KINDS",
     "LEAST",
     "MOST",
     "NEAR",
@@ -44,6 +45,8 @@ __all__ = [
     "tensor_sample",
 ]
 
+#: Primitive kinds that are sampled here.
+KINDS = ("triangle", "rectangle")
 #: Codes of shapes: a triangle, a rectangle, a parallelogram that is no rectangle, anything else.
 TRIANGLE, RECTANGLE, SKEW, OTHER = 0, 1, 2, 3
 #: Solid angles, in steradians, beyond which lights are sampled by area.
@@ -68,7 +71,7 @@ def table_of(kinds: Sequence[str], p0: Tensor, e1: Tensor, e2: Tensor, near: flo
         ``(K, 14)`` float64: the shape's code, the squared distance from which on it is sampled by area, the centre which
         that is from, ``p0``, ``e1``, ``e2``. None where none of the kinds is sampled by its solid angle.
     """
-    if not {"triangle", "rectangle"} & set(kinds):
+    if not set(KINDS) & set(kinds):
         return None
     p, a, b = (x.detach().double() for x in (p0, e1, e2))
     numbers = {"triangle": TRIANGLE, "rectangle": RECTANGLE}

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.lights.solid_angle import table_of
 from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Lights
@@ -118,6 +119,7 @@ def lights_of(
         quadric=column,
         quadrics=None if column is None else primitives.quadrics,
         prim=torch.cat((prim, prim.new_zeros(rest))) if textured else None,
+        solid=table_of(names, joined["p0"], joined["e1"], joined["e2"]),
     )
 
 
