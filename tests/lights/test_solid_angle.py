@@ -376,6 +376,33 @@ def test_behind_the_emitter_there_is_nothing_and_gradients_are_those_of_the_area
     torch.testing.assert_close(slope, torch.tensor([0.5 / 0.4, 0.0, 1.0, 1.0], dtype=D))
 
 
+@pytest.mark.parametrize("place", ["near", "beyond"])
+@pytest.mark.parametrize("name", ["triangle", "rectangle", "parallelogram"])
+def test_derivatives_of_a_moving_light_are_those_of_the_integral(name, place):
+    """The draw is held and the weight follows: against differences of the irradiance, each over a fine grid."""
+    x = column(*PLACES[place])
+    g = (torch.arange(400, dtype=D) + 0.5) / 400
+    u = torch.cartesian_prod(g, g).T.contiguous()
+
+    def irradiance(move: Tensor) -> Tensor:
+        p0, e1, e2 = LIGHTS[name]
+        p0, e1 = p0 + move[0] * column(0.3, 1, -0.2), e1 * (1 + move[1])
+        uv, angle = solid_angle.sample(table(name, (p0, e1, e2)), None, x.expand(3, u.shape[1]), u)
+        assert bool((angle > 0).all())
+        to = affine(p0, e1, uv[0], e2, uv[1]) - x
+        square = dot(to, to)
+        face = cross(e1, e2)
+        area = dot(face, face).sqrt() * (0.5 if name == "triangle" else 1.0)
+        wi = to / square.sqrt()
+        return (wi[1] * solid_angle.inverse_pdf(angle, planar(column(0, -1, 0), area, wi, square))).mean()
+
+    move = torch.zeros(2, dtype=D, requires_grad=True)
+    (slope,) = torch.autograd.grad(irradiance(move), move)
+    for k, step in enumerate(1e-3 * torch.eye(2, dtype=D)):
+        expected = (irradiance(step) - irradiance(-step)) / 2e-3
+        assert float(slope[k]) == pytest.approx(float(expected), rel=1e-3)
+
+
 def test_beyond_some_radii_lights_are_sampled_by_area():
     lights, row, x, _ = _scatter(20_000, D, 4.0)
     whole, *_ = _scatter(20_000, D)
