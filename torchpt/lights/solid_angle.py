@@ -52,7 +52,7 @@ TRIANGLE, RECTANGLE, SKEW, OTHER = 0, 1, 2, 3
 #: Solid angles, in steradians, beyond which lights are sampled by area.
 LEAST, MOST = 3e-4, 2.0 * math.pi - 1e-5
 #: Farther than this from its centre, in units of the radius about it, a light is sampled by area.
-NEAR = 4.0
+NEAR = 2.0
 #: Cosine of the edges below which a parallelogram is a rectangle: rounding of its corners in float32.
 SQUARE = 1e-6
 
