@@ -49,6 +49,17 @@ class Perspective:
         )
         return half * (w / h) if vertical else half
 
+    def lens(self) -> Tensor:
+        """How large a pixel is in the world, ``(5,)``: ``e``, ``w``, ``spread``.
+
+        From a point ``p`` the camera lies toward ``e - w p``, and a pixel's footprint there, across the line of sight, is
+        ``spread`` times that vector's length on a side. Here ``e`` is the camera's place, ``w`` is 1, and ``spread`` a pixel's
+        side at distance 1 in the middle of the picture; of parallel rays ``e`` is the unit direction against them, ``w`` is 0.
+        """
+        pose = self.to_world
+        spread = self._half_width() * (2.0 / self.width)
+        return torch.cat((pose[:3, 3], torch.stack((torch.ones_like(spread), spread))))
+
     def rays(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Origins ``(3, 1)`` and unit directions ``(3, N)`` through film positions in pixels, from the upper left."""
         half = self._half_width()

@@ -146,8 +146,6 @@ LATER: dict[str, tuple[dict[str, Any], str]] = {
     "camera": ({"camera": {**CAMERA, "type": "thinlens", "aperture_radius": 1}}, "camera.type"),
     "camera key": (camera(blades=5), "camera.blades"),
     "light": (scene(lights={"l": {"type": "envmap", "path": "a.exr"}}), "lights.l.type"),
-    "filter": (scene(film={"filter": "tent"}), "film.filter.type"),
-    "sampler": (scene(sampler={"type": "zsobol"}), "sampler.type"),
     "adaptive": (scene(sampler={"adaptive": True}), "sampler.adaptive"),
     "integrator": (scene(integrator={"type": "bdpt"}), "integrator.type"),
     "time limit": (scene(render={"time_limit": 10}), "render.time_limit"),

@@ -7,6 +7,7 @@ write the same result twice, so nothing needs to know of them. (Under gradients 
 
 from __future__ import annotations
 
+import copy
 import shutil
 import types
 from collections.abc import Callable
@@ -24,6 +25,11 @@ from torchpt.records import Hit, PathState, Shadow, World, tensors_of
 
 __all__ = ["CompiledStages", "Stages", "can_compile"]
 
+#: Inductor writes what is used more than once out again for each use, unless it took more operations than this. Indices into
+#: textures and the frames of maps are long chains in which each step uses the one before twice: beyond its own 50 that is
+#: 2^50 visits, and compilation does not end. Of scenes without textures the default makes the faster code.
+REALIZE = 10
+
 Search = Callable[[PathState], Hit]
 
 
@@ -33,12 +39,16 @@ def can_compile(device: torch.device) -> bool:
 
 
 class Stages:
-    """The stages, eager: always complete and correct."""
+    """The stages, eager: always complete and correct.
+
+    Attributes:
+        lens: how large a pixel is in the world, see :func:`torchpt.integrators.surfaces.spot_at`; None where nothing asks.
+    """
 
     compiled = False
 
-    def __init__(self, plan: Plan, world: World) -> None:
-        self.plan, self.world = plan, world
+    def __init__(self, plan: Plan, world: World, lens: Tensor | None = None) -> None:
+        self.plan, self.world, self.lens = plan, world, lens
 
     def generate(
         self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
@@ -66,7 +76,7 @@ class Stages:
         salts: Tensor,
     ) -> tuple[PathState, Hit | None, Shadow | None]:
         """See :func:`torchpt.integrators.stages.bounce`."""
-        return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
+        return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, self.lens)
 
 
 class CompiledStages(Stages):
@@ -78,8 +88,8 @@ class CompiledStages(Stages):
 
     compiled = True
 
-    def __init__(self, plan: Plan, world: World) -> None:
-        super().__init__(plan, world)
+    def __init__(self, plan: Plan, world: World, lens: Tensor | None = None) -> None:
+        super().__init__(plan, world, lens)
         if not can_compile(world.p0.device):
             raise RenderError("render.compile: on needs a C++ compiler (g++ or clang++) for the CPU; none was found")
         # Only lanes vary in number; a scene's tables do not.
@@ -87,6 +97,14 @@ class CompiledStages(Stages):
             torch._dynamo.mark_static(table)
         self.graphs: dict[str, int] = {}
         self._made: dict[tuple[Any, ...], Callable[..., Any]] = {}
+
+    def through(self, lens: Tensor | None) -> CompiledStages:
+        """The same graphs for another camera."""
+        if lens is not None:
+            torch._dynamo.mark_static(lens)
+        found = copy.copy(self)
+        found.lens = lens
+        return found
 
     def generate(
         self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
@@ -123,12 +141,12 @@ class CompiledStages(Stages):
         """See :func:`torchpt.integrators.stages.bounce`."""
 
         def stage(
-            state: PathState, hit: Hit, index: Tensor, salts: Tensor
+            state: PathState, hit: Hit, index: Tensor, salts: Tensor, lens: Tensor | None
         ) -> tuple[PathState, Hit | None, Shadow | None]:
-            return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
+            return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, lens)
 
         name = f"bounce {self.world.models[model]}"
-        return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts)
+        return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts, self.lens)
 
     def _get(self, name: str, variant: tuple[Any, ...], stage: Callable[..., Any]) -> Callable[..., Any]:
         """The compiled form of ``stage``, made once for each variant."""
@@ -142,9 +160,13 @@ class CompiledStages(Stages):
         from torch._inductor.compile_fx import compile_fx
         from torch.fx.experimental import _config
 
+        options: dict[str, Any] = {"assert_indirect_indexing": False}
+        if self.world.textures is not None:
+            options["realize_opcount_threshold"] = REALIZE
+
         def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Any:
             self.graphs[name] = self.graphs.get(name, 0) + 1
-            return compile_fx(graph, inputs, config_patches={"assert_indirect_indexing": False})
+            return compile_fx(graph, inputs, config_patches=options)
 
         config: Any = _config  # its `patch` is put there at run time
         # A code object of its own: dynamo counts graphs by code, and those of another scene are no business of this one.

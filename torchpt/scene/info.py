@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from torchpt import bsdfs
 from torchpt.accel import Accel
-from torchpt.records import KINDS, World, tensors_of
+from torchpt.lights.choice import ByTree
+from torchpt.records import KINDS, Lights, World, tensors_of
 from torchpt.scene.settings import Settings
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     made: dict[str, Any] = {
         "accel": accel.describe(),
         "bsdfs": _groups(world),
-        "lights": {} if lights is None else {"rows": len(lights.area), "kinds": list(lights.kinds)},
+        "lights": {} if lights is None else _lights(lights),
         "scene_bytes": memory,
     }
     if world.textures is not None:
@@ -66,6 +67,16 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "left_out": _left_out(world, settings),
         "settings": settings.model_dump(mode="json", warnings=False),
     }
+
+
+def _lights(lights: Lights) -> dict[str, Any]:
+    found: dict[str, Any] = {"rows": len(lights.area), "kinds": list(lights.kinds)}
+    if isinstance(lights.choice, ByTree):
+        tree = lights.choice.tree
+        found["choice"] = {"tree": {"nodes": len(tree.nodes), "levels": tree.levels}}
+    elif lights.choice is not None:
+        found["choice"] = "a fixed chance for each"
+    return found
 
 
 def _left_out(world: World, settings: Settings) -> list[str]:
@@ -95,6 +106,8 @@ def _left_out(world: World, settings: Settings) -> list[str]:
     else:
         if lights.choice is None:
             absent.append("choice among lights (one light)")
+        elif not isinstance(lights.choice, ByTree):
+            absent.append("light tree (few lights)")
         if lights.environment is None:
             absent.append("environment")
         if lights.row_of_prim is None:

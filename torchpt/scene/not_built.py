@@ -16,8 +16,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
         "thinlens": (*_POSE, "fov", "fov_axis", "aperture_radius", "focus_distance", "blades"),
         "orthographic": (*_POSE, "width"),
     },
-    "filter": {"tent": ("radius",), "mitchell": ("radius",)},
-    "sampler": {"stratified": ("adaptive",), "hammersley": ("adaptive",), "zsobol": ("adaptive",)},
     "integrator": {
         "ibl": ("strict",),
         "bdpt": ("max_depth", "rr_depth", "rr_prob", "clamp", "strict"),

@@ -97,7 +97,7 @@ class Scene:
         }
         self._centre = torch.from_numpy(self._built.centre).to(device)
         self._lock = threading.RLock()
-        self._worlds: dict[tuple[torch.dtype, bool], tuple[World, Geometry]] = {}
+        self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._state: dict[str, tuple[Tensor, int]] = {}
 
@@ -162,20 +162,21 @@ class Scene:
                     )
 
     def world(
-        self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False
+        self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False, choice: str = "auto"
     ) -> tuple[World, Geometry]:
         """The tensors that lanes gather from, and what the search sees; made once for the scene's own parameters.
 
-        ``uv``: with texture coordinates, whether or not a texture reads them.
+        ``uv``: with texture coordinates, whether or not a texture reads them. ``choice``: how lights are chosen.
         """
         if params:
-            return self._assemble(self.merged(params), dtype, uv)
+            return self._assemble(self.merged(params), dtype, uv, choice)
         with self._lock:
             self._refresh()
-            if (dtype, uv) not in self._worlds:
+            key = dtype, uv, choice
+            if key not in self._worlds:
                 with torch.no_grad():
-                    self._worlds[dtype, uv] = self._assemble(self.params, dtype, uv)
-            return self._worlds[dtype, uv]
+                    self._worlds[key] = self._assemble(self.params, dtype, uv, choice)
+            return self._worlds[key]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
         """A search structure: built for ``geometry``, or kept for the scene's own."""
@@ -202,13 +203,15 @@ class Scene:
 
     def info(self, settings: Settings) -> dict[str, Any]:
         """What the scene holds, what was built for it and what was left out."""
-        world, _ = self.world(torch.float32)
+        world, _ = self.world(torch.float32, choice=settings.light_choice)
         threads = None if settings.render.threads == "auto" else int(settings.render.threads)
         return describe(self.description, self._built, world, self.accel(settings.render.accel, threads), settings)
 
-    def _assemble(self, params: Mapping[str, Tensor], dtype: torch.dtype, uv: bool) -> tuple[World, Geometry]:
+    def _assemble(
+        self, params: Mapping[str, Tensor], dtype: torch.dtype, uv: bool, choice: str
+    ) -> tuple[World, Geometry]:
         built = self._built
-        return assemble(built.parts, params, built.sources, self._centre, dtype, built.copies, uv)
+        return assemble(built.parts, params, built.sources, self._centre, dtype, built.copies, uv, choice)
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""

@@ -120,7 +120,10 @@ def _heights(value: Any) -> Slot:
         value = {"texture": value}
     if not isinstance(value, Mapping):
         raise wrong("the name of a texture, or a texture")
-    return slot_value(value, False, -_LARGEST, _LARGEST)
+    found = slot_value(value, False, -_LARGEST, _LARGEST)
+    if getattr(found.texture, "filter", "") == "trilinear":
+        raise wrong("nearest or bilinear, as displacement is read at points", "trilinear", ("filter",))
+    return found
 
 
 _LARGEST = float(np.finfo(np.float32).max)
