@@ -509,6 +509,49 @@ def write_ply(path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32
     path.write_bytes(header.encode() + vertices.tobytes() + records.tobytes())
 
 
+#: Colours of the lanterns' paper: radiance.
+PAPER = {
+    "amber": (52.0, 18.0, 3.6),
+    "gold": (44.0, 28.0, 6.4),
+    "rose": (48.0, 6.4, 9.6),
+    "jade": (4.8, 34.0, 14.0),
+    "azure": (4.8, 16.0, 52.0),
+    "pearl": (32.0, 30.0, 26.0),
+}
+
+
+def write_lanterns(path: Path) -> None:
+    """110 octahedra that shine, 880 triangles, hung over a square about the origin: an OBJ and its MTL.
+
+    Sizes and radiances vary, each by a factor of several, so that the brightest have a hundred times the power
+    of the faintest.
+    """
+    random = np.random.default_rng(1913)
+    corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1.4, 0], [0, -1.4, 0], [0, 0, 1], [0, 0, -1]], np.float64)
+    faces = np.array([[3, 5, 1], [3, 1, 6], [3, 6, 2], [3, 2, 5], [4, 1, 5], [4, 6, 1], [4, 2, 6], [4, 5, 2]])
+    names = list(PAPER)
+    lines, material = ["# made by scripts/make_assets.py", f"mtllib {path.stem}.mtl"], []
+    for number in range(110):
+        row, column = divmod(number, 10)
+        place = np.array([2.0 * column - 9.0, 1.9, 1.7 * row - 11.5])
+        place += random.uniform(-1.0, 1.0, 3) * (0.7, 0.7, 0.6)
+        size, strength = 0.2 * random.uniform(0.35, 1.0), 4.0 ** random.uniform(-1.0, 1.0)
+        colour = names[random.integers(len(names))]
+        turn = random.uniform(0.0, 2.0 * np.pi)
+        spin = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+        level = int(np.clip(np.round(2.0 * np.log2(strength)), -4, 4))
+        lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in corners @ spin.T * size + place]
+        lines.append(f"usemtl {colour}{level:+d}")
+        material.append((colour, level))
+        lines += ["f " + " ".join(str(6 * number + k) for k in face) for face in faces]
+    path.write_text("\n".join(lines) + "\n")
+    shades = ["# made by scripts/make_assets.py"]
+    for colour, level in sorted(set(material)):
+        radiance = " ".join(f"{x * 2.0 ** (0.5 * level):.4g}" for x in PAPER[colour])
+        shades += [f"newmtl {colour}{level:+d}", "Kd 0.6 0.6 0.6", f"Ke {radiance}"]
+    path.with_suffix(".mtl").write_text("\n".join(shades) + "\n")
+
+
 def main() -> None:
     """Writes every asset."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -518,6 +561,7 @@ def main() -> None:
     for make in (standin, statue, cup, pot, curved_wall):
         write_ply(folder / f"{make.__name__}.ply", *make())
     write_toy_duck(folder / "toy_duck.glb")
+    write_lanterns(folder / "lanterns.obj")
 
 
 if __name__ == "__main__":
