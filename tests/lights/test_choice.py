@@ -185,7 +185,9 @@ def test_the_picture_does_not_depend_on_the_choice(strategy):
     (a, va), (b, vb) = (spread([coarse(image, 6) for image in pictures[way]]) for way in pictures)
     z = (a - b) / (va + vb).clamp_min(1e-20).sqrt()
     assert float(z.abs().max()) < 1.5 * z_limit(z.numel())  # variances from eight pictures each
-    assert float(a.mean()) == pytest.approx(float(b.mean()), rel=0.02)
+    means = [torch.stack([image.double().mean() for image in images]) for images in pictures.values()]
+    noise = sum(float(mean.var()) / len(mean) for mean in means) ** 0.5
+    assert abs(float(means[0].mean() - means[1].mean())) < 4 * noise < 0.15 * float(means[0].mean())
 
 
 #: Thirty points over a floor, and where one pixel sees it.

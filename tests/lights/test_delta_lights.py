@@ -12,6 +12,7 @@ from trials import film_of, shoot, z_limit
 import torchpt
 from torchpt import lights
 from torchpt.errors import EdgeWarning, SceneError
+from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import normalize
 from torchpt.shapes.interaction import OFFSET
 
@@ -97,9 +98,11 @@ def test_no_ray_meets_them():
 
 def test_the_table_tells_deltas_apart():
     lamp = {"type": "rectangle", "emission": 1, "transform": [{"translate": [0, 0, -4]}]}
-    world, _ = torchpt.load(floor({**LIGHTS, "sky": {"type": "constant"}}, lamp=lamp), "cpu").world(torch.float32)
+    world, _ = torchpt.load(floor({**LIGHTS, "sky": {"type": "constant"}}, lamp=lamp), "cpu").world(
+        torch.float32, choice="power"
+    )
     table = world.lights
-    assert table is not None and table.choice is not None
+    assert table is not None and isinstance(table.choice, Discrete)
     assert table.kinds == ("rectangle", "point", "spot", "directional", "constant")
     n = 4096
     x = torch.rand(3, n, generator=torch.Generator().manual_seed(1))

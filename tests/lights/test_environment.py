@@ -15,6 +15,7 @@ from trials import SIGNIFICANCE, chi_square_p, coarse, estimate, film_of, shoot,
 import torchpt
 from torchpt.errors import AssetError, SceneError
 from torchpt.lights.envmap import EnvironmentMap
+from torchpt.math.distributions import Discrete
 
 ALBEDO = 0.6
 
@@ -151,8 +152,9 @@ def test_a_black_map(tmp_path):
     lit = under(sky)
     lit["lights"]["lamp"] = {"type": "point", "position": [0, 3, 2], "intensity": 5.0}
     alone = {**lit, "lights": {"lamp": lit["lights"]["lamp"]}}
-    world, _ = torchpt.load(lit, "cpu").world(torch.float32)
-    assert world.lights is not None and world.lights.choice is not None and float(world.lights.choice.pmf[-1]) == 0
+    world, _ = torchpt.load(lit, "cpu").world(torch.float32, choice="power")
+    assert world.lights is not None and isinstance(world.lights.choice, Discrete)
+    assert float(world.lights.choice.pmf[-1]) == 0
     torch.testing.assert_close(shoot(lit, 4).image, shoot(alone, 4).image, rtol=1e-5, atol=1e-6)
 
 

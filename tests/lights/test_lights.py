@@ -13,6 +13,7 @@ from trials import SIGNIFICANCE, chi_square_p
 import torchpt
 from torchpt import lights
 from torchpt.lights import sphere
+from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import dot
 from torchpt.records import Hit
 from torchpt.shapes import interact
@@ -137,9 +138,9 @@ def test_nothing_comes_from_behind(name):
 def test_lights_are_chosen_by_power():
     names = ["triangle", "rectangle", "sphere"]
     radiance = {"triangle": 3.0, "rectangle": 1.0, "sphere": 0.1}
-    world, _ = scene_of(names, radiance).world(torch.float64)
+    world, _ = scene_of(names, radiance).world(torch.float64, choice="power")
     table = world.lights
-    assert table is not None and table.choice is not None
+    assert table is not None and isinstance(table.choice, Discrete)
     areas = table.area
     power = areas * table.radiance[0]
     expected = 0.99 * power / power.sum() + 0.01 / 3  # a hundredth is even, see Discrete

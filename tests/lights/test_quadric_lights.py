@@ -10,6 +10,7 @@ from trials import film_of, shoot, spread, z_limit
 
 import torchpt
 from torchpt import lights
+from torchpt.math.distributions import Discrete
 from torchpt.math.warps import uniform_sphere
 from torchpt.records import Hit
 from torchpt.shapes import interact
@@ -98,8 +99,8 @@ def test_power_is_by_true_area():
         one = {"type": "rectangle", "emission": [1, 1, 1]}  # of area 4
         shapes = {"light": {**shape, "emission": [1, 1, 1]}, "one": one}
         scene = torchpt.load({"camera": {"origin": [0, 0, 5], "target": [0, 0, 0]}, "shapes": shapes}, device="cpu")
-        world, _ = scene.world(torch.float64)
-        assert world.lights is not None and world.lights.choice is not None
+        world, _ = scene.world(torch.float64, choice="power")
+        assert world.lights is not None and isinstance(world.lights.choice, Discrete)
         pmf = (world.lights.choice.pmf - 0.005) / 0.99
         return float(4 * pmf[1] / pmf[0])
 

@@ -213,7 +213,7 @@ def test_a_whole_scene() -> None:
     assert found.shapes["lamp"].emission == (3, 3, 3)
     assert found.shapes["lamp"].to_world()[1, 3] == 5
     assert not found.materials["red"].two_sided
-    assert found.lights["sky"].radiance == (1, 2, 3)
+    assert found.lights["sky"].numbers() == {"radiance": (1, 2, 3)}
 
 
 def test_polygons_become_fans() -> None:
