@@ -20,8 +20,8 @@ import torch
 import torchpt
 from torchpt.math.vectors import cross, dot
 from torchpt.scene import Scene
-from torchpt.scene.assemble import corners_of
-from torchpt.scene.parts import MaterialSlot, Part, VertexColors
+from torchpt.scene.assembly import corners_of
+from torchpt.scene.parts import MaterialSlot, Part, Source, VertexColors
 from torchpt.scene.settings import Film, PathIntegrator, Settings
 from torchpt.scene.texels import images_of
 from torchpt.textures import Node
@@ -100,10 +100,29 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
     }
     for number, part in enumerate(scene.parts.parts):
         out[f"part{number}"] = _shape(mitsuba, scene, part, folder / f"part{number}.ply")
-    if scene.parts.environment is not None:
-        radiance = scene.parts.parameters[scene.parts.environment]
-        out["environment"] = {"type": "constant", "radiance": _rgb(radiance)}
+    for source in scene.parts.sources:
+        out[source.name.replace(".", "_")] = _source(mitsuba, scene, source)
     return out
+
+
+def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
+    """Mitsuba's dict of a light that is no surface."""
+    name = source.name.removeprefix("lights.")
+    given = scene.description.lights[name].numbers()
+    found: dict[str, Any] = {"type": source.kind}
+    for key, value in given.items():
+        if key in ("intensity", "irradiance", "radiance"):
+            found[key] = _rgb(value)
+        elif key in ("position", "target"):
+            found[key] = list(value)
+        else:
+            found[key] = list(value) if key == "direction" else value
+    if source.kind == "spot":
+        origin, target = found.pop("position"), found.pop("target")
+        along = np.subtract(target, origin)
+        up = [1.0, 0.0, 0.0] if abs(along[0]) < 0.9 * np.linalg.norm(along) else [0.0, 1.0, 0.0]
+        found["to_world"] = mitsuba.ScalarTransform4f().look_at(origin=origin, target=target, up=up)
+    return found
 
 
 def comparable(name: str) -> Scene:

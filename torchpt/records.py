@@ -19,8 +19,10 @@ if TYPE_CHECKING:
     from torchpt.textures import Atlas, Look, Veils
 
 __all__ = [
+    "DISTANT",
     "KINDS",
     "QUADRICS",
+    "SOURCES",
     "BsdfSample",
     "Copies",
     "Geometry",
@@ -39,6 +41,10 @@ __all__ = [
 
 #: Primitive kinds in the order in which a :class:`Geometry` stores them.
 KINDS = ("triangle", "rectangle", "disk", "sphere", "quadric")
+#: Lights that are no surfaces, in the order of their rows: those somewhere, then those infinitely far.
+SOURCES = ("point", "spot", "directional", "constant")
+#: Those infinitely far.
+DISTANT = ("directional", "constant")
 #: Surfaces of a quadric in its own space, in the order of their codes (:mod:`torchpt.shapes.quadrics`).
 QUADRICS = ("ellipsoid", "cylinder", "cone")
 
@@ -109,27 +115,28 @@ class Copies:
 
 @dataclass(frozen=True)
 class Lights:
-    """The emitters: one row per emissive primitive, and the environment as the last row where there is one."""
+    """The emitters: a row for each emissive primitive, then one for each light of :data:`SOURCES`, in that order.
+
+    Columns are a primitive's own; what the others put there is said in their files in :mod:`torchpt.lights`.
+    """
 
     choice: Discrete | None  # over the rows; None where there is but one
-    kinds: tuple[str, ...]  # primitive kinds among the rows, and "constant"
+    kinds: tuple[str, ...]  # kinds among the rows, of KINDS and SOURCES in their order
     kind: Tensor | None  # (K,) index into `kinds`; None where there is but one
-    p0: Tensor  # (3, K), as the primitives' own
+    p0: Tensor  # (3, K)
     e1: Tensor  # (3, K)
     e2: Tensor  # (3, K)
     normal: Tensor  # (3, K) unit, the side that emits
     flip: Tensor  # (K,) -1 where a sphere emits inward
     area: Tensor  # (K,); of a quadric its own space's area times |det|, see torchpt.lights.quadric
     bound: Tensor  # (K,) see World.bound
-    radiance: Tensor  # (3, K)
+    radiance: Tensor  # (3, K); of a point or spot its intensity, of a directional light its irradiance
     opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
     environment: Tensor | None  # (3,) radiance that comes from outside
     row_of_prim: Tensor | None  # (P + I,) int64, -1 where a primitive does not emit; None where none does
-    quadric: Tensor | None = (
-        None  # (K,) int64 column of World.quadrics, 0 for the other kinds; None where no quadric emits
-    )
-    quadrics: Quadrics | None = None  # World.quadrics where a quadric emits
-    prim: Tensor | None = None  # (K,) int64 the primitive; None where no texture says how much it emits
+    quadric: Tensor | None  # (K,) int64 column of World.quadrics, 0 for the other kinds; None where no quadric emits
+    quadrics: Quadrics | None  # World.quadrics where a quadric emits
+    prim: Tensor | None  # (K,) int64 the primitive; None where no texture says how much it emits
 
 
 @dataclass(frozen=True)
@@ -233,11 +240,12 @@ class LightSample:
 
     wi: Tensor  # (3, N) unit, toward the light
     target: Tensor  # (3, N) end of the shadow ray, moved off the light's surface; a direction where `distant`
-    distant: Tensor | None  # (N,) bool: the environment; None where no lane can draw it
-    radiance: Tensor  # (3, N), zero where the draw failed
-    pdf: Tensor  # (N,) in solid angle, with the choice of the light, detached
+    distant: Tensor | None  # (N,) bool: lights infinitely far; None where there are none
+    radiance: Tensor  # (3, N), zero where the draw failed; of a delta light what `weight` is to be multiplied by
+    pdf: Tensor  # (N,) in solid angle, with the choice of the light, detached; inf where it is a delta
     weight: Tensor  # (N,) = 1 / pdf, differentiable in the geometry
     at: Interaction | None = None  # the point itself, without tangents; None where no texture asks for it
+    bare: Tensor | None = None  # (N,) bool: where `at` has no meaning, as the light is no surface; None: nowhere
 
 
 @dataclass(frozen=True)

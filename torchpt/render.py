@@ -17,7 +17,7 @@ from torchpt.forward import BYTES_PER_LANE, Progress, Rendering, Run, chunks_of,
 from torchpt.integrators.compiled import Stages
 from torchpt.scene import Scene
 from torchpt.scene.description import settings as complete
-from torchpt.scene.scene import INDICES
+from torchpt.scene.scene import INDICES, MOVING
 from torchpt.scene.settings import AovIntegrator, Settings
 
 __all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene"]
@@ -98,7 +98,7 @@ def render(
         raise SceneError("integrator.type", "aov", "path or direct where gradients are wanted")
     names = tuple(wanted)
     attached = _moves(scene, names)
-    if attached:
+    if attached or any(name.startswith("lights.") and name.endswith(MOVING) for name in names):
         warnings.warn(
             "the gradient with respect to what moves or bends rays leaves out visibility edges (silhouettes and shadow edges "
             "that move); see docs/gradients.md",

@@ -153,9 +153,9 @@ def test_bad_instances_are_one_line(name):
 
 
 def test_more_primitives_than_ids_are_refused(monkeypatch):
-    from torchpt.scene import assemble
+    from torchpt.scene.assembly import copies
 
-    monkeypatch.setattr(assemble, "MOST_PRIMITIVES", 16)
+    monkeypatch.setattr(copies, "MOST_PRIMITIVES", 16)
     with pytest.raises(SceneError, match="primitives"):
         torchpt.load(described(False), "cpu").world(torch.float32)
 

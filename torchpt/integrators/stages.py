@@ -187,7 +187,7 @@ def _shining(world: World, light: LightSample) -> Tensor:
         share = share * glow(world, light.at)
     if world.veils is not None:
         share = share * veil(world, light.at)
-    return light.radiance * (share if light.distant is None else torch.where(light.distant, 1.0, share))
+    return light.radiance * (share if light.bare is None else torch.where(light.bare, 1.0, share))
 
 
 def _leaning(world: World, model: int) -> bool:

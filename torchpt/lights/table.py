@@ -1,6 +1,7 @@
 """The table of lights: choice by power, sampling, and the densities that MIS asks for.
 
-A row is an emissive primitive; the environment, where there is one, is the last row. Kinds absent from the scene cost
+Rows are emissive primitives, then lights that are no surfaces; the environment, where there is one, is the last row. Delta
+lights (points, spots, directional ones) have an infinite density, and no ray meets them. Kinds absent from the scene cost
 nothing: ``Lights.kinds`` is static, and a single row is neither chosen nor gathered.
 """
 
@@ -11,9 +12,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lights import area, constant, quadric, sphere
+from torchpt.lights import area, constant, point, quadric, sphere, spot
 from torchpt.math.vectors import dot, safe_reciprocal, take
-from torchpt.records import Interaction, Lights, LightSample, Quadrics, rows
+from torchpt.records import DISTANT, KINDS, Interaction, Lights, LightSample, Quadrics, rows
 
 __all__ = ["emitted", "environment", "sample"]
 
@@ -61,31 +62,64 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
         offset: how far shadow rays stop off the light's surface, in units of ``Lights.bound``.
     """
     row = None if lights.choice is None or choice is None else lights.choice.sample(choice)
-    at = _rows(lights, row)
+    at, probability = _rows(lights, row), _probability(lights, row)
+    surfaces = len([kind for kind in lights.kinds if kind in KINDS])
+    near = len([kind for kind in lights.kinds if kind not in DISTANT])
+    bare, distant = _from(lights, surfaces, row), _from(lights, near, row)
+    drawn = _on_surfaces(lights, at, row, x, u, offset, probability) if surfaces else None
+    if near > surfaces:
+        drawn = _merged(bare, _at_points(lights, at, row, x, probability), drawn)
+    if near < len(lights.kinds):
+        drawn = _merged(distant, _from_afar(lights, at, row, u, probability), drawn)
+    assert drawn is not None
+    return replace(drawn, distant=distant, bare=bare)
+
+
+def _from(lights: Lights, first: int, row: Tensor | None) -> Tensor | None:
+    """Mask of the lanes whose row is of the kinds from ``first`` on; ``None`` where there are no such kinds."""
+    if first == len(lights.kinds):
+        return None
+    if row is None:
+        return torch.full_like(lights.area, first == 0, dtype=torch.bool)
+    assert lights.kind is not None
+    return take(lights.kind, row) >= first
+
+
+def _merged(mask: Tensor | None, a: LightSample, b: LightSample | None) -> LightSample:
+    """``a`` where the mask holds, else ``b``; where there is no ``b``, ``a``."""
+    if b is None:
+        return a
+    assert mask is not None
+    names = ("wi", "target", "radiance", "pdf", "weight")
+    return replace(b, **{name: torch.where(mask, getattr(a, name), getattr(b, name)) for name in names})
+
+
+def _on_surfaces(
+    lights: Lights, at: Lights, row: Tensor | None, x: Tensor, u: Tensor, offset: float, probability: Tensor | float
+) -> LightSample:
     target: Tensor | None = None
     normal: Tensor | None = None
     bent: Quadrics | None = None
     place = torch.zeros_like(u)
     for kind in lights.kinds:
-        if kind == "constant":
+        if kind not in KINDS:
             continue
         mask = _is(lights, kind, row)
         if kind == "sphere":
             # Detached: from a moving reference point the same spot on the light is held, as on planar lights.
-            spot, facing = sphere.sample(x.detach(), at.p0.detach(), at.e1[0].detach(), at.flip, u)
-            spot = at.p0 + (spot - at.p0).detach() * (at.e1[0] / at.e1[0].detach())
+            radius = at.e1[0]
+            p, facing = sphere.sample(x.detach(), at.p0.detach(), radius.detach(), at.flip, u)
+            grown = radius / torch.where(radius == 0, 1.0, radius).detach()  # 1; rows of other kinds may have a 0 there
+            p = at.p0 + (p - at.p0).detach() * grown
         elif kind == "quadric":
             bent = _quadrics(lights, row)
-            spot, facing = quadric.point(at.p0, at.e1, at.e2, bent, u)
+            p, facing = quadric.point(at.p0, at.e1, at.e2, bent, u)
         else:
             here = area.WARPS[kind](u)
-            spot, facing = area.point(at.p0, at.e1, at.e2, here), at.normal
+            p, facing = area.point(at.p0, at.e1, at.e2, here), at.normal
             place = _pick(mask, here, place)
-        target, normal = _pick(mask, spot, target), _pick(mask, facing, normal)
-
-    if target is None or normal is None:  # nothing but the environment
-        wi = constant.sample(u)
-        return _environment_sample(lights, wi, 1.0)
+        target, normal = _pick(mask, p, target), _pick(mask, facing, normal)
+    assert target is not None and normal is not None
     to = target - x
     square = dot(to, to)
     wi = to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt()
@@ -101,46 +135,50 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
         value = inverse.detach()
         ball = ball * torch.where(value > 0, inverse / torch.where(value > 0, value, 1.0), 1.0)
         inverse = _pick(_is(lights, "sphere", row), ball, inverse)
-    probability = _probability(lights, row)
     if lights.choice is not None:
         inverse = inverse / probability
     # Where the light is not seen the weight is 0, and the density has no say.
     pdf = safe_reciprocal(inverse.detach())
-    spot = None if lights.prim is None else _spot(lights, row, target, normal, place, bent, u)
+    found = None if lights.prim is None else _textured(lights, row, target, normal, place, bent, u)
     target = torch.addcmul(target, normal, bound * offset)
     radiance = at.radiance if at.opacity is None else at.radiance * at.opacity
-    here = LightSample(wi, target, None, radiance.expand_as(wi), pdf, inverse, spot)
-    if "constant" not in lights.kinds:
-        return here
-    distant = _is(lights, "constant", row)
-    assert distant is not None
-    there = _environment_sample(lights, constant.sample(u), probability)
-    return LightSample(
-        wi=torch.where(distant, there.wi, here.wi),
-        target=torch.where(distant, there.target, here.target),
-        distant=distant,
-        radiance=torch.where(distant, there.radiance, here.radiance),
-        pdf=torch.where(distant, there.pdf, here.pdf),
-        weight=torch.where(distant, there.weight, here.weight),
-        at=spot,
-    )
+    return LightSample(wi, target, None, radiance.expand_as(wi), pdf, inverse, found)
 
 
-def _spot(
+def _textured(
     lights: Lights, row: Tensor | None, p: Tensor, normal: Tensor, place: Tensor, bent: Quadrics | None, u: Tensor
 ) -> Interaction:
-    """The point on the light as textures ask for it; of the environment any."""
+    """The point on the light as textures ask for it."""
     assert lights.prim is not None
     prim = lights.prim.expand(p.shape[1]) if row is None else take(lights.prim, row)
     own = None if bent is None else quadric.own_point(bent, u)
     return Interaction(p, normal, normal, None, None, prim, prim, None, place[0], place[1], own)
 
 
-def _environment_sample(lights: Lights, wi: Tensor, probability: Tensor | float) -> LightSample:
-    assert lights.environment is not None
-    weight = torch.full_like(wi[0], constant.INVERSE_PDF) / probability
-    everywhere = torch.ones_like(wi[0], dtype=torch.bool)
-    return LightSample(wi, wi, everywhere, lights.environment[:, None].expand_as(wi), 1.0 / weight, weight)
+def _at_points(lights: Lights, at: Lights, row: Tensor | None, x: Tensor, probability: Tensor | float) -> LightSample:
+    wi, inverse = point.toward(x, at.p0)
+    radiance = at.radiance.expand_as(wi)
+    if "spot" in lights.kinds:
+        share, mask = spot.falloff(wi, at.normal, at.e1[0], at.e1[1]), _is(lights, "spot", row)
+        radiance = radiance * (share if mask is None else torch.where(mask, share, 1.0))
+    infinite = torch.full_like(inverse, torch.inf)
+    return LightSample(wi, at.p0.expand_as(wi), None, radiance, infinite, inverse / probability)
+
+
+def _from_afar(lights: Lights, at: Lights, row: Tensor | None, u: Tensor, probability: Tensor | float) -> LightSample:
+    wi: Tensor | None = None
+    pdf: Tensor | None = None
+    weight: Tensor | None = None
+    if "constant" in lights.kinds:
+        wi = constant.sample(u).to(at.radiance.dtype)
+        pdf, weight = (torch.full_like(wi[0], value) for value in (1.0 / constant.INVERSE_PDF, constant.INVERSE_PDF))
+    if "directional" in lights.kinds:
+        mask = _is(lights, "directional", row)
+        one = torch.ones_like(u[0], dtype=at.radiance.dtype)
+        wi = _pick(mask, (-at.normal).expand(3, u.shape[1]), wi)
+        pdf, weight = _pick(mask, one * torch.inf, pdf), _pick(mask, one, weight)
+    assert wi is not None and pdf is not None and weight is not None
+    return LightSample(wi, wi, None, at.radiance.expand_as(wi), pdf * probability, weight / probability)
 
 
 def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,12 +8,13 @@ import numpy as np
 
 from torchpt.errors import AssetError, SceneError
 from torchpt.math.transforms import is_singular, similarity_scale
-from torchpt.records import KINDS
+from torchpt.records import KINDS, SOURCES
 from torchpt.scene.description import Description
 from torchpt.scene.displacement import displaced
+from torchpt.scene.lights import ENVIRONMENTS
 from torchpt.scene.loaders import FileMaterial, MeshPart, load_mesh, unit_cube
 from torchpt.scene.materials import MATERIALS, Diffuse, check_material, read_material, slot_of
-from torchpt.scene.parts import Copy, MaterialSlot, Part
+from torchpt.scene.parts import Copy, MaterialSlot, Part, Source
 from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
 from torchpt.scene.texels import Opener
 from torchpt.textures import Node
@@ -32,14 +33,14 @@ class Built:
         parts: what can be hit.
         parameters: arrays by dotted name, float64.
         centre: ``(3,)`` float64, subtracted from all positions.
-        environment: dotted name of the constant environment's radiance, or None.
+        sources: lights that are no surfaces, in the order of ``records.SOURCES``.
         copies: instances of parts.
     """
 
     parts: tuple[Part, ...]
     parameters: dict[str, np.ndarray]
     centre: np.ndarray
-    environment: str | None
+    sources: tuple[Source, ...] = ()
     copies: tuple[Copy, ...] = ()
 
 
@@ -62,17 +63,25 @@ def build_parts(description: Description) -> Built:
             copies += _copies(description, name, shape, number, parts, parameters, opener)
     for name, material in description.materials.items():
         _declare(slot_of(material, f"materials.{name}", description.materials, opener), parameters)
-    if len(description.lights) > 1:
-        first, second = list(description.lights)[:2]
-        raise SceneError(f"lights.{second}", "constant", f"one environment only ({first} is one)", description.file)
-    environment = None
-    for name, light in description.lights.items():
-        environment = f"lights.{name}.radiance"
-        parameters[environment] = np.asarray(light.radiance, np.float64)
+    sources = _sources(description, parameters)
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
     parameters["camera.fov"] = np.asarray(description.camera.fov, np.float64)
     parts.sort(key=lambda part: KINDS.index(part.kind))
-    return Built(tuple(parts), parameters, _centre(parts, copies), environment, tuple(copies))
+    return Built(tuple(parts), parameters, _centre(parts, copies), sources, tuple(copies))
+
+
+def _sources(description: Description, parameters: dict[str, np.ndarray]) -> tuple[Source, ...]:
+    """The lights block; its numbers become parameters."""
+    lights = description.lights
+    around = [name for name, light in lights.items() if light.type in ENVIRONMENTS]
+    if len(around) > 1:
+        first, second = around[:2]
+        expected = f"one environment only ({first} is one)"
+        raise SceneError(f"lights.{second}", lights[second].type, expected, description.file)
+    for name, light in lights.items():
+        parameters.update({f"lights.{name}.{key}": np.asarray(x, np.float64) for key, x in light.numbers().items()})
+    found = [Source(f"lights.{name}", light.type) for name, light in lights.items()]
+    return tuple(sorted(found, key=lambda source: SOURCES.index(source.kind)))
 
 
 def _copies(

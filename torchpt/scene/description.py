@@ -13,8 +13,9 @@ from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, SceneError
 from torchpt.scene import schema
 from torchpt.scene import settings as run_settings
+from torchpt.scene.lights import LIGHTS, Light
 from torchpt.scene.materials import MATERIALS, Material, check_material, custom_types, read_material
-from torchpt.scene.schema import ConstantLight, Perspective, Shape
+from torchpt.scene.schema import Perspective, Shape
 from torchpt.scene.settings import BLOCKS, Settings
 from torchpt.scene.textures import TEXTURES, Named, Texture
 from torchpt.scene.validate import check_keys, select
@@ -58,7 +59,7 @@ class Description:
     textures: dict[str, Texture] = field(default_factory=dict)
     materials: dict[str, Material] = field(default_factory=dict)
     shapes: dict[str, Shape] = field(default_factory=dict)
-    lights: dict[str, ConstantLight] = field(default_factory=dict)
+    lights: dict[str, Light] = field(default_factory=dict)
 
     def resolve(self, path: str | tuple[str, ...], key: str) -> Path:
         """The file that a scene names, or the first existing one of several.
@@ -167,7 +168,7 @@ def _describe(raw: dict[str, Any], types: Mapping[str, type[Material]], file: st
     for name, material in materials.items():
         check_material(material, f"materials.{name}", materials, textures, file)
     shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, textures, types, file))
-    lights = _named(raw, "lights", file, lambda item, key: select("light", schema.LIGHTS, item, key, file))
+    lights = _named(raw, "lights", file, lambda item, key: select("light", LIGHTS, item, key, file))
     return Description(
         file, base, camera, version, **blocks, textures=textures, materials=materials, shapes=shapes, lights=lights
     )

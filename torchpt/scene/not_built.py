@@ -24,9 +24,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "light": {
         "envmap": ("path", "scale", "transform"),
-        "point": ("position", "intensity"),
-        "spot": ("position", "target", "intensity", "cutoff_angle", "beam_width"),
-        "directional": ("direction", "irradiance"),
     },
 }
 

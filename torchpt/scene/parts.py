@@ -9,7 +9,7 @@ import numpy as np
 from torchpt.bsdfs import Bsdf
 from torchpt.textures import Node
 
-__all__ = ["Copy", "MaterialSlot", "Part", "Reading", "Value", "VertexColors"]
+__all__ = ["Copy", "MaterialSlot", "Part", "Reading", "Source", "Value", "VertexColors"]
 
 
 @dataclass(frozen=True)
@@ -151,3 +151,16 @@ class Copy:
     material: MaterialSlot
     flip: bool
     to_world: np.ndarray
+
+
+@dataclass(frozen=True)
+class Source:
+    """A light that is no surface.
+
+    Attributes:
+        name: dotted prefix of its parameters, e.g. ``lights.sky``.
+        kind: one of ``records.SOURCES``.
+    """
+
+    name: str
+    kind: str

@@ -18,14 +18,20 @@ from torchpt.cameras import Perspective
 from torchpt.errors import RenderError, SceneError
 from torchpt.math.transforms import is_singular, similarity_scale
 from torchpt.records import Geometry, World
-from torchpt.scene.assemble import assemble
+from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
 from torchpt.scene.description import Description, read_description, settings
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
 
-__all__ = ["INDICES", "Scene", "device_of", "load"]
+__all__ = ["INDICES", "MOVING", "Scene", "device_of", "load"]
 
+#: Parameters that say where things are, in the scene's own coordinates.
+PLACES = (".vertices", ".to_world", ".position", ".target")
+#: Parameters of lights that move shadows.
+MOVING = (".position", ".direction")
+#: Parameters that are amounts of light.
+AMOUNTS = (".emission", ".radiance", ".intensity", ".irradiance")
 #: Parameters of materials that are indices of refraction.
 INDICES = (".int_ior", ".ext_ior", ".ior")
 
@@ -85,7 +91,7 @@ class Scene:
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
             name: torch.from_numpy(value.copy()).to(
-                device, torch.float64 if far and name.endswith((".vertices", ".to_world")) else torch.float32
+                device, torch.float64 if far and name.endswith(PLACES) else torch.float32
             )
             for name, value in self._built.parameters.items()
         }
@@ -135,12 +141,16 @@ class Scene:
         if not bool(torch.isfinite(value).all()):
             raise SceneError(f"params.{name}", "a value that is not finite", "finite numbers")
         low = 0.0
-        if ".material." in name or name.startswith("materials.") or name.endswith((".emission", ".radiance")):
+        if ".material." in name or name.startswith("materials.") or name.endswith(AMOUNTS):
             if name.endswith(INDICES):
                 low = 1e-3
             if bool((value < low).any()):
                 bad = f"numbers below {low:g}" if low else "negative numbers"
                 raise SceneError(f"params.{name}", value.tolist(), f"no {bad} (clamp before rendering)")
+        if name.endswith(".direction") and not bool(value.any()):
+            raise SceneError(f"params.{name}", value.tolist(), "a direction other than [0, 0, 0]")
+        if name.endswith((".cutoff_angle", ".beam_width")) and not 0 < float(value) <= 180:
+            raise SceneError(f"params.{name}", float(value), "an angle in degrees, 0 < angle <= 180")
         if name.endswith(".to_world"):
             matrix = value.double().cpu().numpy()
             if is_singular(matrix):
@@ -197,8 +207,8 @@ class Scene:
         return describe(self.description, self._built, world, self.accel(settings.render.accel, threads), settings)
 
     def _assemble(self, params: Mapping[str, Tensor], dtype: torch.dtype, uv: bool) -> tuple[World, Geometry]:
-        environment = params[self._built.environment] if self._built.environment else None
-        return assemble(self._built.parts, params, environment, self._centre, dtype, self._built.copies, uv)
+        built = self._built
+        return assemble(built.parts, params, built.sources, self._centre, dtype, built.copies, uv)
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""

@@ -1,4 +1,4 @@
-"""The blocks of a scene file as models: camera, shapes, lights (materials have a file of their own). One table each."""
+"""The blocks of a scene file as models: camera and shapes (materials and lights have files of their own). One table each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from torchpt.errors import SceneError
 from torchpt.math import transforms
 from torchpt.scene.fields import (
     Affine,
-    Color,
     FaceArray,
     Flag,
     Rows2,
@@ -31,8 +30,8 @@ from torchpt.scene.textures import Slot, slot_value
 from torchpt.scene.validate import Model, construct
 
 __all__ = [
-    "CAMERAS", "FOV_AXES", "LIGHTS", "SHAPES",
-    "Cone", "ConstantLight", "Cube", "Cylinder", "Disk", "Instance", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
+    "CAMERAS", "FOV_AXES", "SHAPES",
+    "Cone", "Cube", "Cylinder", "Disk", "Instance", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
 ]  # fmt: skip
 
 FOV_AXES = ("x", "y", "diagonal", "smaller", "larger")
@@ -303,13 +302,6 @@ class Cube(Shape):
     type: Literal["cube"] = "cube"
 
 
-class ConstantLight(Model):
-    """An environment of one radiance from all directions."""
-
-    type: Literal["constant"] = "constant"
-    radiance: Color = (1.0, 1.0, 1.0)
-
-
 CAMERAS: dict[str, type[Perspective]] = {"perspective": Perspective}
 SHAPES: dict[str, type[Shape]] = {
     "mesh": Mesh,
@@ -321,4 +313,3 @@ SHAPES: dict[str, type[Shape]] = {
     "cone": Cone,
     "instance": Instance,
 }
-LIGHTS: dict[str, type[ConstantLight]] = {"constant": ConstantLight}

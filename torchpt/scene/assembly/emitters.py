@@ -1,0 +1,197 @@
+"""The table of lights: a row for each emissive primitive, then one for each light that is no surface."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.math.distributions import Discrete
+from torchpt.math.vectors import dot, luminance, normalize
+from torchpt.records import KINDS, SOURCES, Lights
+from torchpt.scene.assembly.curved import quadric_area
+from torchpt.scene.assembly.primitives import Primitives
+from torchpt.scene.parts import Part, Source
+from torchpt.scene.texels import images_of
+
+__all__ = ["lights_of"]
+
+
+def _emission(part: Part, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> Tensor:
+    """Radiance ``(3,)`` of a part that emits."""
+    radiance, *strength = (parameters[name].to(dtype) for name in part.emission_names)
+    if part.glow is not None:
+        return radiance.expand(3)  # the strength alone: the texture's share is looked up
+    return radiance if not strength else radiance * strength[0]
+
+
+def _mean_glow(part: Part, parameters: Mapping[str, Tensor]) -> float:
+    """Mean luminance of the texture that a part shines by; 1 without."""
+    if part.glow is None:
+        return 1.0
+    image = images_of([part.glow], parameters)[part.glow.texels].detach().double()
+    color = image[..., :3].mean((0, 1)) if image.shape[2] >= 3 else image[..., 0].mean().expand(3)
+    return float(luminance((color * color.new_tensor(part.glow.scale)).abs()))
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Columns of :class:`~torchpt.records.Lights` for some of its rows, and their power."""
+
+    kind: list[str]  # of each row
+    p0: Tensor
+    e1: Tensor
+    e2: Tensor
+    normal: Tensor
+    flip: Tensor
+    area: Tensor
+    bound: Tensor
+    radiance: Tensor
+    power: Tensor  # float64, detached
+
+
+def lights_of(
+    parts: Sequence[Part],
+    sources: Sequence[Source],
+    primitives: Primitives,
+    parameters: Mapping[str, Tensor],
+    centre: Tensor,
+    opacity: Tensor | None,
+    emissive: Tensor,
+    veiled: bool,
+) -> Lights | None:
+    """The lights; None where nothing emits.
+
+    Args:
+        parts: ordered by kind.
+        sources: lights that are no surfaces, ordered by kind.
+        primitives: of ``parts``.
+        parameters: every tensor by dotted name.
+        centre: ``(3,)`` float64 that becomes the origin.
+        opacity: ``(P + I,)``, or None.
+        emissive: ``(P + I,)`` bool, which primitives emit.
+        veiled: whether opacity textures cover any of them.
+    """
+    prim = emissive.nonzero().squeeze(1)
+    if not len(prim) and not sources:
+        return None
+    dtype, device = primitives.p0.dtype, primitives.p0.device
+    glowing = [(part, n) for part, n in zip(parts, primitives.sizes, strict=True) if part.emission is not None and n]
+    groups, column = [], None
+    if glowing:
+        surfaces, column = _surfaces(glowing, primitives, parameters, prim)
+        groups.append(surfaces)
+    low, high = primitives.extent()
+    reach = (high.amax(1) - low.amin(1)).norm() * 0.5 if low.shape[1] else torch.ones((), device=device)
+    groups += [_source(source, parameters, centre, reach, dtype) for source in sources]
+    names = [name for group in groups for name in group.kind]
+    kinds = tuple(kind for kind in (*KINDS, *SOURCES) if kind in names)
+    joined = {
+        name: torch.cat([getattr(group, name) for group in groups], -1)
+        for name in ("p0", "e1", "e2", "normal", "flip", "area", "bound", "radiance", "power")
+    }
+    rest = len(names) - len(prim)
+    power, seen = joined.pop("power"), None
+    if opacity is not None:
+        seen = torch.cat((opacity.index_select(0, prim), opacity.new_ones(rest)))
+        power = power * seen.detach().double()
+    index = None
+    if len(prim):
+        index = torch.full((len(emissive),), -1, dtype=torch.int64, device=device)
+        index[prim] = torch.arange(len(prim), device=device)
+    if column is not None:
+        column = torch.cat((column, column.new_zeros(rest)))
+    textured = veiled or any(part.glow is not None for part, _ in glowing)
+    environment = [source for source in sources if source.kind == "constant"]
+    many = len(names) > 1
+    return Lights(
+        choice=Discrete.of(power, dtype) if many else None,
+        kinds=kinds,
+        kind=torch.tensor([kinds.index(name) for name in names], device=device) if many else None,
+        **joined,
+        opacity=seen,
+        environment=parameters[f"{environment[0].name}.radiance"].to(dtype) if environment else None,
+        row_of_prim=index,
+        quadric=column,
+        quadrics=None if column is None else primitives.quadrics,
+        prim=torch.cat((prim, prim.new_zeros(rest))) if textured else None,
+    )
+
+
+#: Area over the length of the cross product of the edges.
+_SHARES = {"triangle": 0.5, "rectangle": 1.0, "disk": math.pi, "sphere": 0.0, "quadric": 0.0}
+
+
+def _surfaces(
+    glowing: Sequence[tuple[Part, int]], primitives: Primitives, parameters: Mapping[str, Tensor], prim: Tensor
+) -> tuple[_Rows, Tensor | None]:
+    """Rows of emissive primitives ``prim``, and where any is a quadric their columns among the quadrics."""
+    dtype, device = primitives.p0.dtype, primitives.p0.device
+    counts = torch.tensor([n for _, n in glowing], dtype=torch.int64, device=device)
+    names = [part.kind for part, n in glowing for _ in range(n)]
+    of_kind = torch.tensor([KINDS.index(part.kind) for part, _ in glowing], dtype=torch.int64, device=device)
+    of_kind = torch.repeat_interleave(of_kind, counts)
+    share = torch.tensor([_SHARES[kind] for kind in KINDS], dtype=dtype, device=device)[of_kind]
+    p0, e1, e2, face, normal = (
+        x.index_select(1, prim)
+        for x in (primitives.p0, primitives.e1, primitives.e2, primitives.face, primitives.normal)
+    )
+    area = dot(face, face).clamp_min(torch.finfo(dtype).tiny).sqrt() * share
+    area = torch.where(of_kind == KINDS.index("sphere"), (4.0 * math.pi) * e1[0] * e1[0], area)
+    whole, column = area.detach().double(), None
+    if primitives.frame is not None and primitives.quadrics is not None and "quadric" in names:
+        bent = of_kind == KINDS.index("quadric")
+        column = torch.where(bent, prim - sum(primitives.counts[:4]), 0)
+        own, world_area = quadric_area(primitives.quadrics.code, primitives.frame)
+        area = torch.where(bent, own.to(dtype).index_select(0, column), area)
+        whole = torch.where(bent, world_area.index_select(0, column), whole)
+    radiance = torch.cat([_emission(part, parameters, dtype)[:, None].expand(3, n) for part, n in glowing], 1)
+    power = math.pi * luminance(radiance.detach().double().abs()) * whole
+    if any(part.glow is not None for part, _ in glowing):
+        shares = [_mean_glow(part, parameters) for part, _ in glowing]
+        power = power * torch.repeat_interleave(torch.tensor(shares, dtype=torch.float64, device=device), counts)
+    flip, bound = (x.index_select(0, prim) for x in (primitives.sign, primitives.bound))
+    return _Rows(names, p0, e1, e2, normal, flip, area, bound, radiance, power), column
+
+
+def _source(
+    source: Source, parameters: Mapping[str, Tensor], centre: Tensor, reach: Tensor, dtype: torch.dtype
+) -> _Rows:
+    """The row of a light that is no surface; columns as its file in :mod:`torchpt.lights` reads them.
+
+    Args:
+        source: the light.
+        parameters: every tensor by dotted name.
+        centre: ``(3,)`` float64 that becomes the origin.
+        reach: radius of the scene, float64.
+        dtype: of the lanes.
+    """
+
+    def given(key: str) -> Tensor:
+        return parameters[f"{source.name}.{key}"].double()
+
+    blank = torch.zeros(3, dtype=torch.float64, device=centre.device)
+    p0, e1, normal = blank, blank, blank
+    if source.kind in ("point", "spot"):
+        p0, color = given("position") - centre, given("intensity")
+        share = 4.0 * math.pi
+        if source.kind == "spot":
+            normal = normalize((given("target") - given("position"))[:, None])[:, 0]
+            cutoff, beam = (given(key) * (math.pi / 180.0) for key in ("cutoff_angle", "beam_width"))
+            # How fast it falls from the beam's edge to the cutoff; finite where the two are one.
+            slope = 1.0 / (cutoff - beam).clamp_min(1e-6)
+            e1 = torch.stack((cutoff, slope, torch.zeros_like(cutoff)))
+            share = 2.0 * math.pi * (1.0 - 0.5 * (torch.cos(cutoff) + torch.cos(beam))).detach()
+    elif source.kind == "directional":
+        normal, color = normalize(given("direction")[:, None])[:, 0], given("irradiance")
+        share = math.pi * reach**2
+    else:
+        color = given("radiance")
+        share = 4.0 * math.pi**2 * reach**2
+    one = torch.ones(1, dtype=dtype, device=centre.device)
+    p0, e1, e2, normal, light = (x[:, None].to(dtype) for x in (p0, e1, blank, normal, color))
+    power = (share * luminance(color.detach().abs())).reshape(1)
+    return _Rows([source.kind], p0, e1, e2, normal, one, one, one, light, power)

@@ -1,0 +1,119 @@
+"""All primitives of a scene in one table, from the corners of its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import cross, dot, normalize
+from torchpt.records import KINDS, Geometry, Quadrics
+from torchpt.scene.assembly.corners import Corners
+from torchpt.scene.assembly.curved import quadrics_of
+from torchpt.scene.parts import Part
+
+__all__ = ["Primitives", "primitives_of"]
+
+
+def _hull(*points: Tensor) -> tuple[Tensor, Tensor]:
+    every = torch.stack(points)
+    return every.amin(0), every.amax(0)
+
+
+@dataclass(frozen=True)
+class Primitives:
+    """The P primitives, ordered by kind; see :class:`~torchpt.records.World` for what has no comment."""
+
+    sizes: list[int]  # how many each part has
+    counts: tuple[int, int, int, int, int]
+    p0: Tensor
+    p1: Tensor
+    p2: Tensor
+    e1: Tensor
+    e2: Tensor
+    face: Tensor  # (3, P) cross product of the edges
+    sign: Tensor  # (P,) -1 where a shape's normals are turned around
+    normal: Tensor
+    normals: tuple[Tensor, Tensor, Tensor] | None
+    bound: Tensor
+    frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of the quadrics
+    quadrics: Quadrics | None
+
+    def spread(self, values: Sequence[int]) -> Tensor:
+        """One value a part, and where given one a copy, as rows ``(P,)`` or ``(P + I,)`` by primitive and copy."""
+        device = self.p0.device
+        spans = self.sizes + [1] * (len(values) - len(self.sizes))
+        return torch.repeat_interleave(
+            torch.tensor(values, dtype=torch.int64, device=device),
+            torch.tensor(spans, dtype=torch.int64, device=device),
+        )
+
+    def extent(self) -> tuple[Tensor, Tensor]:
+        """Lower and upper corners ``(3, P)`` of boxes about the primitives, float64, detached."""
+        p0, e1, e2 = (x.detach().double() for x in (self.p0, self.e1, self.e2))
+        triangle, rectangle, disk, sphere, _ = torch.split(
+            torch.stack((p0, e1, e2)), list(self.counts), 2
+        )  # (3 columns, 3, n) each
+        boxes = [_hull(triangle[0], triangle[0] + triangle[1], triangle[0] + triangle[2])]
+        corners = rectangle[0], rectangle[0] + rectangle[1], rectangle[0] + rectangle[2]
+        boxes.append(_hull(*corners, corners[1] + rectangle[2]))
+        half = (disk[1] * disk[1] + disk[2] * disk[2]).sqrt()
+        boxes.append((disk[0] - half, disk[0] + half))
+        radius = sphere[1][0].abs()
+        boxes.append((sphere[0] - radius, sphere[0] + radius))
+        if self.frame is not None:
+            move, half = self.frame[:3].detach(), self.frame[3:].detach().abs().view(3, 3, -1).sum(0)
+            boxes.append((move - half, move + half))
+        return torch.cat([box[0] for box in boxes], 1), torch.cat([box[1] for box in boxes], 1)
+
+    def geometry(self, copies: Tensor | None) -> Geometry:
+        """What the search sees."""
+        # The corners themselves: rebuilt from edges, neighbours would no longer share them to the bit.
+        q0, q1, q2 = (x.detach().to(torch.float32).contiguous() for x in (self.p0, self.p1, self.p2))
+        table = None
+        if self.quadrics is not None and self.frame is not None:
+            table = torch.cat((self.frame, self.quadrics.code[None].double())).detach()
+        return Geometry(q0, q1, q2, self.counts, table, None if copies is None else copies.detach())
+
+
+def primitives_of(
+    parts: Sequence[Part], corners: Sequence[Corners], dtype: torch.dtype, device: torch.device
+) -> Primitives:
+    """The primitives of ``parts``, which are ordered by kind as ``records.KINDS``."""
+    sizes = [c.p0.shape[1] for c in corners]
+    numbers = [sum(n for n, part in zip(sizes, parts, strict=True) if part.kind == kind) for kind in KINDS]
+    counts = (numbers[0], numbers[1], numbers[2], numbers[3], numbers[4])
+
+    def joined(pieces: list[Tensor]) -> Tensor:
+        return torch.cat(pieces, -1) if pieces else torch.zeros(3, 0, dtype=dtype, device=device)
+
+    ball = counts[3] + counts[4] > 0
+    p0, p1, p2 = (joined([getattr(c, name) for c in corners]) for name in ("p0", "p1", "p2"))
+    planar = (torch.arange(p0.shape[1], device=device) < sum(counts[:3])) if ball else None
+    e1 = p1 - p0 if planar is None else torch.where(planar, p1 - p0, p1)
+    e2 = p2 - p0 if planar is None else torch.where(planar, p2 - p0, p2)
+    signs = torch.tensor([-1.0 if part.flip else 1.0 for part in parts], dtype=dtype, device=device)
+    sign = torch.repeat_interleave(signs, torch.tensor(sizes, dtype=torch.int64, device=device))
+    face = cross(e1, e2)
+    normal = normalize(face) * sign
+    normals = None
+    if any(c.normals is not None for c in corners):
+        flat = normal.split(sizes, 1)
+        triples = [c.normals or (n, n, n) for c, n in zip(corners, flat, strict=True)]
+        flips = [-1.0 if part.flip and c.normals is not None else 1.0 for part, c in zip(parts, corners, strict=True)]
+        n0, n1, n2 = (joined([t[k] * f for t, f in zip(triples, flips, strict=True)]) for k in range(3))
+        normals = (n0, n1, n2)
+        # The outside is where the shading normals point, whatever way a file winds its faces.
+        against = dot(normal, n0 + n1 + n2).detach() < 0
+        normal = torch.where(against, -normal, normal)
+    # Largest coordinate magnitudes over each primitive, its whole parallelogram or ellipse included.
+    largest = (p0.abs() + e1.abs() + e2.abs()).detach()
+    bound = dot(normal.detach().abs(), largest)
+    if planar is not None:
+        bound = torch.where(planar, bound, (p0.abs().sum(0) + 2.0 * e1[0].abs()).detach())
+    frames = [c.frame for c in corners if c.frame is not None]
+    frame = torch.cat(frames, 1) if frames else None
+    curved = None if frame is None else quadrics_of([part for part in parts if part.kind == "quadric"], frame, dtype)
+    return Primitives(sizes, counts, p0, p1, p2, e1, e2, face, sign, normal, normals, bound, frame, curved)
