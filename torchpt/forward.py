@@ -19,12 +19,20 @@ from torchpt.film import Film, Filter
 from torchpt.integrators import Wave
 from torchpt.integrators.aov import CHANNELS
 from torchpt.integrators.compiled import CompiledStages, Stages, can_compile
+from torchpt.integrators.ibl import Preview
 from torchpt.integrators.path import Limits, Tally
 from torchpt.integrators.stages import Plan
 from torchpt.records import World
 from torchpt.samplers import Sampler
 from torchpt.scene import Scene
-from torchpt.scene.settings import AovIntegrator, DirectIntegrator, GaussianFilter, PathIntegrator, Settings
+from torchpt.scene.settings import (
+    AovIntegrator,
+    DirectIntegrator,
+    GaussianFilter,
+    IblIntegrator,
+    PathIntegrator,
+    Settings,
+)
 
 __all__ = ["BYTES_PER_LANE", "Progress", "Rendering", "Run", "chunks_of", "lanes_for", "limited_threads", "make_wave"]
 
@@ -44,6 +52,7 @@ LARGEST_PASS = 64
 COMPILE_REPAYS = 200_000_000
 
 _compiled: WeakKeyDictionary[Scene, dict[Plan, CompiledStages]] = WeakKeyDictionary()
+_previews: WeakKeyDictionary[Scene, tuple[World, Preview]] = WeakKeyDictionary()
 _forked = False
 _threads_lock = threading.Lock()
 _threads_before, _renders = 0, 0
@@ -172,6 +181,9 @@ def make_wave(
     elif isinstance(integrator, DirectIntegrator):
         limits = Limits(2, 3)
         plan = Plan(settings.sampler.type, integrator.strategy, None, dtype, tape, attached)
+    elif isinstance(integrator, IblIntegrator):
+        limits = Limits(2, 3)
+        plan = Plan(settings.sampler.type, "light", None, dtype, tape, attached)
     spp = settings.render.spp
     return Wave(
         stages=_stages(scene, settings, plan, world, own=not params),
@@ -182,7 +194,18 @@ def make_wave(
         sampler=Sampler(settings.sampler.type, settings.render.seed, min(spp, 4 if spp >= MANY_SAMPLES else 2)),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.centre,
+        preview=_preview(scene, world, own=not params) if isinstance(integrator, IblIntegrator) else None,
     )
+
+
+def _preview(scene: Scene, world: World, own: bool) -> Preview:
+    """The environment's maps; kept with the scene, unless the world is not the scene's ``own``."""
+    if not own or torch.is_grad_enabled():
+        return Preview.of(world)
+    kept = _previews.get(scene)
+    if kept is None or kept[0] is not world:
+        kept = _previews[scene] = world, Preview.of(world)
+    return kept[1]
 
 
 def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, own: bool) -> Stages:

@@ -16,9 +16,9 @@ from torchpt.errors import SceneError
 from torchpt.ibl.convolve import irradiance_map, prefiltered
 from torchpt.ibl.equirect import coordinates, corners
 from torchpt.ibl.table import brdf_table
-from torchpt.math.vectors import affine, dot, take
+from torchpt.math.vectors import dot, take
 
-__all__ = ["F0", "IblMaps", "Sky", "maps", "shade"]
+__all__ = ["F0", "IblMaps", "Sky", "Surface", "fresnel", "maps", "shade"]
 
 #: Reflectance at normal incidence of what is no metal.
 F0 = 0.04
@@ -107,8 +107,36 @@ def shade(
     base = lanes(base_color)
     coloured = isinstance(f0, Tensor) and f0.dim() > 0 and f0.shape[-1] == 3 and f0.dim() in (1, len(shape))
     clear = lanes(f0) if coloured and isinstance(f0, Tensor) else numbers("f0", f0)
-    out = Sky.of(maps).reflected(lanes(n), lanes(v), base, clear + (base - clear) * metal, rough, 1.0 - metal)
+    surface = Surface(base * (1.0 - metal), clear + (base - clear) * metal, torch.ones_like(rough), rough)
+    out = Sky.of(maps).reflected(lanes(n), lanes(v), surface)
     return out.T.reshape(shape)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What split-sum shading knows of surfaces.
+
+    Attributes:
+        diffuse: colour of the diffuse part ``(3, N)``: base colour by ``1 - metallic``.
+        f0: reflectance of the mirror at normal incidence, ``(3, N)`` or ``(N,)``.
+        f90: at grazing incidence, likewise.
+        roughness: ``(N,)`` from 0 to 1.
+        coupled: 1 where what is mirrored is missing from the diffuse part, 0 where the two are added.
+    """
+
+    diffuse: Tensor
+    f0: Tensor
+    f90: Tensor
+    roughness: Tensor
+    coupled: float = 1.0
+
+
+def fresnel(cosine: Tensor, surface: Surface) -> Tensor:
+    """Schlick's ``F0 + (max((1 - roughness) F90, F0) - F0)(1 - cosine)^5``: rough surfaces rise less toward grazing."""
+    grazing = 1.0 - cosine
+    weight = (grazing * grazing) * (grazing * grazing) * grazing
+    end = torch.maximum(*torch.broadcast_tensors((1.0 - surface.roughness) * surface.f90, surface.f0))
+    return surface.f0 + (end - surface.f0) * weight
 
 
 @dataclass(frozen=True)
@@ -148,27 +176,16 @@ class Sky:
             len(maps.brdf),
         )
 
-    def reflected(self, n: Tensor, v: Tensor, base: Tensor, f0: Tensor, roughness: Tensor, share: Tensor) -> Tensor:
-        """Radiance ``(3, N)``.
-
-        Args:
-            n: unit normals ``(3, N)``.
-            v: unit directions toward the eye ``(3, N)``.
-            base: diffuse colour ``(3, N)``.
-            f0: reflectance at normal incidence ``(3, N)`` or ``(N,)``.
-            roughness: ``(N,)``.
-            share: ``(N,)`` of what is not mirrored that is diffuse.
-        """
+    def reflected(self, n: Tensor, v: Tensor, surface: Surface) -> Tensor:
+        """Radiance ``(3, N)`` toward unit ``v (3, N)`` off surfaces with unit normals ``n (3, N)``."""
         cosine = dot(n, v)
-        mirrored = affine(-v, n, 2.0 * cosine, n, torch.zeros_like(cosine))
+        mirrored = torch.addcmul(-v, n, 2.0 * cosine)
         cosine = cosine.clamp(0.0, 1.0)
-        roughness = roughness.clamp(0.0, 1.0)
-        grazing = 1.0 - cosine
-        schlick = (grazing * grazing) * (grazing * grazing) * grazing
-        fresnel = f0 + (torch.maximum((1.0 - roughness).expand_as(f0), f0) - f0) * schlick
+        roughness = surface.roughness.clamp(0.0, 1.0)
         scale, bias = self.reflectance(cosine, roughness)
-        diffuse = (1.0 - fresnel) * share * base * self.diffuse(n)
-        return torch.addcmul(diffuse, self.prefiltered(mirrored, roughness), (f0 * scale + bias).expand_as(diffuse))
+        color = (surface.f0 * scale + surface.f90 * bias).expand(3, -1)
+        base = surface.diffuse * (1.0 - surface.coupled * fresnel(cosine, surface))
+        return torch.addcmul(base * self.diffuse(n), self.prefiltered(mirrored, roughness), color)
 
     def diffuse(self, n: Tensor) -> Tensor:
         """``E / pi (3, N)`` of normals ``(3, N)``."""

@@ -19,7 +19,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
     "filter": {"tent": ("radius",), "mitchell": ("radius",)},
     "sampler": {"stratified": ("adaptive",), "hammersley": ("adaptive",), "zsobol": ("adaptive",)},
     "integrator": {
-        "ibl": ("strict",),
         "bdpt": ("max_depth", "rr_depth", "rr_prob", "clamp", "strict"),
     },
     "light": {

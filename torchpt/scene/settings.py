@@ -15,7 +15,7 @@ from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_
 
 __all__ = [
     "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter",
-    "Integrator", "PathIntegrator", "Render", "Sampler", "Settings", "merge",
+    "IblIntegrator", "Integrator", "PathIntegrator", "Render", "Sampler", "Settings", "merge",
 ]  # fmt: skip
 
 AOVS = ("albedo", "normal", "depth", "position", "uv", "object_id", "variance")
@@ -170,8 +170,21 @@ class AovIntegrator(Model):
     type: Literal["aov"] = "aov"
 
 
-Integrator = PathIntegrator | DirectIntegrator | AovIntegrator
-INTEGRATORS: dict[str, type[Any]] = {"path": PathIntegrator, "direct": DirectIntegrator, "aov": AovIntegrator}
+class IblIntegrator(Model):
+    """A preview: the first surface under the environment by split sum, unshadowed, and other lights with their shadows."""
+
+    type: Literal["ibl"] = "ibl"
+    clamp: Clamp = None
+    strict: Flag = False
+
+
+Integrator = PathIntegrator | DirectIntegrator | AovIntegrator | IblIntegrator
+INTEGRATORS: dict[str, type[Any]] = {
+    "path": PathIntegrator,
+    "direct": DirectIntegrator,
+    "aov": AovIntegrator,
+    "ibl": IblIntegrator,
+}
 
 
 class Sampler(Model):
@@ -219,7 +232,7 @@ class Settings(Model):
     """All run settings, complete."""
 
     film: Film = Film()
-    integrator: PathIntegrator | DirectIntegrator | AovIntegrator = PathIntegrator()
+    integrator: Integrator = PathIntegrator()
     sampler: Sampler = Sampler()
     render: Render = Render()
 
