@@ -4,6 +4,7 @@
 - `dents_normal.png`: normals of a hammered sheet, tiling.
 - `weave.png`: heights of a plain weave in grey, tiling.
 - `leaf.png`: a leaf in colour on nothing (alpha).
+- `sky.exr`: an evening sky with a low sun over brown ground, an environment map of half floats.
 - `cushion.ply`: a square cushion of half-width 1 with texture coordinates.
 """
 
@@ -103,6 +104,40 @@ def leaf(size: int = 256) -> NDArray[np.uint8]:
     return np.clip(np.round(np.concatenate([colour, alpha], -1)), 0, 255).astype(np.uint8)
 
 
+def sky(height: int = 128) -> NDArray[np.float16]:
+    """An environment map: zenith at the top, rows at the poles and columns at half texels, as the format has them."""
+    width = 2 * height
+    theta = np.linspace(0, np.pi, height)[:, None]
+    phi = (np.arange(width) + 0.5)[None] * (2 * np.pi / width)
+    d = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi, -np.sin(theta) * np.cos(phi)], -1)
+    toward = np.array([0.62, 0.36, 0.70])
+    toward /= np.linalg.norm(toward)
+    away = np.arccos(np.clip(d @ toward, -1, 1))[..., None]
+    up = d[..., 1:2]
+    haze = np.exp(-np.clip(up, 0, 1) / 0.18)
+    blue, warm = np.array([0.16, 0.30, 0.62]), np.array([0.95, 0.72, 0.50])
+    above = blue + (warm - blue) * haze + np.array([1.6, 1.05, 0.55]) * np.exp(-away / 0.35)
+    streaks = _noise(width, 24, 11)[:height, :, None] * _noise(width, 6, 12)[:height, :, None]
+    above = above + np.array([0.9, 0.8, 0.75]) * streaks**2 * np.exp(-(((up - 0.28) / 0.2) ** 2))
+    below = np.array([0.16, 0.12, 0.085]) * (0.7 + 0.6 * _noise(width, 32, 13)[:height, :, None])
+    edge = np.clip(0.5 + up * 40, 0, 1)
+    disk = np.clip((0.045 - away) / 0.015, 0, 1) * np.array([900.0, 700.0, 430.0])
+    return (below + (above - below) * edge + disk).astype(np.float16)
+
+
+def write_exr(path: Path, texels: NDArray[np.float16]) -> None:
+    """Half floats, compressed without loss."""
+    import OpenImageIO as oiio
+
+    height, width, _ = texels.shape
+    spec = oiio.ImageSpec(width, height, 3, "half")
+    spec.attribute("compression", "zip")
+    out = oiio.ImageOutput.create(str(path))
+    if out is None or not out.open(str(path), spec) or not out.write_image(texels):
+        raise OSError(f"{path}: {oiio.geterror() if out is None else out.geterror()}")
+    out.close()
+
+
 def write_cushion(path: Path, cells: int = 24) -> None:
     """Two bulging squares that share their rim, with the same texture on both."""
     side = np.linspace(-1, 1, cells + 1)
@@ -138,6 +173,7 @@ def main() -> None:
         "leaf": leaf(),
     }.items():
         iio.imwrite(SCENES / f"{name}.png", image)
+    write_exr(SCENES / "sky.exr", sky())
     write_cushion(SCENES / "cushion.ply")
 
 

@@ -107,6 +107,13 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
 
 def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
     """Mitsuba's dict of a light that is no surface."""
+    if source.kind == "envmap":
+        texels, scale, pose = (scene.params[f"{source.name}.{key}"] for key in ("texels", "scale", "to_world"))
+        linear = pose[:3, :3].double().cpu().numpy()
+        turn = np.eye(4)
+        turn[:3, :3] = linear / np.cbrt(abs(np.linalg.det(linear)))
+        picture = mitsuba.Bitmap(np.ascontiguousarray(texels.cpu().numpy()))
+        return {"type": "envmap", "bitmap": picture, "scale": float(scale), "to_world": mitsuba.ScalarTransform4f(turn)}
     name = source.name.removeprefix("lights.")
     given = scene.description.lights[name].numbers()
     found: dict[str, Any] = {"type": source.kind}

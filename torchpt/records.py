@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpt.bsdfs import Bsdf, Parameters
+    from torchpt.lights.envmap import EnvironmentMap
     from torchpt.math.distributions import Discrete
     from torchpt.textures import Atlas, Look, Veils
 
@@ -42,9 +43,9 @@ __all__ = [
 #: Primitive kinds in the order in which a :class:`Geometry` stores them.
 KINDS = ("triangle", "rectangle", "disk", "sphere", "quadric")
 #: Lights that are no surfaces, in the order of their rows: those somewhere, then those infinitely far.
-SOURCES = ("point", "spot", "directional", "constant")
+SOURCES = ("point", "spot", "directional", "constant", "envmap")
 #: Those infinitely far.
-DISTANT = ("directional", "constant")
+DISTANT = ("directional", "constant", "envmap")
 #: Surfaces of a quadric in its own space, in the order of their codes (:mod:`torchpt.shapes.quadrics`).
 QUADRICS = ("ellipsoid", "cylinder", "cone")
 
@@ -132,7 +133,7 @@ class Lights:
     bound: Tensor  # (K,) see World.bound
     radiance: Tensor  # (3, K); of a point or spot its intensity, of a directional light its irradiance
     opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
-    environment: Tensor | None  # (3,) radiance that comes from outside
+    environment: Tensor | EnvironmentMap | None  # what comes from outside: one radiance (3,), or a map
     row_of_prim: Tensor | None  # (P + I,) int64, -1 where a primitive does not emit; None where none does
     quadric: Tensor | None  # (K,) int64 column of World.quadrics, 0 for the other kinds; None where no quadric emits
     quadrics: Quadrics | None  # World.quadrics where a quadric emits

@@ -134,6 +134,8 @@ def _moves(scene: Scene, names: Iterable[str]) -> bool:
     bending = {slot.name for slot in slots if slot.model.refracts and slot.model.delta}
 
     def moves(name: str) -> bool:
+        if name.startswith("lights."):
+            return False  # a turned map moves no surface
         if name.endswith((".vertices", ".to_world")) or name.startswith("camera."):
             return True
         return name.endswith(INDICES) and name.rpartition(".")[0] in bending

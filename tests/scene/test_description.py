@@ -145,7 +145,6 @@ def test_bad_input_is_one_line_that_names_the_key(name: str) -> None:
 LATER: dict[str, tuple[dict[str, Any], str]] = {
     "camera": ({"camera": {**CAMERA, "type": "thinlens", "aperture_radius": 1}}, "camera.type"),
     "camera key": (camera(blades=5), "camera.blades"),
-    "light": (scene(lights={"l": {"type": "envmap", "path": "a.exr"}}), "lights.l.type"),
     "filter": (scene(film={"filter": "tent"}), "film.filter.type"),
     "sampler": (scene(sampler={"type": "zsobol"}), "sampler.type"),
     "adaptive": (scene(sampler={"adaptive": True}), "sampler.adaptive"),

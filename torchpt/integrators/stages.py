@@ -153,7 +153,9 @@ def shade(
     table = world.lights
     draws = Draws(plan.sampler, state.key, salts)
     choice = None if table.choice is None else draws.one(Dimension.LIGHT_CHOICE)
-    light = lights.sample(table, at.p, choice, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET)
+    light = lights.sample(
+        table, at.p, choice, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET, plan.strategy == "mis"
+    )
     wi = surface.frame.to_local(light.wi)
     weight = light.weight
     if plan.strategy == "mis":

@@ -12,7 +12,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lights import area, constant, point, quadric, sphere, spot
+from torchpt.lights import area, constant, envmap, point, quadric, sphere, spot
+from torchpt.lights.envmap import EnvironmentMap
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.records import DISTANT, KINDS, Interaction, Lights, LightSample, Quadrics, rows
 
@@ -51,7 +52,7 @@ def _probability(lights: Lights, row: Tensor | None) -> Tensor | float:
     return 1.0 if lights.choice is None or row is None else take(lights.choice.pmf, row)
 
 
-def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: float) -> LightSample:
+def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: float, mis: bool = True) -> LightSample:
     """A point on the lights, seen from ``x (3, N)``.
 
     Args:
@@ -60,6 +61,7 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
         choice: ``(N,)`` in [0, 1), picks the light; unused (``None``) where there is but one.
         u: ``(2, N)`` in [0, 1), picks the point.
         offset: how far shadow rays stop off the light's surface, in units of ``Lights.bound``.
+        mis: whether BSDF sampling shares the work: an environment map then leaves it the dim directions.
     """
     row = None if lights.choice is None or choice is None else lights.choice.sample(choice)
     at, probability = _rows(lights, row), _probability(lights, row)
@@ -70,7 +72,7 @@ def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: 
     if near > surfaces:
         drawn = _merged(bare, _at_points(lights, at, row, x, probability), drawn)
     if near < len(lights.kinds):
-        drawn = _merged(distant, _from_afar(lights, at, row, u, probability), drawn)
+        drawn = _merged(distant, _from_afar(lights, at, row, u, probability, mis), drawn)
     assert drawn is not None
     return replace(drawn, distant=distant, bare=bare)
 
@@ -165,20 +167,27 @@ def _at_points(lights: Lights, at: Lights, row: Tensor | None, x: Tensor, probab
     return LightSample(wi, at.p0.expand_as(wi), None, radiance, infinite, inverse / probability)
 
 
-def _from_afar(lights: Lights, at: Lights, row: Tensor | None, u: Tensor, probability: Tensor | float) -> LightSample:
+def _from_afar(
+    lights: Lights, at: Lights, row: Tensor | None, u: Tensor, probability: Tensor | float, mis: bool
+) -> LightSample:
     wi: Tensor | None = None
     pdf: Tensor | None = None
     weight: Tensor | None = None
     if "constant" in lights.kinds:
         wi = constant.sample(u).to(at.radiance.dtype)
         pdf, weight = (torch.full_like(wi[0], value) for value in (1.0 / constant.INVERSE_PDF, constant.INVERSE_PDF))
+    radiance = at.radiance.expand(3, u.shape[1])
+    if isinstance(lights.environment, EnvironmentMap):
+        wi, pdf, light = envmap.sample(lights.environment, u, mis)
+        weight = torch.where(pdf > 0, safe_reciprocal(pdf), 0.0)
+        radiance = _pick(_is(lights, "envmap", row), light, radiance)
     if "directional" in lights.kinds:
         mask = _is(lights, "directional", row)
         one = torch.ones_like(u[0], dtype=at.radiance.dtype)
         wi = _pick(mask, (-at.normal).expand(3, u.shape[1]), wi)
         pdf, weight = _pick(mask, one * torch.inf, pdf), _pick(mask, one, weight)
     assert wi is not None and pdf is not None and weight is not None
-    return LightSample(wi, wi, None, at.radiance.expand_as(wi), pdf * probability, weight / probability)
+    return LightSample(wi, wi, None, radiance, pdf * probability, weight / probability)
 
 
 def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Tensor, Tensor]:
@@ -212,8 +221,11 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Ten
 
 
 def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them."""
+    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS."""
     assert lights.environment is not None
     probability = 1.0 if lights.choice is None else lights.choice.pmf[-1]
+    if isinstance(lights.environment, EnvironmentMap):
+        radiance, pdf = envmap.environment(lights.environment, d, mis=True)
+        return radiance, pdf * probability
     pdf = torch.full_like(d[0], 1.0 / constant.INVERSE_PDF) * probability
     return lights.environment[:, None].expand_as(d), pdf

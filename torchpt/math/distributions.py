@@ -1,4 +1,4 @@
-"""A discrete distribution by its cumulative sums, kept in float64: a float32 sum of many weights collapses."""
+"""Distributions by their cumulative sums, kept in float64: a float32 sum of many weights collapses."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Discrete"]
+from torchpt.math.vectors import take
+
+__all__ = ["Cells", "Discrete", "invert_linear"]
 
 
 @dataclass(frozen=True)
@@ -47,3 +49,66 @@ class Discrete:
     def sample(self, u: Tensor) -> Tensor:
         """Outcomes ``(N,)`` int64 for ``u`` in ``[0, 1)``; one of probability 0 is never drawn."""
         return torch.searchsorted(self.cdf, u.double(), right=True).clamp_max(len(self.cdf) - 1)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Choice of a cell of an R x C grid, rows first; what a draw leaves over is a fresh number within the cell.
+
+    The cells' preimages are rectangles of the unit square, so points that are stratified there stay so.
+
+    Attributes:
+        rows: ``(R + 1,)`` float64 cumulative sums over the rows, from 0 to 1.
+        columns: ``(R C + 1,)`` float64: row number plus the cumulative sums within that row. It never falls, so that one
+            binary search finds a cell of any row.
+    """
+
+    rows: Tensor
+    columns: Tensor
+
+    @staticmethod
+    def of(weights: Tensor) -> Cells:
+        """From non-negative weights ``(R, C)`` of which one is positive."""
+        w = weights.detach().double()
+        number = w.shape[0]
+        along = torch.cumsum(w, 1)
+        total = along[:, -1:]
+        # A row without weight is never asked.
+        along = torch.where(total > 0, along / torch.where(total > 0, total, 1.0), 1.0)
+        along += torch.arange(number, dtype=w.dtype, device=w.device)[:, None]
+        down = torch.cumsum(total[:, 0], 0)
+        zero = down.new_zeros(1)
+        return Cells(torch.cat((zero, down / down[-1])), torch.cat((zero, along.reshape(-1))))
+
+    def sample(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Rows and columns ``(N,)`` int64 for ``u (2, N)`` in ``[0, 1)``, and what is left ``(2, N)``: columns by ``u[0]``.
+
+        A cell without weight is never drawn.
+        """
+        number = len(self.rows) - 1
+        width = (len(self.columns) - 1) // number
+        # Just below 1 a row number plus u would round to the next row.
+        v = u.double().contiguous().clamp_max(1.0 - 2.0**-32)
+        row = torch.searchsorted(self.rows, v[1], right=True) - 1
+        across = v[0] + row
+        cell = torch.searchsorted(self.columns, across, right=True) - 1
+        rest = torch.stack((_within(self.columns, cell, across), _within(self.rows, row, v[1])))
+        return row, cell - row * width, rest.to(u.dtype)
+
+
+def _within(cdf: Tensor, index: Tensor, v: Tensor) -> Tensor:
+    """Where ``v`` lies in the interval ``index``, in ``[0, 1)``."""
+    low, high = take(cdf, index), take(cdf, index + 1)
+    return (v - low) / (high - low)
+
+
+def invert_linear(u: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """``x`` in ``[0, 1]`` distributed as ``a (1 - x) + b x``, for ``u`` in ``[0, 1)``; ``a, b >= 0`` and not both 0.
+
+    The root of the quadratic in the form that does not cancel. Where rounding made both 0, x is 0.
+    """
+    largest = torch.maximum(a, b)
+    scale = torch.where(largest > 0, largest, 1.0)
+    a, b = a / scale, b / scale
+    bottom = a + torch.addcmul(a * a, b * b - a * a, u).clamp_min(0.0).sqrt()
+    return (u * (a + b) / torch.where(bottom > 0, bottom, 1.0)).clamp_max(1.0)

@@ -11,12 +11,12 @@ from torchpt.math.transforms import is_singular, similarity_scale
 from torchpt.records import KINDS, SOURCES
 from torchpt.scene.description import Description
 from torchpt.scene.displacement import displaced
-from torchpt.scene.lights import ENVIRONMENTS
+from torchpt.scene.lights import ENVIRONMENTS, EnvmapLight
 from torchpt.scene.loaders import FileMaterial, MeshPart, load_mesh, unit_cube
 from torchpt.scene.materials import MATERIALS, Diffuse, check_material, read_material, slot_of
 from torchpt.scene.parts import Copy, MaterialSlot, Part, Source
 from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
-from torchpt.scene.texels import Opener
+from torchpt.scene.texels import Opener, radiance_of
 from torchpt.textures import Node
 
 __all__ = ["Built", "build_parts"]
@@ -80,6 +80,10 @@ def _sources(description: Description, parameters: dict[str, np.ndarray]) -> tup
         raise SceneError(f"lights.{second}", lights[second].type, expected, description.file)
     for name, light in lights.items():
         parameters.update({f"lights.{name}.{key}": np.asarray(x, np.float64) for key, x in light.numbers().items()})
+        if isinstance(light, EnvmapLight):
+            key = f"lights.{name}.path"
+            source = description.resolve(light.path, key)
+            parameters[f"lights.{name}.texels"] = radiance_of(source, key, description.file)
     found = [Source(f"lights.{name}", light.type) for name, light in lights.items()]
     return tuple(sorted(found, key=lambda source: SOURCES.index(source.kind)))
 

@@ -20,7 +20,8 @@ from torchpt.math import transforms
 
 __all__ = [
     "Affine", "Color", "FaceArray", "Flag", "Rows2", "Rows3", "Text", "Transform", "Vec3",
-    "bounded", "choice", "color", "integer", "memory_size", "number", "number_field", "pair", "scalar", "vector", "wrong",
+    "bounded", "choice", "color", "file_paths", "integer", "memory_size",
+    "number", "number_field", "pair", "scalar", "vector", "wrong",
 ]  # fmt: skip
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -175,6 +176,14 @@ def _slot(value: Mapping[str, Any], coloured: bool, low: float, high: float) -> 
     from torchpt.scene.textures import slot_value  # whose own fields are of these types
 
     return slot_value(value, coloured, low, high)
+
+
+def file_paths(value: Any) -> tuple[str, ...]:
+    """One file path, or a list of candidates of which the first existing one is used."""
+    paths = tuple(value) if isinstance(value, list | tuple) else (value,)
+    if not paths or not all(isinstance(path, str) and path.strip() and path.isprintable() for path in paths):
+        raise wrong("a file path, or a list of them (the first that is there is used)")
+    return paths
 
 
 def _flag(value: Any) -> bool:

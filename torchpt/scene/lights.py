@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import model_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PlainValidator, model_validator
 
-from torchpt.scene.fields import Color, Vec3, number_field, wrong
+from torchpt.math.transforms import similarity_scale
+from torchpt.scene.fields import Color, Transform, Vec3, file_paths, number_field, scalar, wrong
 from torchpt.scene.validate import Model
 
 __all__ = ["ENVIRONMENTS", "LIGHTS", "Light"]
@@ -15,7 +18,7 @@ Angle = Annotated[float, number_field("an angle in degrees, 0 < angle <= 180", l
 
 
 class Light(Model):
-    """What every light has: numbers, each of them a parameter of the scene."""
+    """What every light has: numbers, each of them a parameter of the scene (textures apart)."""
 
     type: str
 
@@ -96,11 +99,41 @@ class ConstantLight(Light):
     radiance: Color = (1.0, 1.0, 1.0)
 
 
+class EnvmapLight(Light):
+    """An environment given by a picture of all directions (:mod:`torchpt.lights.envmap`).
+
+    Attributes:
+        path: candidates, the first existing one is used.
+        scale: factor of its radiance.
+        transform: turns it (and may mirror it); where it is moved to, and how much it is enlarged, do not matter.
+    """
+
+    type: Literal["envmap"] = "envmap"
+    path: Annotated[tuple[str, ...], PlainValidator(file_paths)]
+    scale: Annotated[float, scalar()] = 1.0
+    transform: Transform | None = None
+
+    def numbers(self) -> dict[str, Any]:
+        return {"scale": self.scale, "to_world": self.to_world()}  # its texels are read when the scene is built
+
+    def to_world(self) -> NDArray[np.float64]:
+        """The map's own space to world, ``(4, 4)`` float64."""
+        return np.eye(4) if self.transform is None else self.transform
+
+    @model_validator(mode="after")
+    def _turned(self) -> EnvmapLight:
+        if similarity_scale(self.to_world()) is None:
+            expected = "a transform that keeps angles (rotation, reflection, uniform scale)"
+            raise wrong(expected, self.to_world().tolist(), ("transform",))
+        return self
+
+
 LIGHTS: dict[str, type[Light]] = {
     "point": PointLight,
     "spot": SpotLight,
     "directional": DirectionalLight,
     "constant": ConstantLight,
+    "envmap": EnvmapLight,
 }
 #: Those that surround the scene, of which there may be one.
-ENVIRONMENTS = ("constant",)
+ENVIRONMENTS = ("constant", "envmap")

@@ -21,9 +21,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
     "integrator": {
         "bdpt": ("max_depth", "rr_depth", "rr_prob", "clamp", "strict"),
     },
-    "light": {
-        "envmap": ("path", "scale", "transform"),
-    },
 }
 
 #: kind of thing -> keys of built types that are not built -> the value that asks for nothing.

@@ -32,6 +32,8 @@ PLACES = (".vertices", ".to_world", ".position", ".target")
 MOVING = (".position", ".direction")
 #: Parameters that are amounts of light.
 AMOUNTS = (".emission", ".radiance", ".intensity", ".irradiance")
+#: Parameters of environment maps that are amounts of light.
+MAPS = (".texels", ".scale")
 #: Parameters of materials that are indices of refraction.
 INDICES = (".int_ior", ".ext_ior", ".ior")
 
@@ -141,12 +143,18 @@ class Scene:
         if not bool(torch.isfinite(value).all()):
             raise SceneError(f"params.{name}", "a value that is not finite", "finite numbers")
         low = 0.0
-        if ".material." in name or name.startswith("materials.") or name.endswith(AMOUNTS):
+        if (
+            ".material." in name
+            or name.startswith("materials.")
+            or name.endswith(AMOUNTS)
+            or (name.startswith("lights.") and name.endswith(MAPS))
+        ):
             if name.endswith(INDICES):
                 low = 1e-3
             if bool((value < low).any()):
                 bad = f"numbers below {low:g}" if low else "negative numbers"
-                raise SceneError(f"params.{name}", value.tolist(), f"no {bad} (clamp before rendering)")
+                shown = value.tolist() if value.numel() <= 16 else float(value.min())
+                raise SceneError(f"params.{name}", shown, f"no {bad} (clamp before rendering)")
         if name.endswith(".direction") and not bool(value.any()):
             raise SceneError(f"params.{name}", value.tolist(), "a direction other than [0, 0, 0]")
         if name.endswith((".cutoff_angle", ".beam_width")) and not 0 < float(value) <= 180:
@@ -155,6 +163,9 @@ class Scene:
             matrix = value.double().cpu().numpy()
             if is_singular(matrix):
                 raise SceneError(f"params.{name}", matrix.tolist(), "a matrix that can be inverted")
+            if name.startswith("lights.") and similarity_scale(matrix, 1e-4) is None:
+                expected = "a transform that keeps angles (rotation, reflection, uniform scale)"
+                raise SceneError(f"params.{name}", matrix.tolist(), expected)
             if any(part.kind == "sphere" and name == f"{part.name}.to_world" for part in self._built.parts):
                 if similarity_scale(matrix, 1e-4) is None:
                     raise SceneError(

@@ -21,6 +21,7 @@ from torchpt.scene.fields import (
     Vec3,
     choice,
     color,
+    file_paths,
     integer,
     number_field,
     wrong,
@@ -107,12 +108,7 @@ class Shape(Model):
 
 
 def _path(value: Any) -> tuple[str, ...] | None:
-    if value is None:
-        return None
-    paths = tuple(value) if isinstance(value, list | tuple) else (value,)
-    if not paths or not all(isinstance(path, str) and path.strip() and path.isprintable() for path in paths):
-        raise wrong("a file path, or a list of them (the first that is there is used)")
-    return paths
+    return None if value is None else file_paths(value)
 
 
 def _heights(value: Any) -> Slot:

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.lights import envmap
 from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Lights
 from torchpt.scene.assembly.curved import quadric_area
 from torchpt.scene.assembly.primitives import Primitives
+from torchpt.scene.lights import ENVIRONMENTS
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.texels import images_of
 
@@ -86,7 +88,9 @@ def lights_of(
         groups.append(surfaces)
     low, high = primitives.extent()
     reach = (high.amax(1) - low.amin(1)).norm() * 0.5 if low.shape[1] else torch.ones((), device=device)
-    groups += [_source(source, parameters, centre, reach, dtype) for source in sources]
+    around = [_surroundings(source, parameters, dtype) for source in sources if source.kind in ENVIRONMENTS]
+    environment = around[0] if around else None
+    groups += [_source(source, parameters, environment, centre, reach, dtype) for source in sources]
     names = [name for group in groups for name in group.kind]
     kinds = tuple(kind for kind in (*KINDS, *SOURCES) if kind in names)
     joined = {
@@ -105,7 +109,6 @@ def lights_of(
     if column is not None:
         column = torch.cat((column, column.new_zeros(rest)))
     textured = veiled or any(part.glow is not None for part, _ in glowing)
-    environment = [source for source in sources if source.kind == "constant"]
     many = len(names) > 1
     return Lights(
         choice=Discrete.of(power, dtype) if many else None,
@@ -113,7 +116,7 @@ def lights_of(
         kind=torch.tensor([kinds.index(name) for name in names], device=device) if many else None,
         **joined,
         opacity=seen,
-        environment=parameters[f"{environment[0].name}.radiance"].to(dtype) if environment else None,
+        environment=environment,
         row_of_prim=index,
         quadric=column,
         quadrics=None if column is None else primitives.quadrics,
@@ -157,14 +160,32 @@ def _surfaces(
     return _Rows(names, p0, e1, e2, normal, flip, area, bound, radiance, power), column
 
 
+def _surroundings(
+    source: Source, parameters: Mapping[str, Tensor], dtype: torch.dtype
+) -> Tensor | envmap.EnvironmentMap:
+    """What an environment sends: one radiance, or a map."""
+    if source.kind == "constant":
+        return parameters[f"{source.name}.radiance"].to(dtype)
+    texels, scale, pose = (parameters[f"{source.name}.{key}"] for key in ("texels", "scale", "to_world"))
+    linear = pose[:3, :3].double()
+    turn = torch.linalg.inv(linear) * torch.linalg.det(linear).abs() ** (1.0 / 3.0)
+    return envmap.build(texels.to(dtype), turn.to(dtype), scale.to(dtype))
+
+
 def _source(
-    source: Source, parameters: Mapping[str, Tensor], centre: Tensor, reach: Tensor, dtype: torch.dtype
+    source: Source,
+    parameters: Mapping[str, Tensor],
+    environment: Tensor | envmap.EnvironmentMap | None,
+    centre: Tensor,
+    reach: Tensor,
+    dtype: torch.dtype,
 ) -> _Rows:
     """The row of a light that is no surface; columns as its file in :mod:`torchpt.lights` reads them.
 
     Args:
         source: the light.
         parameters: every tensor by dotted name.
+        environment: of the scene.
         centre: ``(3,)`` float64 that becomes the origin.
         reach: radius of the scene, float64.
         dtype: of the lanes.
@@ -189,9 +210,10 @@ def _source(
         normal, color = normalize(given("direction")[:, None])[:, 0], given("irradiance")
         share = math.pi * reach**2
     else:
-        color = given("radiance")
+        map = isinstance(environment, envmap.EnvironmentMap)
+        color = (environment.mean * environment.scale.detach()).expand(3) if map else given("radiance")
         share = 4.0 * math.pi**2 * reach**2
     one = torch.ones(1, dtype=dtype, device=centre.device)
     p0, e1, e2, normal, light = (x[:, None].to(dtype) for x in (p0, e1, blank, normal, color))
-    power = (share * luminance(color.detach().abs())).reshape(1)
+    power = (share * luminance(color.detach().double().abs())).reshape(1)
     return _Rows([source.kind], p0, e1, e2, normal, one, one, one, light, power)
