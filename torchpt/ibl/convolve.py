@@ -76,7 +76,7 @@ def prefiltered(
         map: radiance ``(H, W, 3)``.
         levels: how many; the first is the map itself.
         sizes: ``(rows, columns)`` of the levels after the first; by default as many columns as the map for the
-            second, 256 at most, halved down to 64.
+            second, from 16 to 256, halved down to 64.
         samples: directions for each texel.
 
     Returns:
@@ -87,7 +87,8 @@ def prefiltered(
             raise SceneError(key, value, f"an integer, at least {least}")
     checked(map)
     if sizes is None:
-        widths = [max(min(256, map.shape[1]) >> k, 64) for k in range(levels - 1)]
+        most = max(min(256, map.shape[1]), 16)
+        widths = [max(most >> k, min(64, most)) for k in range(levels - 1)]
         sizes = [(width // 2, width) for width in widths]
     if len(sizes) != levels - 1:
         raise SceneError("sizes", list(sizes), f"{levels - 1} pairs (rows, columns), one a level after the first")

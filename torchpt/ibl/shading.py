@@ -107,7 +107,8 @@ def shade(
     base = lanes(base_color)
     coloured = isinstance(f0, Tensor) and f0.dim() > 0 and f0.shape[-1] == 3 and f0.dim() in (1, len(shape))
     clear = lanes(f0) if coloured and isinstance(f0, Tensor) else numbers("f0", f0)
-    surface = Surface(base * (1.0 - metal), clear + (base - clear) * metal, torch.ones_like(rough), rough)
+    color = clear + (base - clear) * metal
+    surface = Surface(base * (1.0 - metal), color, torch.ones_like(rough), rough, color)
     out = Sky.of(maps).reflected(lanes(n), lanes(v), surface)
     return out.T.reshape(shape)
 
@@ -121,22 +122,22 @@ class Surface:
         f0: reflectance of the mirror at normal incidence, ``(3, N)`` or ``(N,)``.
         f90: at grazing incidence, likewise.
         roughness: ``(N,)`` from 0 to 1.
-        coupled: 1 where what is mirrored is missing from the diffuse part, 0 where the two are added.
+        over: F0 of the mirror over the diffuse part, whose light is missing there, as ``f0``; None where the two are added.
     """
 
     diffuse: Tensor
     f0: Tensor
     f90: Tensor
     roughness: Tensor
-    coupled: float = 1.0
+    over: Tensor | None
 
 
-def fresnel(cosine: Tensor, surface: Surface) -> Tensor:
+def fresnel(cosine: Tensor, f0: Tensor, surface: Surface) -> Tensor:
     """Schlick's ``F0 + (max((1 - roughness) F90, F0) - F0)(1 - cosine)^5``: rough surfaces rise less toward grazing."""
     grazing = 1.0 - cosine
     weight = (grazing * grazing) * (grazing * grazing) * grazing
-    end = torch.maximum(*torch.broadcast_tensors((1.0 - surface.roughness) * surface.f90, surface.f0))
-    return surface.f0 + (end - surface.f0) * weight
+    end = torch.maximum(*torch.broadcast_tensors((1.0 - surface.roughness) * surface.f90, f0))
+    return f0 + (end - f0) * weight
 
 
 @dataclass(frozen=True)
@@ -184,8 +185,10 @@ class Sky:
         roughness = surface.roughness.clamp(0.0, 1.0)
         scale, bias = self.reflectance(cosine, roughness)
         color = (surface.f0 * scale + surface.f90 * bias).expand(3, -1)
-        base = surface.diffuse * (1.0 - surface.coupled * fresnel(cosine, surface))
-        return torch.addcmul(base * self.diffuse(n), self.prefiltered(mirrored, roughness), color)
+        base = surface.diffuse * self.diffuse(n)
+        if surface.over is not None:
+            base = base * (1.0 - fresnel(cosine, surface.over, surface))
+        return torch.addcmul(base, self.prefiltered(mirrored, roughness), color)
 
     def diffuse(self, n: Tensor) -> Tensor:
         """``E / pi (3, N)`` of normals ``(3, N)``."""

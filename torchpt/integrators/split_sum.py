@@ -60,7 +60,8 @@ def under(sky: Sky, model: Bsdf, parameters: Parameters, n: Tensor, v: Tensor) -
     if found.through is None:
         return out
     cosine = (dot(n, v) * side).clamp(0.0, 1.0)
-    on, passes = -v, 1.0 - fresnel(cosine, found.surface)
+    assert found.surface.over is not None
+    on, passes = -v, 1.0 - fresnel(cosine, found.surface.over, found.surface)
     if found.eta is not None:
         eta = torch.where(side > 0, found.eta, 1.0 / found.eta)
         boundary = fresnel_dielectric(cosine, eta)
@@ -70,7 +71,7 @@ def under(sky: Sky, model: Bsdf, parameters: Parameters, n: Tensor, v: Tensor) -
 
 def _matte(color: Tensor) -> _Approximation:
     none = torch.zeros_like(color[0])
-    return _Approximation(Surface(color, none, none, torch.ones_like(none)))
+    return _Approximation(Surface(color, none, none, torch.ones_like(none), None))
 
 
 def _normal_incidence(eta: Tensor) -> Tensor:
@@ -88,7 +89,7 @@ def _metal(parameters: Parameters, roughness: Tensor) -> _Approximation:
     factor, one = parameters["specular_reflectance"], torch.ones_like(roughness)
     f0 = metal_colour(parameters, one)
     black = torch.zeros_like(f0)
-    return _Approximation(Surface(black, tinted(one, factor) * f0, tinted(one, factor), roughness))
+    return _Approximation(Surface(black, tinted(one, factor) * f0, tinted(one, factor), roughness, None))
 
 
 def _conductor(parameters: Parameters) -> _Approximation:
@@ -105,7 +106,8 @@ def _coat(parameters: Parameters, roughness: Tensor) -> _Approximation:
     eta, factor = parameters["eta"], parameters["specular_reflectance"]
     one = torch.ones_like(eta)
     base = parameters["base"] * (1.0 - fresnel_diffuse(eta))
-    return _Approximation(Surface(base, tinted(_normal_incidence(eta), factor), tinted(one, factor), roughness))
+    f0 = _normal_incidence(eta)
+    return _Approximation(Surface(base, tinted(f0, factor), tinted(one, factor), roughness, f0))
 
 
 def _plastic(parameters: Parameters) -> _Approximation:
@@ -119,7 +121,7 @@ def _rough_plastic(parameters: Parameters) -> _Approximation:
 def _clear(parameters: Parameters, roughness: Tensor, f0: Tensor, eta: Tensor | None) -> _Approximation:
     one = torch.ones_like(f0)
     reflects, passes = parameters["specular_reflectance"], parameters["specular_transmittance"]
-    surface = Surface(torch.zeros_like(one).expand(3, -1), tinted(f0, reflects), tinted(one, reflects), roughness)
+    surface = Surface(torch.zeros_like(one).expand(3, -1), tinted(f0, reflects), tinted(one, reflects), roughness, f0)
     return _Approximation(surface, tinted(one, passes), eta)
 
 
@@ -140,14 +142,14 @@ def _pane(parameters: Parameters) -> _Approximation:
 
 def _nothing(parameters: Parameters) -> _Approximation:
     none = torch.zeros(3, len(parameters["row"]), device=parameters["row"].device)
-    return _Approximation(Surface(none, none[0], none[0], none[0]), none + 1.0)
+    return _Approximation(Surface(none, none[0], none[0], none[0], none[0]), none + 1.0)
 
 
 def _lobe(parameters: Parameters, alpha2: Tensor, peak: Tensor | float) -> _Approximation:
     """A diffuse and a glossy lobe, added."""
     specular = parameters["specular"] * peak
     roughness = alpha2.clamp(0.0, 1.0).sqrt().sqrt()
-    return _Approximation(Surface(parameters["diffuse"], specular, specular, roughness, coupled=0.0))
+    return _Approximation(Surface(parameters["diffuse"], specular, specular, roughness, None))
 
 
 def _phong(parameters: Parameters) -> _Approximation:
@@ -163,15 +165,14 @@ def _blinn_phong(parameters: Parameters) -> _Approximation:
 def _nonmetal(parameters: Parameters) -> _Approximation:
     s = parameters["specular"]
     roughness = torch.where(parameters["smooth"], 0.0, parameters["alpha"].sqrt())
-    return _Approximation(Surface(parameters["base_color"], s, s, roughness))
+    return _Approximation(Surface(parameters["base_color"], s, s, roughness, s))
 
 
 def _microfacet(parameters: Parameters) -> _Approximation:
     specular = parameters["specular"]
     roughness = torch.where(parameters["smooth"], 0.0, parameters["alpha"].sqrt())
-    return _Approximation(
-        Surface(parameters["diffuse"], _normal_incidence(parameters["ior"]) * specular, specular, roughness)
-    )
+    f0 = _normal_incidence(parameters["ior"])
+    return _Approximation(Surface(parameters["diffuse"], f0 * specular, specular, roughness, f0))
 
 
 def _principled(parameters: Parameters) -> _Approximation:
@@ -179,6 +180,7 @@ def _principled(parameters: Parameters) -> _Approximation:
     f0 = _normal_incidence(eta).expand_as(base)
     if parameters["spec_tint"] is not None:
         f0 = f0 + (f0 * tint(base) - f0) * parameters["spec_tint"]
+    over = f0
     rest: Tensor = torch.ones_like(eta)
     if parameters["metallic"] is not None:
         f0 = f0 + (base - f0) * parameters["metallic"]
@@ -188,7 +190,7 @@ def _principled(parameters: Parameters) -> _Approximation:
     if through is not None:
         # Colour is taken at the way in and the way out.
         passing, rest = base.clamp_min(1e-12).sqrt() * (rest * through), rest * (1.0 - through)
-    surface = Surface(base * rest, f0, torch.ones_like(eta), (u * v).sqrt().sqrt())
+    surface = Surface(base * rest, f0, torch.ones_like(eta), (u * v).sqrt().sqrt(), over)
     return _Approximation(surface, passing, None if through is None else eta)
 
 
