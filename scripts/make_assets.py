@@ -4,6 +4,7 @@
   directions: body, head, two ears, tail, feet) with the bunny's bounding box, pose and no vertex normals.
 - `statue.ply`: a draped figure on a plinth that holds up a sphere, of height 1 from y = 0, facing +z; closed.
 - `cup.ply`: a cup with a handle, of height 1 from y = 0; two closed pieces.
+- `pot.ply` stands where the Utah teapot would: of its size and pose (z up, spout toward +x); four closed pieces.
 - `curved_wall.ply`: an upright sheet along an arc of radius 1 about the y axis, of height 1, facing the axis.
 - `toy_duck.glb`: a bath duck with a painted texture, facing +x, with the bounding box of Khronos' sample duck; closed.
 """
@@ -331,6 +332,57 @@ def cup() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     return np.concatenate([points, ring]).astype("<f4"), both.astype("<i4")
 
 
+def _tube(path: NDArray[np.float64], radius: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """A closed tube about ``path (K, 2)`` in the plane of x and z, of ``radius (K,)``."""
+    along = np.gradient(path, axis=0)
+    side = np.stack([-along[:, 1], along[:, 0]], -1) / np.linalg.norm(along, axis=1, keepdims=True)
+    around = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
+    out = radius[:, None] * np.cos(around)
+    rings = np.stack(
+        [path[:, :1] + side[:, :1] * out, radius[:, None] * np.sin(around), path[:, 1:] + side[:, 1:] * out], axis=-1
+    )
+    inner = len(path)
+    index = np.pad(np.arange(inner * 20).reshape(inner, 20), ((0, 0), (0, 1)), mode="wrap")
+    ring = np.arange(20)
+    first, last = ring, ring + (inner - 1) * 20
+    caps = [
+        np.stack([np.full(20, inner * 20), first, np.roll(first, -1)], -1),
+        np.stack([np.full(20, inner * 20 + 1), np.roll(last, -1), last], -1),
+    ]
+    ends = [(path[0, 0], 0.0, path[0, 1]), (path[-1, 0], 0.0, path[-1, 1])]
+    return np.concatenate([rings.reshape(-1, 3), ends]), np.concatenate([_grid(index), *caps])
+
+
+def pot() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """A teapot: body and lid turned on a lathe, a spout and a handle."""
+    body = ((0.0, 0.0), (1.3, 0.0), (1.5, 0.06), (1.75, 0.3), (1.95, 0.7), (2.0, 1.05), (1.93, 1.5), (1.75, 2.0),
+            (1.55, 2.35), (1.45, 2.45), (1.38, 2.4), (0.0, 2.4))  # fmt: skip
+    lid = ((0.0, 2.38), (1.3, 2.38), (1.32, 2.44), (1.1, 2.55), (0.6, 2.66), (0.2, 2.74), (0.17, 2.82), (0.3, 2.94),
+           (0.34, 3.02), (0.25, 3.12), (0.0, 3.15))  # fmt: skip
+    spout = ((1.6, 0.8), (2.1, 0.9), (2.45, 1.25), (2.65, 1.75), (2.9, 2.15), (3.2, 2.4))
+    handle = ((-1.75, 2.05), (-2.2, 2.1), (-2.65, 2.0), (-2.82, 1.65), (-2.6, 1.2), (-2.2, 0.85), (-1.85, 0.7))
+    pieces = []
+    for outline in (body, lid):
+        points, faces = lathe(_smoothed(outline, 40), 64)
+        pieces.append((points[:, [2, 0, 1]], faces))
+    way = _smoothed(spout, 24)
+    pieces.append(_tube(way, np.linspace(0.5, 0.2, len(way))))
+    way = _smoothed(handle, 32)
+    pieces.append(_tube(way, np.full(len(way), 0.18)))
+    starts = np.cumsum([0, *(len(points) for points, _ in pieces)])
+    joined = np.concatenate([faces + start for (_, faces), start in zip(pieces, starts[:-1], strict=True)])
+    return np.concatenate([points for points, _ in pieces]).astype("<f4"), joined.astype("<i4")
+
+
+def _smoothed(keys: tuple[tuple[float, float], ...], number: int) -> NDArray[np.float64]:
+    """Points ``(about number, 2)`` of a curve through ``keys``, which are among them."""
+    given = np.array(keys)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(given, axis=0), axis=1))])
+    at = np.unique(np.concatenate([np.linspace(0.0, length[-1], number), length]))
+    columns = [curve(tuple(zip(length.tolist(), column.tolist(), strict=True)), at) for column in given.T]
+    return np.stack([columns[0], columns[1].clip(min=given[:, 1].min())], axis=-1)
+
+
 def curved_wall() -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """A sheet of height 1 along 150 degrees of the unit circle about y, its middle toward -z, facing the axis."""
     angle = np.radians(np.linspace(-75.0, 75.0, 193))[:, None]
@@ -457,15 +509,59 @@ def write_ply(path: Path, vertices: NDArray[np.float32], faces: NDArray[np.int32
     path.write_bytes(header.encode() + vertices.tobytes() + records.tobytes())
 
 
+#: Colours of the lanterns' paper: radiance.
+PAPER = {
+    "amber": (52.0, 18.0, 3.6),
+    "gold": (44.0, 28.0, 6.4),
+    "rose": (48.0, 6.4, 9.6),
+    "jade": (4.8, 34.0, 14.0),
+    "azure": (4.8, 16.0, 52.0),
+    "pearl": (32.0, 30.0, 26.0),
+}
+
+
+def write_lanterns(path: Path) -> None:
+    """110 octahedra that shine, 880 triangles, hung over a square about the origin: an OBJ and its MTL.
+
+    Sizes and radiances vary, each by a factor of several, so that the brightest have a hundred times the power
+    of the faintest.
+    """
+    random = np.random.default_rng(1913)
+    corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1.4, 0], [0, -1.4, 0], [0, 0, 1], [0, 0, -1]], np.float64)
+    faces = np.array([[3, 5, 1], [3, 1, 6], [3, 6, 2], [3, 2, 5], [4, 1, 5], [4, 6, 1], [4, 2, 6], [4, 5, 2]])
+    names = list(PAPER)
+    lines, material = ["# made by scripts/make_assets.py", f"mtllib {path.stem}.mtl"], []
+    for number in range(110):
+        row, column = divmod(number, 10)
+        place = np.array([2.0 * column - 9.0, 1.9, 1.7 * row - 11.5])
+        place += random.uniform(-1.0, 1.0, 3) * (0.7, 0.7, 0.6)
+        size, strength = 0.2 * random.uniform(0.35, 1.0), 4.0 ** random.uniform(-1.0, 1.0)
+        colour = names[random.integers(len(names))]
+        turn = random.uniform(0.0, 2.0 * np.pi)
+        spin = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+        level = int(np.clip(np.round(2.0 * np.log2(strength)), -4, 4))
+        lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in corners @ spin.T * size + place]
+        lines.append(f"usemtl {colour}{level:+d}")
+        material.append((colour, level))
+        lines += ["f " + " ".join(str(6 * number + k) for k in face) for face in faces]
+    path.write_text("\n".join(lines) + "\n")
+    shades = ["# made by scripts/make_assets.py"]
+    for colour, level in sorted(set(material)):
+        radiance = " ".join(f"{x * 2.0 ** (0.5 * level):.4g}" for x in PAPER[colour])
+        shades += [f"newmtl {colour}{level:+d}", "Kd 0.6 0.6 0.6", f"Ke {radiance}"]
+    path.with_suffix(".mtl").write_text("\n".join(shades) + "\n")
+
+
 def main() -> None:
     """Writes every asset."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=SCENES, help="folder to write to")
     folder = parser.parse_args().out
     folder.mkdir(parents=True, exist_ok=True)
-    for make in (standin, statue, cup, curved_wall):
+    for make in (standin, statue, cup, pot, curved_wall):
         write_ply(folder / f"{make.__name__}.ply", *make())
     write_toy_duck(folder / "toy_duck.glb")
+    write_lanterns(folder / "lanterns.obj")
 
 
 if __name__ == "__main__":

@@ -22,11 +22,12 @@ from torchpt.math.vectors import cross, dot
 from torchpt.scene import Scene
 from torchpt.scene.assembly import corners_of
 from torchpt.scene.parts import MaterialSlot, Part, Source, VertexColors
+from torchpt.scene.schema import Camera, Orthographic, Perspective, ThinLens
 from torchpt.scene.settings import Film, PathIntegrator, Settings
 from torchpt.scene.texels import images_of
 from torchpt.textures import Node
 
-__all__ = ["NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "load_mitsuba"]
+__all__ = ["NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "load_mitsuba", "sensor"]
 
 #: Models with the same parameters on both sides; those with microfacets become the smooth one where alpha is next to nothing.
 SHARED = ("diffuse", "conductor", "dielectric", "thindielectric", "plastic", "principled", "null")
@@ -36,7 +37,7 @@ LEAST_ALPHA = 1e-4
 
 
 class NoCounterpartError(ValueError):
-    """A material that Mitsuba cannot express."""
+    """A material or camera that Mitsuba cannot express."""
 
 
 def find_llvm() -> str | None:
@@ -79,21 +80,15 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
         folder: where meshes are put as PLY files.
 
     Raises:
-        NoCounterpartError: a material that Mitsuba cannot express.
+        NoCounterpartError: a material or camera that Mitsuba cannot express.
     """
     integrator = settings.integrator
     assert isinstance(integrator, PathIntegrator)
-    camera = scene.description.camera
     out: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": integrator.max_depth, "rr_depth": integrator.rr_depth},
         "sensor": {
-            "type": "perspective",
-            "to_world": _transform(mitsuba, camera.pose()),
-            "fov": camera.fov,
-            "fov_axis": camera.fov_axis,
-            "near_clip": 1e-3,
-            "far_clip": 1e7,
+            **sensor(mitsuba, scene.description.camera),
             "film": _film(settings.film),
             "sampler": {"type": "independent", "sample_count": settings.render.spp},
         },
@@ -132,6 +127,31 @@ def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
     return found
 
 
+def sensor(mitsuba: Any, camera: Camera) -> dict[str, Any]:
+    """Mitsuba's dict of a camera, without film and sampler.
+
+    Raises:
+        NoCounterpartError: an aperture with blades.
+    """
+    pose = camera.pose()
+    if isinstance(camera, Orthographic):  # its film is [-1, 1] wide, and sized by the pose
+        pose = pose @ np.diag([0.5 * camera.width, 0.5 * camera.width, 1.0, 1.0])
+        found: dict[str, Any] = {"type": "orthographic"}
+    elif isinstance(camera, ThinLens):
+        if camera.blades or not camera.aperture_radius:
+            raise NoCounterpartError("camera: Mitsuba's lens is round, and has a size")
+        found = {
+            "type": "thinlens",
+            "aperture_radius": camera.aperture_radius,
+            "focus_distance": camera.focus_distance,
+        }
+    else:
+        found = {"type": "perspective"}
+    if isinstance(camera, Perspective | ThinLens):
+        found |= {"fov": camera.fov, "fov_axis": camera.fov_axis}
+    return {**found, "to_world": _transform(mitsuba, pose), "near_clip": 1e-3, "far_clip": 1e7}
+
+
 def comparable(name: str) -> Scene:
     """A scene of ``configs/scene`` without what Mitsuba cannot express, and without meshes that not every machine has."""
     scene = torchpt.load(name, device="cpu")
@@ -155,10 +175,17 @@ def _film(film: Film) -> dict[str, Any]:
         "type": "hdrfilm",
         "width": film.width,
         "height": film.height,
+        **_crop(film),
         "pixel_format": "rgb",
         "component_format": "float32",
         "rfilter": {"type": "box"} if film.filter.type == "box" else {"type": "gaussian", "stddev": film.filter.stddev},
     }
+
+
+def _crop(film: Film) -> dict[str, int]:
+    if film.crop is None:
+        return {}
+    return dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), film.crop, strict=True))
 
 
 def _transform(mitsuba: Any, matrix: np.ndarray) -> Any:

@@ -110,3 +110,107 @@ def test_slope_is_the_derivative(wrap: str):
     (expected,) = torch.autograd.grad(look_up(atlas, index, uv, False).sum(), uv)
     found = torch.stack(slope(atlas, index, uv.detach()))
     assert torch.allclose(found, expected, atol=1e-12)
+
+
+FILTERED = {  # odd and even sizes, grey and colour
+    "odd": torch.rand(13, 7, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64),
+    "even": torch.rand(8, 16, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64),
+    "flat": torch.rand(1, 12, 1, generator=torch.Generator().manual_seed(8), dtype=torch.float64),
+    "dot": torch.rand(1, 1, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64),
+}
+
+
+def smaller(image: Tensor) -> Tensor:
+    """Half as large by exact areas: every old texel is cut at the new ones' edges."""
+    for dim in (0, 1):
+        n = image.shape[dim]
+        m = max(n // 2, 1)
+        edges = torch.arange(m + 1, dtype=torch.float64) * (n / m)
+        share = torch.zeros(m, n, dtype=torch.float64)
+        for new, old in itertools.product(range(m), range(n)):
+            share[new, old] = max(0.0, float(min(edges[new + 1], old + 1) - max(edges[new], old))) * m / n
+        image = torch.einsum("mn,n...->m...", share, image.movedim(dim, 0)).movedim(0, dim)
+    return image
+
+
+def filtered(node: Node, uv: Tensor, footprint: Tensor, images: dict[str, Tensor] = FILTERED) -> Tensor:
+    atlas = atlas_of([node], images, torch.float64, CPU)
+    return look_up(atlas, torch.zeros(uv.shape[1], dtype=torch.int64), uv, node.channel is None, footprint)
+
+
+@pytest.mark.parametrize("name", FILTERED)
+@pytest.mark.parametrize("wrap", WRAPS)
+def test_filtered_look_ups_lie_between_images_of_half_the_size(name: str, wrap: str):
+    uv, image = points(300), FILTERED[name]
+    transform = ((0.5, 0.0, 0.1), (0.0, 2.0, 0.2))  # keeps areas
+    sizes = [image]
+    while max(sizes[-1].shape[:2]) > 1:
+        sizes.append(smaller(sizes[-1]))
+    texels = image.shape[0] * image.shape[1]
+    for level in (0.0, 0.25, 1.0, 1.5, 2.75, 9.0):
+        footprint = torch.full((300,), 4.0**level / texels, dtype=torch.float64)
+        node = Node(name, None, wrap, False, transform, (2.0, 0.5, 1.0), True)
+        low = min(int(level), len(sizes) - 1)
+        high, share = min(low + 1, len(sizes) - 1), level - int(level)
+        alone = Node("image", None, wrap, False, transform, (2.0, 0.5, 1.0))
+        a, b = (
+            look_up(
+                atlas_of([alone], {"image": sizes[k]}, torch.float64, CPU),
+                torch.zeros(300, dtype=torch.int64),
+                uv,
+                True,
+            )
+            for k in (low, high)
+        )
+        assert torch.allclose(filtered(node, uv, footprint), a + (b - a) * share, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", FILTERED)
+def test_the_last_size_is_the_mean(name: str):
+    found = filtered(Node(name, None, "repeat", False, SAME, PLAIN, True), points(5), torch.full((5,), 1e6).double())
+    assert torch.allclose(found, FILTERED[name].mean((0, 1)).expand(3)[:, None].expand(3, 5), atol=1e-14)
+
+
+def test_up_to_one_texel_a_filtered_look_up_is_bilinear_to_the_bit():
+    uv = points(200)
+    for footprint in (0.0, 1e-9, 0.999 / (13 * 7)):
+        found = filtered(
+            Node("odd", None, "repeat", False, SAME, PLAIN, True), uv, torch.full((200,), footprint).double()
+        )
+        atlas = atlas_of([Node("odd", None, "repeat", False, SAME, PLAIN)], FILTERED, torch.float64, CPU)
+        assert torch.equal(found, look_up(atlas, torch.zeros(200, dtype=torch.int64), uv, True))
+
+
+def test_nodes_that_do_not_filter_are_untouched_by_those_that_do():
+    names = list(FILTERED)
+    nodes = [Node(name, None, "mirror", False, SAME, PLAIN, filtered) for name in names for filtered in (False, True)]
+    atlas = atlas_of(nodes, FILTERED, torch.float64, CPU)
+    uv = points(50)
+    footprint = torch.rand(50, generator=torch.Generator().manual_seed(3)).double()
+    for k, node in enumerate(nodes):
+        index = torch.full((50,), k)
+        alone = filtered(node, uv, footprint)
+        assert torch.equal(look_up(atlas, index, uv, True, footprint), alone)
+        if not node.filtered:
+            assert torch.equal(alone, look_up(atlas, index, uv, True))
+
+
+def test_gradients_of_filtered_look_ups():
+    texels = FILTERED["odd"][:5, :3].clone().requires_grad_()
+    heights = FILTERED["flat"][:, :5].clone().requires_grad_()
+    uv = points(6).requires_grad_()
+    footprint = (0.01 + torch.rand(6, generator=torch.Generator().manual_seed(3)).double()).requires_grad_()
+    transform = ((0.7, 0.2, 0.1), (0.3, -0.9, 0.2))
+    nodes = [
+        Node("odd", None, "mirror", False, transform, (0.5, 2.0, 1.0), True),
+        Node("flat", 0, "repeat", False, transform, (3.0, 3.0, 3.0), True),
+    ]
+
+    def value(texels: Tensor, heights: Tensor, uv: Tensor, footprint: Tensor) -> Tensor:
+        atlas = atlas_of(nodes, {"odd": texels, "flat": heights}, torch.float64, CPU)
+        index = torch.zeros(6, dtype=torch.int64)
+        return torch.cat(
+            (look_up(atlas, index, uv, True, footprint), torch.stack(slope(atlas, index + 1, uv, footprint)))
+        )
+
+    assert torch.autograd.gradcheck(value, (texels, heights, uv, footprint))

@@ -16,44 +16,80 @@ __all__ = ["RELMSE_FLOOR", "Film", "Filter"]
 #: relMSE is the mean of ``(x - ref)^2 / (ref^2 + RELMSE_FLOOR)`` over pixels and channels.
 RELMSE_FLOOR = 1e-2
 _CELLS = 4096
+#: Numbers in [0, 1) are multiples of one over this.
+_STEPS = 1 << 24
 
 
-def _profile(kind: str, radius: float, stddev: float, x: np.ndarray) -> np.ndarray:
-    if kind == "gaussian":  # as Mitsuba: shifted so that it ends at zero
-        floor = np.exp(-0.5 * (radius / stddev) ** 2)
-        return np.maximum(np.exp(-0.5 * (x / stddev) ** 2) - floor, 0.0)
-    raise ValueError(f"no profile for filter {kind!r}")
+def _gaussian(x: np.ndarray, radius: float, stddev: float) -> np.ndarray:
+    """As Mitsuba's: shifted so that it ends at zero."""
+    return np.maximum(np.exp(-0.5 * (x / stddev) ** 2) - np.exp(-0.5 * (radius / stddev) ** 2), 0.0)
+
+
+def _mitchell(x: np.ndarray, b: float, c: float) -> np.ndarray:
+    """Mitchell and Netravali, *Reconstruction Filters in Computer Graphics*, SIGGRAPH 1988, equation 8; its integral is 1."""
+    x = np.abs(x)
+    inner = (12 - 9 * b - 6 * c) * x**3 + (-18 + 12 * b + 6 * c) * x**2 + (6 - 2 * b)
+    outer = (-b - 6 * c) * x**3 + (6 * b + 30 * c) * x**2 + (-12 * b - 48 * c) * x + (8 * b + 24 * c)
+    return np.where(x < 1, inner, np.where(x < 2, outer, 0.0)) / 6
 
 
 class Filter:
     """A separable reconstruction filter that is sampled.
 
+    Where a filter is negative, places are drawn from its magnitude and the sample is weighted by the filter's sign times
+    the integral of the magnitude over that of the filter. The weight's expectation is 1: constants are kept without bias,
+    and no sample depends on another as it would where sums are divided by sums of weights.
+
     Args:
-        kind: ``box`` or ``gaussian``.
-        radius: half width in pixels.
+        kind: ``box``, ``tent``, ``gaussian`` or ``mitchell``.
+        radius: half width in pixels; mitchell's is 2 by definition.
         stddev: of the gaussian, in pixels.
         device: where the lanes live.
+        b: parameter of mitchell, 0..1.
+        c: parameter of mitchell, 0..1.
+
+    Attributes:
+        signed: whether samples have weights; else every weight is 1.
     """
 
-    def __init__(self, kind: str, radius: float, stddev: float, device: torch.device) -> None:
-        self.kind, self.radius, self._inverse = kind, radius, None
-        if kind == "box":
+    def __init__(
+        self, kind: str, radius: float, stddev: float, device: torch.device, b: float = 1 / 3, c: float = 1 / 3
+    ) -> None:
+        self.kind, self.radius, self.signed, self._inverse = kind, radius, False, None
+        if kind in ("box", "tent"):
             return
         # Inverse of the cumulative profile, tabulated in float64 and read linearly.
-        x = np.linspace(-radius, radius, 1 << 16)
-        weight = _profile(kind, radius, stddev, 0.5 * (x[1:] + x[:-1]))
-        cdf = np.concatenate(([0.0], np.cumsum(weight)))
+        x = np.linspace(-radius, radius, (1 << 16) + 1)
+        middle = 0.5 * (x[1:] + x[:-1])
+        weight = _gaussian(middle, radius, stddev) if kind == "gaussian" else _mitchell(middle, b, c)
+        cdf = np.concatenate(([0.0], np.cumsum(np.abs(weight))))
         inverse = np.interp(np.linspace(0.0, 1.0, _CELLS + 1), cdf / cdf[-1], x)
         self._inverse = torch.from_numpy(inverse.astype(np.float32)).to(device)
+        # The negative lobes are the outermost, each with a share of the numbers, in whole steps of 2^-24. Both are drawn by
+        # the lowest numbers: the fewer ends of intervals, the more evenly stratified points share them out.
+        self._lobe = round(float(np.abs(weight[: 1 << 15]).dot(weight[: 1 << 15] < 0)) / cdf[-1] * _STEPS) / _STEPS
+        self.signed = self._lobe > 0
 
     def offset(self, u: Tensor) -> Tensor:
         """Offsets from the pixel's centre, in pixels, for ``u`` in [0, 1): any shape."""
-        if self._inverse is None:
+        if self.kind == "box":
             return (u - 0.5) * (2.0 * self.radius)
+        if self.kind == "tent":
+            t = 2.0 * u - 1.0
+            return torch.copysign(1.0 - (1.0 - t.abs()).sqrt(), t) * self.radius
+        assert self._inverse is not None
+        if self.signed:
+            u = torch.where(u < self._lobe, u + (1.0 - self._lobe), u - self._lobe)
         place = u * float(_CELLS)
         cell = place.to(torch.int64)
         low = torch.take(self._inverse, cell)
         return low + (torch.take(self._inverse, cell + 1) - low) * (place - cell)
+
+    def weight(self, u: Tensor) -> Tensor:
+        """Weights ``(N,)`` of samples at the offsets of ``u (2, N)``, of a filter that is ``signed``."""
+        negative = u < 2.0 * self._lobe
+        norm = 1.0 / (1.0 - 4.0 * self._lobe)
+        return norm * norm * (1.0 - 2.0 * (negative[0] ^ negative[1]).to(u.dtype))
 
 
 class Film:

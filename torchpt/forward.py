@@ -14,10 +14,11 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from torchpt.cameras import Camera
 from torchpt.errors import RenderError
 from torchpt.film import Film, Filter
 from torchpt.integrators import Wave
-from torchpt.integrators.aov import CHANNELS
+from torchpt.integrators.aov import CHANNELS, NAMES
 from torchpt.integrators.compiled import CompiledStages, Stages, can_compile
 from torchpt.integrators.ibl import Preview
 from torchpt.integrators.path import Limits, Tally
@@ -30,11 +31,22 @@ from torchpt.scene.settings import (
     DirectIntegrator,
     GaussianFilter,
     IblIntegrator,
+    MitchellFilter,
     PathIntegrator,
     Settings,
 )
 
-__all__ = ["BYTES_PER_LANE", "Progress", "Rendering", "Run", "chunks_of", "lanes_for", "limited_threads", "make_wave"]
+__all__ = [
+    "BYTES_PER_LANE",
+    "Progress",
+    "Rendering",
+    "Run",
+    "chunks_of",
+    "lanes_for",
+    "limited_threads",
+    "make_wave",
+    "pixel_of",
+]
 
 #: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
 LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
@@ -168,12 +180,14 @@ def make_wave(
     attached: bool = False,
 ) -> Wave:
     """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``."""
-    world, geometry = scene.world(dtype, params, "uv" in settings.film.aovs)
+    world, geometry = scene.world(dtype, params, "uv" in settings.film.aovs, settings.light_choice)
     threads = None if settings.render.threads == "auto" else int(settings.render.threads)
     moved = any(name.startswith("shapes.") and name.endswith((".vertices", ".to_world")) for name in params or {})
     accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
     film, integrator = settings.film, settings.integrator
-    stddev = film.filter.stddev if isinstance(film.filter, GaussianFilter) else 0.5
+    own = film.filter
+    stddev = own.stddev if isinstance(own, GaussianFilter) else 0.5
+    lobes = (own.B, own.C) if isinstance(own, MitchellFilter) else ()
     limits, plan = None, Plan(settings.sampler.type, "mis", None, dtype, tape, attached)
     if isinstance(integrator, PathIntegrator):
         limits = Limits(integrator.max_depth, integrator.rr_depth)
@@ -185,13 +199,15 @@ def make_wave(
         limits = Limits(2, 3)
         plan = Plan(settings.sampler.type, "light", None, dtype, tape, attached)
     spp = settings.render.spp
+    camera = scene.camera(film, scene.merged(params), dtype)
+    randomizations = min(spp, 4 if spp >= MANY_SAMPLES else 2)
     return Wave(
-        stages=_stages(scene, settings, plan, world, own=not params),
+        stages=_stages(scene, settings, plan, world, pixel_of(world, camera), own=not params),
         limits=limits,
         accel=accel,
-        camera=scene.camera(film, scene.merged(params), dtype),
-        filter=Filter(film.filter.type, film.filter.radius, stddev, scene.device),
-        sampler=Sampler(settings.sampler.type, settings.render.seed, min(spp, 4 if spp >= MANY_SAMPLES else 2)),
+        camera=camera,
+        filter=Filter(own.type, own.radius, stddev, scene.device, *lobes),
+        sampler=Sampler(settings.sampler.type, settings.render.seed, randomizations, spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.centre,
         preview=_preview(scene, world, own=not params) if isinstance(integrator, IblIntegrator) else None,
@@ -208,7 +224,12 @@ def _preview(scene: Scene, world: World, own: bool) -> Preview:
     return kept[1]
 
 
-def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, own: bool) -> Stages:
+def pixel_of(world: World, camera: Camera) -> Tensor | None:
+    """What textures filtered by the pixel's footprint need of the camera; None where there are none."""
+    return camera.pixel() if world.textures is not None and world.textures.pyramids is not None else None
+
+
+def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: Tensor | None, own: bool) -> Stages:
     """Eager or compiled stages; compiled ones are kept with the scene, unless the world is not the scene's ``own``."""
     mode = settings.render.compile
     if mode == "auto":
@@ -224,13 +245,13 @@ def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, own: boo
             else "off"
         )
     if mode == "off" or plan.tape or torch.is_grad_enabled():
-        return Stages(plan, world)
+        return Stages(plan, world, pixel)
     if not own:
-        return CompiledStages(plan, world)
+        return CompiledStages(plan, world, pixel)
     kept = _compiled.setdefault(scene, {})
     if plan not in kept or kept[plan].world is not world:
         kept[plan] = CompiledStages(plan, world)
-    return kept[plan]
+    return kept[plan].through(pixel)
 
 
 def _passes(spp: int, randomizations: int) -> Iterator[tuple[int, int]]:
@@ -328,7 +349,7 @@ class Run:
         radiance = torch.where(finite, radiance, 0.0)
         if settings.clamp is None:
             return radiance
-        scale = (settings.clamp / radiance.amax(0).clamp_min(settings.clamp)).clamp_max(1.0)
+        scale = (settings.clamp / radiance.abs().amax(0).clamp_min(settings.clamp)).clamp_max(1.0)
         clamped = radiance * scale
         self.light += torch.stack((radiance.double().sum(), clamped.double().sum()))
         return clamped
@@ -337,8 +358,8 @@ class Run:
         """The picture so far."""
         layers = {name: film.mean().to(self.dtype) for name, film in self.layers.items()}
         aov = isinstance(self.settings.integrator, AovIntegrator)
-        if "object_id" in layers:  # an identity has no average: that of the first sample
-            layers["object_id"] = self.layers["object_id"].first().to(self.dtype)
+        for name in set(NAMES) & set(layers):
+            layers[name] = self.layers[name].first().to(self.dtype)
         image = self.film.mean().to(self.dtype)
         variance = None if aov else self.film.variance()
         if aov and self.names:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpt.bsdfs import Bsdf, Parameters
+    from torchpt.lights.choice import ByTree
     from torchpt.lights.envmap import EnvironmentMap
     from torchpt.math.distributions import Discrete
     from torchpt.textures import Atlas, Look, Veils
@@ -121,7 +122,7 @@ class Lights:
     Columns are a primitive's own; what the others put there is said in their files in :mod:`torchpt.lights`.
     """
 
-    choice: Discrete | None  # over the rows; None where there is but one
+    choice: Discrete | ByTree | None  # over the rows; None where there is but one
     kinds: tuple[str, ...]  # kinds among the rows, of KINDS and SOURCES in their order
     kind: Tensor | None  # (K,) index into `kinds`; None where there is but one
     p0: Tensor  # (3, K)
@@ -272,6 +273,10 @@ class PathState:
     lane: Tensor  # (N,) int64 place in the wave
     key: Tensor  # (2, N) int32 of the sampler
     eta: Tensor | None = None  # (N,) index of refraction here over that at the camera; None where nothing refracts
+    #: (3, N) the vertex that d leaves, and its normal as `lights.sample` was given it; None where the choice of lights is the
+    #: same everywhere.
+    p: Tensor | None = None
+    n: Tensor | None = None
 
 
 R = TypeVar("R", PathState, Hit, Quadrics, Copies)

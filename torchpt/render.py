@@ -13,14 +13,24 @@ from torch import Tensor
 
 from torchpt import adjoint as adjoints
 from torchpt.errors import EdgeWarning, SceneError
-from torchpt.forward import BYTES_PER_LANE, Progress, Rendering, Run, chunks_of, lanes_for, limited_threads, make_wave
+from torchpt.forward import (
+    BYTES_PER_LANE,
+    Progress,
+    Rendering,
+    Run,
+    chunks_of,
+    lanes_for,
+    limited_threads,
+    make_wave,
+    pixel_of,
+)
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.ibl import Preview
 from torchpt.records import tensors_of
 from torchpt.scene import Scene
 from torchpt.scene.description import settings as complete
 from torchpt.scene.scene import INDICES, MOVING
-from torchpt.scene.settings import AovIntegrator, Settings
+from torchpt.scene.settings import AovIntegrator, BoxFilter, Settings
 
 __all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene"]
 
@@ -145,7 +155,7 @@ def _moves(scene: Scene, names: Iterable[str]) -> bool:
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:
     """Layers ``(H, W, C)`` of the first surface at one sample a pixel: a preview that is there at once."""
-    film = settings.film.model_copy(update={"aovs": names})
+    film = settings.film.model_copy(update={"aovs": names, "filter": BoxFilter()})  # one sample fills no wider filter
     once = settings.render.model_copy(update={"spp": 1})
     quick = settings.model_copy(update={"film": film, "render": once, "integrator": AovIntegrator()})
     return render_scene(scene, quick).layers
@@ -196,9 +206,9 @@ def _differentiable_chunks(
 
     def radiance(span: tuple[int, int, int, int], *tensors: Tensor) -> Tensor:
         given = {**plain, **dict(zip(wanted, tensors, strict=True))}
-        world, _ = scene.world(dtype, given)
+        world, _ = scene.world(dtype, given, choice=settings.light_choice)
         camera = scene.camera(settings.film, scene.merged(given), dtype)
-        stages = Stages(still.stages.plan, world)
+        stages = Stages(still.stages.plan, world, pixel_of(world, camera))
         preview = still.preview
         if preview is not None and world.lights is not None:
             if any(t.requires_grad for t in tensors_of(world.lights.environment)):
@@ -206,7 +216,7 @@ def _differentiable_chunks(
         values, _ = replace(still, stages=stages, camera=camera, preview=preview).radiance(*span)
         values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
         if clamp is not None:
-            values = values * (clamp / values.detach().amax(0).clamp_min(clamp)).clamp_max(1.0)
+            values = values * (clamp / values.detach().abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
         return values.sum(1) / settings.render.spp
 
     for first, count, sample, samples, _ in chunks_of(settings, lanes, still.sampler.randomizations, pixels):

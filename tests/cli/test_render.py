@@ -10,6 +10,7 @@ import torch
 
 from torchpt.cli import main
 from torchpt.images import read_image, read_layers
+from torchpt.images.colour import TONEMAPS
 
 from .conftest import SCENE, Renderer
 
@@ -93,6 +94,22 @@ def test_display_settings_reach_the_8_bit_picture(folder: Path, renderer: Render
     assert main(["render", "scene=s.yaml", "out=[a.png,a.exr]", *words]) == 0
     assert torch.allclose(read_image("a.png", linear=True), torch.tensor(1 / 3), atol=2e-3)
     assert torch.equal(read_image("a.exr"), torch.ones(6, 8, 3))
+
+
+@pytest.mark.parametrize("gamma", [1 / 2.2, 0.6, 1.0])
+@pytest.mark.parametrize("curve", ["none", "reinhard", "aces", "filmic"])
+def test_exposure_curve_and_exponent_reach_every_8_bit_picture_and_the_preview(
+    folder: Path, renderer: Renderer, gamma: float, curve: str
+) -> None:
+    words = ["film.exposure=-2", f"film.gamma={gamma}", f"film.tonemap={curve}"]
+    outs = ["a.png", "a.jpg", "a.ppm", "a.exr", "a.hdr"]
+    assert main(["render", "scene=s.yaml", f"out=[{','.join(outs)}]", "render.preview=p.png", *words]) == 0
+    level = TONEMAPS[curve](torch.tensor(0.25)).item() ** gamma
+    for name in ("a.png", "a.jpg", "a.ppm", "p.png"):
+        assert torch.allclose(read_image(name, linear=True), torch.tensor(level), atol=0.6 / 255), name
+    for name in ("a.exr", "a.hdr"):  # linear, as rendered
+        assert torch.equal(read_image(name), torch.ones(6, 8, 3)), name
+    assert torch.allclose(read_image("p.albedo.png"), torch.tensor(0.5), atol=3e-3)  # a layer is no light: not exposed
 
 
 def test_preview_shows_albedo_and_normal_first(folder: Path, renderer: Renderer) -> None:

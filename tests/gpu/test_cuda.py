@@ -52,3 +52,10 @@ def test_mesh_with_smooth_normals():
     cpu, cuda = (torchpt.render(torchpt.load("cornell_bunny", device), **wish).cpu() for device in ("cpu", "cuda"))
     assert torch.isclose(cpu, cuda, rtol=1e-2, atol=1e-3).all(-1).float().mean() > 0.9
     assert abs(float(cpu.mean() / cuda.mean()) - 1) < 5e-3
+
+
+def test_many_lights_by_the_tree():
+    wish = {"spp": 8, "film": FILM, "compile": "off"}
+    cpu, cuda = (torchpt.render(torchpt.load("many_lights", device), **wish).cpu() for device in ("cpu", "cuda"))
+    assert torch.isclose(cpu, cuda, rtol=1e-2, atol=1e-3).all(-1).float().mean() > 0.8
+    assert abs(float(cpu.mean() / cuda.mean()) - 1) < 5e-3

@@ -13,6 +13,7 @@ at any affordable number of samples: there block means, shapes and the whole are
 from __future__ import annotations
 
 import functools
+import math
 import os
 import sys
 from pathlib import Path
@@ -91,8 +92,27 @@ DELTAS: dict[str, Any] = {
         "sun": {"type": "directional", "direction": [0.5, -1, -0.4], "irradiance": [1, 0.9, 0.6]},
     },
 }
+#: More lights than are chosen by power alone, of unlike power, some behind others.
+BULBS: dict[str, Any] = {
+    "camera": ZOO["camera"],
+    "materials": {**ZOO["materials"], "gloss": {"type": "roughplastic", "alpha": 0.2}},
+    "shapes": {
+        "floor": ZOO["shapes"]["floor"],
+        "ball": {"type": "sphere", "center": [-0.4, 0.6, 0.2], "radius": 0.6, "material": "gloss"},
+        "block": ZOO["shapes"]["block"],
+        **{
+            f"bulb{k}": {
+                "type": "sphere",
+                "center": [2.2 * math.cos(2.4 * k), 0.5 + 0.08 * k, 2.2 * math.sin(2.4 * k)],
+                "radius": 0.12,
+                "emission": [4 + k % 3, 4 + k % 5, 3 + k % 4],
+            }
+            for k in range(20)
+        },
+    },
+}
 #: Scenes that are rendered by both, by name; others ship.
-LIVE = {"zoo": ZOO, "deltas": DELTAS}
+LIVE = {"zoo": ZOO, "deltas": DELTAS, "bulbs": BULBS}
 
 
 def ours(scene: Any, size: int, spp: int = 16) -> tuple[Tensor, Tensor]:
@@ -250,7 +270,7 @@ def test_live(scene, tmp_path, monkeypatch):
     from mitsuba_scene import convert, load_mitsuba
 
     mitsuba = load_mitsuba("scalar_rgb")
-    loaded = torchpt.load(LIVE.get(scene, scene), device="cpu")
+    loaded = torchpt.load(LIVE[scene] if scene in LIVE else scene, device="cpu")
     film = {**film_of(48), "filter": "box"}
     wishes = settings(loaded.description, {"film": film, "integrator": {"type": "path", **KEYS}, "render": {"spp": 32}})
     theirs = mitsuba.load_dict(convert(mitsuba, loaded, wishes, tmp_path))

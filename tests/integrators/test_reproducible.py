@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import pytest
@@ -109,7 +110,6 @@ def _real(seed: int, *shape: int) -> torch.Tensor:
 
 
 A, B, U = _real(1, 3, N), _real(2, 3, N), torch.rand(3, N, generator=torch.Generator().manual_seed(3))
-KEYS = Sampler("sobol", 5, 4).key(torch.arange(N), torch.arange(N) % 97)
 CHOICE = Discrete.of(U[0, :999], torch.float32)
 
 #: Arithmetic done on lanes: (name of the operation, function of columns of A, B, U).
@@ -196,10 +196,11 @@ def _same(a: torch.Tensor, b: torch.Tensor) -> bool:
 @pytest.mark.parametrize("sampler", list(SAMPLERS))
 def test_numbers_drawn_do_not_depend_on_their_place(sampler):
     module, salt = SAMPLERS[sampler], salts(3, torch.device("cpu"))[4]
+    key = Sampler(sampler, 5, 4, 97, 300).key(torch.arange(N), torch.arange(N) % 97)
     for draw in (module.draw_1d, module.draw_2d):
-        whole = draw(KEYS, salt)
+        whole = draw(key, salt)
         for first, size in ((0, 1), (1, 3), (3, 1001), (11, 32_769)):
-            assert torch.equal(draw(KEYS[:, first : first + size], salt), whole[..., first : first + size])
+            assert torch.equal(draw(key[:, first : first + size], salt), whole[..., first : first + size])
 
 
 class _Recorder(TorchDispatchMode):
@@ -228,10 +229,9 @@ def test_the_audit_covers_what_waves_use(monkeypatch):
     for strategy in ("mis", "light", "uniform"):
         shoot(materials, 2, 0, "sobol", {"strategy": strategy, "max_depth": 4}, film_of(16), accel="brute")
     scene = torchpt.load(MIXED, device="cpu")
-    for sampler in SAMPLERS:
-        for strategy in ("mis", "bsdf", "light", "uniform"):
-            for filter in ("box", "gaussian"):
-                keys = {"strategy": strategy, "max_depth": 5, "rr_depth": 2}
-                shoot(scene, 2, 0, sampler, keys, {**film_of(8), "filter": filter}, accel="brute")
+    strategies = product(("mis", "bsdf", "light", "uniform"), ("box", "gaussian", "tent", "mitchell"))
+    for (strategy, filter), sampler in zip(strategies, 4 * list(SAMPLERS), strict=False):
+        keys = {"strategy": strategy, "max_depth": 5, "rr_depth": 2}
+        shoot(scene, 2, 0, sampler, keys, {**film_of(8), "filter": filter}, accel="brute")
     assert "mul" in recorder.seen
     assert recorder.seen - EXACT - {name for name, _ in OPERATIONS} <= {"tan"}  # of the camera's angle: one number

@@ -10,7 +10,7 @@ from trials import SIGNIFICANCE, grid_cells, uniform_p
 
 from torchpt.math import warps
 
-TESTS = 12  # chi-square tests in this file
+TESTS = 17  # chi-square tests in this file
 U = torch.rand(2, 1 << 18, generator=torch.Generator().manual_seed(8))
 EDGES = torch.cartesian_prod(*(torch.tensor([0.0, 2**-24, 0.5, 1 - 2**-24]),) * 2).T
 SIDE = 24
@@ -37,6 +37,41 @@ def test_concentric_disk():
     assert_uniform(square, azimuth(p))
     assert torch.isfinite(warps.concentric_disk(EDGES)).all()
     assert torch.equal(warps.concentric_disk(torch.full((2, 1), 0.5)), torch.zeros(2, 1))
+
+
+@pytest.mark.parametrize("sides", [3, 4, 5, 6, 64])
+def test_uniform_polygon(sides):
+    p = warps.uniform_polygon(U, sides).double()
+    # In the sector of each corner pair: the distance from the centre as a share of the edge's, and the place along the edge.
+    turn = (torch.atan2(p[1], p[0]) / (2 * math.pi) - 0.25) % 1.0 * sides
+    edge = turn.floor()
+    middle = 2 * math.pi * (0.25 + (edge + 0.5) / sides)
+    out = (torch.cos(middle) * p[0] + torch.sin(middle) * p[1]) / math.cos(math.pi / sides)
+    along = (-torch.sin(middle) * p[0] + torch.cos(middle) * p[1]) / math.sin(math.pi / sides)
+    assert out.max() <= 1 + 1e-6
+    whole = (edge + (along / out + 1) / 2) / sides
+    assert_uniform(out**2, whole)
+    edges = warps.uniform_polygon(EDGES, sides)
+    assert torch.isfinite(edges).all() and edges.norm(dim=0).max() <= 1 + 1e-6
+    top = warps.uniform_polygon(torch.tensor([[0.5], [1 - 2**-24]], dtype=torch.float64), sides)
+    assert torch.allclose(top, torch.tensor([[0.0], [1]], dtype=torch.float64), atol=1e-6)
+    assert torch.equal(warps.uniform_polygon(torch.full((2, 1), 0.5), sides).abs(), torch.zeros(2, 1))
+
+
+@pytest.mark.parametrize("sides", [3, 6, 11])
+def test_uniform_polygon_keeps_areas_and_neighbours(sides):
+    u = U[:, :20_000].double() * 0.998 + 0.001
+    step = 1e-6
+    rows = []
+    for axis in range(2):
+        ahead = torch.zeros(2, 1, dtype=torch.float64)
+        ahead[axis] = step
+        rows.append((warps.uniform_polygon(u + ahead, sides) - warps.uniform_polygon(u - ahead, sides)) / (2 * step))
+    area = (rows[0][0] * rows[1][1] - rows[0][1] * rows[1][0]).abs()
+    exact = 0.5 * sides * math.sin(2 * math.pi / sides)
+    smooth = (area / exact - 1).abs() < 1e-4
+    assert smooth.double().mean() > 0.999  # all but where a difference straddles a seam
+    assert max(float(row.abs().max()) for row in rows) < 6  # no seam tears the square apart
 
 
 def test_cosine_hemisphere():

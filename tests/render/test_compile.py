@@ -72,3 +72,42 @@ def test_without_a_compiler_on_is_an_error_and_auto_stays_eager(monkeypatch):
         run(scene, 1, "on")
     assert run(scene, 1, "auto").complete
     assert scene not in forward._compiled or not forward._compiled[scene]
+
+
+@pytest.mark.slow
+def test_textures_and_maps_compile():
+    """Long chains of indices and frames: with inductor's own settings their compilation does not end."""
+    squares = {"type": "checkerboard", "scale": 9, "filter": "trilinear"}
+    material = {
+        "type": "diffuse",
+        "reflectance": squares,
+        "normal_map": {**squares, "color0": [0.6, 0.45, 0.95], "color1": [0.4, 0.5, 0.95]},
+    }
+    scene = torchpt.load(
+        {
+            "camera": {"origin": [0, 1, 4], "target": [0, 0, 0]},
+            "shapes": {
+                "floor": {
+                    "type": "rectangle",
+                    "material": material,
+                    "transform": [{"scale": 3}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}],
+                },
+                "lamp": {
+                    "type": "rectangle",
+                    "emission": 20,
+                    "transform": [
+                        {"rotate": {"axis": [1, 0, 0], "angle": 90}},
+                        {"scale": 0.3},
+                        {"translate": [0, 2, 0]},
+                    ],
+                },
+            },
+        }
+    )
+    wish = {"film": FILM, "render": {"spp": 4}, "integrator": {"max_depth": 3}}
+    pictures = [
+        render_scene(scene, settings(scene.description, {**wish, "render": {"spp": 4, "compile": mode}})).image
+        for mode in ("on", "off")
+    ]
+    assert torch.isclose(*pictures, rtol=1e-3, atol=1e-4).all(-1).float().mean() > 0.9
+    assert float(pictures[0].mean()) == pytest.approx(float(pictures[1].mean()), rel=2e-3)

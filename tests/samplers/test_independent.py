@@ -63,7 +63,8 @@ def test_every_stream_has_a_name_of_its_own():
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_numbers_lie_in_zero_to_below_one(kind):
-    key = lanes(1 << 10, 1 << 9)
+    pixel = torch.arange(1 << 10).repeat_interleave(1 << 9)
+    key = Sampler(kind, 0, 1, 1 << 9, 32).key(pixel, torch.arange(1 << 9).repeat(1 << 10))
     one = KINDS[kind].draw_1d(key, salts(3, CPU)[6])
     two = KINDS[kind].draw_2d(key, salts(3, CPU)[5])
     for u in (one, two):

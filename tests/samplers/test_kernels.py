@@ -12,15 +12,21 @@ CPU = torch.device("cpu")
 NAMES = [0, 1, -1, 2**31 - 1, -(2**31), *salts(3, CPU).tolist()]
 
 
-def keys(n: int) -> torch.Tensor:
-    words = torch.randint(-(2**31), 2**31, (2, n), generator=torch.Generator().manual_seed(n))
+def keys(n: int, kind: str = "sobol") -> torch.Tensor:
+    """Any words at all; of points that are counted, the largest numbers among them."""
+    g = torch.Generator().manual_seed(n)
+    words = torch.randint(-(2**31), 2**31, (2, n), generator=g)
+    if kind in ("stratified", "hammersley"):
+        count = torch.randint(1, 2**30, (n,), generator=g) >> torch.randint(0, 30, (n,), generator=g)
+        count = count.clamp_min(1)
+        words = torch.stack((words[0], words[1].abs() % count, count))
     return words.to(torch.int32)
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
 @pytest.mark.parametrize("n", [0, 1, 3, 1023, 1025, 70_003])
 def test_bits_are_those_of_the_tensor_form(kind, n):
-    key, module = keys(n), KINDS[kind]
+    key, module = keys(n, kind), KINDS[kind]
     for name in NAMES:
         salt = torch.tensor(name, dtype=torch.int32)
         assert torch.equal(draw(kind, 1, key, name), module.draw_1d(key, salt)[None])
@@ -29,7 +35,7 @@ def test_bits_are_those_of_the_tensor_form(kind, n):
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_place_and_threads_do_not_matter(kind):
-    key = keys(70_003)
+    key = keys(70_003, kind)
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -45,7 +51,7 @@ def test_place_and_threads_do_not_matter(kind):
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_draws_are_the_modules(kind):
-    key = Sampler(kind, 3, 4).key(torch.arange(999), torch.arange(999) % 7)
+    key = Sampler(kind, 3, 4, 28).key(torch.arange(999), torch.arange(999) % 7)
     draws, names = Draws(kind, key, salts(2, CPU)), salts(2, CPU)
     roulette, bsdf = int(Dimension.ROULETTE), int(Dimension.BSDF)
     assert torch.equal(draws.one(Dimension.ROULETTE), KINDS[kind].draw_1d(key, names[roulette]))

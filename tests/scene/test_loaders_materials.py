@@ -149,6 +149,17 @@ def test_mtl_maps(tmp_path: Path) -> None:
     assert ignored == ("map_Ks -t", "map_Ks")
 
 
+@pytest.mark.parametrize(("key", "name"), [("norm", "hills.png"), ("map_Bump", "hills_normal.png")])
+def test_mtl_strength_of_normals(tmp_path: Path, key: str, name: str) -> None:
+    path = picture(tmp_path, name)
+    material, ignored = mtl(tmp_path, f"{key} -bm 0.3 {name}\n")
+    assert material["normal_map"] == {"type": "image", "path": path} and material["normal_strength"] == 0.3
+    assert ignored == ()
+    accepted(material)
+    material, ignored = mtl(tmp_path, f"{key} -bm -1 {name}\n")
+    assert "normal_strength" not in material and ignored == (f"{key} -bm",)
+
+
 def test_mtl_factors_multiply_maps(tmp_path: Path) -> None:
     file = picture(tmp_path, "a.png")
     material, _ = mtl(tmp_path, "Kd .5 .5 .5\nmap_Kd a.png\nKs .2 .2 .2\nmap_Ks a.png\nNs 0\nKe 1 2 3\nmap_Ke a.png")
@@ -346,10 +357,11 @@ def test_gltf_textures_multiply_factors(tmp_path: Path) -> None:
         "metallic": {**entry, "channel": "b"},
         "spec_trans": {**entry, "channel": "r"},
         "normal_map": entry,
+        "normal_strength": 0.7,
         "emission": entry,
         "opacity": {**entry, "scale": 0.5, "channel": "a"},
     }
-    assert ignored == ("normalTexture.scale",)
+    assert ignored == ()
     found, _ = only(gltf(tmp_path, material))  # a picture without alpha
     assert found["opacity"] == 0.5
 

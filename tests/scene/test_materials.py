@@ -300,6 +300,7 @@ BAD: dict[str, tuple[dict[str, Any], str, str]] = {  # name -> material, key bel
     "opacity": ({"type": "diffuse", "opacity": -0.1}, "opacity", "in 0..1, or a texture, got -0.1"),
     "emission": ({"type": "diffuse", "emission": [1, -1, 0]}, "emission", ">= 0"),
     "strength": ({"type": "diffuse", "emission": 1, "emission_strength": -1}, "emission_strength", ">= 0, got -1"),
+    "leaning alone": ({"type": "diffuse", "normal_strength": 2}, "normal_strength", "a normal_map beside"),
     "strength alone": ({"type": "diffuse", "emission_strength": 2}, "emission_strength", "an emission beside"),
     "two-sided glass": ({"type": "dielectric", "two_sided": False}, "two_sided", "opaque ones only"),
     "two-sided coat": ({"type": "principled", "spec_trans": 0.1, "two_sided": True}, "two_sided", "opaque ones only"),

@@ -8,7 +8,15 @@ import pytest
 
 from torchpt.errors import SceneError
 from torchpt.scene.description import read_description, settings
-from torchpt.scene.settings import BoxFilter, DirectIntegrator, GaussianFilter, PathIntegrator, Settings
+from torchpt.scene.settings import (
+    BoxFilter,
+    DirectIntegrator,
+    GaussianFilter,
+    MitchellFilter,
+    PathIntegrator,
+    Settings,
+    TentFilter,
+)
 
 
 def merged(overrides: dict[str, Any] | None = None, **blocks: Any) -> Settings:
@@ -52,6 +60,9 @@ def test_keys_of_another_type_do_not_follow() -> None:
         ({"stddev": 0.25}, {"radius": 3}, GaussianFilter(stddev=0.25, radius=3.0)),
         ({"stddev": 0.25}, "box", BoxFilter()),
         ("box", {"type": "gaussian"}, GaussianFilter()),
+        ({"stddev": 0.25, "radius": 3}, "tent", TentFilter(radius=3.0)),
+        ("tent", None, TentFilter(radius=1.0)),
+        ({"radius": 3}, {"type": "mitchell", "B": 0}, MitchellFilter(B=0.0, C=1 / 3)),
     ],
 )
 def test_filter_merges(scene: Any, override: Any, expected: Any) -> None:
@@ -76,6 +87,11 @@ def test_words_and_sizes() -> None:
         ({"render": {"seed": -1}}, "render.seed"),
         ({"render": {"seed": 2**63}}, "render.seed"),
         ({"render": {"threads": 0}}, "render.threads"),
+        ({"film": {"filter": {"type": "mitchell", "radius": 2}}}, "film.filter.radius"),
+        ({"film": {"filter": {"type": "mitchell", "C": 1.5}}}, "film.filter.C"),
+        ({"film": {"filter": {"type": "tent", "radius": 0}}}, "film.filter.radius"),
+        ({"film": {"filter": {"type": "tent", "stddev": 1}}}, "film.filter.stddev"),
+        ({"sampler": {"type": "halton"}}, "sampler.type"),
         ({"render": {"compile": "maybe"}}, "render.compile"),
         ({"film": {"width": 0}}, "film.width"),
         ({"film": {"width": 60000, "height": 60000}}, "film.width"),

@@ -11,6 +11,9 @@ import pytest
 import torch
 
 import torchpt
+from torchpt.render import render_scene
+from torchpt.scene import texels
+from torchpt.scene.description import settings
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0], "fov": 20}
 
@@ -192,3 +195,35 @@ def test_the_uv_layer_needs_no_texture():
     assert torch.allclose(image[..., 0], expected.expand(64, 64), atol=4e-3)
     assert torch.allclose(image[..., 1], (1 - expected)[:, None].expand(64, 64), atol=4e-3)
     assert float(image[..., 2].abs().max()) == 0
+
+
+def test_images_are_capped_unless_said_otherwise(png: str, monkeypatch: pytest.MonkeyPatch):
+    image = {"type": "image", "path": png}  # 6 x 4
+    with pytest.raises(torchpt.AssetError, match="6 x 4 pixels.* more than 23 pixels are not read"):
+        scene({"m": {"type": "diffuse", "reflectance": {**image, "max_pixels": 23}}})
+    scene({"m": {"type": "diffuse", "reflectance": {**image, "max_pixels": 24}}})
+    # Whatever another texture of the same file may do.
+    with pytest.raises(torchpt.AssetError, match="more than 23 pixels"):
+        material = {"type": "principled", "base_color": image, "roughness": {**image, "max_pixels": 23}}
+        scene({"m": material})
+    monkeypatch.setattr(texels, "MAX_PIXELS", 10)
+    with pytest.raises(torchpt.AssetError, match="more than 10 pixels"):
+        scene({"m": {"type": "diffuse", "reflectance": image}})
+    scene({"m": {"type": "diffuse", "reflectance": {**image, "max_pixels": 24}}})
+    with pytest.raises(torchpt.SceneError, match=r"max_pixels: expected a whole number"):
+        scene({"m": {"type": "diffuse", "reflectance": {**image, "max_pixels": 0}}})
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.5, 1.0, 3.0])
+def test_normal_strength(tmp_path: Path, strength: float):
+    """The lean of every normal is multiplied: of ``2 c - 1`` the parts along the surface."""
+    iio.imwrite(tmp_path / "n.png", np.full((2, 2, 3), (153, 102, 230), np.uint8))
+    flat = {"type": "image", "path": str(tmp_path / "n.png")}
+    other = {"type": "diffuse", "normal_map": flat}  # of the same group: its strength is 1
+    found = scene({"a": {"type": "diffuse", "normal_map": flat, "normal_strength": strength}, "b": other})
+    assert ("materials.a.normal_strength" in found.params) == (strength != 1.0)
+    wish = {"film": {"width": 4, "height": 4, "aovs": ["normal"]}, "integrator": {"type": "aov"}, "render": {"spp": 1}}
+    normal = render_scene(found, settings(found.description, wish)).layers["normal"][2, 2]
+    x, y, z = (2 * c / 255 - 1 for c in (153, 102, 230))
+    expected = torch.tensor([strength * x, strength * y, z])
+    assert torch.allclose(normal, expected / expected.norm(), atol=1e-6)

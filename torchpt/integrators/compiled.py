@@ -7,6 +7,7 @@ write the same result twice, so nothing needs to know of them. (Under gradients 
 
 from __future__ import annotations
 
+import copy
 import shutil
 import types
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.errors import RenderError
 from torchpt.film import Filter
 from torchpt.integrators import stages
@@ -23,6 +24,11 @@ from torchpt.integrators.stages import Plan
 from torchpt.records import Hit, PathState, Shadow, World, tensors_of
 
 __all__ = ["CompiledStages", "Stages", "can_compile"]
+
+#: Inductor writes what is used more than once out again for each use, unless it took more operations than this. Indices into
+#: textures and the frames of maps are long chains in which each step uses the one before twice: beyond its own 50 that is
+#: 2^50 visits, and compilation does not end. Of scenes without textures the default makes the faster code.
+REALIZE = 10
 
 Search = Callable[[PathState], Hit]
 
@@ -33,16 +39,18 @@ def can_compile(device: torch.device) -> bool:
 
 
 class Stages:
-    """The stages, eager: always complete and correct."""
+    """The stages, eager: always complete and correct.
+
+    Attributes:
+        pixel: how large a pixel is in the world, see :func:`torchpt.integrators.surfaces.spot_at`; None where nothing asks.
+    """
 
     compiled = False
 
-    def __init__(self, plan: Plan, world: World) -> None:
-        self.plan, self.world = plan, world
+    def __init__(self, plan: Plan, world: World, pixel: Tensor | None = None) -> None:
+        self.plan, self.world, self.pixel = plan, world, pixel
 
-    def generate(
-        self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
-    ) -> PathState:
+    def generate(self, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
         """See :func:`torchpt.integrators.stages.generate`."""
         return stages.generate(self.plan, camera, filter, x, y, key, salts)
 
@@ -66,7 +74,9 @@ class Stages:
         salts: Tensor,
     ) -> tuple[PathState, Hit | None, Shadow | None]:
         """See :func:`torchpt.integrators.stages.bounce`."""
-        return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
+        return stages.bounce(
+            self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, self.pixel
+        )
 
 
 class CompiledStages(Stages):
@@ -78,8 +88,8 @@ class CompiledStages(Stages):
 
     compiled = True
 
-    def __init__(self, plan: Plan, world: World) -> None:
-        super().__init__(plan, world)
+    def __init__(self, plan: Plan, world: World, pixel: Tensor | None = None) -> None:
+        super().__init__(plan, world, pixel)
         if not can_compile(world.p0.device):
             raise RenderError("render.compile: on needs a C++ compiler (g++ or clang++) for the CPU; none was found")
         # Only lanes vary in number; a scene's tables do not.
@@ -88,17 +98,23 @@ class CompiledStages(Stages):
         self.graphs: dict[str, int] = {}
         self._made: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
-    def generate(
-        self, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
-    ) -> PathState:
+    def through(self, pixel: Tensor | None) -> CompiledStages:
+        """The same graphs for another camera."""
+        if pixel is not None:
+            torch._dynamo.mark_static(pixel)
+        found = copy.copy(self)
+        found.pixel = pixel
+        return found
+
+    def generate(self, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
         """See :func:`torchpt.integrators.stages.generate`."""
         if len(x) % 16:  # the last chunk of a film: once a pass, not worth a graph
             return super().generate(camera, filter, x, y, key, salts)
 
-        def stage(camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+        def stage(camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
             return stages.generate(self.plan, camera, filter, x, y, key, salts)
 
-        variant = (camera.width, camera.height, camera.fov_axis, filter.kind, filter.radius)
+        variant = (*camera.kind(), filter.kind, filter.radius)
         return self._get("generate", variant, stage)(camera, filter, x, y, key, salts)
 
     def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
@@ -123,12 +139,12 @@ class CompiledStages(Stages):
         """See :func:`torchpt.integrators.stages.bounce`."""
 
         def stage(
-            state: PathState, hit: Hit, index: Tensor, salts: Tensor
+            state: PathState, hit: Hit, index: Tensor, salts: Tensor, pixel: Tensor | None
         ) -> tuple[PathState, Hit | None, Shadow | None]:
-            return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts)
+            return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, pixel)
 
         name = f"bounce {self.world.models[model]}"
-        return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts)
+        return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts, self.pixel)
 
     def _get(self, name: str, variant: tuple[Any, ...], stage: Callable[..., Any]) -> Callable[..., Any]:
         """The compiled form of ``stage``, made once for each variant."""
@@ -142,9 +158,13 @@ class CompiledStages(Stages):
         from torch._inductor.compile_fx import compile_fx
         from torch.fx.experimental import _config
 
+        options: dict[str, Any] = {"assert_indirect_indexing": False}
+        if self.world.textures is not None:
+            options["realize_opcount_threshold"] = REALIZE
+
         def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Any:
             self.graphs[name] = self.graphs.get(name, 0) + 1
-            return compile_fx(graph, inputs, config_patches={"assert_indirect_indexing": False})
+            return compile_fx(graph, inputs, config_patches=options)
 
         config: Any = _config  # its `patch` is put there at run time
         # A code object of its own: dynamo counts graphs by code, and those of another scene are no business of this one.

@@ -17,6 +17,7 @@ from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import Tally, gather_light, partition
 from torchpt.integrators.search import Search
 from torchpt.integrators.split_sum import under
+from torchpt.lights.choice import ByTree
 from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import dot
 from torchpt.records import Lights, PathState, World, rows
@@ -72,7 +73,7 @@ def first_hit(stages: Stages, preview: Preview, accel: Accel, state: PathState) 
         if met.chance is not None:
             here = replace(here, throughput=here.throughput * met.chance)
         at = interact(world, here.o, here.d, met, slide)
-        surface, shadow = pure.shade(plan, local, model, here, at, salt)
+        surface, shadow = pure.shade(plan, local, model, here, at, salt, stages.pixel)
         radiance = torch.zeros_like(here.radiance)
         if preview.sky is not None:
             n, v = preview.turned(surface.frame.n), preview.turned(-here.d)
@@ -99,5 +100,14 @@ def without_environment(lights: Lights | None) -> Lights | None:
     choice = lights.choice
     if left == 1 or choice is None:
         return replace(lights, **{**cut, "kind": None}, kinds=lights.kinds[:1], choice=None, environment=None)
-    again = Discrete.of(choice.pmf[:left], choice.pmf.dtype)
-    return replace(lights, **cut, kinds=lights.kinds[:-1], choice=again, environment=None)
+    if isinstance(choice, ByTree):
+        beside = choice.beside
+        assert beside is not None  # the environment is infinitely far, so not of the tree
+        choice = replace(choice, beside=None if len(beside.pmf) == 2 else _without_last(beside))
+    else:
+        choice = _without_last(choice)
+    return replace(lights, **cut, kinds=lights.kinds[:-1], choice=choice, environment=None)
+
+
+def _without_last(choice: Discrete) -> Discrete:
+    return Discrete.of(choice.pmf[:-1], choice.pmf.dtype)

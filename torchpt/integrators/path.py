@@ -12,6 +12,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from torchpt import lights
 from torchpt.accel import Accel
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.search import Search
@@ -51,6 +52,8 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
     search = Search(accel, world, plan.sampler, plan.dtype)
     if any(model.refracts for model in world.models):
         state = replace(state, eta=torch.ones_like(state.t_max))
+    if lights.local(world.lights):
+        state = replace(state, p=state.o.clone(), n=torch.zeros_like(state.o))
     # Where a delta sends a ray on, its next point slides along it as the camera's does.
     exact = plan.attached or plan.dtype == torch.float64
     sliding = exact and any(model.delta for model in world.models)
@@ -124,10 +127,10 @@ def partition(world: World, hit: Hit) -> tuple[Ends, list[tuple[int, Tensor]]]:
 
 def gather_light(stages: Stages, state: PathState, hit: Hit, ends: Ends, slide: bool) -> None:
     """Add to ``state.radiance`` what the lanes gather from emitters they hit and from the environment."""
-    lights = stages.world.lights
-    if lights is None:
+    table = stages.world.lights
+    if table is None:
         return
     if len(ends.emissive):
         state.radiance.scatter_add_(1, ends.emissive.expand(3, -1), stages.emit(state, hit, ends.emissive, slide))
-    if lights.environment is not None and len(ends.missed):
+    if table.environment is not None and len(ends.missed):
         state.radiance.scatter_add_(1, ends.missed.expand(3, -1), stages.escape(state, hit, ends.missed))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.surfaces import Surface, glow, surface_at, veil
 from torchpt.math.mis import power_heuristic
@@ -57,12 +57,12 @@ class Plan:
     attached: bool  # whether they are wanted with respect to geometry
 
 
-def generate(
-    plan: Plan, camera: Perspective, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor
-) -> PathState:
-    """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter."""
-    place = filter.offset(Draws(plan.sampler, key, salts).two(Dimension.PIXEL)).to(plan.dtype)
-    o, d = camera.rays(x + 0.5 + place[0], y + 0.5 + place[1])
+def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+    """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter (and on the lens, where there is one)."""
+    draws = Draws(plan.sampler, key, salts)
+    place = filter.offset(draws.two(Dimension.PIXEL)).to(plan.dtype)
+    lens = draws.two(Dimension.LENS).to(plan.dtype) if camera.lens else None
+    o, d = camera.rays(x + 0.5 + place[0], y + 0.5 + place[1], lens)
     n = d.shape[1]
     ones = torch.ones_like(d)
     everywhere = torch.full((n,), math.inf, dtype=plan.dtype, device=d.device)
@@ -76,7 +76,9 @@ def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -
     assert world.lights is not None
     o, d = take(state.o, index), take(state.d, index)
     at = interact(world, o, d, rows(hit, index), slide)
-    radiance, pdf = lights.emitted(world.lights, o, at, d)
+    # Where lights are chosen by place the density is that at the vertex itself, which is not quite where the ray begins.
+    x = o if state.p is None else take(state.p, index)
+    radiance, pdf = lights.emitted(world.lights, x, at, d, None if state.n is None else take(state.n, index))
     if world.glows is not None:
         radiance = radiance * glow(world, at)
     return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
@@ -111,6 +113,7 @@ def bounce(
     hit: Hit,
     index: Tensor,
     salts: Tensor,
+    pixel: Tensor | None = None,
 ) -> tuple[PathState, Hit | None, Shadow | None]:
     """One vertex of the paths at ``index``, all of which hit surfaces of one BSDF model.
 
@@ -125,6 +128,7 @@ def bounce(
         hit: of the whole wave.
         index: lanes concerned ``(n,)``.
         salts: names of this depth's dimensions.
+        pixel: see :func:`torchpt.integrators.surfaces.spot_at`.
 
     Returns:
         The state of the ``n`` paths with their next rays, the next hits where they had to be found already, and the shadow
@@ -134,28 +138,38 @@ def bounce(
     at = interact(world, here.o, here.d, met, slide)
     if met.chance is not None:
         here = replace(here, throughput=here.throughput * met.chance)
-    surface, shadow = shade(plan, world, model, here, at, salts)
+    surface, shadow = shade(plan, world, model, here, at, salts, pixel)
     after, found = scatter(plan, world, model, here, at, surface, salts, roulette, search)
     return after, found, shadow
 
 
 def shade(
-    plan: Plan, world: World, model: int, state: PathState, at: Interaction, salts: Tensor
+    plan: Plan,
+    world: World,
+    model: int,
+    state: PathState,
+    at: Interaction,
+    salts: Tensor,
+    pixel: Tensor | None,
 ) -> tuple[Surface, Shadow | None]:
     """Resolve the material at the surface points and sample a light for each.
 
     Returns:
         The surface, and the shadow rays (None where no light is sampled).
     """
-    surface, kind = surface_at(world, model, state.d, at), world.models[model]
+    surface, kind = surface_at(world, model, state.d, at, pixel), world.models[model]
     if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
         return surface, None
     table = world.lights
     draws = Draws(plan.sampler, state.key, salts)
-    choice = None if table.choice is None else draws.one(Dimension.LIGHT_CHOICE)
-    light = lights.sample(
-        table, at.p, choice, draws.two(Dimension.LIGHT).to(plan.dtype), OFFSET, plan.strategy == "mis"
-    )
+    which = None
+    if lights.local(table):
+        which = lights.fine(draws.two(Dimension.LIGHT_CHOICE))
+    elif table.choice is not None:
+        which = draws.one(Dimension.LIGHT_CHOICE)
+    n = None if kind.transmits else surface.frame.n
+    u, mis = draws.two(Dimension.LIGHT).to(plan.dtype), plan.strategy == "mis"
+    light = lights.sample(table, at.p, which, u, OFFSET, n, mis)
     wi = surface.frame.to_local(light.wi)
     weight = light.weight
     if plan.strategy == "mis":
@@ -293,4 +307,8 @@ def scatter(
         key=state.key,
         eta=eta,
     )
+    if state.p is not None:
+        n = torch.zeros_like(at.p) if kind.transmits else frame.n
+        # Copies: no two tensors of a state share memory.
+        after = replace(after, p=at.p.detach().clone(), n=n.detach().clone())
     return after, hit

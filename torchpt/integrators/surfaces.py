@@ -15,7 +15,51 @@ from torchpt.records import Interaction, World
 from torchpt.shapes import surface_uv, vertex_colors
 from torchpt.textures import Look, Pick, look_up, slope
 
-__all__ = ["Surface", "glow", "parameters_at", "shading_normal", "surface_at", "veil"]
+__all__ = ["Spot", "Surface", "glow", "parameters_at", "shading_normal", "spot_at", "surface_at", "veil"]
+
+#: Seen more slantingly than this (as a cosine), a footprint grows no further.
+_SLANT = 1e-3
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Where textures are read."""
+
+    uv: Tensor  # (2, N)
+    footprint: Tensor | None  # (N,) area in texture coordinates; None: they are read at points
+
+
+def spot_at(world: World, number: int, at: Interaction, pixel: Tensor | None) -> Spot | None:
+    """Where the textures of model ``number`` are read; None where it reads no image.
+
+    Args:
+        world: the scene's tensors.
+        number: of the model.
+        at: the points.
+        pixel: how large a pixel is in the world, see :meth:`torchpt.cameras.Camera.pixel`; None: a point.
+    """
+    look = world.looks[number]
+    if look is None or world.uvs is None:
+        return None
+    wide = look.filtered and pixel is not None
+    return Spot(surface_uv(world, at), _footprint(at, pixel) if wide and pixel is not None else None)
+
+
+def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
+    """Area ``(N,)`` in texture coordinates of what a pixel covers of the surface; 0 where it has no coordinates.
+
+    Every vertex of a path counts as if the camera saw it directly (Pharr, Jakob, Humphreys, *Physically Based Rendering*,
+    4th edition, 10.1.3). Of the ellipse that a pixel is on the surface, the area: filters here are round.
+    """
+    assert at.tangent is not None and at.bitangent is not None
+    away = torch.addcmul(pixel[0:3, None], at.p, pixel[3], value=-1)
+    square = dot(away, away)
+    cosine = dot(normalize(away), at.ng).abs().clamp_min(_SLANT)
+    across = cross(at.tangent, at.bitangent)
+    stretch = dot(across, across)  # of the area, squared
+    some = stretch > 0
+    stretch = torch.where(some, torch.where(some, stretch, 1.0).sqrt(), torch.inf)
+    return square * (pixel[4] * pixel[4]) / (cosine * stretch)
 
 
 @dataclass(frozen=True)
@@ -48,7 +92,7 @@ class Surface:
     relief: Relief | None  # None where no map bends the normals
 
 
-def surface_at(world: World, number: int, d: Tensor, at: Interaction) -> Surface:
+def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Tensor | None = None) -> Surface:
     """Resolve the material at surface points.
 
     Args:
@@ -56,10 +100,11 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction) -> Surface
         number: of the model that all of them have.
         d: directions ``(3, N)`` of the rays that came.
         at: the points.
+        pixel: see :func:`spot_at`.
     """
     model, row = world.models[number], take(world.material, at.slot)
     look = world.looks[number]
-    uv = None if look is None or world.uvs is None else surface_uv(world, at)
+    spot = spot_at(world, number, at, pixel)
     ns, side, shown, relief = at.ns, None, None, None
     if not model.transmits:
         side = torch.copysign(torch.ones_like(ns[0]), -dot(d, ns).detach())
@@ -67,43 +112,44 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction) -> Surface
         if both is not None:
             shown = ((side > 0) | take(both, row)).to(side.dtype)
     if look is not None and (look.normal is not None or look.bump is not None):
-        assert uv is not None
-        frame, relief = _mapped(world, look, row, uv, d, at, side)
+        assert spot is not None
+        frame, relief = _mapped(world, look, row, spot, d, at, side)
     else:
         ns = ns if side is None else ns * side
         frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
-    return Surface(frame, side, shown, parameters_at(world, number, row, at, uv), frame.to_local(-d), relief)
+    return Surface(frame, side, shown, parameters_at(world, number, row, at, spot), frame.to_local(-d), relief)
 
 
-def parameters_at(world: World, number: int, row: Tensor, at: Interaction, uv: Tensor | None) -> bsdfs.Parameters:
-    """Lane values of the BSDF ``number`` at rows ``(N,)``; ``uv (2, N)`` where images are read."""
+def parameters_at(world: World, number: int, row: Tensor, at: Interaction, spot: Spot | None) -> bsdfs.Parameters:
+    """Lane values of the BSDF ``number`` at rows ``(N,)``; ``spot`` where images are read."""
     values, look = bsdfs.gather(world.bsdfs[number], row), world.looks[number]
     if look is None:
         return values
-    return world.models[number].prepare(_filled(world, values, look.readings, row, at, uv))
+    return world.models[number].prepare(_filled(world, values, look.readings, row, at, spot))
 
 
 def _filled(
-    world: World, values: bsdfs.Parameters, readings: dict[str, Any], row: Tensor, at: Interaction, uv: Tensor | None
+    world: World, values: bsdfs.Parameters, readings: dict[str, Any], row: Tensor, at: Interaction, spot: Spot | None
 ) -> bsdfs.Parameters:
     """Values with those that textures give."""
     found = dict(values)
     for key, reading in readings.items():
         if isinstance(reading, Pick):
-            found[key] = _read(world, reading, row, at, uv)
+            found[key] = _read(world, reading, row, at, spot)
         else:
-            found[key] = _filled(world, values.get(key, {}), reading, row, at, uv)
+            found[key] = _filled(world, values.get(key, {}), reading, row, at, spot)
     return found
 
 
-def _read(world: World, pick: Pick, row: Tensor, at: Interaction, uv: Tensor | None) -> Tensor:
+def _read(world: World, pick: Pick, row: Tensor, at: Interaction, spot: Spot | None) -> Tensor:
     if pick.nodes is None:
         colors = vertex_colors(world, at)
         if pick.channel is None:
             return colors
         return colors[pick.channel] if pick.channel >= 0 else luminance(colors)
-    assert world.textures is not None and uv is not None
-    return look_up(world.textures, take(pick.nodes, row), uv, pick.channel is None)
+    assert world.textures is not None and spot is not None
+    footprint = spot.footprint if pick.filtered else None
+    return look_up(world.textures, take(pick.nodes, row), spot.uv, pick.channel is None, footprint)
 
 
 def veil(world: World, at: Interaction) -> Tensor:
@@ -127,18 +173,19 @@ def glow(world: World, at: Interaction) -> Tensor:
     return torch.where(node < 0, 1.0, value)
 
 
-def shading_normal(world: World, number: int, d: Tensor, at: Interaction) -> Tensor:
+def shading_normal(world: World, number: int, d: Tensor, at: Interaction, spot: Spot | None) -> Tensor:
     """The shading normal ``(3, N)`` on the shape's own outside, maps included."""
     look = world.looks[number]
     if look is None or (look.normal is None and look.bump is None):
         return at.ns
-    uv, row = surface_uv(world, at), take(world.material, at.slot)
+    assert spot is not None
+    row = take(world.material, at.slot)
     side = torch.copysign(torch.ones_like(d[0]), -dot(d, at.ns))
-    return _mapped(world, look, row, uv, d, at, side)[0].n * side
+    return _mapped(world, look, row, spot, d, at, side)[0].n * side
 
 
 def _mapped(
-    world: World, look: Look, row: Tensor, uv: Tensor, d: Tensor, at: Interaction, side: Tensor | None
+    world: World, look: Look, row: Tensor, spot: Spot, d: Tensor, at: Interaction, side: Tensor | None
 ) -> tuple[Frame, Relief]:
     """The frame about the normal of a normal or bump map, and what the map did.
 
@@ -150,11 +197,15 @@ def _mapped(
     assert world.textures is not None and at.tangent is not None
     base = Frame.along(at.ns, at.tangent)
     if look.normal is not None:
-        local = look_up(world.textures, take(look.normal, row), uv, True) * 2.0 - 1.0
+        local = _read(world, look.normal, row, at, spot) * 2.0 - 1.0
         x, y, z = local[0], local[1], local[2].clamp_min(1e-3)
+        if look.strength is not None:
+            strength = take(look.strength, row)
+            x, y = x * strength, y * strength
     else:
-        assert look.bump is not None and at.bitangent is not None
-        du, dv = slope(world.textures, take(look.bump, row), uv)
+        assert look.bump is not None and look.bump.nodes is not None and at.bitangent is not None
+        footprint = spot.footprint if look.bump.filtered else None
+        du, dv = slope(world.textures, take(look.bump.nodes, row), spot.uv, footprint)
         along = torch.addcmul(at.tangent, at.ns, du - dot(at.ns, at.tangent))
         across = torch.addcmul(at.bitangent, at.ns, dv - dot(at.ns, at.bitangent))
         x, y, z = base.to_local(cross(along, across))

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators import aov, ibl
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import Limits, Tally, trace
 from torchpt.integrators.search import Search
 from torchpt.records import PathState
-from torchpt.samplers import Sampler, salts
+from torchpt.samplers import Dimension, Draws, Sampler, salts
 
 __all__ = ["Wave"]
 
@@ -39,7 +39,7 @@ class Wave:
     stages: Stages
     limits: Limits | None
     accel: Accel
-    camera: Perspective
+    camera: Camera
     filter: Filter
     sampler: Sampler
     crop: tuple[int, int, int, int]
@@ -67,7 +67,14 @@ class Wave:
             radiance, tally = trace(self.stages, self.limits, self.accel, state)
         else:
             radiance, tally = ibl.first_hit(self.stages, self.preview, self.accel, state)
+        if self.filter.signed:
+            radiance = radiance * self._weight(state)
         return radiance.view(3, samples, pixels), tally
+
+    def _weight(self, state: PathState) -> Tensor:
+        """What the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""
+        draws = Draws(self.stages.plan.sampler, state.key, salts(0, self.centre.device))
+        return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.stages.plan.dtype)
 
     def layers(
         self, names: tuple[str, ...], first_pixel: int, pixels: int, first_sample: int, samples: int
@@ -76,5 +83,8 @@ class Wave:
         state = self.rays(first_pixel, pixels, first_sample, samples)
         plan, world = self.stages.plan, self.stages.world
         search = Search(self.accel, world, plan.sampler, plan.dtype)
-        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype)
+        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel)
+        if self.filter.signed:
+            weight = self._weight(state)
+            found = {name: value if name in aov.NAMES else value * weight for name, value in found.items()}
         return {name: value.view(len(value), samples, pixels) for name, value in found.items()}

@@ -1,14 +1,17 @@
-"""Lights: emissive primitives, points, the environment; the table that chooses among them by power.
+"""Lights: emissive primitives, points, the environment; the table that chooses among them.
 
-    sample(lights, x, choice, u) -> LightSample     a point on the lights seen from x
+    sample(lights, x, which, u) -> LightSample     a point on the lights seen from x
     emitted(lights, prim, ...) -> radiance, pdf     what a ray that hit an emitter by chance brings
 
 One kind a file: ``area`` (triangle, rectangle, disk), ``sphere``, ``quadric``, ``point``, ``spot``, ``constant``,
-``envmap``; of a directional light there is nothing to compute.
+``envmap``; of a directional light there is nothing to compute. Which light is drawn is said in ``choice``: by power, or by
+the light ``tree``.
 """
 
 from __future__ import annotations
 
+from torchpt.lights.choice import WAYS, choice_of, local
 from torchpt.lights.table import emitted, environment, sample
+from torchpt.lights.tree import fine
 
-__all__ = ["emitted", "environment", "sample"]
+__all__ = ["WAYS", "choice_of", "emitted", "environment", "fine", "local", "sample"]

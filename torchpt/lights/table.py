@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lights import area, constant, envmap, point, quadric, sphere, spot
+from torchpt.lights import area, choice, constant, envmap, point, quadric, sphere, spot
 from torchpt.lights.envmap import EnvironmentMap
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.records import DISTANT, KINDS, Interaction, Lights, LightSample, Quadrics, rows
@@ -48,23 +48,32 @@ def _pick(mask: Tensor | None, a: Tensor, b: Tensor | None) -> Tensor:
     return a if mask is None or b is None else torch.where(mask, a, b)
 
 
-def _probability(lights: Lights, row: Tensor | None) -> Tensor | float:
-    return 1.0 if lights.choice is None or row is None else take(lights.choice.pmf, row)
-
-
-def sample(lights: Lights, x: Tensor, choice: Tensor | None, u: Tensor, offset: float, mis: bool = True) -> LightSample:
+def sample(
+    lights: Lights,
+    x: Tensor,
+    which: Tensor | None,
+    u: Tensor,
+    offset: float,
+    n: Tensor | None = None,
+    mis: bool = True,
+) -> LightSample:
     """A point on the lights, seen from ``x (3, N)``.
 
     Args:
         lights: the table.
         x: reference points ``(3, N)``.
-        choice: ``(N,)`` in [0, 1), picks the light; unused (``None``) where there is but one.
+        which: ``(N,)`` in [0, 1), picks the light; unused (``None``) where there is but one.
         u: ``(2, N)`` in [0, 1), picks the point.
         offset: how far shadow rays stop off the light's surface, in units of ``Lights.bound``.
+        n: normals ``(3, N)`` of surfaces that nothing lights from behind, zero for others; None: no such surface. Asked for
+            where the choice is local, see :func:`torchpt.lights.choice.local`.
         mis: whether BSDF sampling shares the work: an environment map then leaves it the dim directions.
     """
-    row = None if lights.choice is None or choice is None else lights.choice.sample(choice)
-    at, probability = _rows(lights, row), _probability(lights, row)
+    row: Tensor | None = None
+    probability: Tensor | float = 1.0
+    if lights.choice is not None and which is not None:
+        row, probability = choice.draw(lights.choice, which, x, n)
+    at = _rows(lights, row)
     surfaces = len([kind for kind in lights.kinds if kind in KINDS])
     near = len([kind for kind in lights.kinds if kind not in DISTANT])
     bare, distant = _from(lights, surfaces, row), _from(lights, near, row)
@@ -190,7 +199,7 @@ def _from_afar(
     return LightSample(wi, wi, None, radiance, pdf * probability, weight / probability)
 
 
-def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Tensor, Tensor]:
+def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """What emitters that were hit send back along ``wi``.
 
     Args:
@@ -198,6 +207,7 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Ten
         x: where the rays came from ``(3, N)``.
         at: points on emissive primitives.
         wi: unit directions from ``x`` to them ``(3, N)``.
+        n: normals ``(3, N)`` where they came from, as :func:`sample` was given them.
 
     Returns:
         Radiance ``(3, N)``, zero from behind, and the density ``(N,)`` with which :func:`sample` would have drawn ``wi``.
@@ -216,14 +226,17 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor) -> tuple[Ten
             ball = sphere.inverse_pdf(x, table.p0, table.e1[0], at.ng, wi, dot(to, to))
             inverse = _pick(_is(lights, "sphere", row), ball, inverse)
         facing = dot(wi, at.ng) < 0
-        pdf = torch.where(facing, safe_reciprocal(inverse) * _probability(lights, row), 0.0)
+        pdf = safe_reciprocal(inverse)
+        if lights.choice is not None and row is not None:
+            pdf = pdf * choice.probability(lights.choice, row, x, n)
+        pdf = torch.where(facing, pdf, 0.0)
     return torch.where(facing, table.radiance, 0.0), pdf
 
 
 def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
     """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS."""
     assert lights.environment is not None
-    probability = 1.0 if lights.choice is None else lights.choice.pmf[-1]
+    probability = choice.environment(lights.choice)
     if isinstance(lights.environment, EnvironmentMap):
         radiance, pdf = envmap.environment(lights.environment, d, mis=True)
         return radiance, pdf * probability

@@ -13,6 +13,7 @@ __all__ = [
     "one_minus_cos",
     "uniform_cone",
     "uniform_hemisphere",
+    "uniform_polygon",
     "uniform_sphere",
     "uniform_triangle",
 ]
@@ -20,14 +21,39 @@ __all__ = [
 
 def concentric_disk(u: Tensor) -> Tensor:
     """Area-preserving map to the unit disk ``(2, N)`` (Shirley and Chiu, *A Low Distortion Map*, 1997)."""
+    wide, r, phi = _concentric(u)
+    c, s = torch.cos(phi), torch.sin(phi)
+    return r * torch.stack((torch.where(wide, c, s), torch.where(wide, s, c)))
+
+
+def _concentric(u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The concentric map's signed radius and its angle, from the x axis where ``wide``, else from the y axis (mirrored)."""
     a, b = 2.0 * u[0] - 1.0, 2.0 * u[1] - 1.0
     wide = a.abs() > b.abs()
     r = torch.where(wide, a, b)
     # The quotient is 0/0 only at the centre, where r = 0 makes the angle irrelevant.
     ratio = torch.where(wide, b, a) / torch.where(r == 0, 1.0, r)
-    phi = (math.pi / 4) * ratio
-    c, s = torch.cos(phi), torch.sin(phi)
-    return r * torch.stack((torch.where(wide, c, s), torch.where(wide, s, c)))
+    return wide, r, (math.pi / 4) * ratio
+
+
+def uniform_polygon(u: Tensor, sides: int) -> Tensor:
+    """Points ``(2, N)`` uniform over the regular polygon in the unit circle, one of its corners at ``(0, 1)``.
+
+    The concentric map to the disk, then each sector of the disk onto its triangle: a share of the angle becomes the same
+    share of the edge. That preserves area as well and is continuous, so that strata of the square stay compact.
+    """
+    wide, r, phi = _concentric(u)
+    # Anticlockwise from the upper corner: half a turn on where the radius is negative, a quarter back from the x axis.
+    turn = phi * (0.5 / math.pi)
+    turn = torch.where(wide, turn - 0.25, -turn) + torch.where(r < 0, 0.5, 0.0)
+    place = turn * sides
+    edge = torch.floor(place)
+    middle = (edge + 0.5) * (2.0 * math.pi / sides)
+    c, s = torch.cos(middle), torch.sin(middle)
+    size = r.abs()
+    out = size * math.cos(math.pi / sides)
+    along = size * (2.0 * (place - edge) - 1.0) * math.sin(math.pi / sides)
+    return torch.stack((-s * out - c * along, c * out - s * along))
 
 
 def cosine_hemisphere(u: Tensor) -> Tensor:

@@ -14,14 +14,20 @@ import torch
 from torch import Tensor
 
 from torchpt.native.operators import choose, operator
-from torchpt.samplers import independent, sobol
+from torchpt.samplers import hammersley, independent, sobol, stratified, zsobol
 from torchpt.samplers.dimensions import Dimension, salt
 from torchpt.samplers.hashing import as_int32, mix, mix_int
 
 __all__ = ["KINDS", "Dimension", "Draws", "Sampler", "salts"]
 
-#: Sampler types by name: modules with ``draw_1d(key, salt)`` and ``draw_2d(key, salt)``.
-KINDS: dict[str, ModuleType] = {"sobol": sobol, "independent": independent}
+#: Sampler types by name: modules with ``draw_1d(key, salt)``, ``draw_2d(key, salt)`` and ``NEEDS_COUNT``.
+KINDS: dict[str, ModuleType] = {
+    "sobol": sobol,
+    "independent": independent,
+    "stratified": stratified,
+    "hammersley": hammersley,
+    "zsobol": zsobol,
+}
 
 
 @dataclass(frozen=True)
@@ -31,24 +37,40 @@ class Sampler:
     Attributes:
         kind: name of the type, from :data:`KINDS`.
         seed: any integer from 0 to 2^63 - 1.
-        randomizations: how many independent sequences share the samples of a pixel.
+        randomizations: R, how many independent sequences share the samples of a pixel: ``spp // R`` points each, and one
+            more for the first ``spp % R``.
+        spp: samples a pixel in all, for the kinds that must know it beforehand; 0 where nobody knows.
+        width: of the film in pixels, by which pixels are numbered; for kinds that ask where a pixel lies.
     """
 
     kind: str
     seed: int
     randomizations: int = 1
+    spp: int = 0
+    width: int = 1
+
+    def __post_init__(self) -> None:
+        if KINDS[self.kind].NEEDS_COUNT and self.spp < self.randomizations:
+            raise ValueError(f"{self.kind} points must know their number, at least one for each randomization")
 
     def key(self, pixel: Tensor, sample: Tensor) -> Tensor:
         """``(2, N)`` int32 for int64 pixel and sample indices ``(N,)``: a pixel's seed and a point's index.
 
         The seed is a bijection of the pixel index for each (seed, randomization), so no two pixels share a sequence.
+        ``stratified`` and ``hammersley`` have a third row, how many points there are; ``zsobol`` has :func:`zsobol.key`.
         """
         group, point = sample % self.randomizations, sample // self.randomizations
         seeds = [
             mix_int(mix_int(mix_int(self.seed) ^ as_int32(self.seed >> 32)) + g) for g in range(self.randomizations)
         ]
         seed = torch.tensor(seeds, dtype=torch.int32, device=pixel.device)[group]
-        return torch.stack((mix(mix(pixel.to(torch.int32)) ^ seed), point.to(torch.int32)))
+        if self.kind == "zsobol":
+            return zsobol.key(pixel, point, seed, -(-self.spp // self.randomizations), self.width)
+        key = [mix(mix(pixel.to(torch.int32)) ^ seed), point.to(torch.int32)]
+        if KINDS[self.kind].NEEDS_COUNT:
+            every, more = divmod(self.spp, self.randomizations)
+            key.append((every + (group < more)).to(torch.int32))
+        return torch.stack(key)
 
 
 class Draws:
@@ -56,7 +78,7 @@ class Draws:
 
     Args:
         kind: type of the sampler.
-        key: ``(2, N)`` int32 as given by :meth:`Sampler.key`.
+        key: ``(rows, N)`` int32 as given by :meth:`Sampler.key`.
         salts: ``(len(Dimension),)`` int32, the dimensions' names at this depth; a tensor, so that a compiled stage does not
             specialize on the depth.
     """

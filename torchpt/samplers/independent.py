@@ -7,8 +7,10 @@ from torch import Tensor
 
 from torchpt.samplers.hashing import as_int32, mix, to_unit
 
-__all__ = ["draw_1d", "draw_2d"]
+__all__ = ["NEEDS_COUNT", "draw_1d", "draw_2d"]
 
+#: Any number of points may be drawn, and then more.
+NEEDS_COUNT = False
 _SECOND = as_int32(0x9E3779B9)
 
 

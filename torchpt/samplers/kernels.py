@@ -14,55 +14,12 @@ import torch
 from torch import Tensor
 
 from torchpt.native.jit import jit, launch, thread_count
+from torchpt.samplers.kernels_bits import SECOND, U, X, Y, mix, reverse, scramble, second_dimension, unit
 
 __all__ = ["draw"]
 
-U = np.uint32
-_M0, _M1 = U(0x7FEB352D), U(0x846CA68B)
-_K0, _K1, _K2 = U(0x3D20ADEA), U(0x05526C56), U(0x53A22864)
-_X, _Y, _SECOND = U(0x68BC21EB), U(0x02E5BE93), U(0x9E3779B9)
-_SCALE = np.float32(1.0 / (1 << 24))
 #: Lanes a thread takes at once.
 BLOCK = 1024
-
-
-@jit(inline="always")
-def _mix(x: Any) -> Any:
-    x = U(U(x ^ (x >> U(16))) * _M0)
-    x = U(U(x ^ (x >> U(15))) * _M1)
-    return U(x ^ (x >> U(16)))
-
-
-@jit(inline="always")
-def _reverse(x: Any) -> Any:
-    x = U(((x >> U(1)) & U(0x55555555)) | ((x & U(0x55555555)) << U(1)))
-    x = U(((x >> U(2)) & U(0x33333333)) | ((x & U(0x33333333)) << U(2)))
-    x = U(((x >> U(4)) & U(0x0F0F0F0F)) | ((x & U(0x0F0F0F0F)) << U(4)))
-    x = U(((x >> U(8)) & U(0x00FF00FF)) | ((x & U(0x00FF00FF)) << U(8)))
-    return U((x >> U(16)) | (x << U(16)))
-
-
-@jit(inline="always")
-def _scramble(x: Any, seed: Any) -> Any:
-    x = U(x ^ U(x * _K0))
-    x = U(x + seed)
-    x = U(x * U((seed >> U(16)) | U(1)))
-    x = U(x ^ U(x * _K1))
-    return U(x ^ U(x * _K2))
-
-
-@jit(inline="always")
-def _second_dimension(x: Any) -> Any:
-    x = U(x ^ ((x >> U(16)) & U(0x0000FFFF)))
-    x = U(x ^ ((x >> U(8)) & U(0x00FF00FF)))
-    x = U(x ^ ((x >> U(4)) & U(0x0F0F0F0F)))
-    x = U(x ^ ((x >> U(2)) & U(0x33333333)))
-    return U(x ^ ((x >> U(1)) & U(0x55555555)))
-
-
-@jit(inline="always")
-def _unit(x: Any) -> Any:
-    return np.float32(np.int32(x >> U(8))) * _SCALE
 
 
 # Rows are separate one-dimensional arrays: indexed as rows of one array, the loops are not turned into vector code.
@@ -71,32 +28,32 @@ def _unit(x: Any) -> Any:
 @jit()
 def _sobol_1d(k0: Any, k1: Any, salt: Any, o0: Any, o1: Any) -> None:
     for i in range(len(k0)):
-        seed = _mix(U(k0[i] ^ salt))
-        index = _reverse(_scramble(_reverse(k1[i]), seed))
-        o0[i] = _unit(_reverse(_scramble(index, _mix(U(seed ^ _X)))))
+        seed = mix(U(k0[i] ^ salt))
+        index = reverse(scramble(reverse(k1[i]), seed))
+        o0[i] = unit(reverse(scramble(index, mix(U(seed ^ X)))))
 
 
 @jit()
 def _sobol_2d(k0: Any, k1: Any, salt: Any, o0: Any, o1: Any) -> None:
     for i in range(len(k0)):
-        seed = _mix(U(k0[i] ^ salt))
-        index = _reverse(_scramble(_reverse(k1[i]), seed))
-        o0[i] = _unit(_reverse(_scramble(index, _mix(U(seed ^ _X)))))
-        o1[i] = _unit(_reverse(_scramble(_second_dimension(index), _mix(U(seed ^ _Y)))))
+        seed = mix(U(k0[i] ^ salt))
+        index = reverse(scramble(reverse(k1[i]), seed))
+        o0[i] = unit(reverse(scramble(index, mix(U(seed ^ X)))))
+        o1[i] = unit(reverse(scramble(second_dimension(index), mix(U(seed ^ Y)))))
 
 
 @jit()
 def _independent_1d(k0: Any, k1: Any, salt: Any, o0: Any, o1: Any) -> None:
     for i in range(len(k0)):
-        o0[i] = _unit(_mix(U(_mix(U(k1[i] ^ salt)) + k0[i])))
+        o0[i] = unit(mix(U(mix(U(k1[i] ^ salt)) + k0[i])))
 
 
 @jit()
 def _independent_2d(k0: Any, k1: Any, salt: Any, o0: Any, o1: Any) -> None:
     for i in range(len(k0)):
-        word = _mix(U(_mix(U(k1[i] ^ salt)) + k0[i]))
-        o0[i] = _unit(word)
-        o1[i] = _unit(_mix(U(word ^ _SECOND)))
+        word = mix(U(mix(U(k1[i] ^ salt)) + k0[i]))
+        o0[i] = unit(word)
+        o1[i] = unit(mix(U(word ^ SECOND)))
 
 
 @jit(inline="always")
@@ -130,7 +87,15 @@ def draw(kind: str, rows: int, key: Tensor, salt: int) -> Tensor:
     out = torch.empty(rows, n, dtype=torch.float32)
     if n:
         words, values = key.contiguous().numpy().view(np.uint32), out.numpy()
-        body = 2 * (kind == "independent") + rows - 1
-        arguments = (body, words[0], words[1], U(salt & 0xFFFFFFFF), values[0], values[-1])
-        launch(_serial, _parallel, -(-n // BLOCK), thread_count(None), 16, arguments)
+        name, ends = U(salt & 0xFFFFFFFF), (values[0], values[-1])
+        if kind in ("sobol", "independent"):
+            body = 2 * (kind == "independent") + rows - 1
+            run, split, arguments = _serial, _parallel, (body, words[0], words[1], name, *ends)
+        else:
+            from torchpt.samplers import kernels_counted as counted
+
+            body = 2 * counted.BODIES.index(kind) + rows - 1
+            run, split = counted.serial, counted.parallel
+            arguments = (BLOCK, body, words[0], words[1], words[-1], name, *ends)
+        launch(run, split, -(-n // BLOCK), thread_count(None), 16, arguments)
     return out

@@ -15,8 +15,10 @@ from torch import Tensor
 
 from torchpt.samplers.hashing import as_int32, logical_shift, mix, to_unit
 
-__all__ = ["draw_1d", "draw_2d", "reverse_bits", "scramble", "second_dimension"]
+__all__ = ["NEEDS_COUNT", "draw_1d", "draw_2d", "reverse_bits", "scramble", "second_dimension"]
 
+#: Any number of points may be drawn, and then more.
+NEEDS_COUNT = False
 _K0, _K1, _K2 = 0x3D20ADEA, 0x05526C56, 0x53A22864
 _X, _Y = as_int32(0x68BC21EB), as_int32(0x02E5BE93)
 _HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))

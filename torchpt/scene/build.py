@@ -65,7 +65,8 @@ def build_parts(description: Description) -> Built:
         _declare(slot_of(material, f"materials.{name}", description.materials, opener), parameters)
     sources = _sources(description, parameters)
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
-    parameters["camera.fov"] = np.asarray(description.camera.fov, np.float64)
+    for name, number in description.camera.numbers().items():
+        parameters[f"camera.{name}"] = np.asarray(number, np.float64)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     return Built(tuple(parts), parameters, _centre(parts, copies), sources, tuple(copies))
 
@@ -320,12 +321,14 @@ def _ignored(piece: MeshPart | None) -> tuple[str, ...]:
 
 def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
     """Faces that have an area, and how many do not."""
-    corners = (piece.vertices @ pose[:3, :3].T)[piece.faces]
-    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    columns = pose[:3, :3] @ piece.vertices.T
+    p0, p1, p2 = (columns[:, piece.faces[:, k]] for k in range(3))
     # Relative to the longest edge, so that neither tiny nor huge meshes are mistaken for degenerate ones.
-    longest = np.maximum(np.abs(e1).max(1), np.abs(e2).max(1))
-    safe = np.where(longest > 0, longest, 1.0)[:, None]
-    solid = (longest > 0) & (np.linalg.norm(np.cross(e1 / safe, e2 / safe), axis=1) > 1e-12)
+    longest = np.maximum(np.abs(p1 - p0), np.abs(p2 - p0)).max(0)
+    safe = np.where(longest > 0, longest, 1.0)
+    (ax, ay, az), (bx, by, bz) = (p1 - p0) / safe, (p2 - p0) / safe
+    square = (ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2
+    solid = (longest > 0) & (square > 1e-24)
     return np.ascontiguousarray(piece.faces[solid]), int((~solid).sum())
 
 

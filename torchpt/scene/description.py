@@ -15,7 +15,7 @@ from torchpt.scene import schema
 from torchpt.scene import settings as run_settings
 from torchpt.scene.lights import LIGHTS, Light
 from torchpt.scene.materials import MATERIALS, Material, check_material, custom_types, read_material
-from torchpt.scene.schema import Perspective, Shape
+from torchpt.scene.schema import Camera, Shape
 from torchpt.scene.settings import BLOCKS, Settings
 from torchpt.scene.textures import TEXTURES, Named, Texture
 from torchpt.scene.validate import check_keys, select
@@ -50,7 +50,7 @@ class Description:
 
     file: str | None
     base: Path
-    camera: Perspective
+    camera: Camera
     version: int | None = None
     film: dict[str, Any] = field(default_factory=dict)
     integrator: dict[str, Any] = field(default_factory=dict)
@@ -160,7 +160,7 @@ def _describe(raw: dict[str, Any], types: Mapping[str, type[Material]], file: st
         raise SceneError("version", version, "1", file)
     if raw.get("camera") is None:
         raise SceneError("camera", None, "a camera (every scene needs one)", file)
-    camera = select("camera", schema.CAMERAS, raw["camera"], "camera", file, "perspective")
+    camera = schema.read_camera(raw["camera"], file)
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
     run_settings.merge(blocks, {}, file)
     textures = _named(raw, "textures", file, lambda item, key: select("texture", TEXTURES, item, key, file))

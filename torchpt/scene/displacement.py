@@ -76,8 +76,10 @@ def _places(vertices: Rows) -> tuple[Rows, NDArray[np.int64]]:
     bits = (np.ascontiguousarray(vertices) + 0.0).view(np.uint64)  # + 0 makes -0 and 0 one
     mixed = bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
     mixed ^= mixed >> np.uint64(29)
-    _, first, group = np.unique(mixed.sum(1) * np.uint64(0xBF58476D1CE4E5B9), return_index=True, return_inverse=True)
-    place, group = vertices[first], group.reshape(-1)
+    # Any vertex of a place will do for it: asked for the first ones, `unique` would have to sort stably, which is far slower.
+    keys, group = np.unique(mixed.sum(1) * np.uint64(0xBF58476D1CE4E5B9), return_inverse=True)
+    place, group = np.empty((len(keys), 3)), group.reshape(-1)
+    place[group] = vertices
     if not np.array_equal(place[group], vertices):  # two places of one hash: once in 2^64 / V^2 meshes
         place, group = np.unique(vertices, axis=0, return_inverse=True)
     return place, group.reshape(-1)
@@ -85,8 +87,7 @@ def _places(vertices: Rows) -> tuple[Rows, NDArray[np.int64]]:
 
 def _averaged(rows: Rows, group: NDArray[np.int64], count: int) -> Rows:
     """Means ``(count, C)`` over groups."""
-    total = np.zeros((count, rows.shape[1]))
-    np.add.at(total, group, rows)
+    total = np.stack([np.bincount(group, column, minlength=count) for column in rows.T], 1)
     return total / np.bincount(group, minlength=count)[:, None]
 
 

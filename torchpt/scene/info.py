@@ -6,7 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from torchpt import bsdfs
 from torchpt.accel import Accel
-from torchpt.records import KINDS, World, tensors_of
+from torchpt.lights.choice import ByTree
+from torchpt.lights.envmap import EnvironmentMap
+from torchpt.records import KINDS, Lights, World, tensors_of
+from torchpt.scene.schema import ThinLens
 from torchpt.scene.settings import Settings
 
 if TYPE_CHECKING:
@@ -46,9 +49,13 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     made: dict[str, Any] = {
         "accel": accel.describe(),
         "bsdfs": _groups(world),
-        "lights": {} if lights is None else {"rows": len(lights.area), "kinds": list(lights.kinds)},
+        "lights": {} if lights is None else _lights(lights),
         "scene_bytes": memory,
     }
+    around = None if lights is None else lights.environment
+    if isinstance(around, EnvironmentMap):
+        compensated = around.compensated is not None
+        made["lights"]["envmap"] = {"texels": [around.width, around.height], "mis_compensation": compensated}
     if world.textures is not None:
         texels = world.textures.texels
         made["textures"] = {"reads": world.textures.places.shape[1], "bytes": texels.numel() * texels.element_size()}
@@ -57,18 +64,29 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     return {
         "scene": {
             "file": description.file,
+            "camera": type(description.camera).__name__.lower(),
             "primitives": {kind: n for kind, n in zip(KINDS, world.counts, strict=True) if n},
             **({"instances": len(built.copies)} if built.copies else {}),
             "parameters": len(built.parameters),
         },
         "shapes": shapes,
         "built": made,
-        "left_out": _left_out(world, settings),
+        "left_out": _left_out(description, world, settings),
         "settings": settings.model_dump(mode="json", warnings=False),
     }
 
 
-def _left_out(world: World, settings: Settings) -> list[str]:
+def _lights(lights: Lights) -> dict[str, Any]:
+    found: dict[str, Any] = {"rows": len(lights.area), "kinds": list(lights.kinds)}
+    if isinstance(lights.choice, ByTree):
+        tree = lights.choice.tree
+        found["choice"] = {"tree": {"nodes": len(tree.nodes), "levels": tree.levels}}
+    elif lights.choice is not None:
+        found["choice"] = "a fixed chance for each"
+    return found
+
+
+def _left_out(description: Description, world: World, settings: Settings) -> list[str]:
     """Features this scene does not need, for which there is no object, no tensor and no instruction."""
     lights = world.lights
     absent = [f"{kind} primitives" for kind, n in zip(KINDS, world.counts, strict=True) if not n]
@@ -95,6 +113,8 @@ def _left_out(world: World, settings: Settings) -> list[str]:
     else:
         if lights.choice is None:
             absent.append("choice among lights (one light)")
+        elif not isinstance(lights.choice, ByTree):
+            absent.append("light tree (few lights)")
         if lights.environment is None:
             absent.append("environment")
         if lights.row_of_prim is None:
@@ -102,6 +122,8 @@ def _left_out(world: World, settings: Settings) -> list[str]:
         absent += [f"sampling of {kind} lights" for kind in KINDS if kind not in lights.kinds]
     if settings.film.filter.type == "box":
         absent.append("filter table (box)")
+    if not isinstance(description.camera, ThinLens):
+        absent.append("places on a lens (all is in focus)")
     integrator = settings.integrator
     if getattr(integrator, "clamp", None) is None:
         absent.append("clamp")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from torchpt.scene.parts import MaterialSlot, Reading
 from torchpt.scene.presets import INDICES, METALS, metal
 from torchpt.scene.textures import Named, Slot, Texture, VertexColor, slot_value
 from torchpt.scene.validate import Model, select
+from torchpt.textures import Node
 
 __all__ = [
     "MATERIALS", "Blend", "BlinnPhong", "Conductor", "Custom", "Dielectric", "Diffuse", "Material", "Microfacet",
@@ -116,6 +118,7 @@ class Material(Model):
         emission: radiance leaving the front side, linear RGB.
         emission_strength: factor of it.
         normal_map: shading normals in the surface's own frame, ``2 c - 1`` of the colours c.
+        normal_strength: factor of how far the map's normals lean.
         bump_map: heights along the normal, in the scene's units, whose slope tilts the shading normal.
     """
 
@@ -125,6 +128,7 @@ class Material(Model):
     emission: MaybeColor = None
     emission_strength: Annotated[float, scalar(0.0)] = 1.0
     normal_map: Annotated[Slot | None, PlainValidator(_normals)] = None
+    normal_strength: Annotated[float, scalar(0.0)] = 1.0
     bump_map: Annotated[Slot | None, PlainValidator(_heights)] = None
 
     @model_validator(mode="after")
@@ -134,6 +138,8 @@ class Material(Model):
             raise wrong("an opacity beside alpha_cutoff", self.alpha_cutoff, ("alpha_cutoff",))
         if self.normal_map is not None and self.bump_map is not None:
             raise wrong("either normal_map or bump_map, not both", self.bump_map, ("bump_map",))
+        if "normal_strength" in given and self.normal_map is None:
+            raise wrong("a normal_map beside normal_strength", self.normal_strength, ("normal_strength",))
         if "emission_strength" in given and self.emission is None:
             raise wrong("an emission beside emission_strength", self.emission_strength, ("emission_strength",))
         return self
@@ -503,6 +509,8 @@ class Custom(Material):
 
 #: Slots that the colours of vertices cannot give.
 _IMAGED = ("opacity", "emission", "normal_map", "bump_map")
+#: What is read at points, without regard to how large a pixel is: light and cut-outs are the same for every ray.
+_POINTS = ("opacity", "emission")
 
 MATERIALS: dict[str, type[Material]] = {
     "diffuse": Diffuse,
@@ -617,7 +625,8 @@ def slot_of(
         model = material.bsdf()
 
     def opened(value: Any, key: str) -> Any:
-        return resolve(value, f"{name}.{key}") if resolve is not None and isinstance(value, Slot) else value
+        found = resolve(value, f"{name}.{key}") if resolve is not None and isinstance(value, Slot) else value
+        return replace(found, filtered=False) if key in _POINTS and isinstance(found, Node) else found
 
     return MaterialSlot(
         model=model,
@@ -629,6 +638,7 @@ def slot_of(
         emission=opened(material.emission, "emission"),
         emission_strength=material.emission_strength,
         normal_map=opened(material.normal_map, "normal_map"),
+        normal_strength=material.normal_strength,
         bump_map=opened(material.bump_map, "bump_map"),
         inner=inner,
     )
@@ -684,6 +694,9 @@ def check_material(
         sheer = slot == "weight" and any(isinstance(item, Null) for item in _materials(material, materials))
         if isinstance(texture, VertexColor) and (slot in _IMAGED or sheer):
             raise SceneError(f"{key}.{slot}", "vertex_color", "an image, or a number", file)
+        if (slot in _POINTS or sheer) and getattr(found.texture, "filter", "") == "trilinear":
+            expected = f"nearest or bilinear, as {slot} is read at points"
+            raise SceneError(f"{key}.{slot}.filter", "trilinear", expected, file)
     if not isinstance(material, Blend):
         compensated = getattr(material, "energy_compensation", False)
         fixed = tuple(material.values()) if compensated else material.bsdf().tabulated

@@ -8,16 +8,8 @@ from __future__ import annotations
 
 __all__ = ["KEYS", "TYPES"]
 
-_POSE = ("origin", "target", "up", "to_world")
-
 #: kind of thing -> its types that are not built -> the keys each of them takes beside ``type``.
 TYPES: dict[str, dict[str, tuple[str, ...]]] = {
-    "camera": {
-        "thinlens": (*_POSE, "fov", "fov_axis", "aperture_radius", "focus_distance", "blades"),
-        "orthographic": (*_POSE, "width"),
-    },
-    "filter": {"tent": ("radius",), "mitchell": ("radius",)},
-    "sampler": {"stratified": ("adaptive",), "hammersley": ("adaptive",), "zsobol": ("adaptive",)},
     "integrator": {
         "bdpt": ("max_depth", "rr_depth", "rr_prob", "clamp", "strict"),
     },
@@ -25,7 +17,6 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
 
 #: kind of thing -> keys of built types that are not built -> the value that asks for nothing.
 KEYS: dict[str, dict[str, object]] = {
-    "camera": {"aperture_radius": 0, "focus_distance": None, "blades": 0},
     "sampler": {"adaptive": False},
     "render": {"time_limit": None, "target_error": None, "checkpoint": None, "resume": False},
 }

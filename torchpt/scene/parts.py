@@ -38,6 +38,7 @@ class MaterialSlot:
         emission: radiance, or None where it does not emit.
         emission_strength: factor of it.
         normal_map: a colour texture, or None.
+        normal_strength: factor of how far its normals lean.
         bump_map: a number texture, or None.
         inner: the two materials of a blend, whose own ``values`` hold but the weight.
     """
@@ -51,6 +52,7 @@ class MaterialSlot:
     emission: tuple[float, float, float] | Node | None = None
     emission_strength: float = 1.0
     normal_map: Node | None = None
+    normal_strength: float = 1.0
     bump_map: Node | None = None
     inner: tuple[MaterialSlot, ...] = ()
 
@@ -65,6 +67,8 @@ class MaterialSlot:
             mine["opacity"] = self.opacity
         if self.emission is not None:
             mine |= {"emission": self.emission, "emission_strength": self.emission_strength}
+        if self.normal_strength != 1.0:
+            mine["normal_strength"] = self.normal_strength
         found = {f"{self.name}.{key}": value for key, value in mine.items() if isinstance(value, float | tuple)}
         for inner in self.inner:
             found |= inner.numbers()

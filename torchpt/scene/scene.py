@@ -14,10 +14,11 @@ from torch import Tensor
 from torchpt import accel as search
 from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
-from torchpt.cameras import Perspective
+from torchpt.cameras import Camera, Orthographic, Perspective, ThinLens
 from torchpt.errors import RenderError, SceneError
 from torchpt.math.transforms import is_singular, similarity_scale
 from torchpt.records import Geometry, World
+from torchpt.scene import schema
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
 from torchpt.scene.description import Description, read_description, settings
@@ -99,7 +100,7 @@ class Scene:
         }
         self._centre = torch.from_numpy(self._built.centre).to(device)
         self._lock = threading.RLock()
-        self._worlds: dict[tuple[torch.dtype, bool], tuple[World, Geometry]] = {}
+        self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._state: dict[str, tuple[Tensor, int]] = {}
 
@@ -159,6 +160,11 @@ class Scene:
             raise SceneError(f"params.{name}", value.tolist(), "a direction other than [0, 0, 0]")
         if name.endswith((".cutoff_angle", ".beam_width")) and not 0 < float(value) <= 180:
             raise SceneError(f"params.{name}", float(value), "an angle in degrees, 0 < angle <= 180")
+        kind, _, key = name.partition(".")
+        if kind == "camera" and key in schema.CAMERA_NUMBERS:
+            expected, accepted = schema.CAMERA_NUMBERS[key]
+            if not accepted(float(value)):
+                raise SceneError(f"params.{name}", float(value), expected)
         if name.endswith(".to_world"):
             matrix = value.double().cpu().numpy()
             if is_singular(matrix):
@@ -173,20 +179,21 @@ class Scene:
                     )
 
     def world(
-        self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False
+        self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False, choice: str = "auto"
     ) -> tuple[World, Geometry]:
         """The tensors that lanes gather from, and what the search sees; made once for the scene's own parameters.
 
-        ``uv``: with texture coordinates, whether or not a texture reads them.
+        ``uv``: with texture coordinates, whether or not a texture reads them. ``choice``: how lights are chosen.
         """
         if params:
-            return self._assemble(self.merged(params), dtype, uv)
+            return self._assemble(self.merged(params), dtype, uv, choice)
         with self._lock:
             self._refresh()
-            if (dtype, uv) not in self._worlds:
+            key = dtype, uv, choice
+            if key not in self._worlds:
                 with torch.no_grad():
-                    self._worlds[dtype, uv] = self._assemble(self.params, dtype, uv)
-            return self._worlds[dtype, uv]
+                    self._worlds[key] = self._assemble(self.params, dtype, uv, choice)
+            return self._worlds[key]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
         """A search structure: built for ``geometry``, or kept for the scene's own."""
@@ -198,28 +205,32 @@ class Scene:
                 self._accels[kind, threads] = search.build(own, kind, threads)
             return self._accels[kind, threads]
 
-    def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Perspective:
+    def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
         """The camera on a film of a given size, in the lanes' coordinates."""
         pose = params["camera.to_world"].double()
         shift = torch.zeros(4, 4, dtype=torch.float64, device=self.device)
         shift[:3, 3] = self._centre
-        return Perspective(
-            (pose - shift).to(dtype),
-            params["camera.fov"].to(dtype),
-            self.description.camera.fov_axis,
-            film.width,
-            film.height,
-        )
+        kind = self.description.camera
+        number: dict[str, Any] = {name: params[f"camera.{name}"].to(dtype) for name in kind.numbers()}
+        placed: dict[str, Any] = {"to_world": (pose - shift).to(dtype), "width": film.width, "height": film.height}
+        if isinstance(kind, schema.Orthographic):
+            return Orthographic(**placed, extent=number["width"])
+        if isinstance(kind, schema.ThinLens):
+            return ThinLens(**placed, **number, fov_axis=kind.fov_axis, blades=kind.blades)
+        assert isinstance(kind, schema.Perspective)
+        return Perspective(**placed, **number, fov_axis=kind.fov_axis)
 
     def info(self, settings: Settings) -> dict[str, Any]:
         """What the scene holds, what was built for it and what was left out."""
-        world, _ = self.world(torch.float32)
+        world, _ = self.world(torch.float32, choice=settings.light_choice)
         threads = None if settings.render.threads == "auto" else int(settings.render.threads)
         return describe(self.description, self._built, world, self.accel(settings.render.accel, threads), settings)
 
-    def _assemble(self, params: Mapping[str, Tensor], dtype: torch.dtype, uv: bool) -> tuple[World, Geometry]:
+    def _assemble(
+        self, params: Mapping[str, Tensor], dtype: torch.dtype, uv: bool, choice: str
+    ) -> tuple[World, Geometry]:
         built = self._built
-        return assemble(built.parts, params, built.sources, self._centre, dtype, built.copies, uv)
+        return assemble(built.parts, params, built.sources, self._centre, dtype, built.copies, uv, choice)
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -28,41 +28,48 @@ from torchpt.scene.fields import (
 )  # fmt: skip
 from torchpt.scene.materials import Material
 from torchpt.scene.textures import Slot, slot_value
-from torchpt.scene.validate import Model, construct
+from torchpt.scene.validate import Model, construct, refuse_foreign, select
 
 __all__ = [
-    "CAMERAS", "FOV_AXES", "SHAPES",
-    "Cone", "Cube", "Cylinder", "Disk", "Instance", "Mesh", "Perspective", "Rectangle", "Shape", "Sphere",
+    "CAMERAS", "CAMERA_NUMBERS", "FOV_AXES", "SHAPES", "Camera", "Cone", "Cube", "Cylinder",
+    "Disk", "Instance", "Mesh", "Orthographic", "Perspective", "Rectangle", "Shape", "Sphere", "ThinLens", "read_camera",
 ]  # fmt: skip
 
 FOV_AXES = ("x", "y", "diagonal", "smaller", "larger")
 _UP = (0.0, 1.0, 0.0)
 
 
-class Perspective(Model):
-    """A pinhole camera, posed by ``origin``, ``target``, ``up`` or by ``to_world``.
+def _rounded(x: float) -> float:
+    return float(np.float32(x))
 
-    Attributes:
-        fov: full angle of view in degrees along ``fov_axis`` of the whole film.
-    """
 
-    type: Literal["perspective"] = "perspective"
+#: The numbers that cameras have: what is accepted, in words and as a test of the float32 that it becomes.
+CAMERA_NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
+    "fov": ("an angle in degrees, 0 < fov < 180", lambda x: 0 < _rounded(x) < 180),
+    "aperture_radius": ("a number >= 0 (0 is a pinhole)", lambda x: x >= 0),
+    "focus_distance": ("a number > 0", lambda x: _rounded(x) > 0),
+    "width": ("a number > 0", lambda x: _rounded(x) > 0),
+}
+
+
+class Camera(Model):
+    """What every camera has: a pose, by ``origin``, ``target``, ``up`` or by ``to_world``."""
+
     origin: Vec3 | None = None
     target: Vec3 | None = None
     up: Vec3 | None = None
     to_world: Affine = None
-    fov: Annotated[float, number_field("an angle in degrees, 0 < fov < 180", lambda x: 0 < x < 180)] = 39.3
-    fov_axis: Annotated[str, choice(*FOV_AXES)] = "x"
 
     @model_validator(mode="after")
-    def _posed(self) -> Perspective:
+    def _posed(self) -> Camera:
         if self.to_world is not None:
             for name in ("origin", "target", "up"):
                 if getattr(self, name) is not None:
                     raise wrong("either to_world or origin, target and up, not both", getattr(self, name), (name,))
             turn = self.to_world[:3, :3]
             if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3:
-                raise wrong("a pose without scale or shear", self.to_world.tolist(), ("to_world",))
+                hint = " (an orthographic camera is sized by width)" if isinstance(self, Orthographic) else ""
+                raise wrong(f"a pose without scale or shear{hint}", self.to_world.tolist(), ("to_world",))
             return self
         for name in ("origin", "target"):
             if getattr(self, name) is None:
@@ -78,6 +85,59 @@ class Perspective(Model):
         if self.to_world is not None:
             return self.to_world
         return transforms.look_at(self.origin, self.target, self.up or _UP, key="")
+
+    def numbers(self) -> dict[str, float]:
+        """Its numbers by key, those of :data:`CAMERA_NUMBERS`."""
+        return {name: getattr(self, name) for name in CAMERA_NUMBERS if name in type(self).model_fields}
+
+
+class _Angular(Camera):
+    """A camera with an angle of view.
+
+    Attributes:
+        fov: full angle of view in degrees along ``fov_axis`` of the whole film.
+    """
+
+    fov: Annotated[float, number_field(*CAMERA_NUMBERS["fov"])] = 39.3
+    fov_axis: Annotated[str, choice(*FOV_AXES)] = "x"
+
+
+class Perspective(_Angular):
+    """A pinhole camera."""
+
+    type: Literal["perspective"] = "perspective"
+
+
+class ThinLens(_Angular):
+    """A camera with depth of field.
+
+    Attributes:
+        aperture_radius: of the lens, in world units.
+        focus_distance: depth of the plane in focus, from the lens along the viewing direction.
+        blades: corners of the aperture, a regular polygon in the circle of ``aperture_radius``; 0 is the disk itself.
+    """
+
+    type: Literal["thinlens"] = "thinlens"
+    aperture_radius: Annotated[float, number_field(*CAMERA_NUMBERS["aperture_radius"])]
+    focus_distance: Annotated[float, number_field(*CAMERA_NUMBERS["focus_distance"])]
+    blades: Annotated[int, integer(3, 64, also=(0,))] = 0
+
+
+class Orthographic(Camera):
+    """A parallel projection.
+
+    Attributes:
+        width: what the film's width shows, in world units (Mitsuba's has 2, times the scale of its ``to_world``).
+    """
+
+    type: Literal["orthographic"] = "orthographic"
+    width: Annotated[float, number_field(*CAMERA_NUMBERS["width"])] = 2.0
+
+
+def read_camera(raw: Any, file: str | None) -> Camera:
+    """The camera of a scene file's block."""
+    refuse_foreign("camera", CAMERAS, raw, "perspective", file)
+    return select("camera", CAMERAS, raw, "camera", file, "perspective")
 
 
 def _material(value: Any) -> Any:
@@ -116,7 +176,10 @@ def _heights(value: Any) -> Slot:
         value = {"texture": value}
     if not isinstance(value, Mapping):
         raise wrong("the name of a texture, or a texture")
-    return slot_value(value, False, -_LARGEST, _LARGEST)
+    found = slot_value(value, False, -_LARGEST, _LARGEST)
+    if getattr(found.texture, "filter", "") == "trilinear":
+        raise wrong("nearest or bilinear, as displacement is read at points", "trilinear", ("filter",))
+    return found
 
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -298,7 +361,11 @@ class Cube(Shape):
     type: Literal["cube"] = "cube"
 
 
-CAMERAS: dict[str, type[Perspective]] = {"perspective": Perspective}
+CAMERAS: dict[str, type[Camera]] = {
+    "perspective": Perspective,
+    "thinlens": ThinLens,
+    "orthographic": Orthographic,
+}
 SHAPES: dict[str, type[Shape]] = {
     "mesh": Mesh,
     "sphere": Sphere,

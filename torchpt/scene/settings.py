@@ -9,13 +9,14 @@ from typing import Annotated, Any, Literal
 from pydantic import PlainValidator, model_validator
 
 from torchpt.errors import SceneError
+from torchpt.samplers import KINDS
 from torchpt.scene import not_built
 from torchpt.scene.fields import Flag, choice, integer, memory_size, number_field, wrong
-from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_not_built, select
+from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_foreign, refuse_not_built, select
 
 __all__ = [
     "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter",
-    "IblIntegrator", "Integrator", "PathIntegrator", "Render", "Sampler", "Settings", "merge",
+    "IblIntegrator", "Integrator", "MitchellFilter", "PathIntegrator", "Render", "Sampler", "Settings", "TentFilter", "merge",
 ]  # fmt: skip
 
 AOVS = ("albedo", "normal", "depth", "position", "uv", "object_id", "variance")
@@ -24,10 +25,13 @@ MAX_SIDE = 65_536
 MAX_PIXELS = 2**28
 
 Positive = Annotated[float, number_field("a number > 0", lambda x: x > 0)]
+Share = Annotated[float, number_field("a number in 0..1", lambda x: 0 <= x <= 1)]
 Clamp = Annotated[float | None, number_field("null or a number > 0", lambda x: x > 0, optional=True)]
 Survival = Annotated[
     float | None, number_field("null or a number, 0 < rr_prob <= 1", lambda x: 0 < x <= 1, optional=True)
 ]
+
+LightChoice = Annotated[str, choice("auto", "uniform", "power", "tree")]
 
 
 class BoxFilter(Model):
@@ -39,6 +43,26 @@ class BoxFilter(Model):
     def radius(self) -> float:
         """Half the width in pixels."""
         return 0.5
+
+
+class TentFilter(Model):
+    """A triangle that falls to zero at ``radius`` pixels, as Mitsuba's."""
+
+    type: Literal["tent"] = "tent"
+    radius: Positive = 1.0
+
+
+class MitchellFilter(Model):
+    """Mitchell and Netravali's cubic, two pixels wide, with Mitsuba's names; its lobes are negative where ``C`` > 0."""
+
+    type: Literal["mitchell"] = "mitchell"
+    B: Share = 1 / 3
+    C: Share = 1 / 3
+
+    @property
+    def radius(self) -> float:
+        """Half the width in pixels."""
+        return 2.0
 
 
 class GaussianFilter(Model):
@@ -57,8 +81,10 @@ class GaussianFilter(Model):
         return raw
 
 
-Filter = BoxFilter | GaussianFilter
-FILTERS: dict[str, type[Any]] = {"gaussian": GaussianFilter, "box": BoxFilter}
+Filter = BoxFilter | TentFilter | GaussianFilter | MitchellFilter
+FILTERS: dict[str, type[Any]] = {
+    "gaussian": GaussianFilter, "box": BoxFilter, "tent": TentFilter, "mitchell": MitchellFilter,
+}  # fmt: skip
 
 
 def _crop(value: Any) -> tuple[int, int, int, int] | None:
@@ -91,7 +117,7 @@ def _gamma(value: Any) -> float | str:
 
 
 def _filter(value: Any) -> Any:
-    if isinstance(value, BoxFilter | GaussianFilter):
+    if isinstance(value, Filter):
         return value
     raise wrong("a filter")
 
@@ -108,7 +134,7 @@ class Film(Model):
 
     width: Annotated[int, integer(1, MAX_SIDE)] = 512
     height: Annotated[int, integer(1, MAX_SIDE)] = 512
-    filter: Annotated[BoxFilter | GaussianFilter, PlainValidator(_filter)] = GaussianFilter()
+    filter: Annotated[Filter, PlainValidator(_filter)] = GaussianFilter()
     crop: Annotated[tuple[int, int, int, int] | None, PlainValidator(_crop)] = None
     aovs: Annotated[tuple[str, ...], PlainValidator(_aovs)] = ()
     exposure: Annotated[float, number_field("a number of stops in -64..64", lambda x: abs(x) <= 64)] = 0.0
@@ -136,6 +162,7 @@ class PathIntegrator(Model):
         rr_depth: the depth from which Russian roulette may end a path.
         rr_prob: a constant survival probability, or None (by throughput).
         strategy: how light is found: mis, bsdf, light, uniform (hemisphere).
+        light_choice: which light is sampled: all alike (uniform), by power, by the light tree, or as many lights ask (auto).
         clamp: largest contribution of a sample, or None.
         strict: whether a sample that is not finite is an error.
     """
@@ -145,6 +172,7 @@ class PathIntegrator(Model):
     rr_depth: Annotated[int, integer(1, 2**31 - 1)] = 5
     rr_prob: Survival = None
     strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
+    light_choice: LightChoice = "auto"
     clamp: Clamp = None
     strict: Flag = False
 
@@ -160,6 +188,7 @@ class DirectIntegrator(Model):
 
     type: Literal["direct"] = "direct"
     strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
+    light_choice: LightChoice = "auto"
     clamp: Clamp = None
     strict: Flag = False
 
@@ -174,6 +203,7 @@ class IblIntegrator(Model):
     """A preview: the first surface under the environment by split sum, unshadowed, and other lights with their shadows."""
 
     type: Literal["ibl"] = "ibl"
+    light_choice: LightChoice = "auto"
     clamp: Clamp = None
     strict: Flag = False
 
@@ -190,10 +220,15 @@ INTEGRATORS: dict[str, type[Any]] = {
 class Sampler(Model):
     """Where sample points come from."""
 
-    type: Literal["sobol", "independent"] = "sobol"
+    type: Literal["sobol", "independent", "stratified", "hammersley", "zsobol"] = "sobol"
+
+    @property
+    def needs_count(self) -> bool:
+        """Whether ``render.spp`` must be known before the first sample, so that nothing else may end a render."""
+        return KINDS[self.type].NEEDS_COUNT
 
 
-SAMPLERS: dict[str, type[Sampler]] = {"sobol": Sampler, "independent": Sampler}
+SAMPLERS: dict[str, type[Sampler]] = dict.fromkeys(KINDS, Sampler)
 
 _DEVICE = re.compile(r"(auto|cpu|cuda|cuda:[0-9]{1,3})\Z")
 
@@ -235,6 +270,11 @@ class Settings(Model):
     integrator: Integrator = PathIntegrator()
     sampler: Sampler = Sampler()
     render: Render = Render()
+
+    @property
+    def light_choice(self) -> str:
+        """How a light is chosen; where no light is sampled it does not matter."""
+        return getattr(self.integrator, "light_choice", "auto")
 
 
 _TYPED: dict[str, tuple[dict[str, type[Any]], str]] = {
@@ -284,6 +324,8 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
             inner = [_set(part.get("filter"), "film.filter", name) for part, name in ((below, file), (above, None))]
             raw["filter"] = _overlay("filter", *inner)
         try:
+            if block == "render":
+                _open_end(raw, blocks["sampler"])
             blocks[block] = _block(block, raw)
         except SceneError as error:
             blame = None if _given(overrides, error.key) else file
@@ -293,6 +335,17 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
             "film.aovs", list(blocks["film"].aovs), "no variance where integrator is aov (it carries no light)", file
         )
     return Settings.model_construct(**blocks)
+
+
+def _open_end(raw: Mapping[str, Any], sampler: Sampler) -> None:
+    """Raises where something else than ``spp`` is to end a render whose points depend on their number."""
+    for name in ("time_limit", "target_error"):
+        if sampler.needs_count and raw.get(name) is not None:
+            free = ", ".join(kind for kind, module in KINDS.items() if not module.NEEDS_COUNT)
+            expected = (
+                f"null where sampler is {sampler.type}, whose points depend on how many there are (free of it: {free})"
+            )
+            raise SceneError(dotted("render", name), raw[name], expected)
 
 
 def _given(overrides: Mapping[str, Any], key: str) -> bool:
@@ -309,7 +362,7 @@ def _block(block: str, raw: dict[str, Any]) -> Model:
     if block in _TYPED:
         table, default = _TYPED[block]
         if block == "integrator":
-            _useless(raw, table, default)
+            refuse_foreign(block, table, raw, default, None)
         return select(block, table, raw, block, None, default)
     if block == "film":
         if "filter" in raw:
@@ -319,18 +372,3 @@ def _block(block: str, raw: dict[str, Any]) -> Model:
     check_keys({k: v for k, v in raw.items() if k not in later}, Render.model_fields, block, what, None)
     rest = refuse_not_built(raw, later, block, ", ".join(Render.model_fields), None)
     return construct(Render, rest, block, None, what)
-
-
-def _useless(raw: Mapping[str, Any], table: Mapping[str, type[Model]], default: str) -> None:
-    """Raises for a key of another integrator: it would be accepted and do nothing."""
-    kind = raw.get("type", default)
-    if kind not in table:
-        return
-    own = table[kind].model_fields
-    for name, value in raw.items():
-        owners = [other for other, model in table.items() if name in model.model_fields]
-        if name not in own and owners:
-            expected = (
-                f"only keys that the {kind} integrator reads ({', '.join(own)}); {name} belongs to {', '.join(owners)}"
-            )
-            raise SceneError(dotted("integrator", name), value, expected)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from torchpt.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
+from torchpt.images.decode import MAX_PIXELS
 from torchpt.math.transforms import uv_matrix
 from torchpt.scene.parts import Reading, VertexColors
 from torchpt.scene.textures import CHANNELS, Checkerboard, Image, Named, Slot, Texture, VertexColor
@@ -108,6 +110,7 @@ class Opener:
         node = self._found(slot, key)
         if not isinstance(node, Node):
             raise SceneError(key, "vertex_color", "an image or a checkerboard", self.file)
+        node = replace(node, filtered=False)
         images = images_of([node], {name: torch.from_numpy(value) for name, value in self._parameters.items()})
         # What shapes the mesh is spent with it: no parameter.
         for name in set(self._parameters) - set(before):
@@ -130,7 +133,10 @@ class Opener:
             self._parameters[f"{name}.{which}"] = np.asarray(color, np.float64)
         uv = texture.uv_transform
         matrix = uv_matrix(uv.scale, uv.rotate, uv.translate, texture.scale)
-        return Node(name, None if slot.coloured else CHANNELS.index(channel) - 1, "repeat", True, matrix, _ONE)
+        filtered = texture.filter == "trilinear"
+        return Node(
+            name, None if slot.coloured else CHANNELS.index(channel) - 1, "repeat", True, matrix, _ONE, filtered
+        )
 
     def _image(self, slot: Slot, texture: Image, name: str, channel: str, key: str) -> Node:
         if isinstance(texture.path, EncodedImage):
@@ -138,9 +144,10 @@ class Opener:
         else:
             source = self._resolve(texture.path, f"{name}.path")
             label = str(source)
-        if label not in self.files:
-            self.files[label] = read_texels(source)
-        found = self.files[label]
+        most = MAX_PIXELS if texture.max_pixels is None else texture.max_pixels
+        found = self.files.get(label)
+        if found is None or found.values.shape[0] * found.values.shape[1] > most:
+            found = self.files[label] = read_texels(source, most)
         alpha = not slot.coloured and channel == "a"  # which is never encoded
         colour = texture.colorspace == "srgb" or (texture.colorspace == "auto" and (alpha or not slot.linear))
         decode = found.eight_bit and colour
@@ -163,7 +170,8 @@ class Opener:
             }[channel]
         uv = texture.uv_transform
         matrix = uv_matrix(uv.scale, uv.rotate, uv.translate, (1.0, 1.0))
-        return Node(name, index, texture.wrap, texture.filter == "nearest", matrix, texture.scale)
+        nearest, filtered = texture.filter == "nearest", texture.filter == "trilinear"
+        return Node(name, index, texture.wrap, nearest, matrix, texture.scale, filtered)
 
     def _declare(self, name: str, found: Texels, decode: bool, alpha: bool) -> str:
         """The parameter that holds an image's texels, decoded or as stored (of alpha either will do)."""

@@ -15,7 +15,7 @@ from pydantic import PlainValidator
 from torchpt.errors import SceneError
 from torchpt.images import EncodedImage
 from torchpt.math.transforms import uv_matrix
-from torchpt.scene.fields import choice, color, number_field, pair, wrong
+from torchpt.scene.fields import choice, color, integer, number_field, pair, wrong
 from torchpt.scene.validate import Model, check_keys, select
 from torchpt.textures import WRAPS
 
@@ -75,30 +75,37 @@ class Image(Texture):
     Attributes:
         path: candidates, the first existing one is used; an image in memory where another file holds it.
         wrap: how it goes on beyond its edges.
-        filter: how values between texels are found.
+        filter: how values between texels are found; ``trilinear``: and the image is read in smaller sizes where a pixel
+            covers several texels.
         colorspace: of an image with 8 bits a value. ``auto``: sRGB where it gives a colour, linear where it gives a number.
         scale: factor of the values.
         channel: which of them a number takes.
+        max_pixels: larger images are refused; None: 64 Mpixel.
         uv_transform: applied to texture coordinates.
     """
 
     type: Literal["image"] = "image"
     path: Annotated[tuple[str, ...] | EncodedImage, PlainValidator(_source)]
     wrap: Annotated[str, choice(*WRAPS)] = "repeat"
-    filter: Annotated[str, choice("bilinear", "nearest")] = "bilinear"
+    filter: Annotated[str, choice("bilinear", "nearest", "trilinear")] = "bilinear"
     colorspace: Annotated[str, choice("auto", "srgb", "linear")] = "auto"
     scale: Annotated[Rgb, color(None)] = (1.0, 1.0, 1.0)
     channel: Annotated[str | None, choice(*CHANNELS)] = None
+    max_pixels: Annotated[int | None, integer(1, 2**34, also=(None,))] = None
     uv_transform: Uv = UvTransform()
 
 
 class Checkerboard(Texture):
-    """Two colours in turn; a unit of u and v holds two squares each way, times ``scale``."""
+    """Two colours in turn; a unit of u and v holds two squares each way, times ``scale``.
+
+    ``filter: trilinear`` lets them go over into their mean where a pixel covers several squares.
+    """
 
     type: Literal["checkerboard"] = "checkerboard"
     color0: Annotated[Rgb, color()] = (0.4, 0.4, 0.4)
     color1: Annotated[Rgb, color()] = (0.2, 0.2, 0.2)
     scale: Annotated[tuple[float, float], pair("a number or [u, v]", single=True)] = (1.0, 1.0)
+    filter: Annotated[str, choice("nearest", "trilinear")] = "nearest"
     uv_transform: Uv = UvTransform()
 
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from torchpt.errors import NotBuiltError, SceneError
 from torchpt.scene import not_built
 
-__all__ = ["Model", "check_keys", "construct", "dotted", "refuse_not_built", "select"]
+__all__ = ["Model", "check_keys", "construct", "dotted", "refuse_foreign", "refuse_not_built", "select"]
 
 
 class Model(BaseModel):
@@ -111,6 +111,28 @@ def select(kind: str, table: Mapping[str, type[M]], raw: Any, key: str, file: st
     rest = refuse_not_built(raw, later, key, ", ".join(_fields(model)), file)
     given = {k: value for k, value in rest.items() if value is not None}  # null means unset
     return construct(model, {**given, "type": name}, key, file, what)
+
+
+def refuse_foreign(kind: str, table: Mapping[str, type[Model]], raw: Any, default: str, file: str | None) -> None:
+    """Raises for a key of a block that another type of the table reads: it could be accepted only to do nothing.
+
+    Args:
+        kind: what the table holds, which is the block's key too.
+        table: the built types.
+        raw: the block as written.
+        default: the type where none is given.
+        file: scene file for the error.
+    """
+    name = raw.get("type", default) if isinstance(raw, Mapping) else None
+    if not isinstance(name, str) or name not in table:
+        return
+    own = table[name].model_fields
+    for key, value in raw.items():
+        owners = [other for other, model in table.items() if key in model.model_fields]
+        if key not in own and owners:
+            keys, others = ", ".join(own), ", ".join(owners)
+            expected = f"only keys that the {name} {kind} reads ({keys}); {key} belongs to {others}"
+            raise SceneError(dotted(kind, key), value, expected, file)
 
 
 def _fields(model: type[Model]) -> list[str]:

@@ -29,7 +29,9 @@ def charts_of(
 ) -> dict[str, Any]:
     """What of :class:`World` says where a point lies on its surface, each thing only where something reads it."""
     readings = [reading for slot in slots.values() for reading in slot.readings()]
+    # Filtered look-ups ask how large a surface's texels are.
     bumpy = any(slot.bump_map is not None for slot in slots.values())
+    bumpy = bumpy or any(isinstance(reading, Node) and reading.filtered for reading in readings)
     framed = bumpy or any(slot.normal_map is not None for slot in slots.values()) or any(m.anisotropic for m in models)
     imaged = uv or any(isinstance(reading, Node) for reading in readings)
     coloured = any(isinstance(reading, VertexColors) for reading in readings)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchpt.lights import envmap
-from torchpt.math.distributions import Discrete
+from torchpt.lights import choice_of, envmap
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Lights
 from torchpt.scene.assembly.curved import quadric_area
@@ -64,6 +63,7 @@ def lights_of(
     opacity: Tensor | None,
     emissive: Tensor,
     veiled: bool,
+    choice: str = "auto",
 ) -> Lights | None:
     """The lights; None where nothing emits.
 
@@ -76,6 +76,7 @@ def lights_of(
         opacity: ``(P + I,)``, or None.
         emissive: ``(P + I,)`` bool, which primitives emit.
         veiled: whether opacity textures cover any of them.
+        choice: how one of them is chosen, from ``lights.WAYS``.
     """
     prim = emissive.nonzero().squeeze(1)
     if not len(prim) and not sources:
@@ -110,8 +111,8 @@ def lights_of(
         column = torch.cat((column, column.new_zeros(rest)))
     textured = veiled or any(part.glow is not None for part, _ in glowing)
     many = len(names) > 1
-    return Lights(
-        choice=Discrete.of(power, dtype) if many else None,
+    lights = Lights(
+        choice=None,
         kinds=kinds,
         kind=torch.tensor([kinds.index(name) for name in names], device=device) if many else None,
         **joined,
@@ -122,6 +123,7 @@ def lights_of(
         quadrics=None if column is None else primitives.quadrics,
         prim=torch.cat((prim, prim.new_zeros(rest))) if textured else None,
     )
+    return replace(lights, choice=choice_of(lights, power, choice))
 
 
 #: Area over the length of the cross product of the edges.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -32,7 +33,12 @@ def nodes_of(slots: Iterable[MaterialSlot]) -> dict[Node, int]:
 
 
 def materials_of(
-    slots: Mapping[str, MaterialSlot], surfaces: Mapping[str, Surface], nodes: Mapping[Node, int], device: torch.device
+    slots: Mapping[str, MaterialSlot],
+    surfaces: Mapping[str, Surface],
+    nodes: Mapping[Node, int],
+    parameters: Mapping[str, Tensor],
+    dtype: torch.dtype,
+    device: torch.device,
 ) -> tuple[
     tuple[Kind, ...],
     dict[str, tuple[int, int]],
@@ -57,7 +63,13 @@ def materials_of(
             looks.append(None)
         else:
             tables.append(stacked([_tabulated(model, surfaces[name].values) for name in names]))
-            looks.append(_look([slots[name] for name in names], [surfaces[name] for name in names], nodes, device))
+            look = _look([slots[name] for name in names], [surfaces[name] for name in names], nodes, device)
+            strong = [f"{name}.normal_strength" for name in names]
+            if any(name in parameters for name in strong):
+                one = torch.ones((), dtype=dtype, device=device)
+                strengths = [parameters[name].to(one) if name in parameters else one for name in strong]
+                look = replace(look, strength=torch.stack(strengths))
+            looks.append(look)
         both = [slots[name].two_sided for name in names]
         sides.append(None if all(both) else torch.tensor(both, device=device))
     return tuple(groups), rows, tuple(tables), tuple(looks), tuple(sides)
@@ -94,9 +106,13 @@ def _look(
 ) -> Look:
     """The textures of materials of one form."""
 
-    def numbers(column: list[Node | None]) -> Tensor | None:
-        found = [nodes[node] for node in column if node is not None]
-        return torch.tensor(found, device=device) if found else None
+    def image(column: Sequence[Node]) -> Pick:
+        numbers = torch.tensor([nodes[node] for node in column], device=device)
+        return Pick(numbers, column[0].channel, any(node.filtered for node in column))
+
+    def relief(column: list[Node | None]) -> Pick | None:
+        found = [node for node in column if node is not None]
+        return image(found) if found else None
 
     def pick(column: list[Any]) -> Any:
         first = column[0]
@@ -104,10 +120,15 @@ def _look(
             return {key: pick([item[key] for item in column]) for key in first}
         if isinstance(first, VertexColors):
             return Pick(None, first.channel)
-        return Pick(numbers(column), first.channel)
+        return image(column)
 
     readings = pick([surface.readings for surface in surfaces])
-    return Look(readings, numbers([slot.normal_map for slot in slots]), numbers([slot.bump_map for slot in slots]))
+    return Look(
+        readings,
+        relief([slot.normal_map for slot in slots]),
+        relief([slot.bump_map for slot in slots]),
+        filtered=any(isinstance(r, Node) and r.filtered for slot in slots for r in slot.readings()),
+    )
 
 
 def veils_of(

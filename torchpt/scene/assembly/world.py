@@ -33,6 +33,7 @@ def assemble(
     dtype: torch.dtype,
     copies: Sequence[Copy] = (),
     uv: bool = False,
+    choice: str = "auto",
 ) -> tuple[World, Geometry]:
     """The world of ``parts`` under ``parameters``, and what the search sees of it.
 
@@ -44,6 +45,7 @@ def assemble(
         dtype: of the lanes.
         copies: instances of parts.
         uv: whether texture coordinates are wanted even if no texture reads them.
+        choice: how a light is chosen, from ``lights.WAYS``.
     """
     device = centre.device
     corners = [corners_of(part, parameters, centre, dtype) for part in parts]
@@ -52,7 +54,7 @@ def assemble(
     slots = {owner.material.name: owner.material for owner in owners}
     surfaces = {name: surface_of(slot, parameters, dtype) for name, slot in slots.items()}
     nodes = nodes_of(slots.values())
-    kinds, rows, tables, looks, two_sided = materials_of(slots, surfaces, nodes, device)
+    kinds, rows, tables, looks, two_sided = materials_of(slots, surfaces, nodes, parameters, dtype, device)
     models = tuple(model for model, _ in kinds)
     wide = primitives.sizes + [1] * len(copies)
     opacity = opacity_of(owners, surfaces, wide, dtype, device)
@@ -86,7 +88,7 @@ def assemble(
         glows=glows,
         two_sided=two_sided,
         object_id=primitives.spread([owner.object_id for owner in owners]),
-        lights=lights_of(parts, sources, primitives, parameters, centre, opacity, dark == 0, veiled),
+        lights=lights_of(parts, sources, primitives, parameters, centre, opacity, dark == 0, veiled, choice),
         quadrics=primitives.quadrics,
         copies=None if maps is None else copies_of(maps, copies, dtype),
     )

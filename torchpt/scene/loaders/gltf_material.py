@@ -188,8 +188,11 @@ class _Rules:
         if normals is None:
             return
         material["normal_map"] = normals
-        if self.number(self.block["normalTexture"], "scale", 1.0, 1e6, -1e6) != 1.0:
+        strength = self.number(self.block["normalTexture"], "scale", 1.0, 1e6, -1e6)
+        if strength < 0.0:
             self.ignored.append("normalTexture.scale")
+        elif strength != 1.0:
+            material["normal_strength"] = strength
 
     def glow(self, material: dict[str, Any]) -> None:
         """EmissiveFactor times its picture times KHR_materials_emissive_strength."""

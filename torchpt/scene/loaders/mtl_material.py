@@ -220,7 +220,10 @@ class _Rules:
         stem = PurePath(self.files[kind]).stem.lower()
         if kind == "norm" or "normal" in stem or stem.endswith(("_n", "_nrm", "_nor", "_norm")):
             material["normal_map"] = self._image(kind, 1.0, None)
-            self.ignored += [f"{found.key} -bm"] * (found.bump != 1.0)
+            if found.bump < 0.0:
+                self.ignored.append(f"{found.key} -bm")
+            elif found.bump != 1.0:
+                material["normal_strength"] = found.bump
         else:
             material["bump_map"] = self._image(kind, found.bump, found.channel or "luminance")
 

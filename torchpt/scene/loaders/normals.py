@@ -18,21 +18,34 @@ def smooth_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
         vertices: ``(V, 3)``.
         faces: ``(F, 3)``.
     """
-    corners = vertices[faces]  # (F, 3, 3): face, corner, coordinate
-    corners = corners - corners[:, :1]
-    size = np.abs(corners).max(axis=(1, 2), keepdims=True)
-    corners = corners / np.where(size > 0, size, 1.0)
-    face_normal = np.cross(corners[:, 1], corners[:, 2])
-    length = np.linalg.norm(face_normal, axis=1)
-    face_normal /= np.where(length > 0, length, 1.0)[:, None]
-    total = np.zeros_like(vertices, dtype=np.float64)
+    columns = np.ascontiguousarray(
+        np.asarray(vertices, np.float64).T
+    )  # by coordinate: several times faster than by row
+    first, second, third = (columns[:, faces[:, k]] for k in range(3))
+    second, third = second - first, third - first
+    size = np.maximum(np.abs(second), np.abs(third)).max(axis=0)
+    size = np.where(size > 0, size, 1.0)
+    second, third = second / size, third / size
+    corners = (np.zeros_like(second), second, third)
+    face_normal = _cross(second, third)
+    length = np.sqrt(_dot(face_normal, face_normal))
+    face_normal /= np.where(length > 0, length, 1.0)
+    total = np.zeros_like(columns)
     for corner in range(3):
-        a = corners[:, (corner + 1) % 3] - corners[:, corner]
-        b = corners[:, (corner + 2) % 3] - corners[:, corner]
-        angle = np.arctan2(length, np.einsum("ij,ij->i", a, b))  # |a x b| is the same at every corner
-        weighted = np.where(length > 0, angle, 0.0)[:, None] * face_normal
+        a = corners[(corner + 1) % 3] - corners[corner]
+        b = corners[(corner + 2) % 3] - corners[corner]
+        angle = np.arctan2(length, _dot(a, b))  # |a x b| is the same at every corner
+        weight = np.where(length > 0, angle, 0.0)
         for axis in range(3):
-            total[:, axis] += np.bincount(faces[:, corner], weighted[:, axis], minlength=len(vertices))
-    norm = np.linalg.norm(total, axis=1)
-    total[norm <= 1e-12] = (0.0, 0.0, 1.0)  # weights are angles: a sum this small is cancellation
-    return total / np.where(norm > 1e-12, norm, 1.0)[:, None]
+            total[axis] += np.bincount(faces[:, corner], weight * face_normal[axis], minlength=len(vertices))
+    norm = np.sqrt(_dot(total, total))
+    total[:, norm <= 1e-12] = np.array([[0.0], [0.0], [1.0]])  # weights are angles: a sum this small is cancellation
+    return np.ascontiguousarray((total / np.where(norm > 1e-12, norm, 1.0)).T)
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))

@@ -1,0 +1,12 @@
+"""Cameras: from film positions to rays, one kind a file.
+
+A pose is Mitsuba's ``to_world``: the camera looks along its own ``+z``, ``+y`` is up and ``+x`` points to the image's left,
+so that image right is ``(target - origin) x up``.
+"""
+
+from torchpt.cameras.base import Camera
+from torchpt.cameras.orthographic import Orthographic
+from torchpt.cameras.perspective import FOV_AXES, Perspective
+from torchpt.cameras.thinlens import ThinLens
+
+__all__ = ["FOV_AXES", "Camera", "Orthographic", "Perspective", "ThinLens"]

@@ -1,0 +1,61 @@
+"""Integer arithmetic that the samplers' kernels share; the tensor forms are in ``hashing.py`` and ``sobol.py``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from torchpt.native.jit import jit
+
+__all__ = ["SCALE", "SECOND", "U", "X", "Y", "mix", "reverse", "scramble", "second_dimension", "unit"]
+
+U = np.uint32
+_M0, _M1 = U(0x7FEB352D), U(0x846CA68B)
+_K0, _K1, _K2 = U(0x3D20ADEA), U(0x05526C56), U(0x53A22864)
+X, Y, SECOND = U(0x68BC21EB), U(0x02E5BE93), U(0x9E3779B9)
+SCALE = np.float32(1.0 / (1 << 24))
+
+
+@jit(inline="always")
+def mix(x: Any) -> Any:
+    """As ``hashing.mix``."""
+    x = U(U(x ^ (x >> U(16))) * _M0)
+    x = U(U(x ^ (x >> U(15))) * _M1)
+    return U(x ^ (x >> U(16)))
+
+
+@jit(inline="always")
+def reverse(x: Any) -> Any:
+    """As ``sobol.reverse_bits``."""
+    x = U(((x >> U(1)) & U(0x55555555)) | ((x & U(0x55555555)) << U(1)))
+    x = U(((x >> U(2)) & U(0x33333333)) | ((x & U(0x33333333)) << U(2)))
+    x = U(((x >> U(4)) & U(0x0F0F0F0F)) | ((x & U(0x0F0F0F0F)) << U(4)))
+    x = U(((x >> U(8)) & U(0x00FF00FF)) | ((x & U(0x00FF00FF)) << U(8)))
+    return U((x >> U(16)) | (x << U(16)))
+
+
+@jit(inline="always")
+def scramble(x: Any, seed: Any) -> Any:
+    """As ``sobol.scramble``."""
+    x = U(x ^ U(x * _K0))
+    x = U(x + seed)
+    x = U(x * U((seed >> U(16)) | U(1)))
+    x = U(x ^ U(x * _K1))
+    return U(x ^ U(x * _K2))
+
+
+@jit(inline="always")
+def second_dimension(x: Any) -> Any:
+    """As ``sobol.second_dimension``."""
+    x = U(x ^ ((x >> U(16)) & U(0x0000FFFF)))
+    x = U(x ^ ((x >> U(8)) & U(0x00FF00FF)))
+    x = U(x ^ ((x >> U(4)) & U(0x0F0F0F0F)))
+    x = U(x ^ ((x >> U(2)) & U(0x33333333)))
+    return U(x ^ ((x >> U(1)) & U(0x55555555)))
+
+
+@jit(inline="always")
+def unit(x: Any) -> Any:
+    """As ``hashing.to_unit``."""
+    return np.float32(np.int32(x >> U(8))) * SCALE
