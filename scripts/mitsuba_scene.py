@@ -23,7 +23,7 @@ from torchpt.scene import Scene
 from torchpt.scene.assembly import corners_of
 from torchpt.scene.parts import MaterialSlot, Part, Source, VertexColors
 from torchpt.scene.schema import Camera, Orthographic, Perspective, ThinLens
-from torchpt.scene.settings import Film, PathIntegrator, Settings
+from torchpt.scene.settings import Film, Filter, PathIntegrator, Settings
 from torchpt.scene.texels import images_of
 from torchpt.textures import Node
 
@@ -178,7 +178,7 @@ def _film(film: Film) -> dict[str, Any]:
         **_crop(film),
         "pixel_format": "rgb",
         "component_format": "float32",
-        "rfilter": {"type": "box"} if film.filter.type == "box" else {"type": "gaussian", "stddev": film.filter.stddev},
+        "rfilter": _rfilter(film.filter),
     }
 
 
@@ -186,6 +186,11 @@ def _crop(film: Film) -> dict[str, int]:
     if film.crop is None:
         return {}
     return dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), film.crop, strict=True))
+
+
+def _rfilter(filter: Filter) -> dict[str, Any]:
+    # Mitsuba's gaussian has no radius of its own: it is four deviations, as ours is where none is given.
+    return {key: value for key, value in filter.model_dump().items() if key != "radius" or filter.type == "tent"}
 
 
 def _transform(mitsuba: Any, matrix: np.ndarray) -> Any:

@@ -139,6 +139,9 @@ class Lights:
     quadric: Tensor | None  # (K,) int64 column of World.quadrics, 0 for the other kinds; None where no quadric emits
     quadrics: Quadrics | None  # World.quadrics where a quadric emits
     prim: Tensor | None  # (K,) int64 the primitive; None where no texture says how much it emits
+    solid: (
+        Tensor | None
+    )  # (K, 14) float64, see torchpt.lights.solid_angle.table_of; None without triangles and rectangles
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,10 @@ ROOM = {
 }
 
 
+#: Far enough away for its size to be sampled by area.
+FAR = {**ROOM["shapes"]["panel"], "transform": [{"scale": 0.4}, *ROOM["shapes"]["panel"]["transform"]]}
+
+
 def only(*names: str) -> dict:
     return {**ROOM, "shapes": {name: shape for name, shape in ROOM["shapes"].items() if name in names}}
 
@@ -73,8 +77,9 @@ def test_gradcheck_reflectance_and_emission():
 @pytest.mark.parametrize("name", ["shapes.floor.vertices", "shapes.panel.to_world", "camera.to_world"])
 def test_gradcheck_geometry(name):
     # Light sampling alone: points on lights are fixed on their surface, so the estimator itself is differentiated. (Of
-    # several emitters the choice would follow their areas, which is not: hence the one panel.)
-    scene = torchpt.load(only("floor", "panel"), "cpu")
+    # several emitters the choice would follow their areas, which is not: hence the one panel. Nor is the choice of points by
+    # solid angle, which is held as directions are: hence it is far away.)
+    scene = torchpt.load({**ROOM, "shapes": {**only("floor")["shapes"], "panel": FAR}}, "cpu")
     assert checked(scene, (name,), integrator={"type": "direct", "strategy": "light"})
 
 
@@ -98,7 +103,7 @@ def test_gradcheck_smooth_normals():
         "face_normals": False,
         "vertices": [[-2, 0, -2], [2, 0.2, -2], [2, 0, 2], [-2, 0.1, 2]],
     }
-    scene = torchpt.load({**ROOM, "shapes": {"floor": bent, "panel": ROOM["shapes"]["panel"]}}, "cpu")
+    scene = torchpt.load({**ROOM, "shapes": {"floor": bent, "panel": FAR}}, "cpu")
     assert checked(scene, ("shapes.floor.vertices",), integrator={"type": "direct", "strategy": "light"})
 
 
@@ -111,6 +116,7 @@ def test_gradcheck_smooth_normals():
         ("shapes.lamp.vertices", (1, 1), 0.05),
         ("shapes.lamp.vertices", (1, 0), 0.05),
         ("shapes.ball.to_world", (1, 3), 0.05),
+        ("shapes.panel.to_world", (1, 3), 0.05),
         ("camera.to_world", (1, 3), 0.05),
     ],
 )

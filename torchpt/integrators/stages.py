@@ -162,14 +162,16 @@ def shade(
         return surface, None
     table = world.lights
     draws = Draws(plan.sampler, state.key, salts)
-    which = None
+    # The density of a light that a ray meets is asked for from where the ray left. That is where a reflected one will leave,
+    # unless paths keep the vertex itself.
+    which, x = None, offset_origin(world, at, -state.d)
     if lights.local(table):
-        which = lights.fine(draws.two(Dimension.LIGHT_CHOICE))
+        which, x = lights.fine(draws.two(Dimension.LIGHT_CHOICE)), at.p
     elif table.choice is not None:
         which = draws.one(Dimension.LIGHT_CHOICE)
     n = None if kind.transmits else surface.frame.n
     u, mis = draws.two(Dimension.LIGHT).to(plan.dtype), plan.strategy == "mis"
-    light = lights.sample(table, at.p, which, u, OFFSET, n, mis)
+    light = lights.sample(table, x, which, u, OFFSET, n, mis)
     wi = surface.frame.to_local(light.wi)
     weight = light.weight
     if plan.strategy == "mis":

@@ -1,21 +1,12 @@
-"""Planar emitters (triangle, rectangle, disk), sampled uniformly by area. They shine from the side of their normal."""
+"""Planar emitters (triangle, rectangle, disk): points and their density by area. They shine from the side of their normal."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
 from torchpt.math.vectors import affine, dot, safe_reciprocal
-from torchpt.math.warps import concentric_disk, uniform_triangle
 
-__all__ = ["WARPS", "inverse_pdf", "point"]
-
-
-def _identity(u: Tensor) -> Tensor:
-    return u
-
-
-#: Unit square to the primitive's own ``(u, v)``, uniform by area.
-WARPS = {"triangle": uniform_triangle, "rectangle": _identity, "disk": concentric_disk}
+__all__ = ["inverse_pdf", "point"]
 
 
 def point(p0: Tensor, e1: Tensor, e2: Tensor, uv: Tensor) -> Tensor:

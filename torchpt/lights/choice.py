@@ -22,7 +22,7 @@ __all__ = ["MANY", "WAYS", "ByTree", "choice_of", "draw", "environment", "local"
 
 #: Ways to choose: all lights alike, by power, by the tree, or by power below MANY lights and by the tree from there on.
 WAYS = ("auto", "uniform", "power", "tree")
-MANY = 12
+MANY = 10
 
 
 @dataclass(frozen=True)

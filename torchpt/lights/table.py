@@ -12,9 +12,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lights import area, choice, constant, envmap, point, quadric, sphere, spot
+from torchpt.lights import area, choice, constant, envmap, point, quadric, solid_angle, sphere, spot
 from torchpt.lights.envmap import EnvironmentMap
 from torchpt.math.vectors import dot, safe_reciprocal, take
+from torchpt.math.warps import concentric_disk
 from torchpt.records import DISTANT, KINDS, Interaction, Lights, LightSample, Quadrics, rows
 
 __all__ = ["emitted", "environment", "sample"]
@@ -111,9 +112,12 @@ def _on_surfaces(
     target: Tensor | None = None
     normal: Tensor | None = None
     bent: Quadrics | None = None
-    place = torch.zeros_like(u)
+    place, angle = torch.zeros_like(u), None
+    if lights.solid is not None:
+        place, angle = solid_angle.sample(lights.solid, row, x, u)
+        target, normal = area.point(at.p0, at.e1, at.e2, place), at.normal.expand_as(x)
     for kind in lights.kinds:
-        if kind not in KINDS:
+        if kind not in KINDS or kind in solid_angle.KINDS:
             continue
         mask = _is(lights, kind, row)
         if kind == "sphere":
@@ -126,7 +130,7 @@ def _on_surfaces(
             bent = _quadrics(lights, row)
             p, facing = quadric.point(at.p0, at.e1, at.e2, bent, u)
         else:
-            here = area.WARPS[kind](u)
+            here = concentric_disk(u)
             p, facing = area.point(at.p0, at.e1, at.e2, here), at.normal
             place = _pick(mask, here, place)
         target, normal = _pick(mask, p, target), _pick(mask, facing, normal)
@@ -140,6 +144,8 @@ def _on_surfaces(
         size = _pick(mask, quadric.world_area(size, at.e1, at.e2, bent.e3, normal), size)
         bound = _pick(mask, dot(normal.detach().abs(), bent.reach), bound)
     inverse = area.inverse_pdf(normal, size, wi, square)
+    if angle is not None:
+        inverse = solid_angle.inverse_pdf(angle, inverse)
     if "sphere" in lights.kinds:
         ball = sphere.inverse_pdf(x.detach(), at.p0.detach(), at.e1[0].detach(), normal, wi.detach(), square.detach())
         # In area measure the derivative of a sphere's share is that of the planar form.
@@ -222,6 +228,8 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | 
             found = quadric.world_area(size, table.e1, table.e2, _quadrics(lights, row).e3, at.ng)
             size = _pick(_is(lights, "quadric", row), found, size)
         inverse = area.inverse_pdf(at.ng, size, wi, dot(to, to))
+        if lights.solid is not None:
+            inverse = solid_angle.inverse_pdf(solid_angle.angles(lights.solid, row, x), inverse)
         if "sphere" in lights.kinds:
             ball = sphere.inverse_pdf(x, table.p0, table.e1[0], at.ng, wi, dot(to, to))
             inverse = _pick(_is(lights, "sphere", row), ball, inverse)

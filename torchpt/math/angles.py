@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["azimuth"]
+__all__ = ["SERIES", "azimuth"]
 
 #: ``atan(x) / x`` in powers of ``x^2`` for ``|x| <= tan(pi / 8)``: Chebyshev interpolation, error below 3e-13.
-_SERIES = (
+SERIES = (
     0.9999999999992449,
     -0.33333333276920757,
     0.19999993053407192,
@@ -38,8 +38,8 @@ def azimuth(x: Tensor, y: Tensor) -> Tensor:
     upper = low > (math.sqrt(2.0) - 1.0) * high
     ratio = torch.where(upper, low - high, low) / torch.where(upper, low + high, high)
     square = ratio * ratio
-    series = torch.full_like(square, _SERIES[-1])
-    for coefficient in reversed(_SERIES[:-1]):
+    series = torch.full_like(square, SERIES[-1])
+    for coefficient in reversed(SERIES[:-1]):
         series = series * square + coefficient
     angle = ratio * series + upper.to(x.dtype) * (0.25 * math.pi)
     angle = torch.where(steep, 0.5 * math.pi - angle, angle)

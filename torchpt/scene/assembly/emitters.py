@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.lights import choice_of, envmap
+from torchpt.lights.solid_angle import table_of
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Lights
 from torchpt.scene.assembly.curved import quadric_area
@@ -122,6 +123,7 @@ def lights_of(
         quadric=column,
         quadrics=None if column is None else primitives.quadrics,
         prim=torch.cat((prim, prim.new_zeros(rest))) if textured else None,
+        solid=table_of(names, joined["p0"], joined["e1"], joined["e2"]),
     )
     return replace(lights, choice=choice_of(lights, power, choice))
 
