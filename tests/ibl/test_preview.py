@@ -177,3 +177,16 @@ def test_gradients_flow_to_sky_and_material(kind: str, sky: dict[str, Any]) -> N
 def test_what_is_refused() -> None:
     with pytest.raises(torchpt.SceneError, match="integrator.max_depth"):
         torchpt.render(ball({"type": "diffuse"}, WHITE), integrator={"type": "ibl", "max_depth": 3}, spp=1)
+
+
+@pytest.mark.parametrize("directional", [False, True])
+def test_a_light_tree_is_cut_likewise(directional: bool) -> None:
+    lights: dict[str, Any] = {**WHITE, "a": {"type": "point", "position": [0, 2, 3], "intensity": 4.0}}
+    lights["b"] = {"type": "point", "position": [3, 0, 2], "intensity": 6.0}
+    if directional:
+        lights["c"] = {"type": "directional", "direction": [1, 0, -1], "irradiance": 0.5}
+    scene = ball({"type": "diffuse"}, lights)
+    tree, power = (
+        torchpt.render(scene, integrator={**IBL, "light_choice": way}, spp=64).mean() for way in ("tree", "power")
+    )
+    assert float(tree) == pytest.approx(float(power), rel=0.01)
