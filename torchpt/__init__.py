@@ -22,6 +22,7 @@ from torchpt.errors import (
 )
 
 if TYPE_CHECKING:
+    from torchpt import ibl
     from torchpt.bsdfs import Bsdf
     from torchpt.images import read_image, read_layers, write_image
     from torchpt.render import render
@@ -39,6 +40,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "TorchptError",
+    "ibl",
     "load",
     "read_image",
     "read_layers",
@@ -59,10 +61,12 @@ _LAZY = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module 'torchpt' has no attribute {name!r}")
     from importlib import import_module
 
+    if name == "ibl":
+        return import_module("torchpt.ibl")
+    if name not in _LAZY:
+        raise AttributeError(f"module 'torchpt' has no attribute {name!r}")
     value = getattr(import_module(_LAZY[name]), name)
     globals()[name] = value
     return value

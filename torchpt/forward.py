@@ -20,6 +20,7 @@ from torchpt.film import Film, Filter
 from torchpt.integrators import Wave
 from torchpt.integrators.aov import CHANNELS, NAMES
 from torchpt.integrators.compiled import CompiledStages, Stages, can_compile
+from torchpt.integrators.ibl import Preview
 from torchpt.integrators.path import Limits, Tally
 from torchpt.integrators.stages import Plan
 from torchpt.records import World
@@ -29,6 +30,7 @@ from torchpt.scene.settings import (
     AovIntegrator,
     DirectIntegrator,
     GaussianFilter,
+    IblIntegrator,
     MitchellFilter,
     PathIntegrator,
     Settings,
@@ -62,6 +64,7 @@ LARGEST_PASS = 64
 COMPILE_REPAYS = 200_000_000
 
 _compiled: WeakKeyDictionary[Scene, dict[Plan, CompiledStages]] = WeakKeyDictionary()
+_previews: WeakKeyDictionary[Scene, tuple[World, Preview]] = WeakKeyDictionary()
 _forked = False
 _threads_lock = threading.Lock()
 _threads_before, _renders = 0, 0
@@ -192,6 +195,9 @@ def make_wave(
     elif isinstance(integrator, DirectIntegrator):
         limits = Limits(2, 3)
         plan = Plan(settings.sampler.type, integrator.strategy, None, dtype, tape, attached)
+    elif isinstance(integrator, IblIntegrator):
+        limits = Limits(2, 3)
+        plan = Plan(settings.sampler.type, "light", None, dtype, tape, attached)
     spp = settings.render.spp
     camera = scene.camera(film, scene.merged(params), dtype)
     randomizations = min(spp, 4 if spp >= MANY_SAMPLES else 2)
@@ -204,7 +210,18 @@ def make_wave(
         sampler=Sampler(settings.sampler.type, settings.render.seed, randomizations, spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.centre,
+        preview=_preview(scene, world, own=not params) if isinstance(integrator, IblIntegrator) else None,
     )
+
+
+def _preview(scene: Scene, world: World, own: bool) -> Preview:
+    """The environment's maps; kept with the scene, unless the world is not the scene's ``own``."""
+    if not own or torch.is_grad_enabled():
+        return Preview.of(world)
+    kept = _previews.get(scene)
+    if kept is None or kept[0] is not world:
+        kept = _previews[scene] = world, Preview.of(world)
+    return kept[1]
 
 
 def pixel_of(world: World, camera: Camera) -> Tensor | None:

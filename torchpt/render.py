@@ -25,6 +25,8 @@ from torchpt.forward import (
     pixel_of,
 )
 from torchpt.integrators.compiled import Stages
+from torchpt.integrators.ibl import Preview
+from torchpt.records import tensors_of
 from torchpt.scene import Scene
 from torchpt.scene.description import settings as complete
 from torchpt.scene.scene import INDICES, MOVING
@@ -105,7 +107,7 @@ def render(
     drawn_anew = settings.render.model_copy(update={"seed": backward_seed, "spp": backward_spp})
     again = settings.model_copy(update={"render": drawn_anew})
     if isinstance(settings.integrator, AovIntegrator):
-        raise SceneError("integrator.type", "aov", "path or direct where gradients are wanted")
+        raise SceneError("integrator.type", "aov", "path, direct or ibl where gradients are wanted")
     names = tuple(wanted)
     attached = _moves(scene, names)
     if attached or any(name.startswith("lights.") and name.endswith(MOVING) for name in names):
@@ -207,7 +209,11 @@ def _differentiable_chunks(
         world, _ = scene.world(dtype, given, choice=settings.light_choice)
         camera = scene.camera(settings.film, scene.merged(given), dtype)
         stages = Stages(still.stages.plan, world, pixel_of(world, camera))
-        values, _ = replace(still, stages=stages, camera=camera).radiance(*span)
+        preview = still.preview
+        if preview is not None and world.lights is not None:
+            if any(t.requires_grad for t in tensors_of(world.lights.environment)):
+                preview = Preview.of(world)
+        values, _ = replace(still, stages=stages, camera=camera, preview=preview).radiance(*span)
         values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
         if clamp is not None:
             values = values * (clamp / values.detach().abs().amax(0).clamp_min(clamp)).clamp_max(1.0)

@@ -20,7 +20,7 @@ from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, joined
 from torchpt.samplers import salts
 
-__all__ = ["ENDLESS", "Limits", "Tally", "trace"]
+__all__ = ["ENDLESS", "Limits", "Tally", "gather_light", "partition", "trace"]
 
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted.
 ENDLESS = 4096
@@ -73,7 +73,7 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
         # the camera's point is found anew, since the search rounds it to float32.
         slide = sliding or (depth == 1 and exact)
         ends, groups = partition(world, hit)
-        _gather_light(stages, state, hit, ends, slide)
+        gather_light(stages, state, hit, ends, slide)
         retire(ends.missed)
         if depth == last:
             for _, index in groups:
@@ -125,7 +125,7 @@ def partition(world: World, hit: Hit) -> tuple[Ends, list[tuple[int, Tensor]]]:
     return Ends(order[: bounds[models]], order[bounds[2 * models] :]), groups
 
 
-def _gather_light(stages: Stages, state: PathState, hit: Hit, ends: Ends, slide: bool) -> None:
+def gather_light(stages: Stages, state: PathState, hit: Hit, ends: Ends, slide: bool) -> None:
     """Add to ``state.radiance`` what the lanes gather from emitters they hit and from the environment."""
     table = stages.world.lights
     if table is None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpt.accel import Accel
 from torchpt.cameras import Camera
 from torchpt.film import Filter
-from torchpt.integrators import aov
+from torchpt.integrators import aov, ibl
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import Limits, Tally, trace
 from torchpt.integrators.search import Search
@@ -33,6 +33,7 @@ class Wave:
         sampler: random numbers.
         crop: ``(x, y, width, height)`` of the picture on the film.
         centre: ``(3,)`` float64, see Scene.centre.
+        preview: the environment of a split-sum preview; None where paths are traced.
     """
 
     stages: Stages
@@ -43,6 +44,7 @@ class Wave:
     sampler: Sampler
     crop: tuple[int, int, int, int]
     centre: Tensor
+    preview: ibl.Preview | None = None
 
     def rays(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> PathState:
         """Camera rays of consecutive pixels of the picture, row by row; lanes run over pixels, then over samples."""
@@ -61,7 +63,10 @@ class Wave:
         """Radiance ``(3, samples, pixels)`` and what it took."""
         assert self.limits is not None
         state = self.rays(first_pixel, pixels, first_sample, samples)
-        radiance, tally = trace(self.stages, self.limits, self.accel, state)
+        if self.preview is None:
+            radiance, tally = trace(self.stages, self.limits, self.accel, state)
+        else:
+            radiance, tally = ibl.first_hit(self.stages, self.preview, self.accel, state)
         if self.filter.signed:
             radiance = radiance * self._weight(state)
         return radiance.view(3, samples, pixels), tally

@@ -11,7 +11,6 @@ __all__ = ["KEYS", "TYPES"]
 #: kind of thing -> its types that are not built -> the keys each of them takes beside ``type``.
 TYPES: dict[str, dict[str, tuple[str, ...]]] = {
     "integrator": {
-        "ibl": ("strict",),
         "bdpt": ("max_depth", "rr_depth", "rr_prob", "clamp", "strict"),
     },
 }

@@ -16,7 +16,7 @@ from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_
 
 __all__ = [
     "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter",
-    "Integrator", "MitchellFilter", "PathIntegrator", "Render", "Sampler", "Settings", "TentFilter", "merge",
+    "IblIntegrator", "Integrator", "MitchellFilter", "PathIntegrator", "Render", "Sampler", "Settings", "TentFilter", "merge",
 ]  # fmt: skip
 
 AOVS = ("albedo", "normal", "depth", "position", "uv", "object_id", "variance")
@@ -199,8 +199,22 @@ class AovIntegrator(Model):
     type: Literal["aov"] = "aov"
 
 
-Integrator = PathIntegrator | DirectIntegrator | AovIntegrator
-INTEGRATORS: dict[str, type[Any]] = {"path": PathIntegrator, "direct": DirectIntegrator, "aov": AovIntegrator}
+class IblIntegrator(Model):
+    """A preview: the first surface under the environment by split sum, unshadowed, and other lights with their shadows."""
+
+    type: Literal["ibl"] = "ibl"
+    light_choice: LightChoice = "auto"
+    clamp: Clamp = None
+    strict: Flag = False
+
+
+Integrator = PathIntegrator | DirectIntegrator | AovIntegrator | IblIntegrator
+INTEGRATORS: dict[str, type[Any]] = {
+    "path": PathIntegrator,
+    "direct": DirectIntegrator,
+    "aov": AovIntegrator,
+    "ibl": IblIntegrator,
+}
 
 
 class Sampler(Model):
@@ -253,7 +267,7 @@ class Settings(Model):
     """All run settings, complete."""
 
     film: Film = Film()
-    integrator: PathIntegrator | DirectIntegrator | AovIntegrator = PathIntegrator()
+    integrator: Integrator = PathIntegrator()
     sampler: Sampler = Sampler()
     render: Render = Render()
 

@@ -1,0 +1,115 @@
+"""A map at every pair of resolutions, coarser by rows, by columns, or both; so that a sample can stand for its solid angle.
+
+A texel of a coarse level is the mean of the fine map under the coarse texel's own hat, in solid angle: no level loses light,
+a constant stays the constant. Rows and columns are told apart because a texel of the poles is far narrower than high.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["Pyramid", "resampled"]
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """All levels in one table.
+
+    Attributes:
+        texels: ``(T, 3)``.
+        heights: rows of the levels 0..A-1.
+        widths: columns of the levels 0..B-1.
+        first: ``(A, B)`` int64: where level ``(a, b)`` begins.
+    """
+
+    texels: Tensor
+    heights: tuple[int, ...]
+    widths: tuple[int, ...]
+    first: Tensor
+
+    @staticmethod
+    def of(map: Tensor) -> Pyramid:
+        """From a map ``(H, W, 3)``; differentiable, linear."""
+        height, width, _ = map.shape
+        heights = tuple(intervals + 1 for intervals in _halved(height - 1))
+        widths = _halved(width)
+        parts, first, end = [], [], 0
+        for rows in heights:
+            lower = _means(map, rows, True).transpose(0, 1)  # (W, rows, 3)
+            for columns in widths:
+                parts.append(_means(lower, columns, False).transpose(0, 1).reshape(-1, 3))
+                first.append(end)
+                end += rows * columns
+        places = torch.tensor(first, dtype=torch.int64, device=map.device).view(len(heights), len(widths))
+        return Pyramid(torch.cat(parts), heights, widths, places)
+
+
+def resampled(map: Tensor, height: int, width: int) -> Tensor:
+    """A map ``(height, width, 3)`` of means of a finer one; differentiable, linear."""
+    return _means(_means(map, height, True).transpose(0, 1), width, False).transpose(0, 1)
+
+
+def _halved(size: int) -> tuple[int, ...]:
+    sizes = [size]
+    while sizes[-1] > 1:
+        sizes.append((sizes[-1] + 1) // 2)
+    return tuple(sizes)
+
+
+def _means(x: Tensor, size: int, latitude: bool) -> Tensor:
+    """A map ``(n, m, 3)`` with ``size`` rows instead of ``n``."""
+    n, m, _ = x.shape
+    if n == size:
+        return x
+    index, weight = _matrix(n, size, latitude)
+    matrix = torch.sparse_coo_tensor(
+        torch.from_numpy(index),
+        torch.from_numpy(weight).to(x.dtype),
+        (size, n),
+        is_coalesced=True,
+        check_invariants=False,
+    ).to(x.device)
+    return torch.sparse.mm(matrix, x.reshape(n, m * 3)).view(size, m, 3)
+
+
+@lru_cache(maxsize=64)
+def _matrix(fine: int, coarse: int, latitude: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The matrix ``(coarse, fine)`` of means under the coarse hats: indices ``(2, K)`` sorted by rows, values ``(K,)``.
+
+    Integrals over products of two hats (and the sine of the latitude) between their kinks, by three Gauss-Legendre nodes.
+    """
+    if latitude:
+        kinks = np.union1d(np.arange(fine) / (fine - 1), np.arange(coarse) / (coarse - 1))
+    else:
+        kinks = np.union1d((np.arange(fine) + 0.5) / fine, (np.arange(coarse) + 0.5) / coarse)
+        kinks = np.append(kinks, kinks[0] + 1.0)
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    low, span = kinks[:-1, None], np.diff(kinks)[:, None]
+    t = (low + span * (0.5 + 0.5 * nodes)).ravel()
+    mass = (0.5 * span * weights).ravel() * (np.sin(math.pi * t) if latitude else 1.0)
+
+    def hats(size: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        place = t * (size - 1) if latitude else t * size - 0.5
+        below = np.floor(place).astype(np.int64)
+        if latitude:
+            below = np.minimum(below, size - 2)
+        share = place - below
+        if latitude:
+            return [(below, 1.0 - share), (below + 1, share)]
+        return [(below % size, 1.0 - share), ((below + 1) % size, share)]
+
+    matrix: dict[str, list[np.ndarray]] = {"key": [], "value": []}
+    for row, a in hats(coarse):
+        for column, b in hats(fine):
+            matrix["key"].append(row * fine + column)
+            matrix["value"].append(a * b * mass)
+    key, place = np.unique(np.concatenate(matrix["key"]), return_inverse=True)
+    value = np.bincount(place, np.concatenate(matrix["value"]))
+    row = key // fine
+    return np.stack((row, key % fine)), value / np.bincount(row, value)[row]
