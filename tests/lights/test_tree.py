@@ -104,7 +104,7 @@ def test_what_is_drawn_is_what_is_told(case):
             # What brings light can be drawn.
             assert not ((brought(lights, x, n) > 0) & (p == 0)).any()
         y, m = x.repeat(1, 100), None if normal is None else normal.repeat(1, 100)
-        row, drawn = tree.sample(built, y, m, tree.fine(uniform(2, 4000)))
+        row, drawn, _ = tree.sample(built, y, m, tree.fine(uniform(2, 4000)))
         assert (drawn > 0).all()
         assert torch.equal(tree.probability(built, row, y, m), drawn)
         if case not in ("all dark", "lopsided"):
@@ -117,8 +117,8 @@ def test_the_tensor_form_is_the_kernels_reference(case):
     built, (x, n) = tree.build(**lights), points(500)
     u = tree.fine(uniform(2, 500))
     for normal in (n, None):
-        row, p = tree.sample(built, x, normal, u)
-        same, q = tree._walk(built, x, normal, u, None)
+        row, p, _ = tree.sample(built, x, normal, u)
+        same, q, _ = tree._walk(built, x, normal, u, None)
         assert (row == same).double().mean() > 0.99  # a draw on the edge of two lights may take either
         torch.testing.assert_close(p[row == same], q[row == same], rtol=1e-4, atol=0)
         torch.testing.assert_close(tree._walk(built, x, normal, None, row)[1], p, rtol=1e-4, atol=0)
@@ -130,7 +130,7 @@ def test_frequencies_are_the_probabilities(case):
     built, count, (x, n) = tree.build(**lights), len(lights["intensity"]), points(3)
     for k in range(3):
         p = table(built, count, x[:, k : k + 1], n[:, k : k + 1])[0]
-        row, _ = tree.sample(
+        row, _, _ = tree.sample(
             built,
             x[:, k : k + 1].expand(3, n_draws),
             n[:, k : k + 1].expand(3, n_draws),
@@ -156,7 +156,7 @@ def test_the_estimate_of_all_lights_together_is_unbiased(case):
     x, n = torch.tensor([[0.3], [-0.5], [0.2]]), torch.tensor([[0.0], [1.0], [0.0]])
     p, f = table(built, count, x, n)[0], brought(lights, x, n)[0]
     total, square = f.sum(), torch.where(f > 0, f * f / torch.where(p > 0, p, 1.0), 0.0).sum()
-    row, drawn = tree.sample(built, x.expand(3, n_draws), n.expand(3, n_draws), tree.fine(uniform(2, n_draws)))
+    row, drawn, _ = tree.sample(built, x.expand(3, n_draws), n.expand(3, n_draws), tree.fine(uniform(2, n_draws)))
     mean = (f[row] / drawn.double()).mean()
     error = ((square - total**2).clamp_min(0) / n_draws).sqrt()
     assert abs(float(mean - total)) <= 4 * float(error) + 1e-6 * float(total)
@@ -226,12 +226,12 @@ def test_place_and_threads_do_not_matter():
     u, before = tree.fine(uniform(2, 5003)), torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        row, p = tree.sample(built, x, n, u)
+        row, p, _ = tree.sample(built, x, n, u)
         for threads in (1, 2):
             torch.set_num_threads(threads)
             for first, size in ((0, 5003), (0, 1), (1, 3), (5, 1024), (11, 2049)):
                 part = slice(first, first + size)
-                rows, q = tree.sample(built, x[:, part], n[:, part], u[part])
+                rows, q, _ = tree.sample(built, x[:, part], n[:, part], u[part])
                 assert torch.equal(rows, row[part]) and torch.equal(q, p[part])
                 assert torch.equal(tree.probability(built, rows, x[:, part], n[:, part]), q)
     finally:
@@ -241,7 +241,7 @@ def test_place_and_threads_do_not_matter():
 def test_a_lane_without_a_place_draws_some_light():
     built = tree.build(**emitters("mixed"))
     x, n = torch.full((3, 4), torch.nan), torch.full((3, 4), torch.nan)
-    row, p = tree.sample(built, x, n, torch.zeros(4, dtype=torch.float64))
+    row, p, _ = tree.sample(built, x, n, torch.zeros(4, dtype=torch.float64))
     assert ((row >= 0) & (row < 300)).all() and (p > 0).all()
 
 

@@ -19,7 +19,7 @@ def draws(kind: str, pixel: int, points: int, depth: int) -> Draws:
 @pytest.mark.parametrize("kind", ["sobol", "independent"])
 @pytest.mark.parametrize(
     ("first", "second"),
-    [((Dimension.ROULETTE, 5), (Dimension.ROULETTE, 6)), ((Dimension.LIGHT_CHOICE, 2), (Dimension.ROULETTE, 2))],
+    [((Dimension.ROULETTE, 5), (Dimension.ROULETTE, 6)), ((Dimension.LIGHT_DIGITS, 2), (Dimension.ROULETTE, 2))],
 )
 def test_two_sets_of_one_dimension_fill_the_square(kind, first, second):
     # Scrambled alone, the top bits of both would differ by a constant: two of the four quarters would stay empty.

@@ -105,7 +105,7 @@ def test_padded_dimensions_are_decorrelated(power):
             (5, Dimension.BSDF, 1),
         )
     ]
-    for depth, d in ((1, Dimension.ROULETTE), (2, Dimension.ROULETTE), (1, Dimension.LIGHT_CHOICE)):
+    for depth, d in ((1, Dimension.ROULETTE), (2, Dimension.ROULETTE), (1, Dimension.LIGHT_DIGITS)):
         drawn.append(sobol.draw_1d(key, salts(depth, CPU)[int(d)]))
     pairs = [(a, b) for a in range(len(drawn)) for b in range(a)]
     pairs.remove((2, 1))  # the two axes of one dimension are a net by design

@@ -97,6 +97,7 @@ def without_environment(lights: Lights | None) -> Lights | None:
     columns = ("p0", "e1", "e2", "normal", "flip", "area", "bound", "radiance", "opacity", "quadric", "prim", "kind")
     cut = {name: getattr(lights, name) for name in columns}
     cut = {name: None if value is None else value[..., :left] for name, value in cut.items()}
+    cut["solid"] = None if lights.solid is None else lights.solid[:left]
     choice = lights.choice
     if left == 1 or choice is None:
         return replace(lights, **{**cut, "kind": None}, kinds=lights.kinds[:1], choice=None, environment=None)

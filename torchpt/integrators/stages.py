@@ -164,13 +164,13 @@ def shade(
     draws = Draws(plan.sampler, state.key, salts)
     # The density of a light that a ray meets is asked for from where the ray left. That is where a reflected one will leave,
     # unless paths keep the vertex itself.
-    which, x = None, offset_origin(world, at, -state.d)
-    if lights.local(table):
-        which, x = lights.fine(draws.two(Dimension.LIGHT_CHOICE)), at.p
-    elif table.choice is not None:
-        which = draws.one(Dimension.LIGHT_CHOICE)
+    x = at.p if lights.local(table) else offset_origin(world, at, -state.d)
     n = None if kind.transmits else surface.frame.n
-    u, mis = draws.two(Dimension.LIGHT).to(plan.dtype), plan.strategy == "mis"
+    drawn, which = draws.two(Dimension.LIGHT), None
+    if table.choice is not None:
+        # One number chooses the light and goes on to the place on it, so that both are stratified together.
+        which = lights.fine(torch.stack((drawn[0], draws.one(Dimension.LIGHT_DIGITS))))
+    u, mis = drawn.to(plan.dtype), plan.strategy == "mis"
     light = lights.sample(table, x, which, u, OFFSET, n, mis)
     wi = surface.frame.to_local(light.wi)
     weight = light.weight

@@ -20,9 +20,14 @@ from torchpt.records import Lights
 
 __all__ = ["MANY", "WAYS", "ByTree", "choice_of", "draw", "environment", "local", "probability"]
 
-#: Ways to choose: all lights alike, by power, by the tree, or by power below MANY lights and by the tree from there on.
+#: Ways to choose: all lights alike, by power, by the tree, or by power below MANY lights that lie somewhere, by the tree from
+#: there on.
 WAYS = ("auto", "uniform", "power", "tree")
-MANY = 10
+MANY = 3
+#: Share of the draws near by that is even among the lights: the tree knows of no lobe, and of a glossy surface may draw the
+#: wrong light nearly always. At 64 samples a pixel it halves the error of four plates under five lights; of a thousand lights
+#: over a diffuse floor it adds 4 %.
+EVEN = 0.25
 
 
 @dataclass(frozen=True)
@@ -31,6 +36,7 @@ class ByTree:
 
     tree: LightTree
     beside: Discrete | None  # over the tree and the rows after its own; None where there are none
+    even: Discrete  # over the rows of the tree, what a share EVEN of its draws is taken from
 
 
 def choice_of(lights: Lights, power: Tensor, way: str) -> Discrete | ByTree | None:
@@ -48,12 +54,13 @@ def choice_of(lights: Lights, power: Tensor, way: str) -> Discrete | ByTree | No
         return Discrete.of((power > 0).double() if way == "uniform" else power, dtype)
     bounds = bounds_of(lights, power)
     count = len(bounds.intensity)
-    if not count:
+    if not count or (way == "auto" and count < MANY):
         return Discrete.of(power, dtype)
     beside = None
     if count < len(power):
         beside = Discrete.of(torch.cat((power[:count].sum().reshape(1), power[count:])), dtype)
-    return ByTree(tree.build(*astuple(bounds)), beside)
+    even = Discrete.of((power[:count] > 0).double(), dtype)
+    return ByTree(tree.build(*astuple(bounds)), beside, even)
 
 
 def local(lights: Lights | None) -> bool:
@@ -61,26 +68,51 @@ def local(lights: Lights | None) -> bool:
     return lights is not None and isinstance(lights.choice, ByTree)
 
 
-def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Rows ``(N,)`` and their probabilities ``(N,)``.
+def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows ``(N,)``, their probabilities ``(N,)``, and what the choice leaves of ``u``: ``(N,)`` float64 in [0, 1].
+
+    The rest is uniform whatever was chosen. Who goes on with it keeps the stratification of light and place together.
 
     Args:
         choice: the choice.
-        u: ``(N,)`` in [0, 1); of 48 bits for a tree, see :func:`torchpt.lights.tree.fine`.
+        u: ``(N,)`` float64 in [0, 1) of 48 bits, see :func:`torchpt.lights.tree.fine`.
         x: reference points ``(3, N)``.
         n: normals ``(3, N)`` as :func:`torchpt.lights.tree.sample` takes them, or None.
     """
     if isinstance(choice, Discrete):
-        row = choice.sample(u)
-        return row, take(choice.pmf, row)
+        row, rest = _by_power(choice, u)
+        return row, take(choice.pmf, row), rest
     if choice.beside is None:
-        return tree.sample(choice.tree, x, n, u)
+        return _near(choice, u, x, n)
     beside, first = choice.beside, len(choice.tree.depth)
-    outcome = beside.sample(u)
-    share = beside.cdf[0].clamp_min(torch.finfo(torch.float64).tiny)
-    row, p = tree.sample(choice.tree, x, n, (u.double() / share).clamp_max(1.0))
+    outcome, left = _by_power(beside, u)
+    row, p, rest = _near(choice, left, x, n)
     near = outcome == 0
-    return torch.where(near, row, outcome + (first - 1)), torch.where(near, p, 1.0) * take(beside.pmf, outcome)
+    rest = torch.where(near, rest, left)
+    p = torch.where(near, p, 1.0) * take(beside.pmf, outcome)
+    return torch.where(near, row, outcome + (first - 1)), p, rest
+
+
+def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """:func:`draw` among the rows of the tree."""
+    apart = u < EVEN
+    row, _, rest = tree.sample(choice.tree, x, n, ((u - EVEN) / (1.0 - EVEN)).clamp_min(0.0))
+    other, left = _by_power(choice.even, (u / EVEN).clamp_max(1.0 - 2.0**-53))
+    row, rest = torch.where(apart, other, row), torch.where(apart, left, rest)
+    return row, _chance(choice, row, x, n), rest
+
+
+def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
+    """:func:`probability` among the rows of the tree."""
+    p = tree.probability(choice.tree, row, x, n)
+    return p * (1.0 - EVEN) + take(choice.even.pmf, row) * EVEN
+
+
+def _by_power(choice: Discrete, u: Tensor) -> tuple[Tensor, Tensor]:
+    row = choice.sample(u)
+    low = torch.where(row > 0, take(choice.cdf, (row - 1).clamp_min(0)), 0.0)
+    width = take(choice.cdf, row) - low
+    return row, ((u - low) / torch.where(width > 0, width, 1.0)).clamp(0.0, 1.0)
 
 
 def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
@@ -88,9 +120,9 @@ def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | N
     if isinstance(choice, Discrete):
         return take(choice.pmf, row)
     if choice.beside is None:
-        return tree.probability(choice.tree, row, x, n)
+        return _chance(choice, row, x, n)
     first = len(choice.tree.depth)
-    p = tree.probability(choice.tree, row.clamp_max(first - 1), x, n)
+    p = _chance(choice, row.clamp_max(first - 1), x, n)
     return torch.where(row < first, p, 1.0) * take(choice.beside.pmf, (row - (first - 1)).clamp_min(0))
 
 

@@ -105,7 +105,7 @@ def _total(weight, full):
 
 
 @jit()
-def _sample(first, last, x, n, turns, u, tree, unit, out_row, out_probability):
+def _sample(first, last, x, n, turns, u, tree, unit, out_row, out_probability, out_rest):
     nodes, child, full, _, _ = tree
     weight = np.empty(WIDTH, np.float32)
     nx, ny, nz = _ZERO, _ZERO, _ZERO
@@ -129,6 +129,7 @@ def _sample(first, last, x, n, turns, u, tree, unit, out_row, out_probability):
             node = np.int64(child[node * WIDTH + chosen])
         out_row[i] = ~node
         out_probability[i] = p
+        out_rest[i] = left
 
 
 @jit()
@@ -153,15 +154,15 @@ def _probability(first, last, x, n, turns, row, tree, unit, out):
 
 
 @jit()
-def _sample_blocks(first, last, x, n, turns, u, tree, unit, row, probability):
-    _sample(first * BLOCK, min(last * BLOCK, len(u)), x, n, turns, u, tree, unit, row, probability)
+def _sample_blocks(first, last, x, n, turns, u, tree, unit, row, probability, rest):
+    _sample(first * BLOCK, min(last * BLOCK, len(u)), x, n, turns, u, tree, unit, row, probability, rest)
 
 
 @jit(parallel=True)
-def _sample_parallel(chunks, items, x, n, turns, u, tree, unit, row, probability):
+def _sample_parallel(chunks, items, x, n, turns, u, tree, unit, row, probability, rest):
     for c in nb.prange(chunks):
         a, b = items * c // chunks, items * (c + 1) // chunks
-        _sample_blocks(a, b, x, n, turns, u, tree, unit, row, probability)
+        _sample_blocks(a, b, x, n, turns, u, tree, unit, row, probability, rest)
 
 
 @jit()
@@ -190,13 +191,15 @@ def _arrays(tree: tuple[Tensor, ...]) -> tuple[Any, ...]:
     return _numpy(nodes).reshape(-1), _numpy(child).reshape(-1), _numpy(full), _numpy(trail), _numpy(depth)
 
 
-def sample(tree: tuple[Tensor, ...], x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows ``(N,)`` int64 and their probabilities in the dtype of ``x``; see :func:`torchpt.lights.tree.sample`."""
+def sample(tree: tuple[Tensor, ...], x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows, their probabilities in the dtype of ``x``, and what is left of ``u``: :func:`torchpt.lights.tree.sample`."""
     row, found = torch.empty(len(u), dtype=torch.int64), torch.empty(len(u), dtype=x.dtype)
+    rest = torch.empty(len(u), dtype=torch.float64)
     if len(u):
-        arguments = (*_place(x, n), _numpy(u.double()), _arrays(tree), 1, row.numpy(), found.numpy())
+        out = row.numpy(), found.numpy(), rest.numpy()
+        arguments = (*_place(x, n), _numpy(u.double()), _arrays(tree), 1, *out)
         launch(_sample_blocks, _sample_parallel, -(-len(u) // BLOCK), thread_count(None), 4, arguments)
-    return row, found
+    return row, found, rest
 
 
 def probability(tree: tuple[Tensor, ...], row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:

@@ -63,7 +63,8 @@ def sample(
     Args:
         lights: the table.
         x: reference points ``(3, N)``.
-        which: ``(N,)`` in [0, 1), picks the light; unused (``None``) where there is but one.
+        which: ``(N,)`` float64 in [0, 1), picks the light, and what that leaves of it takes the place of ``u[0]``; unused
+            (``None``) where there is but one.
         u: ``(2, N)`` in [0, 1), picks the point.
         offset: how far shadow rays stop off the light's surface, in units of ``Lights.bound``.
         n: normals ``(3, N)`` of surfaces that nothing lights from behind, zero for others; None: no such surface. Asked for
@@ -73,7 +74,8 @@ def sample(
     row: Tensor | None = None
     probability: Tensor | float = 1.0
     if lights.choice is not None and which is not None:
-        row, probability = choice.draw(lights.choice, which, x, n)
+        row, probability, rest = choice.draw(lights.choice, which, x, n)
+        u = torch.stack((rest.to(u.dtype).clamp_max(1.0 - 2.0**-24), u[1]))
     at = _rows(lights, row)
     surfaces = len([kind for kind in lights.kinds if kind in KINDS])
     near = len([kind for kind in lights.kinds if kind not in DISTANT])

@@ -92,7 +92,7 @@ def fine(u: Tensor) -> Tensor:
     return torch.add(u[0].double(), u[1].double(), alpha=2.0**-24)
 
 
-def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Tensor, Tensor]:
+def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Draws lights for points.
 
     Args:
@@ -103,12 +103,15 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
         u: ``(N,)`` in [0, 1), float64, see :func:`fine`.
 
     Returns:
-        Rows ``(N,)`` int64 and the probabilities ``(N,)`` with which they were drawn, always positive.
+        Rows ``(N,)`` int64, the probabilities ``(N,)`` with which they were drawn, always positive, and what is left of ``u``:
+        ``(N,)`` float64 in [0, 1], uniform whatever was drawn.
     """
     x, n = x.detach(), None if n is None else n.detach()
     if x.device.type == "cpu":
         return choose(_sample_on_cpu, _sample_operator)(*_parts(tree), x, n, u)
-    return _walk(tree, x, n, u, None)
+    row, p, rest = _walk(tree, x, n, u, None)
+    assert rest is not None
+    return row, p, rest
 
 
 def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
@@ -125,7 +128,7 @@ def _parts(tree: LightTree) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 def _sample_on_cpu(
     nodes: Tensor, child: Tensor, full: Tensor, trail: Tensor, depth: Tensor, x: Tensor, n: Tensor | None, u: Tensor
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     from torchpt.lights import kernels_tree
 
     return kernels_tree.sample((nodes, child, full, trail, depth), x, n, u)
@@ -146,8 +149,8 @@ _probability_operator = operator("torchpt::light_tree_probability", _probability
 @_sample_operator.register_fake
 def _(
     nodes: Tensor, child: Tensor, full: Tensor, trail: Tensor, depth: Tensor, x: Tensor, n: Tensor | None, u: Tensor
-) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(u, dtype=torch.int64), torch.empty_like(u, dtype=x.dtype)
+) -> tuple[Tensor, Tensor, Tensor]:
+    return torch.empty_like(u, dtype=torch.int64), torch.empty_like(u, dtype=x.dtype), torch.empty_like(u)
 
 
 @_probability_operator.register_fake
@@ -194,8 +197,10 @@ def _root(a: Tensor) -> Tensor:
     return a.clamp_min(0.0).sqrt()
 
 
-def _walk(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor | None, row: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Ways through the tree, by ``u`` or to ``row``: where they end, and their probabilities."""
+def _walk(
+    tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor | None, row: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Ways through the tree, by ``u`` or to ``row``: where they end, their probabilities, and what is left of ``u``."""
     node = torch.zeros(x.shape[1], dtype=torch.int64, device=x.device)
     p = torch.ones(x.shape[1], dtype=torch.float64, device=x.device)
     places = torch.arange(tree.child.shape[1], device=x.device)
@@ -222,4 +227,4 @@ def _walk(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor | None, row: T
         node = torch.where(deeper, tree.child[inner, chosen].long(), node)
     if row is not None:
         p = torch.where(tree.depth[row] > 0, p, 0.0)
-    return ~node, p.to(x.dtype)
+    return ~node, p.to(x.dtype), left

@@ -14,8 +14,8 @@ class Dimension(IntEnum):
 
     PIXEL = 0  # 2D, place within the pixel's filter
     LENS = 1  # 2D, place on the aperture
-    LIGHT_CHOICE = 2  # 1D
-    LIGHT = 3  # 2D, place on the light
+    LIGHT_DIGITS = 2  # 1D, further digits of the first number of LIGHT
+    LIGHT = 3  # 2D, which light, and the place on it
     LOBE = 4  # 1D, which part of the BSDF
     BSDF = 5  # 2D, direction
     ROULETTE = 6  # 1D
