@@ -111,8 +111,24 @@ BULBS: dict[str, Any] = {
         },
     },
 }
+#: A bunny on a floor in a museum; its files are not everywhere.
+MUSEUM: dict[str, Any] = {
+    "camera": {"origin": [0, 0.2, 0.35], "target": [-0.02, 0.1, 0], "fov": 35},
+    "shapes": {
+        "bunny": {
+            "type": "mesh",
+            "path": "$TORCHPT_ASSETS/bunny.ply",
+            "material": {"type": "plastic", "diffuse_reflectance": [0.5, 0.3, 0.2]},
+        },
+        "floor": {
+            "type": "rectangle",
+            "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"translate": [0, 0.033, 0]}],
+        },
+    },
+    "lights": {"sky": {"type": "envmap", "path": "$TORCHPT_ASSETS/museum.exr", "transform": [turn(40)]}},
+}
 #: Scenes that are rendered by both, by name; others ship.
-LIVE = {"zoo": ZOO, "deltas": DELTAS, "bulbs": BULBS}
+LIVE = {"zoo": ZOO, "deltas": DELTAS, "museum": MUSEUM, "bulbs": BULBS}
 
 
 def ours(scene: Any, size: int, spp: int = 16) -> tuple[Tensor, Tensor]:
@@ -269,6 +285,8 @@ def test_live(scene, tmp_path, monkeypatch):
     sys.modules.pop("mitsuba_scene", None)
     from mitsuba_scene import convert, load_mitsuba
 
+    if scene == "museum" and not os.environ.get("TORCHPT_ASSETS"):
+        pytest.skip("$TORCHPT_ASSETS is not set")
     mitsuba = load_mitsuba("scalar_rgb")
     loaded = torchpt.load(LIVE[scene] if scene in LIVE else scene, device="cpu")
     film = {**film_of(48), "filter": "box"}
