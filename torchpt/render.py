@@ -110,7 +110,7 @@ def render(
         raise SceneError("integrator.type", "aov", "path, direct or ibl where gradients are wanted")
     names = tuple(wanted)
     attached = _moves(scene, names)
-    if attached or any(name.startswith("lights.") and name.endswith(MOVING) for name in names):
+    if attached or any("lights." in name and name.endswith(MOVING) for name in names):
         warnings.warn(
             "the gradient with respect to what moves or bends rays leaves out visibility edges (silhouettes and shadow edges "
             "that move); see docs/gradients.md",

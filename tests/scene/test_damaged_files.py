@@ -113,15 +113,20 @@ def gltf_document() -> tuple[dict[str, Any], bytes]:
         "alphaMode": "MASK",
         "extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 1}, "KHR_materials_ior": {"ior": 1.4}},
     }
+    cone = {"innerConeAngle": 0.5, "outerConeAngle": 1}
+    lamp = {"name": "l", "type": "spot", "color": [1, 1, 1], "intensity": 1, "range": 9, "spot": cone}
     attributes = {"POSITION": 3, "TEXCOORD_0": 2, "NORMAL": 0}
     document = {
         "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [
-            {"children": [1], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]},
+            {"children": [1, 2], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]},
             {"mesh": 0, "translation": [1, 2, 3]},
+            {"translation": [0, 5, 0], "camera": 0, "extensions": {"KHR_lights_punctual": {"light": 0}}},
         ],
+        "extensions": {"KHR_lights_punctual": {"lights": [lamp]}},
+        "cameras": [{"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}],
         "meshes": [{"name": "m", "primitives": [{"attributes": attributes, "indices": 1, "material": 0, "mode": 4}]}],
         "materials": [material],
         "accessors": accessors,
@@ -212,6 +217,10 @@ def check_mesh(file: Path) -> None:
         assert part.normals is None or np.isfinite(part.normals).all()
         assert part.uvs is None or np.isfinite(part.uvs).all()
         assert part.colors is None or np.isfinite(part.colors).all()
+        for light in part.lights:
+            assert np.isfinite([light.position, light.direction]).all() and light.direction.any()
+            assert all(np.isfinite(value).all() and np.min(value) >= 0 for value in light.numbers.values())
+        assert all(np.isfinite(camera.matrix).all() for camera in part.cameras)
         if part.material is not None:
             for entry in part.material.material.values():
                 if isinstance(entry, dict) and isinstance(entry.get("path"), EncodedImage):

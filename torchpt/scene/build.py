@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchpt.errors import AssetError, SceneError
-from torchpt.math.transforms import is_singular, similarity_scale
+from torchpt.math.transforms import apply_points, is_singular, similarity_scale
 from torchpt.records import KINDS, SOURCES
 from torchpt.scene.description import Description
 from torchpt.scene.displacement import displaced
 from torchpt.scene.lights import ENVIRONMENTS, EnvmapLight
-from torchpt.scene.loaders import FileMaterial, MeshPart, load_mesh, unit_cube
+from torchpt.scene.loaders import FileCamera, FileLight, FileMaterial, MeshPart, load_mesh, unit_cube
 from torchpt.scene.materials import MATERIALS, Diffuse, check_material, read_material, slot_of
 from torchpt.scene.parts import Copy, MaterialSlot, Part, Source
 from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
@@ -53,25 +53,26 @@ def build_parts(description: Description) -> Built:
     """
     parameters: dict[str, np.ndarray] = {}
     parts: list[Part] = []
+    found: list[Source] = []
     opener = Opener(description.textures, description.resolve, parameters, description.file)
     for number, (name, shape) in enumerate(description.shapes.items(), 1):
         if not isinstance(shape, Instance):
-            parts += _shape_parts(description, name, shape, number, parameters, opener)
+            parts += _shape_parts(description, name, shape, number, parameters, opener, found)
     copies: list[Copy] = []
     for number, (name, shape) in enumerate(description.shapes.items(), 1):
         if isinstance(shape, Instance):
             copies += _copies(description, name, shape, number, parts, parameters, opener)
     for name, material in description.materials.items():
         _declare(slot_of(material, f"materials.{name}", description.materials, opener), parameters)
-    sources = _sources(description, parameters)
+    sources = sorted([*_sources(description, parameters), *found], key=lambda source: SOURCES.index(source.kind))
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
     for name, number in description.camera.numbers().items():
         parameters[f"camera.{name}"] = np.asarray(number, np.float64)
     parts.sort(key=lambda part: KINDS.index(part.kind))
-    return Built(tuple(parts), parameters, _centre(parts, copies), sources, tuple(copies))
+    return Built(tuple(parts), parameters, _centre(parts, copies), tuple(sources), tuple(copies))
 
 
-def _sources(description: Description, parameters: dict[str, np.ndarray]) -> tuple[Source, ...]:
+def _sources(description: Description, parameters: dict[str, np.ndarray]) -> list[Source]:
     """The lights block; its numbers become parameters."""
     lights = description.lights
     around = [name for name, light in lights.items() if light.type in ENVIRONMENTS]
@@ -85,8 +86,30 @@ def _sources(description: Description, parameters: dict[str, np.ndarray]) -> tup
             key = f"lights.{name}.path"
             source = description.resolve(light.path, key)
             parameters[f"lights.{name}.texels"] = radiance_of(source, key, description.file)
-    found = [Source(f"lights.{name}", light.type) for name, light in lights.items()]
-    return tuple(sorted(found, key=lambda source: SOURCES.index(source.kind)))
+    return [Source(f"lights.{name}", light.type) for name, light in lights.items()]
+
+
+def _lights_of(
+    lights: list[FileLight], prefix: str, pose: np.ndarray, source: str, parameters: dict[str, np.ndarray]
+) -> list[Source]:
+    """The lights of a mesh file, placed in the scene; their numbers become parameters."""
+    found = []
+    for light, label in zip(lights, _labels([light.name for light in lights]), strict=True):
+        stem = f"{prefix}.lights.{label}"
+        with np.errstate(over="ignore", invalid="ignore"):
+            position, direction = apply_points(pose, light.position), pose[:3, :3] @ light.direction
+            direction = direction / np.abs(direction).max()
+        if not np.isfinite([position, direction]).all():
+            raise AssetError(source, f"light {light.name!r} has no finite place under the transform of {prefix}")
+        direction = direction / np.linalg.norm(direction)
+        place = {"direction": direction} if light.kind == "directional" else {"position": position}
+        if light.kind == "spot":
+            # As far off as the origin, so that the difference of the two is as exact as they are.
+            place["target"] = position + direction * max(1.0, np.abs(position).max())
+        for key, value in {**place, **light.numbers}.items():
+            parameters[f"{stem}.{key}"] = np.asarray(value, np.float64)
+        found.append(Source(stem, light.kind))
+    return found
 
 
 def _copies(
@@ -128,8 +151,15 @@ def _declare(slot: MaterialSlot, parameters: dict[str, np.ndarray]) -> None:
 
 
 def _shape_parts(
-    description: Description, name: str, shape: Shape, number: int, parameters: dict[str, np.ndarray], opener: Opener
+    description: Description,
+    name: str,
+    shape: Shape,
+    number: int,
+    parameters: dict[str, np.ndarray],
+    opener: Opener,
+    sources: list[Source],
 ) -> list[Part]:
+    """A shape as parts; lights that its file has beside them go to ``sources``."""
     prefix = f"shapes.{name}"
     pose = shape.to_world()
     if not isinstance(shape, Mesh | Cube):
@@ -160,6 +190,8 @@ def _shape_parts(
         pieces, source, flat = load_mesh(path, materials=shape.material is None), str(path), shape.face_normals
     if isinstance(shape, Mesh) and shape.displacement is not None:
         pieces = [_displaced(piece, shape.displacement, prefix, opener, source) for piece in pieces]
+    lights = [light for piece in pieces for light in piece.lights]
+    sources += _lights_of(lights, prefix, pose, source, parameters)
     labels = _labels([piece.name for piece in pieces])
     parts: list[Part] = []
     known: dict[int, MaterialSlot] = {}
@@ -226,14 +258,14 @@ def _surfaces(shape: Shape, pose: np.ndarray) -> list[tuple[str, str, np.ndarray
 
 def _labels(names: list[str]) -> list[str]:
     """Distinct labels without dots for the pieces of a mesh."""
-    labels: list[str] = []
+    labels: dict[str, None] = {}  # in order, and quick to look up
     for number, name in enumerate(names):
         base = name.replace(".", "_") or f"part{number}"
         label, again = base, number
         while label in labels:
             label, again = f"{base}_{again}", again + 1
-        labels.append(label)
-    return labels
+        labels[label] = None
+    return list(labels)
 
 
 def _slot(description: Description, shape: Shape, prefix: str, opener: Opener) -> MaterialSlot:
@@ -307,16 +339,28 @@ def _part(
         smooth=not flat,
         dropped=dropped,
         source=source,
-        ignored=_ignored(piece),
+        ignored=_ignored(piece, pose),
     )
 
 
-def _ignored(piece: MeshPart | None) -> tuple[str, ...]:
-    """What of a mesh file is not used."""
+def _ignored(piece: MeshPart | None, pose: np.ndarray) -> tuple[str, ...]:
+    """What of a mesh file is not used; cameras as a scene file would have them."""
     if piece is None:
         return ()
     own = piece.material
-    return piece.ignored if own is None else (*piece.ignored, *own.ignored)
+    cameras = [_as_written(camera, pose) for camera in piece.cameras]
+    return (*piece.ignored, *cameras, *(() if own is None else own.ignored))
+
+
+def _as_written(camera: FileCamera, pose: np.ndarray) -> str:
+    """A mesh file's camera as the block of a scene file, mesh under ``pose``."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        matrix = pose @ camera.matrix
+        origin, ahead, up = matrix[:3, 3], -matrix[:3, 2], matrix[:3, 1]
+        target, up = (origin + ahead / np.linalg.norm(ahead), up / np.linalg.norm(up))
+    places = {"origin": origin, "target": target, "up": up}
+    rows = ", ".join(f"{key}: [{', '.join(f'{x + 0.0:.6g}' for x in value)}]" for key, value in places.items())
+    return f"camera {camera.name}: {{type: {camera.kind}, {rows}, {camera.film}}}"
 
 
 def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:

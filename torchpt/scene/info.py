@@ -23,6 +23,11 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     """A nested dict of plain values: ``scene``, ``shapes``, ``built``, ``left_out``, ``notes``, ``settings``."""
     lights = world.lights
     shapes: dict[str, Any] = {}
+    brought: dict[str, dict[str, str]] = {}  # lights that came with a mesh file
+    for source in built.sources:
+        owner, _, label = source.name.rpartition(".lights.")
+        if owner:
+            brought.setdefault(owner.removeprefix("shapes."), {})[label] = source.kind
     for part in built.parts:
         count = len(part.faces) if part.faces is not None else 1
         row: dict[str, Any] = {"kind": part.quadric or part.kind, "primitives": count, "material": part.material.name}
@@ -32,6 +37,8 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
             row["file"] = part.source
         if part.dropped:
             row["degenerate_faces_dropped"] = part.dropped
+        if part.shape in brought:
+            row["lights"] = brought.pop(part.shape)  # once for a shape of several parts
         if part.ignored:
             row["ignored_in_file"] = list(part.ignored)
         if part.kind == "triangle":

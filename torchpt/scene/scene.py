@@ -144,7 +144,7 @@ class Scene:
         if not bool(torch.isfinite(value).all()):
             raise SceneError(f"params.{name}", "a value that is not finite", "finite numbers")
         low = 0.0
-        if (
+        if not name.endswith((*PLACES, ".direction")) and (
             ".material." in name
             or name.startswith("materials.")
             or name.endswith(AMOUNTS)

@@ -10,13 +10,13 @@ import numpy as np
 from torchpt.errors import AssetError
 from torchpt.scene.loaders.cube import unit_cube
 from torchpt.scene.loaders.gltf import load_gltf
-from torchpt.scene.loaders.mesh_part import FileMaterial, MeshPart, checked
+from torchpt.scene.loaders.mesh_part import FileCamera, FileLight, FileMaterial, MeshPart, checked
 from torchpt.scene.loaders.normals import smooth_normals
 from torchpt.scene.loaders.obj import load_obj
 from torchpt.scene.loaders.ply import load_ply
 from torchpt.scene.loaders.stl import load_stl
 
-__all__ = ["FORMATS", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals", "unit_cube"]
+__all__ = ["FORMATS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals", "unit_cube"]
 
 #: File ending -> reader ``(path, data, materials) -> parts``.
 FORMATS: dict[str, Callable[[Path, bytes, bool], list[MeshPart]]] = {

@@ -1,4 +1,4 @@
-"""glTF 2.0, `.glb` and `.gltf`: triangles of every node, moved by the node's world matrix, with their materials.
+"""glTF 2.0, `.glb` and `.gltf`: triangles and lights of every node, moved by the node's world matrix, with their materials.
 
 Khronos glTF 2.0 specification. What is left out is named; a file that requires an extension which is not read is refused.
 """
@@ -6,6 +6,7 @@ Khronos glTF 2.0 specification. What is left out is named; a file that requires 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,13 @@ from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
 from torchpt.scene.loaders.gltf_document import Document
+from torchpt.scene.loaders.gltf_lights import PUNCTUAL, camera_at, light_at
 from torchpt.scene.loaders.gltf_material import MATERIAL_EXTENSIONS, Materials
 from torchpt.scene.loaders.mesh_part import FileMaterial, MeshPart, transformed
 
 __all__ = ["load_gltf"]
 
-_READ = {*MATERIAL_EXTENSIONS, "KHR_texture_transform", "KHR_mesh_quantization"}
+_READ = {*MATERIAL_EXTENSIONS, "KHR_texture_transform", "KHR_mesh_quantization", PUNCTUAL}
 _ATTRIBUTES = ("POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0")
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 #: Vertices or faces, whichever are more, that the nodes of a file may come to (a larger file may hold as many as bytes).
@@ -53,12 +55,21 @@ class _Scene:
         required = [name for name in self.json.get("extensionsRequired", []) if name not in _READ]
         if required:
             raise AssetError(self.path, f"requires the extension {str(required[0])[:80]}, which is not read")
-        left_out = [name for name in ("animations", "skins", "cameras") if self.json.get(name)]
+        nodes = list(self.nodes())
+        cameras = [camera_at(self.document, node, matrix) for node, matrix in nodes if "camera" in node]
+        cameras = tuple(camera for camera in cameras if camera is not None)
+        left_out = [name for name in ("animations", "skins") if self.json.get(name)]
+        left_out += ["cameras"] * (bool(self.json.get("cameras")) and not cameras)
         # Extensions of materials and textures are named where they are met.
         elsewhere = ("KHR_materials_", "KHR_texture_", "EXT_texture_")
         used = [str(name) for name in (*self.json.get("extensionsUsed", []), *self.json.get("extensions", {}))]
         left_out += [name for name in used if name not in _READ and not name.startswith(elsewhere)]
-        placed = [(node, matrix) for node, matrix in self.nodes() if "mesh" in node]
+        lights = tuple(
+            light_at(self.document, node, matrix, left_out)
+            for node, matrix in nodes
+            if PUNCTUAL in node.get("extensions", {})
+        )
+        placed = [(node, matrix) for node, matrix in nodes if "mesh" in node]
         total = 0
         for node, _ in placed:
             total += sum(map(self.size, self.document.item("meshes", node["mesh"])["primitives"]))
@@ -71,6 +82,10 @@ class _Scene:
                 part = self.primitive(mesh, node, number, primitive, materials, left_out)
                 if part is not None:
                     parts.append(transformed(part, matrix))
+        # With a part that is kept: those without a face are not.
+        holder = next((number for number, part in enumerate(parts) if len(part.faces)), None)
+        if holder is not None:
+            parts[holder] = replace(parts[holder], lights=lights, cameras=cameras)
         return parts
 
     def size(self, primitive: dict[str, Any]) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torchpt.errors import AssetError
 from torchpt.scene.loaders.normals import smooth_normals
 
-__all__ = ["FileMaterial", "MeshPart", "checked", "corners_of_polygons", "transformed"]
+__all__ = ["FileCamera", "FileLight", "FileMaterial", "MeshPart", "checked", "corners_of_polygons", "transformed"]
 
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -36,6 +36,42 @@ class FileMaterial:
 
 
 @dataclass(frozen=True)
+class FileLight:
+    """A light of a mesh file that is no surface.
+
+    Attributes:
+        name: as in the file.
+        kind: ``type`` of a scene file's light: ``point``, ``spot`` or ``directional``.
+        position: ``(3,)`` float64 in the file's space.
+        direction: ``(3,)`` of unit length, where it shines.
+        numbers: what a scene file's light of that type has beside its place.
+    """
+
+    name: str
+    kind: str
+    position: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    numbers: dict[str, float | tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class FileCamera:
+    """A camera of a mesh file, for users to copy: a scene has its own.
+
+    Attributes:
+        name: as in the file.
+        kind: ``type`` of a scene file's camera.
+        matrix: ``(4, 4)`` from its own space, where it looks along -z with +y up, to the file's.
+        film: what it sees, as keys of a scene file's camera.
+    """
+
+    name: str
+    kind: str
+    matrix: NDArray[np.float64]
+    film: str
+
+
+@dataclass(frozen=True)
 class MeshPart:
     """Triangles that share a material.
 
@@ -48,6 +84,8 @@ class MeshPart:
         colors: ``(V, 3)`` float64, linear RGB >= 0, or None.
         material: the file's own, or None.
         ignored: what else of the file was left out, by name.
+        lights: of the whole file; one of its parts has them.
+        cameras: the same.
     """
 
     name: str
@@ -58,6 +96,8 @@ class MeshPart:
     colors: NDArray[np.float64] | None = None
     material: FileMaterial | None = None
     ignored: tuple[str, ...] = ()
+    lights: tuple[FileLight, ...] = ()
+    cameras: tuple[FileCamera, ...] = ()
 
 
 def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:
