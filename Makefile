@@ -29,7 +29,7 @@ render: $(VENV)/run.stamp
 	@echo "The picture is $(abspath .)/$(OUT)"
 
 test: $(VENV)/dev.stamp
-	$(PY) -m pytest -m "not slow and not gpu" $(ARGS)
+	$(PY) -m pytest -m "not slow and not gpu" -n 2 --dist loadfile $(ARGS)
 
 test-all: $(VENV)/bench.stamp
 	$(PY) -m pytest $(ARGS)

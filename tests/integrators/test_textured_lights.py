@@ -80,10 +80,10 @@ def test_gradients_reach_the_texture_of_a_lamp():
     name = "shapes.lamp.material.emission.color0"
     color = scene.params[name].clone().requires_grad_()
     film = {"width": 8, "height": 8}
-    torchpt.render(scene, spp=32, params={name: color}, film=film, seed_grad=0).mean().backward()
+    torchpt.render(scene, spp=256, params={name: color}, film=film, seed_grad=0).mean().backward()
     assert color.grad is not None and (color.grad > 0).all()
     # The picture is linear in it; but a brighter lamp is chosen more often, so that not the same samples are compared.
     with torch.no_grad():
-        more = torchpt.render(scene, spp=32, params={name: color + 1}, film=film).mean()
-        same = torchpt.render(scene, spp=32, params={name: color}, film=film).mean()
+        more = torchpt.render(scene, spp=256, params={name: color + 1}, film=film).mean()
+        same = torchpt.render(scene, spp=256, params={name: color}, film=film).mean()
     assert float(color.grad.sum()) == pytest.approx(float(more - same), rel=1e-2)

@@ -24,10 +24,10 @@ __all__ = ["MANY", "WAYS", "ByTree", "choice_of", "draw", "environment", "local"
 #: there on.
 WAYS = ("auto", "uniform", "power", "tree")
 MANY = 3
-#: Share of the draws near by that is even among the lights: the tree knows of no lobe, and of a glossy surface may draw the
-#: wrong light nearly always. At 64 samples a pixel it halves the error of four plates under five lights; of a thousand lights
-#: over a diffuse floor it adds 4 %.
-EVEN = 0.25
+#: Share of the draws near by that is even among the lights, at most; among K of them no more than EACH / K. The tree knows of
+#: no lobe, and of a glossy surface may draw the wrong light nearly always. At 64 samples a pixel it halves the error of four
+#: plates under five lights; among many it would help none of them, and cost where one outshines the others.
+EVEN, EACH = 0.25, 2.0
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class ByTree:
 
     tree: LightTree
     beside: Discrete | None  # over the tree and the rows after its own; None where there are none
-    even: Discrete  # over the rows of the tree, what a share EVEN of its draws is taken from
+    even: Discrete  # over the rows of the tree
+    share: float  # of the draws of a row of the tree that are taken from `even`
 
 
 def choice_of(lights: Lights, power: Tensor, way: str) -> Discrete | ByTree | None:
@@ -59,8 +60,9 @@ def choice_of(lights: Lights, power: Tensor, way: str) -> Discrete | ByTree | No
     beside = None
     if count < len(power):
         beside = Discrete.of(torch.cat((power[:count].sum().reshape(1), power[count:])), dtype)
-    even = Discrete.of((power[:count] > 0).double(), dtype)
-    return ByTree(tree.build(*astuple(bounds)), beside, even)
+    shining = (power[:count] > 0).double()
+    share = min(EVEN, EACH / max(float(shining.sum()), 1.0))
+    return ByTree(tree.build(*astuple(bounds)), beside, Discrete.of(shining, dtype), share)
 
 
 def local(lights: Lights | None) -> bool:
@@ -95,9 +97,10 @@ def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> t
 
 def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """:func:`draw` among the rows of the tree."""
-    apart = u < EVEN
-    row, _, rest = tree.sample(choice.tree, x, n, ((u - EVEN) / (1.0 - EVEN)).clamp_min(0.0))
-    other, left = _by_power(choice.even, (u / EVEN).clamp_max(1.0 - 2.0**-53))
+    share = choice.share
+    apart = u < share
+    row, _, rest = tree.sample(choice.tree, x, n, ((u - share) / (1.0 - share)).clamp_min(0.0))
+    other, left = _by_power(choice.even, (u / share).clamp_max(1.0 - 2.0**-53))
     row, rest = torch.where(apart, other, row), torch.where(apart, left, rest)
     return row, _chance(choice, row, x, n), rest
 
@@ -105,7 +108,7 @@ def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tenso
 def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """:func:`probability` among the rows of the tree."""
     p = tree.probability(choice.tree, row, x, n)
-    return p * (1.0 - EVEN) + take(choice.even.pmf, row) * EVEN
+    return p * (1.0 - choice.share) + take(choice.even.pmf, row) * choice.share
 
 
 def _by_power(choice: Discrete, u: Tensor) -> tuple[Tensor, Tensor]:
