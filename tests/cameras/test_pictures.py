@@ -158,10 +158,8 @@ def test_layers():
 
 @pytest.mark.skipif(not compiled.can_compile(torch.device("cpu")), reason="needs a C++ compiler")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's own, while compiling
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param("thinlens", marks=pytest.mark.slow), "hexagon", pytest.param("orthographic", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["thinlens", "hexagon", "orthographic"])
 def test_compiled_rays(name):
     scene = room(name)
     wish = settings(
