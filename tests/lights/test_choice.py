@@ -12,6 +12,7 @@ from trials import coarse, film_of, shoot, spread, z_limit
 
 import torchpt
 from torchpt import lights
+from torchpt.accel.bounds import primitive_bounds
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.integrators.compiled import can_compile
 from torchpt.lights.bounds import bounds_of
@@ -123,11 +124,13 @@ def test_an_unknown_way_is_an_error(key):
 
 def test_bounds_hold_what_the_lights_draw():
     """Points drawn on every row lie in its box, and shine to where its cones say: in all directions, or off a flat face."""
-    world, _ = torchpt.load(every_kind(), device="cpu").world(torch.float64)
+    world, geometry = torchpt.load(every_kind(), device="cpu").world(torch.float64)
     table = world.lights
-    assert table is not None and table.kind is not None
+    assert table is not None and table.kind is not None and table.row_of_prim is not None
     power = torch.ones(len(table.area), dtype=torch.float64)
-    bounds = bounds_of(table, power)
+    emitting = table.row_of_prim >= 0
+    low, high = (box[:, emitting] for box in primitive_bounds(geometry))
+    bounds = bounds_of(table, power, (low, high))
     near = len(bounds.intensity)
     assert near == len(power) - 2  # but the sun and the sky
     count = 400

@@ -8,6 +8,7 @@ from numba import prange
 from torchpt.accel.kernels_build import WIDTH
 from torchpt.accel.kernels_leaf import distance, setup
 from torchpt.native.jit import jit
+from torchpt.native.vector import at, larger, smaller
 
 __all__ = [
     "LOWEST",
@@ -30,33 +31,17 @@ LOWEST = np.array([0, *((k & -k).bit_length() - 1 for k in range(1, 1 << WIDTH))
 
 
 @jit(forceinline=True)
-def _at(i):
-    """An index that is never negative: numba's test for that would keep LLVM from using vectors."""
-    return np.uint64(i)
-
-
-@jit(forceinline=True)
-def _smaller(a, b):
-    return a if a < b else b
-
-
-@jit(forceinline=True)
-def _larger(a, b):
-    return a if a > b else b
-
-
-@jit(forceinline=True)
 def children(boxes, node, o, inverse, best, near, unit):
     """Entry distances of a node's eight boxes; returns one bit for each that is met before ``best``."""
     base = node * 6 * WIDTH
     met = np.int32(0)
     for k in range(unit * WIDTH):
         i = base + k
-        ax, bx = (boxes[_at(i)] - o[0]) * inverse[0], (boxes[_at(i + 3 * WIDTH)] - o[0]) * inverse[0]
-        ay, by = (boxes[_at(i + WIDTH)] - o[1]) * inverse[1], (boxes[_at(i + 4 * WIDTH)] - o[1]) * inverse[1]
-        az, bz = (boxes[_at(i + 2 * WIDTH)] - o[2]) * inverse[2], (boxes[_at(i + 5 * WIDTH)] - o[2]) * inverse[2]
-        a = _larger(_larger(_smaller(ax, bx), _smaller(ay, by)), _larger(_smaller(az, bz), _ZERO))
-        b = _smaller(_smaller(_larger(ax, bx), _larger(ay, by)), _smaller(_larger(az, bz), best)) * SLACK
+        ax, bx = (boxes[at(i)] - o[0]) * inverse[0], (boxes[at(i + 3 * WIDTH)] - o[0]) * inverse[0]
+        ay, by = (boxes[at(i + WIDTH)] - o[1]) * inverse[1], (boxes[at(i + 4 * WIDTH)] - o[1]) * inverse[1]
+        az, bz = (boxes[at(i + 2 * WIDTH)] - o[2]) * inverse[2], (boxes[at(i + 5 * WIDTH)] - o[2]) * inverse[2]
+        a = larger(larger(smaller(ax, bx), smaller(ay, by)), larger(smaller(az, bz), _ZERO))
+        b = smaller(smaller(larger(ax, bx), larger(ay, by)), smaller(larger(az, bz), best)) * SLACK
         near[k] = a
         met |= (np.int32(1) << np.int32(k)) if (a <= b) & (a < _INF) else np.int32(0)
     return met
@@ -87,14 +72,14 @@ def inside(corners, leaf, px, py, pz, kx, ky, kz, sx, sy, unit):
     x, y, z = base + kx * WIDTH, base + ky * WIDTH, base + kz * WIDTH
     for k in range(unit * WIDTH):
         i, j = 3 * WIDTH + k, 6 * WIDTH + k
-        za, zb, zc = corners[_at(z + k)] - pz, corners[_at(z + i)] - pz, corners[_at(z + j)] - pz
-        ax, ay = (corners[_at(x + k)] - px) - sx * za, (corners[_at(y + k)] - py) - sy * za
-        bx, by = (corners[_at(x + i)] - px) - sx * zb, (corners[_at(y + i)] - py) - sy * zb
-        cx, cy = (corners[_at(x + j)] - px) - sx * zc, (corners[_at(y + j)] - py) - sy * zc
+        za, zb, zc = corners[at(z + k)] - pz, corners[at(z + i)] - pz, corners[at(z + j)] - pz
+        ax, ay = (corners[at(x + k)] - px) - sx * za, (corners[at(y + k)] - py) - sy * za
+        bx, by = (corners[at(x + i)] - px) - sx * zb, (corners[at(y + i)] - py) - sy * zb
+        cx, cy = (corners[at(x + j)] - px) - sx * zc, (corners[at(y + j)] - py) - sy * zc
         e = cx * by - cy * bx
         f = ax * cy - ay * cx
         g = bx * ay - by * ax
-        low, high = _smaller(_smaller(e, f), g), _larger(_larger(e, f), g)
+        low, high = smaller(smaller(e, f), g), larger(larger(e, f), g)
         # a missing triangle is NaN in all corners, and NaN is neither
         crossed |= (np.int32(1) << np.int32(k)) if (low >= _ZERO) | (high <= _ZERO) else np.int32(0)
     return crossed

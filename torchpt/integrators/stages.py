@@ -163,8 +163,9 @@ def shade(
     table = world.lights
     draws = Draws(plan.sampler, state.key, salts)
     # The density of a light that a ray meets is asked for from where the ray left. That is where a reflected one will leave,
-    # unless paths keep the vertex itself.
-    x = at.p if lights.local(table) else offset_origin(world, at, -state.d)
+    # unless paths keep the vertex itself, or nothing that can be met shines.
+    kept = lights.local(table) or table.row_of_prim is None
+    x = at.p if kept else offset_origin(world, at, -state.d)
     n = None if kind.transmits else surface.frame.n
     drawn, which = draws.two(Dimension.LIGHT), None
     if table.choice is not None:

@@ -24,10 +24,10 @@ __all__ = ["MANY", "WAYS", "ByTree", "choice_of", "draw", "environment", "local"
 #: there on.
 WAYS = ("auto", "uniform", "power", "tree")
 MANY = 3
-#: Share of the draws near by that is even among the lights, at most; among K of them no more than EACH / K. The tree knows of
-#: no lobe, and of a glossy surface may draw the wrong light nearly always. At 64 samples a pixel it halves the error of four
-#: plates under five lights; among many it would help none of them, and cost where one outshines the others.
-EVEN, EACH = 0.25, 2.0
+#: Share of the draws near by that is even among the lights, at most; among K of them EACH / K, and none beyond FEW. The tree
+#: knows of no lobe, and of a glossy surface may draw the wrong light nearly always. At 64 samples a pixel it halves the error
+#: of four plates under five lights; among many it would help none of them, and cost where one outshines the others.
+EVEN, EACH, FEW = 0.25, 2.0, 64
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,17 @@ class ByTree:
 
     tree: LightTree
     beside: Discrete | None  # over the tree and the rows after its own; None where there are none
-    even: Discrete  # over the rows of the tree
+    even: Discrete | None  # over the rows of the tree; None where all draws are the tree's own
     share: float  # of the draws of a row of the tree that are taken from `even`
 
 
-def choice_of(lights: Lights, power: Tensor, way: str) -> Discrete | ByTree | None:
+def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str) -> Discrete | ByTree | None:
     """How to choose among the rows of a table.
 
     Args:
         lights: the table; its own choice is not read.
         power: of its rows ``(K,)``, float64.
+        boxes: lower and upper corners ``(3, E)`` of boxes about the E primitives that emit, which come first.
         way: from :data:`WAYS`.
     """
     dtype = lights.area.dtype
@@ -53,7 +54,7 @@ def choice_of(lights: Lights, power: Tensor, way: str) -> Discrete | ByTree | No
         return None
     if way in ("uniform", "power") or (way == "auto" and len(power) < MANY):
         return Discrete.of((power > 0).double() if way == "uniform" else power, dtype)
-    bounds = bounds_of(lights, power)
+    bounds = bounds_of(lights, power, boxes)
     count = len(bounds.intensity)
     if not count or (way == "auto" and count < MANY):
         return Discrete.of(power, dtype)
@@ -61,8 +62,9 @@ def choice_of(lights: Lights, power: Tensor, way: str) -> Discrete | ByTree | No
     if count < len(power):
         beside = Discrete.of(torch.cat((power[:count].sum().reshape(1), power[count:])), dtype)
     shining = (power[:count] > 0).double()
-    share = min(EVEN, EACH / max(float(shining.sum()), 1.0))
-    return ByTree(tree.build(*astuple(bounds)), beside, Discrete.of(shining, dtype), share)
+    few = count <= FEW
+    share = min(EVEN, EACH / max(float(shining.sum()), 1.0)) if few else 0.0
+    return ByTree(tree.build(*astuple(bounds)), beside, Discrete.of(shining, dtype) if few else None, share)
 
 
 def local(lights: Lights | None) -> bool:
@@ -97,6 +99,8 @@ def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> t
 
 def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """:func:`draw` among the rows of the tree."""
+    if choice.even is None:
+        return tree.sample(choice.tree, x, n, u)
     share = choice.share
     apart = u < share
     row, _, rest = tree.sample(choice.tree, x, n, ((u - share) / (1.0 - share)).clamp_min(0.0))
@@ -108,6 +112,8 @@ def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tenso
 def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """:func:`probability` among the rows of the tree."""
     p = tree.probability(choice.tree, row, x, n)
+    if choice.even is None:
+        return p
     return p * (1.0 - choice.share) + take(choice.even.pmf, row) * choice.share
 
 

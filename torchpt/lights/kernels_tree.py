@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.native.jit import jit, launch, thread_count
+from torchpt.native.vector import at, larger
 
 __all__ = ["FIELDS", "NEAR", "SLACK", "WIDTH", "probability", "sample"]
 
@@ -34,24 +35,8 @@ BLOCK = 256
 
 
 @jit(forceinline=True)
-def _at(i):
-    """An index that is never negative: numba's test for that would keep LLVM from using vectors."""
-    return np.uint64(i)
-
-
-@jit(forceinline=True)
-def _smaller(a, b):
-    return a if a < b else b
-
-
-@jit(forceinline=True)
-def _larger(a, b):
-    return a if a > b else b
-
-
-@jit(forceinline=True)
 def _root(a):
-    return math.sqrt(_larger(a, _ZERO))
+    return math.sqrt(larger(a, _ZERO))
 
 
 @jit(forceinline=True)
@@ -66,28 +51,26 @@ def _weigh(nodes, node, px, py, pz, nx, ny, nz, turned, weight, unit):
     base = node * len(FIELDS) * WIDTH
     for k in range(unit * WIDTH):
         i = base + k
-        x, y, z = px - nodes[_at(i)], py - nodes[_at(i + WIDTH)], pz - nodes[_at(i + 2 * WIDTH)]
-        radius = nodes[_at(i + 3 * WIDTH)]
-        cos_o, sin_o, cos_e = nodes[_at(i + 7 * WIDTH)], nodes[_at(i + 8 * WIDTH)], nodes[_at(i + 9 * WIDTH)]
-        square = _larger(x * x + y * y + z * z, _TINY)
+        x, y, z = px - nodes[at(i)], py - nodes[at(i + WIDTH)], pz - nodes[at(i + 2 * WIDTH)]
+        radius = nodes[at(i + 3 * WIDTH)]
+        cos_o, sin_o, cos_e = nodes[at(i + 7 * WIDTH)], nodes[at(i + 8 * WIDTH)], nodes[at(i + 9 * WIDTH)]
+        square = larger(x * x + y * y + z * z, _TINY)
         inverse = _ONE / math.sqrt(square)
         sin_b = radius * inverse
         within = sin_b >= _ONE
         cos_b = _root(_ONE - sin_b * sin_b)
-        cos_w = (
-            nodes[_at(i + 4 * WIDTH)] * x + nodes[_at(i + 5 * WIDTH)] * y + nodes[_at(i + 6 * WIDTH)] * z
-        ) * inverse
+        cos_w = (nodes[at(i + 4 * WIDTH)] * x + nodes[at(i + 5 * WIDTH)] * y + nodes[at(i + 6 * WIDTH)] * z) * inverse
         sin_w = _root(_ONE - cos_w * cos_w)
         covered = cos_w >= cos_o
         cos_x = _ONE if covered else cos_w * cos_o + sin_w * sin_o
         sin_x = _ZERO if covered else sin_w * cos_o - cos_w * sin_o
         best = (_ONE if within | (cos_x >= cos_b) else cos_x * cos_b + sin_x * sin_b) + _SLACK
-        cosine = _larger(best, _SLACK) + _larger(cos_x, _ZERO) if best > cos_e else _ZERO
+        cosine = larger(best, _SLACK) + larger(cos_x, _ZERO) if best > cos_e else _ZERO
         cos_i = -(nx * x + ny * y + nz * z) * inverse
         sin_i = _root(_ONE - cos_i * cos_i)
         best = (_ONE if within | (cos_i >= cos_b) else cos_i * cos_b + sin_i * sin_b) + _SLACK
-        cosine *= (best + _larger(cos_i, _ZERO) if best > _ZERO else _ZERO) if turned else _ONE
-        weight[_at(k)] = nodes[_at(i + 10 * WIDTH)] * cosine / _larger(square, _NEAR * radius * radius)
+        cosine *= (best + larger(cos_i, _ZERO) if best > _ZERO else _ZERO) if turned else _ONE
+        weight[at(k)] = nodes[at(i + 10 * WIDTH)] * cosine / larger(square, _NEAR * radius * radius)
 
 
 @jit(forceinline=True)

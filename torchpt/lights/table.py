@@ -1,4 +1,4 @@
-"""The table of lights: choice by power, sampling, and the densities that MIS asks for.
+"""The table of lights: sampling, and the densities that MIS asks for.
 
 Rows are emissive primitives, then lights that are no surfaces; the environment, where there is one, is the last row. Delta
 lights (points, spots, directional ones) have an infinite density, and no ray meets them. Kinds absent from the scene cost

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchpt.errors import AssetError, SceneError
-from torchpt.math.transforms import apply_points, is_singular, similarity_scale
+from torchpt.math.transforms import is_singular, similarity_scale
 from torchpt.records import KINDS, SOURCES
 from torchpt.scene.description import Description
 from torchpt.scene.displacement import displaced
-from torchpt.scene.lights import ENVIRONMENTS, EnvmapLight
-from torchpt.scene.loaders import FileCamera, FileLight, FileMaterial, MeshPart, load_mesh, unit_cube
+from torchpt.scene.loaders import FileCamera, FileMaterial, MeshPart, load_mesh, unit_cube
 from torchpt.scene.materials import MATERIALS, Diffuse, check_material, read_material, slot_of
 from torchpt.scene.parts import Copy, MaterialSlot, Part, Source
 from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
-from torchpt.scene.texels import Opener, radiance_of
+from torchpt.scene.sources import file_lights, labels_of, sources_of
+from torchpt.scene.texels import Opener
 from torchpt.textures import Node
 
 __all__ = ["Built", "build_parts"]
@@ -64,52 +64,12 @@ def build_parts(description: Description) -> Built:
             copies += _copies(description, name, shape, number, parts, parameters, opener)
     for name, material in description.materials.items():
         _declare(slot_of(material, f"materials.{name}", description.materials, opener), parameters)
-    sources = sorted([*_sources(description, parameters), *found], key=lambda source: SOURCES.index(source.kind))
+    sources = sorted([*sources_of(description, parameters), *found], key=lambda source: SOURCES.index(source.kind))
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
     for name, number in description.camera.numbers().items():
         parameters[f"camera.{name}"] = np.asarray(number, np.float64)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     return Built(tuple(parts), parameters, _centre(parts, copies), tuple(sources), tuple(copies))
-
-
-def _sources(description: Description, parameters: dict[str, np.ndarray]) -> list[Source]:
-    """The lights block; its numbers become parameters."""
-    lights = description.lights
-    around = [name for name, light in lights.items() if light.type in ENVIRONMENTS]
-    if len(around) > 1:
-        first, second = around[:2]
-        expected = f"one environment only ({first} is one)"
-        raise SceneError(f"lights.{second}", lights[second].type, expected, description.file)
-    for name, light in lights.items():
-        parameters.update({f"lights.{name}.{key}": np.asarray(x, np.float64) for key, x in light.numbers().items()})
-        if isinstance(light, EnvmapLight):
-            key = f"lights.{name}.path"
-            source = description.resolve(light.path, key)
-            parameters[f"lights.{name}.texels"] = radiance_of(source, key, description.file)
-    return [Source(f"lights.{name}", light.type) for name, light in lights.items()]
-
-
-def _lights_of(
-    lights: list[FileLight], prefix: str, pose: np.ndarray, source: str, parameters: dict[str, np.ndarray]
-) -> list[Source]:
-    """The lights of a mesh file, placed in the scene; their numbers become parameters."""
-    found = []
-    for light, label in zip(lights, _labels([light.name for light in lights]), strict=True):
-        stem = f"{prefix}.lights.{label}"
-        with np.errstate(over="ignore", invalid="ignore"):
-            position, direction = apply_points(pose, light.position), pose[:3, :3] @ light.direction
-            direction = direction / np.abs(direction).max()
-        if not np.isfinite([position, direction]).all():
-            raise AssetError(source, f"light {light.name!r} has no finite place under the transform of {prefix}")
-        direction = direction / np.linalg.norm(direction)
-        place = {"direction": direction} if light.kind == "directional" else {"position": position}
-        if light.kind == "spot":
-            # As far off as the origin, so that the difference of the two is as exact as they are.
-            place["target"] = position + direction * max(1.0, np.abs(position).max())
-        for key, value in {**place, **light.numbers}.items():
-            parameters[f"{stem}.{key}"] = np.asarray(value, np.float64)
-        found.append(Source(stem, light.kind))
-    return found
 
 
 def _copies(
@@ -191,8 +151,8 @@ def _shape_parts(
     if isinstance(shape, Mesh) and shape.displacement is not None:
         pieces = [_displaced(piece, shape.displacement, prefix, opener, source) for piece in pieces]
     lights = [light for piece in pieces for light in piece.lights]
-    sources += _lights_of(lights, prefix, pose, source, parameters)
-    labels = _labels([piece.name for piece in pieces])
+    sources += file_lights(lights, prefix, pose, source, parameters)
+    labels = labels_of([piece.name for piece in pieces])
     parts: list[Part] = []
     known: dict[int, MaterialSlot] = {}
     for piece, label in zip(pieces, labels, strict=True):
@@ -254,18 +214,6 @@ def _surfaces(shape: Shape, pose: np.ndarray) -> list[tuple[str, str, np.ndarray
     caps = {"bottom": _BOTTOM} if isinstance(shape, Cone) else {"bottom": _BOTTOM, "top": _TOP}
     side = [("quadric", shape.type, None, "side" if shape.capped else "")]
     return side + ([("disk", "", local, name) for name, local in caps.items()] if shape.capped else [])
-
-
-def _labels(names: list[str]) -> list[str]:
-    """Distinct labels without dots for the pieces of a mesh."""
-    labels: dict[str, None] = {}  # in order, and quick to look up
-    for number, name in enumerate(names):
-        base = name.replace(".", "_") or f"part{number}"
-        label, again = base, number
-        while label in labels:
-            label, again = f"{base}_{again}", again + 1
-        labels[label] = None
-    return list(labels)
 
 
 def _slot(description: Description, shape: Shape, prefix: str, opener: Opener) -> MaterialSlot:

@@ -15,7 +15,7 @@ from pydantic import PlainValidator
 from torchpt.errors import SceneError
 from torchpt.images import EncodedImage
 from torchpt.math.transforms import uv_matrix
-from torchpt.scene.fields import choice, color, integer, number_field, pair, wrong
+from torchpt.scene.fields import choice, color, file_paths, integer, number_field, pair, wrong
 from torchpt.scene.validate import Model, check_keys, select
 from torchpt.textures import WRAPS
 
@@ -63,10 +63,7 @@ Uv = Annotated[UvTransform, PlainValidator(_uv_transform)]
 def _source(value: Any) -> tuple[str, ...] | EncodedImage:
     if isinstance(value, EncodedImage):
         return value
-    paths = tuple(value) if isinstance(value, list | tuple) else (value,)
-    if not paths or not all(isinstance(path, str) and path.strip() and path.isprintable() for path in paths):
-        raise wrong("a file path, or a list of them (the first that is there is used)")
-    return paths
+    return file_paths(value)
 
 
 class Image(Texture):

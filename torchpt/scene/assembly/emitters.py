@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchpt.accel.bounds import primitive_bounds
 from torchpt.lights import choice_of, envmap
 from torchpt.lights.solid_angle import table_of
 from torchpt.math.vectors import dot, luminance, normalize
-from torchpt.records import KINDS, SOURCES, Lights
+from torchpt.records import KINDS, SOURCES, Geometry, Lights
 from torchpt.scene.assembly.curved import quadric_area
 from torchpt.scene.assembly.primitives import Primitives
 from torchpt.scene.lights import ENVIRONMENTS
@@ -59,6 +60,7 @@ def lights_of(
     parts: Sequence[Part],
     sources: Sequence[Source],
     primitives: Primitives,
+    geometry: Geometry,
     parameters: Mapping[str, Tensor],
     centre: Tensor,
     opacity: Tensor | None,
@@ -72,6 +74,7 @@ def lights_of(
         parts: ordered by kind.
         sources: lights that are no surfaces, ordered by kind.
         primitives: of ``parts``.
+        geometry: of them, as the search sees it.
         parameters: every tensor by dotted name.
         centre: ``(3,)`` float64 that becomes the origin.
         opacity: ``(P + I,)``, or None.
@@ -88,7 +91,7 @@ def lights_of(
     if glowing:
         surfaces, column = _surfaces(glowing, primitives, parameters, prim)
         groups.append(surfaces)
-    low, high = primitives.extent()
+    low, high = (box.double() for box in primitive_bounds(geometry))
     reach = (high.amax(1) - low.amin(1)).norm() * 0.5 if low.shape[1] else torch.ones((), device=device)
     around = [_surroundings(source, parameters, dtype) for source in sources if source.kind in ENVIRONMENTS]
     environment = around[0] if around else None
@@ -125,7 +128,8 @@ def lights_of(
         prim=torch.cat((prim, prim.new_zeros(rest))) if textured else None,
         solid=table_of(names, joined["p0"], joined["e1"], joined["e2"]),
     )
-    return replace(lights, choice=choice_of(lights, power, choice))
+    boxes = low.index_select(1, prim), high.index_select(1, prim)
+    return replace(lights, choice=choice_of(lights, power, boxes, choice))
 
 
 #: Area over the length of the cross product of the edges.

@@ -17,11 +17,6 @@ from torchpt.scene.parts import Part
 __all__ = ["Primitives", "primitives_of"]
 
 
-def _hull(*points: Tensor) -> tuple[Tensor, Tensor]:
-    every = torch.stack(points)
-    return every.amin(0), every.amax(0)
-
-
 @dataclass(frozen=True)
 class Primitives:
     """The P primitives, ordered by kind; see :class:`~torchpt.records.World` for what has no comment."""
@@ -49,24 +44,6 @@ class Primitives:
             torch.tensor(values, dtype=torch.int64, device=device),
             torch.tensor(spans, dtype=torch.int64, device=device),
         )
-
-    def extent(self) -> tuple[Tensor, Tensor]:
-        """Lower and upper corners ``(3, P)`` of boxes about the primitives, float64, detached."""
-        p0, e1, e2 = (x.detach().double() for x in (self.p0, self.e1, self.e2))
-        triangle, rectangle, disk, sphere, _ = torch.split(
-            torch.stack((p0, e1, e2)), list(self.counts), 2
-        )  # (3 columns, 3, n) each
-        boxes = [_hull(triangle[0], triangle[0] + triangle[1], triangle[0] + triangle[2])]
-        corners = rectangle[0], rectangle[0] + rectangle[1], rectangle[0] + rectangle[2]
-        boxes.append(_hull(*corners, corners[1] + rectangle[2]))
-        half = (disk[1] * disk[1] + disk[2] * disk[2]).sqrt()
-        boxes.append((disk[0] - half, disk[0] + half))
-        radius = sphere[1][0].abs()
-        boxes.append((sphere[0] - radius, sphere[0] + radius))
-        if self.frame is not None:
-            move, half = self.frame[:3].detach(), self.frame[3:].detach().abs().view(3, 3, -1).sum(0)
-            boxes.append((move - half, move + half))
-        return torch.cat([box[0] for box in boxes], 1), torch.cat([box[1] for box in boxes], 1)
 
     def geometry(self, copies: Tensor | None) -> Geometry:
         """What the search sees."""

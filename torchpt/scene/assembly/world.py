@@ -67,6 +67,7 @@ def assemble(
         glowing = [-1 if part.glow is None else nodes[part.glow] for part in parts]
         glows = primitives.spread(glowing + [-1] * len(copies))
     maps = copy_maps(parts, primitives.sizes, copies, parameters, centre) if copies else None
+    geometry = primitives.geometry(maps)
     world = World(
         counts=primitives.counts,
         p0=primitives.p0,
@@ -88,8 +89,8 @@ def assemble(
         glows=glows,
         two_sided=two_sided,
         object_id=primitives.spread([owner.object_id for owner in owners]),
-        lights=lights_of(parts, sources, primitives, parameters, centre, opacity, dark == 0, veiled, choice),
+        lights=lights_of(parts, sources, primitives, geometry, parameters, centre, opacity, dark == 0, veiled, choice),
         quadrics=primitives.quadrics,
         copies=None if maps is None else copies_of(maps, copies, dtype),
     )
-    return world, primitives.geometry(maps)
+    return world, geometry
