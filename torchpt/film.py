@@ -70,6 +70,10 @@ class Filter:
         self._lobe = round(float(np.abs(weight[: 1 << 15]).dot(weight[: 1 << 15] < 0)) / cdf[-1] * _STEPS) / _STEPS
         self.signed = self._lobe > 0
 
+    def tensors(self) -> dict[str, Tensor]:
+        """What lanes read."""
+        return {} if self._inverse is None else {"inverse": self._inverse}
+
     def offset(self, u: Tensor) -> Tensor:
         """Offsets from the pixel's centre, in pixels, for ``u`` in [0, 1): any shape."""
         if self.kind == "box":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,6 +35,38 @@ class Accel(ABC):
     def occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
         """Whether anything lies in the open interval ``(0, t_max)``: ``(N,)`` bool."""
         return self._occluded(*_rays(o, d, t_max))
+
+    def nearest(
+        self,
+        o: np.ndarray,
+        d: np.ndarray,
+        t_max: np.ndarray,
+        count: int,
+        t: np.ndarray,
+        prim: np.ndarray,
+        u: np.ndarray,
+        v: np.ndarray,
+    ) -> None:
+        """:meth:`intersect` for the first ``count`` lanes of an arena, into the arena, in the calling thread alone.
+
+        Args:
+            o: ``(3, C)`` float32.
+            d: ``(3, C)`` float32.
+            t_max: ``(C,)`` float32.
+            count: at most C.
+            t: ``(C,)`` float32, written.
+            prim: ``(C,)`` int32, written.
+            u: ``(C,)`` float32, written.
+            v: ``(C,)`` float32, written.
+        """
+        rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
+        for out, found in zip((t, prim, u, v), self.intersect(*rays), strict=True):
+            out[:count] = found.numpy()
+
+    def blocked(self, o: np.ndarray, d: np.ndarray, t_max: np.ndarray, count: int, out: np.ndarray) -> None:
+        """:meth:`occluded` likewise; ``out (C,)`` int32 becomes 1 or 0."""
+        rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
+        out[:count] = self.occluded(*rays).numpy()
 
     @abstractmethod
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits: ...

@@ -11,15 +11,37 @@ from torch import Tensor
 
 from torchpt.accel import Accel
 from torchpt.integrators.surfaces import veil
+from torchpt.lanes.tracing import tracing
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import Dimension, Draws, salts
 from torchpt.shapes import interact, offset_origin
 
-__all__ = ["Search"]
+__all__ = ["PASSES", "Search", "beyond", "passing"]
 
 #: Beyond the depth of any path: names the numbers for the second, third, ... surface that a ray passes.
 PASSES = 1 << 13
+
+
+def passing(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
+    """Opacity ``(N,)`` of what rays ``o, d`` hit; ``miss`` where they hit nothing."""
+    assert world.opacity is not None
+    missed = hit.prim < 0
+    slot = world.slot(hit.prim).clamp_min(0)
+    opacity = torch.where(missed, miss, take(world.opacity, slot))
+    if world.veils is None:
+        return opacity
+    textured = ~missed & (take(world.veils.nodes, slot) >= 0)
+    if tracing():  # in a loop over lanes each lane takes the same steps
+        return torch.where(textured, opacity * veil(world, interact(world, o, d, hit)), opacity)
+    veiled = textured.nonzero().squeeze(1)
+    at = interact(world, take(o, veiled), take(d, veiled), rows(hit, veiled))
+    return opacity.index_copy(0, veiled, take(opacity, veiled) * veil(world, at))
+
+
+def beyond(world: World, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
+    """Origins behind the surfaces that were hit ``(3, N)``."""
+    return offset_origin(world, interact(world, o, d, hit), d)
 
 
 class Search:
@@ -51,21 +73,11 @@ class Search:
         return Hit(t.to(self._dtype), prim.to(torch.int64), u.to(self._dtype), v.to(self._dtype))
 
     def _opacity(self, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
-        """Opacity ``(N,)`` of what rays ``o, d`` hit; ``miss`` where they hit nothing."""
-        assert self._world.opacity is not None
-        missed = hit.prim < 0
-        slot = self._world.slot(hit.prim).clamp_min(0)
-        opacity = torch.where(missed, miss, take(self._world.opacity, slot))
-        if self._world.veils is None:
-            return opacity
-        veiled = (~missed & (take(self._world.veils.nodes, slot) >= 0)).nonzero().squeeze(1)
-        at = interact(self._world, take(o, veiled), take(d, veiled), rows(hit, veiled))
-        return opacity.index_copy(0, veiled, take(opacity, veiled) * veil(self._world, at))
+        return passing(self._world, o, d, hit, miss)
 
     @torch.no_grad()
     def _beyond(self, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
-        """Origins behind the surfaces that were hit ``(3, N)``."""
-        return offset_origin(self._world, interact(self._world, o, d, hit), d)
+        return beyond(self._world, o, d, hit)
 
     def _met(self, state: PathState, hit: Hit, depth: int) -> Hit:
         """The hits that hold: a surface is met with the chance of its opacity, else the ray goes on behind it."""

@@ -26,6 +26,7 @@ from torch import Tensor
 from torchpt.math.angles import azimuth
 from torchpt.math.vectors import cross, dot
 from torchpt.math.warps import uniform_triangle
+from torchpt.lanes.tracing import tracing
 from torchpt.native.operators import choose, operator
 
 __all__ = [
@@ -99,7 +100,7 @@ def sample(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Ten
         The primitive's own ``(u, v)`` of the points ``(2, N)``, and as :func:`angles` the solid angles ``(N,)``: where they
         are 0 the point was drawn by area. Rows of other shapes keep ``u``.
     """
-    if x.device.type == "cpu":
+    if x.device.type == "cpu" and not tracing():
         return choose(_sample_on_cpu, _sample_operator)(table, row, x, u)
     return tensor_sample(table, row, x, u)
 
@@ -109,7 +110,7 @@ def angles(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
 
     From behind a light fills the same angle; it is the caller who knows which side emits.
     """
-    if x.device.type == "cpu":
+    if x.device.type == "cpu" and not tracing():
         return choose(_angles_on_cpu, _angles_operator)(table, row, x)
     return tensor_angles(table, row, x)
 

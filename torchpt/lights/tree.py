@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.lanes.tracing import tracing
 from torchpt.native.operators import choose, operator
 
 __all__ = ["LightTree", "build", "fine", "probability", "sample"]
@@ -107,7 +108,7 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
         ``(N,)`` float64 in [0, 1], uniform whatever was drawn.
     """
     x, n = x.detach(), None if n is None else n.detach()
-    if x.device.type == "cpu":
+    if x.device.type == "cpu" and not tracing():
         return choose(_sample_on_cpu, _sample_operator)(*_parts(tree), x, n, u)
     row, p, rest = _walk(tree, x, n, u, None)
     assert rest is not None
@@ -117,7 +118,7 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
 def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """``(N,)`` with which :func:`sample` draws ``row (N,)`` at ``x, n``."""
     x, n = x.detach(), None if n is None else n.detach()
-    if x.device.type == "cpu":
+    if x.device.type == "cpu" and not tracing():
         return choose(_probability_on_cpu, _probability_operator)(*_parts(tree), row, x, n)
     return _walk(tree, x, n, None, row)[1]
 

@@ -13,12 +13,13 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
+from torchpt.lanes.tracing import tracing
 from torchpt.native.operators import choose, operator
 from torchpt.samplers import hammersley, independent, sobol, stratified, zsobol
 from torchpt.samplers.dimensions import Dimension, salt
 from torchpt.samplers.hashing import as_int32, mix, mix_int
 
-__all__ = ["KINDS", "Dimension", "Draws", "Sampler", "salts"]
+__all__ = ["KINDS", "Dimension", "Draws", "Numbers", "Sampler", "key_of", "salts"]
 
 #: Sampler types by name: modules with ``draw_1d(key, salt)``, ``draw_2d(key, salt)`` and ``NEEDS_COUNT``.
 KINDS: dict[str, ModuleType] = {
@@ -54,23 +55,55 @@ class Sampler:
             raise ValueError(f"{self.kind} points must know their number, at least one for each randomization")
 
     def key(self, pixel: Tensor, sample: Tensor) -> Tensor:
-        """``(2, N)`` int32 for int64 pixel and sample indices ``(N,)``: a pixel's seed and a point's index.
-
-        The seed is a bijection of the pixel index for each (seed, randomization), so no two pixels share a sequence.
-        ``stratified`` and ``hammersley`` have a third row, how many points there are; ``zsobol`` has :func:`zsobol.key`.
-        """
+        """:func:`key_of` for int64 pixel and sample indices ``(N,)``."""
         group, point = sample % self.randomizations, sample // self.randomizations
+        return key_of(self.kind, self.numbers(pixel.device), pixel, group, point)
+
+    def numbers(self, device: torch.device) -> Numbers:
+        """What :func:`key_of` needs of the sampler."""
         seeds = [
             mix_int(mix_int(mix_int(self.seed) ^ as_int32(self.seed >> 32)) + g) for g in range(self.randomizations)
         ]
-        seed = torch.tensor(seeds, dtype=torch.int32, device=pixel.device)[group]
-        if self.kind == "zsobol":
-            return zsobol.key(pixel, point, seed, -(-self.spp // self.randomizations), self.width)
-        key = [mix(mix(pixel.to(torch.int32)) ^ seed), point.to(torch.int32)]
-        if KINDS[self.kind].NEEDS_COUNT:
-            every, more = divmod(self.spp, self.randomizations)
-            key.append((every + (group < more)).to(torch.int32))
-        return torch.stack(key)
+        every, more = divmod(self.spp, self.randomizations)
+        most = -(-self.spp // self.randomizations)
+        bits = max(most - 1, 0).bit_length()
+        return Numbers(
+            torch.tensor(seeds, dtype=torch.int32, device=device),
+            *(torch.tensor(n, dtype=torch.int64, device=device) for n in (every, more, bits, self.width)),
+        )
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """A sampler as tensors, so that a kernel made for one serves all of its kind."""
+
+    seeds: Tensor  # (R,) int32 of the randomizations
+    every: Tensor  # () int64 points of each randomization
+    more: Tensor  # () int64 how many of them have one more
+    bits: Tensor  # () int64 of the largest index of a point
+    width: Tensor  # () int64 of the film
+
+
+def key_of(kind: str, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
+    """``(2, N)`` int32: a pixel's seed and a point's index.
+
+    The seed is a bijection of the pixel index for each (seed, randomization), so no two pixels share a sequence.
+    ``stratified`` and ``hammersley`` have a third row, how many points there are; ``zsobol`` has :func:`zsobol.key`.
+
+    Args:
+        kind: type of the sampler.
+        numbers: of the sampler.
+        pixel: index on the film ``(N,)`` int64.
+        group: randomization ``(N,)`` int64.
+        point: index in its sequence ``(N,)`` int64.
+    """
+    seed = torch.index_select(numbers.seeds, 0, group)
+    if kind == "zsobol":
+        return zsobol.key(pixel, point, seed, numbers.bits, numbers.width)
+    key = [mix(mix(pixel.to(torch.int32)) ^ seed), point.to(torch.int32)]
+    if KINDS[kind].NEEDS_COUNT:
+        key.append((numbers.every + (group < numbers.more)).to(torch.int32))
+    return torch.stack(key)
 
 
 class Draws:
@@ -88,13 +121,13 @@ class Draws:
 
     def one(self, dimension: Dimension) -> Tensor:
         """``(N,)`` float32 in ``[0, 1)``."""
-        if self._key.device.type == "cpu":
+        if self._key.device.type == "cpu" and not tracing():
             return choose(_draw_on_cpu, _draw_operator)(self._kind, 1, self._key, self._salts, int(dimension))[0]
         return KINDS[self._kind].draw_1d(self._key, self._salts[int(dimension)])
 
     def two(self, dimension: Dimension) -> Tensor:
         """``(2, N)`` float32 in ``[0, 1)``."""
-        if self._key.device.type == "cpu":
+        if self._key.device.type == "cpu" and not tracing():
             return choose(_draw_on_cpu, _draw_operator)(self._kind, 2, self._key, self._salts, int(dimension))
         return KINDS[self._kind].draw_2d(self._key, self._salts[int(dimension)])
 

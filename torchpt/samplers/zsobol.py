@@ -32,25 +32,24 @@ def _spread(x: Tensor) -> Tensor:
     return x
 
 
-def key(pixel: Tensor, point: Tensor, seed: Tensor, points: int, width: int) -> Tensor:
+def key(pixel: Tensor, point: Tensor, seed: Tensor, bits: Tensor, width: Tensor) -> Tensor:
     """``(2, N)`` int32: the seed of the block, and the place of the point on the curve within it.
 
-    The place has ``DIGITS`` digits of two bits above one single bit. Where ``points`` (rounded up) is an odd power of two, the
-    single bit is the last of the point's index and the sign bit is set; else it is none of the place.
+    The place has ``DIGITS`` digits of two bits above one single bit. Where ``bits`` is odd, the single bit is the last of the
+    point's index and the sign bit is set; else it is none of the place.
 
     Args:
         pixel: index on the film ``(N,)`` int64, row by row.
         point: index in the pixel ``(N,)`` int64.
         seed: of the randomization ``(N,)`` int32.
-        points: how many a pixel has.
-        width: of the film.
+        bits: of the largest index in a pixel, ``()`` int64.
+        width: of the film, ``()`` int64.
     """
-    bits = (points - 1).bit_length()
     odd = bits & 1
     code = _spread(pixel % width) | (_spread(pixel // width) << 1)
     curve = (code << bits) | point
-    size = 2 * DIGITS + odd
-    place = (curve & ((1 << size) - 1)) << (1 - odd)
+    size = odd + 2 * DIGITS
+    place = (curve & ((torch.ones_like(size) << size) - 1)) << (1 - odd)
     block = mix(mix((curve >> size).to(torch.int32)) + ((curve >> (size + 32)).to(torch.int32) << 16))
     return torch.stack((mix(block ^ seed), (place - (odd << 31)).to(torch.int32)))
 

@@ -1,0 +1,79 @@
+"""What the rows of an arena hold: the numbers of a path's state, of a hit, of a shadow ray."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchpt.lanes.graph import DTYPES
+from torchpt.lanes.tracing import Tracer
+
+__all__ = ["HIT", "PASS", "SHADOW", "Rows"]
+
+#: Fields of a hit, of a shadow ray, and of a ray that goes on behind a surface that it passed.
+HIT = {"t": ((), "f"), "prim": ((), "l"), "u": ((), "f"), "v": ((), "f")}
+SHADOW = {"shadow_o": ((3,), "f"), "shadow_d": ((3,), "f"), "shadow_t": ((), "f"), "shadow_radiance": ((3,), "f")}
+PASS = {"pass_o": ((3,), "f"), "pass_d": ((3,), "f"), "pass_t": ((), "f"), "before": ((), "f"), "home": ((), "l")}
+
+_DTYPES = {ty: dtype for dtype, ty in DTYPES.items()}
+
+
+class Rows:
+    """Rows of an arena by the names of the fields that they hold.
+
+    Args:
+        fields: shape without lanes and node type of each.
+
+    Attributes:
+        count: how many rows there are.
+    """
+
+    def __init__(self, fields: dict[str, tuple[tuple[int, ...], str]]) -> None:
+        self._fields = fields
+        self._first: dict[str, int] = {}
+        self.count = 0
+        for name, (shape, _) in fields.items():
+            self._first[name] = self.count
+            self.count += math.prod(shape)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._fields
+
+    def first(self, name: str) -> int:
+        """The first row of a field."""
+        return self._first[name]
+
+    def read(self, tracer: Tracer, *names: str) -> dict[str, Tensor]:
+        """Fields as inputs of a trace; those that there are not are left out."""
+        found: dict[str, Tensor] = {}
+        for name in names:
+            if name not in self._fields:
+                continue
+            shape, ty = self._fields[name]
+            first, size = self._first[name], (*shape, tracer.lanes)
+            dtype = _DTYPES[ty]
+            # The numbers are of no consequence: a trace asks for what is done, not for what comes out.
+            like = torch.rand(size) + 0.25 if dtype.is_floating_point else torch.zeros(size, dtype=dtype)
+
+            def node(k: int, first: int = first, ty: str = ty) -> int:
+                return tracer.graph.node("arena", ty, extra=first + k)
+
+            found[name] = tracer.lane(like, node)
+        return found
+
+    def nodes(self, tracer: Tracer, **fields: Tensor) -> list[tuple[int, int]]:
+        """Rows and nodes of results by field; numbers that all lanes share are spread."""
+        found = []
+        for name, value in fields.items():
+            shape, ty = self._fields[name]
+            nodes = tracer.nodes(value)
+            if len(nodes) != math.prod(shape):
+                raise ValueError(f"{name}: {len(nodes)} numbers for {math.prod(shape)} rows")
+            held = ty if ty != "l" else None
+            found += [
+                (self._first[name] + k, node if held is None else tracer.graph.cast(node, held))
+                for k, node in enumerate(nodes)
+            ]
+        return found

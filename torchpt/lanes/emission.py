@@ -1,0 +1,288 @@
+"""From nodes to vector instructions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torchpt.lanes.block import ELEMENTS, WIDTH, Block
+from torchpt.lanes.functions import FUNCTIONS
+from torchpt.lanes.graph import FLOATS, Graph, Unsupported
+
+__all__ = ["MEMORY", "emit"]
+
+#: Types of elements as tables and the arena hold them; see :func:`torchpt.lanes.program.bound`.
+MEMORY = {"f": "float", "d": "double", "i": "i32", "l": "i32", "L": "i32", "u": "i32", "b": "i32"}
+
+_COMPARISONS = {
+    "gt": ("ogt", "sgt"),
+    "lt": ("olt", "slt"),
+    "ge": ("oge", "sge"),
+    "le": ("ole", "sle"),
+    "eq": ("oeq", "eq"),
+    "ne": ("une", "ne"),
+}
+
+
+def emit(block: Block, graph: Graph, node: int, names: dict[int, str]) -> str:
+    """The lines of one node; returns its name. ``names`` has those of its arguments."""
+    op, ty, arguments, extra = graph.nodes[node]
+    a = [names[k] for k in arguments]
+    types = [graph.type(k) for k in arguments]
+    if op == "const":
+        return block.constant(ty, graph.value(node))
+    if op in FUNCTIONS:
+        return FUNCTIONS[op](block, ty, *a)
+    if op in _COMPARISONS:
+        return _comparison(block, op, types[0], *a)
+    if op == "cast":
+        return _cast(block, types[0], ty, a[0])
+    if op == "retype":
+        return a[0]
+    if op == "select":
+        return block.select(ty, *a)
+    handler = _HANDLERS.get(op)
+    if handler is None:
+        raise Unsupported(f"the operation {op} on numbers of type {ty}")
+    return handler(block, ty, *a) if extra is None else handler(block, ty, *a, extra)
+
+
+def _comparison(block: Block, op: str, ty: str, a: str, b: str) -> str:
+    if ty == "b":
+        if op not in ("eq", "ne"):
+            raise Unsupported(f"an order of truth values ({op})")
+        return block.op(f"icmp {op} <{WIDTH} x i1> {a}, {b}")
+    return block.compare(_COMPARISONS[op][ty not in FLOATS], ty, a, b)
+
+
+def _cast(block: Block, source: str, target: str, a: str) -> str:
+    if target == "b":
+        return block.compare("une" if source in FLOATS else "ne", source, a, block.constant(source, 0))
+    if source == "b":
+        return block.select(target, a, block.constant(target, 1), block.constant(target, 0))
+    if source in FLOATS and target in FLOATS:
+        return block.convert("fpext" if target == "d" else "fptrunc", source, target, a)
+    if source in FLOATS:
+        return block.convert("fptosi", source, target, a)
+    if target in FLOATS:
+        return block.convert("sitofp", source, target, a)
+    if target == "L":
+        return block.convert("sext", source, target, a)
+    if source == "L":
+        return block.convert("trunc", source, target, a)
+    return a
+
+
+def _arithmetic(op: str) -> Callable[..., str]:
+    def handler(block: Block, ty: str, a: str, b: str) -> str:
+        if ty == "b":
+            return block.op(f"{'and' if op == 'mul' else 'or'} <{WIDTH} x i1> {a}, {b}")
+        return getattr(block, op)(ty, a, b)
+
+    return handler
+
+
+def _bits(op: str) -> Callable[..., str]:
+    def handler(block: Block, ty: str, a: str, b: str) -> str:
+        return block.op(f"{op} {block.vector(ty)} {a}, {b}")
+
+    return handler
+
+
+def _intrinsic(name: str) -> Callable[..., str]:
+    def handler(block: Block, ty: str, *a: str) -> str:
+        if ty not in FLOATS:
+            return a[0]  # a whole number is its own floor
+        return block.call(name, ty, *a)
+
+    return handler
+
+
+def _abs(block: Block, ty: str, a: str) -> str:
+    if ty in FLOATS:
+        return block.call("llvm.fabs", ty, a)
+    return block.select(ty, block.compare("slt", ty, a, block.constant(ty, 0)), block.negative(ty, a), a)
+
+
+def _sign(block: Block, ty: str, a: str) -> str:
+    zero = block.constant(ty, 0)
+    up, down = ("ogt", "olt") if ty in FLOATS else ("sgt", "slt")
+    found = block.select(ty, block.compare(up, ty, a, zero), block.constant(ty, 1), zero)
+    return block.select(ty, block.compare(down, ty, a, zero), block.constant(ty, -1), found)
+
+
+def _quotient(block: Block, ty: str, a: str, b: str, rounding: str) -> str:
+    """Rounded quotients of 32-bit integers by way of doubles, which hold them exactly; no machine divides such vectors."""
+    x, y = (block.convert("sitofp", ty, "d", v) for v in (a, b))
+    q = block.call(f"llvm.{rounding}", "d", block.div("d", x, y))
+    return block.convert("fptosi", "d", ty, q)
+
+
+def _wide_quotient(block: Block, a: str, b: str) -> tuple[str, str]:
+    """Floored quotient and remainder of 64-bit integers below 2^53 by positive ones: by doubles, then mended."""
+    x, y = (block.convert("sitofp", "L", "d", v) for v in (a, b))
+    q = block.convert("fptosi", "d", "L", block.call("llvm.floor", "d", block.div("d", x, y)))
+    r = block.sub("L", a, block.mul("L", q, b))
+    zero, one = block.constant("L", 0), block.constant("L", 1)
+    low = block.compare("slt", "L", r, zero)
+    q, r = block.select("L", low, block.sub("L", q, one), q), block.select("L", low, block.add("L", r, b), r)
+    high = block.compare("sge", "L", r, b)
+    return block.select("L", high, block.add("L", q, one), q), block.select("L", high, block.sub("L", r, b), r)
+
+
+def _floordiv(block: Block, ty: str, a: str, b: str) -> str:
+    if ty in FLOATS:
+        return block.call("llvm.floor", ty, block.div(ty, a, b))
+    return _wide_quotient(block, a, b)[0] if ty == "L" else _quotient(block, ty, a, b, "floor")
+
+
+def _truncdiv(block: Block, ty: str, a: str, b: str) -> str:
+    if ty == "L":
+        raise Unsupported("truncated division of 64-bit numbers")
+    return _quotient(block, ty, a, b, "trunc")
+
+
+def _remainder(block: Block, ty: str, a: str, b: str) -> str:
+    """The remainder of the floored quotient, which has the divisor's sign."""
+    if ty == "L":
+        return _wide_quotient(block, a, b)[1]
+    if ty not in FLOATS:
+        return block.sub(ty, a, block.mul(ty, _quotient(block, ty, a, b, "floor"), b))
+    r = block.op(f"frem {block.vector(ty)} {a}, {b}")
+    zero = block.constant(ty, 0.0)
+    other = block.op(
+        f"xor <{WIDTH} x i1> {block.compare('olt', ty, r, zero)}, {block.compare('olt', ty, b, zero)}"
+    )
+    wrong = block.op(f"and <{WIDTH} x i1> {other}, {block.compare('une', ty, r, zero)}")
+    return block.select(ty, wrong, block.add(ty, r, b), r)
+
+
+def _fmod(block: Block, ty: str, a: str, b: str) -> str:
+    if ty in FLOATS:
+        return block.op(f"frem {block.vector(ty)} {a}, {b}")
+    return block.sub(ty, a, block.mul(ty, _truncdiv(block, ty, a, b), b))
+
+
+def _gather(block: Block, ty: str, index: str, extra: tuple[int, int, int]) -> str:
+    """Number ``k`` of the ``width`` in entry ``index`` of a table; entries that are not there are the last one."""
+    table, width, k = extra
+    index = block.call("llvm.umin", "i", index, f"%last{table}")
+    if width != 1:
+        index = block.mul("i", index, block.constant("i", width))
+    element = MEMORY[ty]
+    pointer = block.at(f"%table{table}", element, k) if k else f"%table{table}"
+    return _from_memory(block, ty, block.gather(element, pointer, index))
+
+
+def _from_memory(block: Block, ty: str, held: str) -> str:
+    if ty == "b":
+        return block.op(f"icmp ne <{WIDTH} x i32> {held}, zeroinitializer")
+    return block.convert("sext", "i", "L", held) if ty == "L" else held
+
+
+def _scalar(block: Block, ty: str, pointer: str, place: int) -> str:
+    """One number of memory in all lanes."""
+    value = block.load(MEMORY[ty], block.at(pointer, MEMORY[ty], place))
+    if ty == "b":
+        value = block.op(f"trunc i32 {value} to i1")
+    elif ty == "L":
+        value = block.op(f"sext i32 {value} to i64")
+    return block.splat(ty, value)
+
+
+def _search(block: Block, ty: str, value: str, extra: tuple[int, str, bool]) -> str:
+    """How many entries of a sorted table are below a value (or not above it): a function with a loop of its own."""
+    table, element, right = extra
+    name = f"@sorted_{element}_{'right' if right else 'left'}"
+    vector = block.vector(element)
+    return block.op(f"call <{WIDTH} x i32> {name}(ptr %table{table}, i64 %count{table}, {vector} {value})")
+
+
+def _occluded(block: Block, ty: str, *a: str) -> str:
+    given = ", ".join(f"<{WIDTH} x float> {x}" for x in a)
+    return block.op(f"call <{WIDTH} x i1> @occluded({given}, ptr %search)")
+
+
+def _nearest(block: Block, ty: str, *a: str) -> str:
+    given = ", ".join(f"<{WIDTH} x float> {x}" for x in a)
+    return block.op(f"call {{{_HIT}}} @nearest({given}, ptr %search)")
+
+
+_HIT = f"<{WIDTH} x float>, <{WIDTH} x i32>, <{WIDTH} x float>, <{WIDTH} x float>"
+
+
+def _part(block: Block, ty: str, a: str, extra: int) -> str:
+    return block.op(f"extractvalue {{{_HIT}}} {a}, {extra}")
+
+
+def _iota(block: Block, ty: str) -> str:
+    numbers = ", ".join(f"i32 {k}" for k in range(WIDTH))
+    found = block.op(f"add <{WIDTH} x i32> %i32s, <{numbers}>")
+    return block.convert("sext", "i", "L", found) if ty == "L" else _cast(block, "i", ty, found)
+
+
+def _place(block: Block, ty: str) -> str:
+    """Where in the arena the lane is."""
+    return "%place" if block.listed else _iota(block, ty)  # type: ignore[attr-defined]
+
+
+def _arena(block: Block, ty: str, extra: int) -> str:
+    """A row of the arena, at the lane's own place or at that which the list names."""
+    element = MEMORY[ty]
+    if block.listed:  # type: ignore[attr-defined]
+        held = block.gather(element, f"%row{extra}", "%place")
+    else:
+        held = block.op(f"load <{WIDTH} x {element}>, ptr {block.at(f'%row{extra}', element, '%i')}, align 4")
+    return _from_memory(block, ty, held)
+
+
+def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
+    """Row ``k`` of an input tensor at the lane's own place."""
+    slot, k = extra
+    element = {"l": "i64", "L": "i64", "b": "i8", "u": "i8"}.get(ty, ELEMENTS[ty])
+    size = {"i64": 8, "double": 8, "i8": 1}.get(element, 4)
+    row = block.at(f"%in{slot}", "i8", block.op(f"mul i64 %in{slot}s, {k * size}")) if k else f"%in{slot}"
+    held = block.masked_load(element, block.at(row, element, "%i"), "%mask")
+    if element == "i64":
+        return held if ty == "L" else block.op(f"trunc <{WIDTH} x i64> {held} to <{WIDTH} x i32>")
+    if ty == "b":
+        return block.op(f"icmp ne <{WIDTH} x i8> {held}, zeroinitializer")
+    return block.op(f"zext <{WIDTH} x i8> {held} to <{WIDTH} x i32>") if ty == "u" else held
+
+
+_HANDLERS: dict[str, Callable[..., str]] = {
+    "add": _arithmetic("add"),
+    "sub": _arithmetic("sub"),
+    "mul": _arithmetic("mul"),
+    "div": lambda block, ty, a, b: block.div(ty, a, b),
+    "and": _bits("and"),
+    "or": _bits("or"),
+    "xor": _bits("xor"),
+    "ashr": _bits("ashr"),
+    "shl": _bits("shl"),
+    "max": lambda block, ty, a, b: block.extreme("max", ty, a, b),
+    "min": lambda block, ty, a, b: block.extreme("min", ty, a, b),
+    "neg": lambda block, ty, a: block.negative(ty, a),
+    "abs": _abs,
+    "sign": _sign,
+    "sqrt": _intrinsic("llvm.sqrt"),
+    "floor": _intrinsic("llvm.floor"),
+    "ceil": _intrinsic("llvm.ceil"),
+    "round": _intrinsic("llvm.rint"),  # to even, as torch does
+    "trunc": _intrinsic("llvm.trunc"),
+    "copysign": _intrinsic("llvm.copysign"),
+    "floordiv": _floordiv,
+    "truncdiv": _truncdiv,
+    "remainder": _remainder,
+    "fmod": _fmod,
+    "gather": _gather,
+    "element": lambda block, ty, extra: _scalar(block, ty, f"%table{extra[0]}", extra[1]),
+    "uniform": lambda block, ty, extra: _scalar(block, ty, f"%uniform{extra[0]}", extra[1]),
+    "search": _search,
+    "occluded": _occluded,
+    "nearest": _nearest,
+    "part": _part,
+    "iota": _iota,
+    "place": _place,
+    "arena": _arena,
+    "tensor": _tensor,
+}

@@ -1,0 +1,193 @@
+"""From IR to machine code: LLVM through llvmlite, and a cache on disk.
+
+The cache holds native code, so its folder is this user's alone (mode 0700, owner checked) and each entry carries a checksum.
+Where there can be no such folder, kernels are compiled in memory.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import stat
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Function", "Target", "cache_folder", "compiled", "host", "seconds"]
+
+#: Enters every key: entries of another form are never read.
+_FORM = "1"
+_lock = threading.Lock()
+_state: dict[str, Any] = {"ready": False, "seconds": 0.0, "compiled": 0, "loaded": 0}
+_functions: dict[str, Function] = {}
+_machines: dict[Target, Any] = {}
+
+
+@dataclass(frozen=True)
+class Target:
+    """What code is made for; names are LLVM's."""
+
+    cpu: str
+    features: str
+    triple: str | None = None
+
+
+@dataclass(frozen=True)
+class Function:
+    """A kernel's machine code: ``call(address of the arguments, lanes)`` runs it without the GIL."""
+
+    call: Any
+    code: bytes
+    engine: Any  # keeps the code in memory
+
+
+def _llvm() -> Any:
+    """llvmlite's binding, ready for this machine."""
+    import llvmlite.binding as llvm
+
+    if not _state["ready"]:
+        llvm.initialize_native_target()
+        llvm.initialize_native_asmprinter()
+        _state["ready"] = True
+    return llvm
+
+
+def host() -> Target:
+    """This machine."""
+    if "host" not in _state:
+        llvm = _llvm()
+        _state["host"] = Target(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
+    return _state["host"]
+
+
+def seconds() -> float:
+    """Time spent on compiling and loading in this process so far."""
+    return _state["seconds"]
+
+
+def counts() -> tuple[int, int]:
+    """How many kernels this process compiled, and how many it loaded from disk."""
+    return _state["compiled"], _state["loaded"]
+
+
+def compiled(ir: str, target: Target | None = None) -> Function:
+    """The function ``kernel`` of a module, from this process, from disk, or made now."""
+    with _lock:
+        begin = time.perf_counter()
+        target = target or host()
+        key = _key(ir, target)
+        found = _functions.get(key)
+        if found is None:
+            path = _path(key)
+            code = None if path is None else _read(path)
+            if code is None:
+                code = _object(ir, target)
+                _state["compiled"] += 1
+                if path is not None:
+                    _write(path, code)
+            else:
+                _state["loaded"] += 1
+            found = _functions[key] = _loaded(code, target)
+        _state["seconds"] += time.perf_counter() - begin
+        return found
+
+
+def _key(ir: str, target: Target) -> str:
+    import llvmlite
+
+    text = "\n".join((_FORM, llvmlite.__version__, target.cpu, target.features, str(target.triple), ir))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _machine(target: Target) -> Any:
+    if target not in _machines:
+        llvm = _llvm()
+        if target.triple is not None:
+            llvm.initialize_all_targets()
+            llvm.initialize_all_asmprinters()
+        kind = llvm.Target.from_default_triple() if target.triple is None else llvm.Target.from_triple(target.triple)
+        options = {"jit": True} if target.triple is None else {}
+        _machines[target] = kind.create_target_machine(cpu=target.cpu, features=target.features, opt=2, **options)
+    return _machines[target]
+
+
+def _object(ir: str, target: Target) -> bytes:
+    """Object code. Loops are vectors already: what would make them so is left out."""
+    llvm, machine = _llvm(), _machine(target)
+    module = llvm.parse_assembly(ir)
+    module.triple = target.triple or llvm.get_default_triple()
+    module.data_layout = str(machine.target_data)
+    module.verify()
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    options.slp_vectorization = options.loop_vectorization = options.loop_unrolling = False
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+    return machine.emit_object(module)
+
+
+def _loaded(code: bytes, target: Target) -> Function:
+    if target.triple is not None:
+        return Function(None, code, None)  # for another machine: not to be run here
+    llvm = _llvm()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(target))
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(engine.get_function_address("kernel"))
+    return Function(call, code, engine)
+
+
+def cache_folder() -> Path | None:
+    """Where kernels are kept: ``$TORCHPT_CACHE``, else the user's cache folder; None where that cannot be trusted."""
+    given = os.environ.get("TORCHPT_CACHE")
+    if given == "":
+        return None
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    folder = Path(given) if given else Path(base) / "torchpt" / "kernels"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        facts = folder.stat()
+    except OSError:
+        return None
+    if not hasattr(os, "getuid"):  # no owners and modes to check
+        return folder
+    if facts.st_uid != os.getuid() or stat.S_IMODE(facts.st_mode) & 0o077:
+        return None
+    return folder
+
+
+def _path(key: str) -> Path | None:
+    if "folder" not in _state:
+        _state["folder"] = cache_folder()
+    folder = _state["folder"]
+    return None if folder is None else folder / f"{key[:40]}.o"
+
+
+def _read(path: Path) -> bytes | None:
+    """An entry; None where there is none, or a damaged one, which is made again."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    check, code = content[:32], content[32:]
+    return code if hashlib.sha256(code).digest() == check else None
+
+
+def _write(path: Path, code: bytes) -> None:
+    """Put an entry in its place at once or not at all; a full disk is no reason to stop."""
+    name = None
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(hashlib.sha256(code).digest() + code)
+        os.replace(name, path)
+    except OSError:
+        if name is not None:
+            try:
+                os.unlink(name)
+            except OSError:
+                print(f"torchpt: {name} could not be removed", file=sys.stderr)

@@ -1,0 +1,72 @@
+"""Functions of tensors by lanes as kernels of their own: what tests compare with torch, operator by operator."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from torchpt.lanes import engine, gathers, pointwise, views  # noqa: F401  (they register what they lower)
+from torchpt.lanes.engine import Target
+from torchpt.lanes.graph import DTYPES
+from torchpt.lanes.kernel import HEAD, Sinks, Store, text
+from torchpt.lanes.program import bound
+from torchpt.lanes.tracing import LANES, Tracer
+
+__all__ = ["lanewise"]
+
+
+def lanewise(
+    function: Callable[..., Sequence[Tensor]], like: Sequence[Tensor], target: Target | None = None
+) -> Callable[..., list[Tensor]]:
+    """A function of tensors ``(..., N)``, each result lane made of the arguments' lanes alone, as one loop.
+
+    Args:
+        function: gives a sequence of tensors ``(..., N)``.
+        like: arguments of the shapes and dtypes to come; N may differ.
+        target: machine to compile for; this one where None.
+
+    Raises:
+        Unsupported: for what the lane compiler does not know.
+    """
+    lanes = next(n for n in LANES if all(size % n for x in like for size in x.shape[:-1]))
+    tracer = Tracer(lanes, {})
+    given = [_sample(x, lanes) for x in like]
+    for slot, x in enumerate(given):
+        ty = DTYPES[x.dtype]
+        tracer.lane(x, lambda k, slot=slot, ty=ty: tracer.graph.node("tensor", ty, extra=(slot, k)))
+    with torch.no_grad(), tracer:
+        results = list(function(*given))
+    shapes = [tuple(x.shape[:-1]) for x in results]
+    stores = [Store(tuple(tracer.nodes(x)), DTYPES[x.dtype]) for x in results]
+    ir, _ = text(tracer.graph, Sinks(store=stores), len(tracer.tables), 0, len(given), False)
+    made = engine.compiled(ir, target)
+    tables = bound(tracer.tables, tracer.steps, tracer.held, {})
+
+    def run(*arguments: Tensor) -> list[Tensor]:
+        inputs = [x.contiguous() for x in arguments]
+        count = inputs[0].shape[-1]
+        outputs = [
+            torch.empty(*shape, count, dtype=x.dtype) for shape, x in zip(shapes, results, strict=True)
+        ]
+        words = [0] * len(HEAD)
+        words[HEAD.index("tables")] = tables.address
+        for x in (*inputs, *outputs):
+            words += [x.data_ptr(), count]
+        block = (ctypes.c_int64 * len(words))(*words)
+        made.call(ctypes.addressof(block), count)
+        return outputs
+
+    return run
+
+
+def _sample(x: Tensor, lanes: int) -> Tensor:
+    """An argument's first lanes, repeated as often as it takes."""
+    columns = torch.arange(lanes) % max(x.shape[-1], 1)
+    if not x.numel():
+        return torch.zeros(*x.shape[:-1], lanes, dtype=x.dtype)
+    assert math.prod(x.shape)
+    return x[..., columns].contiguous()

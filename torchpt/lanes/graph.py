@@ -1,0 +1,131 @@
+"""A stage as a graph of scalar operations: each node stands for one number in every lane.
+
+Types are one letter: ``f`` float32, ``d`` float64, ``i`` int32, ``b`` bool, ``u`` uint8 held in 32 bits. An int64 tensor has
+nodes of two types: ``l`` where it is an index and 32 bits hold it, ``L`` where it was made of int32 lanes, so that products of
+64 bits may be meant.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import torch
+
+__all__ = ["BYTES", "DTYPES", "FLOATS", "INTEGERS", "Graph", "Unsupported"]
+
+#: Node type of each dtype; int64 may also be ``L``.
+DTYPES = {
+    torch.float32: "f",
+    torch.float64: "d",
+    torch.int32: "i",
+    torch.int64: "l",
+    torch.bool: "b",
+    torch.uint8: "u",
+}
+FLOATS, INTEGERS = "fd", "ilLu"
+#: Bytes of an element in memory outside of the arena.
+BYTES = {"f": 4, "d": 8, "i": 4, "l": 8, "L": 8, "b": 1, "u": 1}
+
+
+class Unsupported(Exception):
+    """A stage does something that the lane compiler does not know; the message names it."""
+
+
+class Graph:
+    """Nodes ``(op, type, arguments, extra)``, each kept once.
+
+    Attributes:
+        nodes: in an order in which arguments come before their users.
+        origins: for each node the files of the package that asked for it first, innermost first.
+        origin: those of the nodes made next.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: list[tuple[str, str, tuple[int, ...], Any]] = []
+        self.origins: list[tuple[str, ...]] = []
+        self.origin: tuple[str, ...] = ()
+        self._known: dict[tuple[str, str, tuple[int, ...], Any], int] = {}
+
+    def node(self, op: str, ty: str, *arguments: int, extra: Any = None) -> int:
+        """The number of a node, made where it is new."""
+        key = op, ty, arguments, extra
+        found = self._known.get(key)
+        if found is None:
+            found = self._known[key] = len(self.nodes)
+            self.nodes.append(key)
+            self.origins.append(self.origin)
+        return found
+
+    def type(self, node: int) -> str:
+        """Its type."""
+        return self.nodes[node][1]
+
+    def constant(self, ty: str, value: float | int | bool) -> int:
+        """A number that is the same in all lanes and scenes."""
+        if ty == "f":
+            value = float(np.float32(value)) if math.isfinite(value) else float(value)
+        if ty in FLOATS:
+            return self.node("const", ty, extra=struct.pack("<d", float(value)))  # by its bits: -0.0, NaN
+        return self.node("const", ty, extra=bool(value) if ty == "b" else int(value))
+
+    def value(self, node: int) -> Any:
+        """The number of a constant; None for other nodes."""
+        op, ty, _, extra = self.nodes[node]
+        if op != "const":
+            return None
+        return struct.unpack("<d", extra)[0] if ty in FLOATS else extra
+
+    def cast(self, node: int, ty: str) -> int:
+        """The number as another type, as torch converts it."""
+        own = self.type(node)
+        if own == ty:
+            return node
+        value = self.value(node)
+        if value is not None and not (own in FLOATS and ty in INTEGERS and not math.isfinite(value)):
+            return self.constant(ty, value != 0 if ty == "b" else value)
+        if own in "ilu" and ty in "ilu":
+            return self.node("retype", ty, node)
+        return self.node("cast", ty, node)
+
+    def select(self, condition: int, yes: int, no: int) -> int:
+        """``yes`` in lanes where the condition holds; both of one type."""
+        if yes == no:
+            return yes
+        known = self.value(condition)
+        if known is not None:
+            return yes if known else no
+        return self.node("select", self.type(yes), condition, yes, no)
+
+    def binary(self, op: str, ty: str, x: int, y: int) -> int:
+        """An operation on two nodes of type ``ty``, without what changes no bit of the result."""
+        a, b = self.value(x), self.value(y)
+        if op in ("mul", "div") and b == 1:
+            return x
+        if op == "mul" and a == 1:
+            return y
+        if ty in INTEGERS and op in ("add", "sub", "shl", "ashr", "or", "xor") and b == 0:
+            return x
+        if ty in INTEGERS and op == "add" and a == 0:
+            return y
+        if ty in FLOATS:
+            if op == "div" and b and abs(math.frexp(b)[0]) == 0.5 and math.isfinite(1.0 / b):
+                return self.node("mul", ty, x, self.constant(ty, 1.0 / b))  # a power of two: exact
+            if a is not None and b is not None and op in ("add", "sub", "mul"):
+                real = np.float32 if ty == "f" else np.float64
+                with np.errstate(all="ignore"):
+                    p, q = real(a), real(b)
+                    return self.constant(ty, float(p + q if op == "add" else p - q if op == "sub" else p * q))
+        return self.node(op, ty, x, y)
+
+    def needed(self, roots: list[int]) -> list[int]:
+        """All nodes that roots depend on, arguments first."""
+        found, stack = set(), list(roots)
+        while stack:
+            node = stack.pop()
+            if node not in found:
+                found.add(node)
+                stack += self.nodes[node][2]
+        return sorted(found)

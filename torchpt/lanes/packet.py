@@ -1,0 +1,216 @@
+"""Sixteen rays against every primitive, as functions inside a kernel: the search for scenes of few primitives.
+
+The tests are those of :mod:`torchpt.accel.kernels_brute`: affine rows with their own rounding error as tolerance for planar
+primitives, perpendiculars in float64 for spheres.
+"""
+
+from __future__ import annotations
+
+import math
+
+from torchpt.lanes.block import WIDTH, Block
+
+__all__ = ["KINDS", "packet_search"]
+
+#: Kinds of primitives that are searched here, in the order of their ids.
+KINDS = ("triangle", "rectangle", "disk", "sphere")
+_F, _I, _D, _B = (f"<{WIDTH} x {t}>" for t in ("float", "i32", "double", "i1"))
+_HIT = f"{{{_F}, {_I}, {_F}, {_F}}}"
+#: Numbers of a planar primitive's row.
+_ROW = 13
+_RAY = ("ox", "oy", "oz", "dx", "dy", "dz")
+
+
+def packet_search(kinds: tuple[str, ...], estimates: bool) -> Block:
+    """Functions ``nearest`` and ``occluded`` of rays and the address of what is searched.
+
+    There lie, 64 bits each: the address of the rows of planar primitives, that of the spheres, for each of :data:`KINDS` the
+    id after its last primitive, and the scene's extent as a float64.
+
+    Args:
+        kinds: those that the scene has.
+        estimates: whether the machine has AVX-512's reciprocal estimates; else it divides.
+    """
+    whole = Block()
+    for any_hit in (False, True):
+        block = _Search(kinds, estimates, any_hit)
+        block.write()
+        whole.lines += block.lines
+        whole.declarations |= block.declarations
+    return whole
+
+
+class _Search(Block):
+    def __init__(self, kinds: tuple[str, ...], estimates: bool, any_hit: bool) -> None:
+        super().__init__()
+        self.kinds, self.estimates, self.any_hit = kinds, estimates, any_hit
+
+    def write(self) -> None:
+        """The function."""
+        given = ", ".join(f"{_F} %{name}" for name in (*_RAY, "t_max"))
+        name, result = ("occluded", _B) if self.any_hit else ("nearest", _HIT)
+        self.lines.append(f"define internal {result} @{name}({given}, ptr %search) noinline #0 {{\nentry:")
+        self._start()
+        t, prim, before = "%t0", "splat (i32 -1)", "entry"
+        for kind in self.kinds:
+            t, prim, before = self._loop(kind, t, prim, before)
+        if self.any_hit:
+            self.do(f"ret {_B} {self.op(f'icmp sge {_I} {prim}, zeroinitializer')}")
+        else:
+            self._finish(t, prim)
+        self.lines.append("}")
+
+    def _start(self) -> None:
+        words = ("rows", "balls", *(f"end_{kind}" for kind in KINDS))
+        for k, word in enumerate(words):
+            self.lines.append(f"  %{word}p = getelementptr i64, ptr %search, i64 {k}")
+            self.lines.append(f"  %{word} = load {'ptr' if k < 2 else 'i64'}, ptr %{word}p, !invariant.load !0")
+        extent = self.load("double", self.at("%search", "i64", len(words)))
+        extent = self.splat("f", self.op(f"fptrunc double {extent} to float"))
+        zero = self.constant("f", 0.0)
+        # NaN unless all are finite; never contracted away, as no flag allows that.
+        nothing = None
+        for name in _RAY:
+            product = self.op(f"fmul {_F} %{name}, {zero}")
+            nothing = product if nothing is None else self.op(f"fadd {_F} {nothing}, {product}")
+        assert nothing is not None
+        good = self.op(
+            f"and {_B} {self.compare('oeq', 'f', nothing, zero)}, {self.compare('ogt', 'f', '%t_max', zero)}"
+        )
+        self.lines.append(f"  %t0 = select {_B} {good}, {_F} %t_max, {_F} {self.constant('f', -1.0)}")
+        far_o, far_d = self._size(_RAY[:3]), self._size(_RAY[3:])
+        self.lines.append(f"  %reach = fmul {_F} {far_d}, {self._larger(far_o, extent)}")
+        bits = self.op(f"bitcast {_B} {good} to i16")
+        self.lines.append(f"  %live = icmp ne i16 {bits}, 0")
+
+    def _larger(self, a: str, b: str) -> str:
+        return self.select("f", self.compare("ogt", "f", a, b), a, b)
+
+    def _size(self, names: tuple[str, ...]) -> str:
+        a, b, c = (self.call("llvm.fabs", "f", f"%{name}") for name in names)
+        return self._larger(self._larger(a, b), c)
+
+    def _loop(self, kind: str, t: str, prim: str, before: str) -> tuple[str, str, str]:
+        """All primitives of a kind; returns the names of distance and primitive after them, and the block that ends it."""
+        number = KINDS.index(kind)
+        first = "0" if number == 0 else f"%end_{KINDS[number - 1]}"
+        self.lines += [
+            f"  %{kind}_some = icmp slt i64 {first}, %end_{kind}",
+            f"  %{kind}_go = and i1 %{kind}_some, %live",
+            f"  br i1 %{kind}_go, label %{kind}, label %{kind}_done",
+            f"{kind}:",
+            f"  %{kind}_id = phi i64 [ {first}, %{before} ], [ %{kind}_next, %{kind} ]",
+            f"  %{kind}_t = phi {_F} [ {t}, %{before} ], [ %{kind}_t1, %{kind} ]",
+            f"  %{kind}_p = phi {_I} [ {prim}, %{before} ], [ %{kind}_p1, %{kind} ]",
+        ]
+        found, hit = self._ball(kind) if kind == "sphere" else self._planar(kind)
+        tests = [self.compare("ogt", "f", found, self.constant("f", 0.0)), self.compare("olt", "f", found, f"%{kind}_t")]
+        for test in tests:
+            hit = test if hit is None else self.op(f"and {_B} {hit}, {test}")
+        # A ray that meets anything at all is done: no distance is below the one it has then.
+        better = self.constant("f", -1.0) if self.any_hit else found
+        number_ = self.splat("i", self.op(f"trunc i64 %{kind}_id to i32"))
+        self.lines += [
+            f"  %{kind}_t1 = select {_B} {hit}, {_F} {better}, {_F} %{kind}_t",
+            f"  %{kind}_p1 = select {_B} {hit}, {_I} {number_}, {_I} %{kind}_p",
+            f"  %{kind}_next = add i64 %{kind}_id, 1",
+            f"  %{kind}_more = icmp slt i64 %{kind}_next, %end_{kind}",
+            f"  br i1 %{kind}_more, label %{kind}, label %{kind}_done",
+            f"{kind}_done:",
+            f"  %{kind}_t2 = phi {_F} [ {t}, %{before} ], [ %{kind}_t1, %{kind} ]",
+            f"  %{kind}_p2 = phi {_I} [ {prim}, %{before} ], [ %{kind}_p1, %{kind} ]",
+        ]
+        return f"%{kind}_t2", f"%{kind}_p2", f"{kind}_done"
+
+    def _reciprocal(self, a: str) -> str:
+        if not self.estimates:
+            return self.div("f", self.constant("f", 1.0), a)
+        name = "llvm.x86.avx512.rcp14.ps.512"
+        self.declarations.add(f"declare {_F} @{name}({_F}, {_F}, i16)")
+        e = self.op(f"call {_F} @{name}({_F} {a}, {_F} zeroinitializer, i16 -1)")
+        rest = self.fma("f", self.negative("f", a), e, self.constant("f", 1.0))
+        return self.fma("f", rest, e, e)
+
+    def _affine(self, row: list[str], x: tuple[str, ...]) -> str:
+        value = row[3]
+        for a, b in zip(row, x, strict=False):
+            value = self.fma("f", a, b, value)
+        return value
+
+    def _planar(self, kind: str) -> tuple[str, str]:
+        base = self.op(f"getelementptr [{_ROW} x float], ptr %rows, i64 %{kind}_id")
+        row = [self.splat("f", self.load("float", self.at(base, "float", k))) for k in range(_ROW)]
+        o, d = tuple(f"%{name}" for name in _RAY[:3]), tuple(f"%{name}" for name in _RAY[3:])
+        slope = self.mul("f", row[0], d[0])
+        for k in (1, 2):
+            slope = self.fma("f", row[k], d[k], slope)
+        inverse = self._reciprocal(slope)
+        t = self.mul("f", self.negative("f", self._affine(row[:4], o)), inverse)
+        p = tuple(self.fma("f", t, d[k], o[k]) for k in range(3))
+        u, v = self._affine(row[4:8], p), self._affine(row[8:12], p)
+        if kind == "disk":
+            square = self.fma("f", u, u, self.mul("f", v, v))
+            return t, self.compare("ole", "f", square, self.constant("f", 1.0))
+        slack = self.mul("f", self.call("llvm.fabs", "f", self.mul("f", "%reach", inverse)), row[12])
+        low = self.select("f", self.compare("olt", "f", u, v), u, v)
+        inside = self.compare("oge", "f", low, self.negative("f", slack))
+        if kind == "triangle":
+            most = self.fma("f", slack, self.constant("f", 2.0), self.constant("f", 1.0))
+            other = self.compare("ole", "f", self.add("f", u, v), most)
+        else:
+            other = self.compare("ole", "f", self._larger(u, v), self.add("f", slack, self.constant("f", 1.0)))
+        return t, self.op(f"and {_B} {inside}, {other}")
+
+    def _dot(self, a: list[str], b: list[str]) -> str:
+        value = self.mul("d", a[0], b[0])
+        for x, y in zip(a[1:], b[1:], strict=True):
+            value = self.fma("d", x, y, value)
+        return value
+
+    def _ball(self, kind: str) -> tuple[str, str | None]:
+        """See :func:`torchpt.accel.kernels_sphere.sphere_distance`."""
+        own = self.op(f"sub i64 %{kind}_id, %end_disk")
+        base = self.op(f"getelementptr [4 x double], ptr %balls, i64 {own}")
+        ball = [self.splat("d", self.load("double", self.at(base, "double", k))) for k in range(4)]
+        o, d = ([self.convert("fpext", "f", "d", f"%{name}") for name in names] for names in (_RAY[:3], _RAY[3:]))
+        f = [self.sub("d", x, c) for x, c in zip(o, ball, strict=False)]
+        a, b = self._dot(d, d), self.negative("d", self._dot(f, d))
+        s = self.div("d", b, a)
+        off = [self.fma("d", s, y, x) for x, y in zip(f, d, strict=True)]
+        square = self.mul("d", ball[3], ball[3])
+        rest = self.sub("d", square, self._dot(off, off))
+        root = self.call("llvm.sqrt", "d", self.mul("d", a, rest))
+        q = self.add("d", b, self.call("llvm.copysign", "d", root, b))
+        near, far = self.div("d", self.sub("d", self._dot(f, f), square), q), self.div("d", q, a)
+        first = self.compare("olt", "d", near, far)
+        low, high = self.select("d", first, near, far), self.select("d", first, far, near)
+        t = self.select("d", self.compare("ogt", "d", low, self.constant("d", 0.0)), low, high)
+        return self.convert("fptrunc", "d", "f", t), None
+
+    def _finish(self, t: str, prim: str) -> None:
+        """Parameters of the planar hits; those in the slack beyond an edge are brought back to the edge."""
+        hit = self.op(f"icmp sge {_I} {prim}, zeroinitializer")
+        zero, one = self.constant("f", 0.0), self.constant("f", 1.0)
+        ends = {kind: self.splat("i", self.op(f"trunc i64 %end_{kind} to i32")) for kind in KINDS[:3]}
+        planar = self.op(f"and {_B} {hit}, {self.op(f'icmp slt {_I} {prim}, ' + ends['disk'])}")
+        u = v = zero
+        if any(kind != "sphere" for kind in self.kinds):
+            place = self.mul("i", self.select("i", planar, prim, "zeroinitializer"), self.constant("i", _ROW))
+            p = tuple(self.fma("f", t, f"%{d}", f"%{o}") for o, d in zip(_RAY[:3], _RAY[3:], strict=True))
+            row = [self.gather("float", self.at("%rows", "float", k), place) for k in range(4, 12)]
+            u, v = self._affine(row[:4], p), self._affine(row[4:], p)
+            flat = self.op(f"icmp slt {_I} {prim}, {ends['rectangle']}")
+            three = self.op(f"icmp slt {_I} {prim}, {ends['triangle']}")
+            inner = self._between(u, zero, one)
+            top = self.select("f", three, self.sub("f", one, inner), one)
+            u, v = self.select("f", flat, inner, u), self.select("f", flat, self._between(v, zero, top), v)
+            u, v = (self.select("f", planar, x, zero) for x in (u, v))
+        t = self.select("f", hit, t, self.constant("f", math.inf))
+        value = "poison"
+        for k, (ty, x) in enumerate(((_F, t), (_I, prim), (_F, u), (_F, v))):
+            value = self.op(f"insertvalue {_HIT} {value}, {ty} {x}, {k}")
+        self.do(f"ret {_HIT} {value}")
+
+    def _between(self, x: str, low: str, high: str) -> str:
+        x = self._larger(x, low)
+        return self.select("f", self.compare("olt", "f", x, high), x, high)

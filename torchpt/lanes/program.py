@@ -1,0 +1,104 @@
+"""The tables of a kernel: the prologue run for a scene, and its results laid out as kernels read them."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.lanes.graph import Unsupported
+from torchpt.lanes.tracing import Source, Step, Table
+
+__all__ = ["Tables", "bound", "laid_out", "replayed"]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Tables in memory.
+
+    Attributes:
+        address: of pairs of pointer and number of entries.
+        keep: what must live as long.
+    """
+
+    address: int
+    keep: tuple[Any, ...]
+
+
+def replayed(steps: Sequence[Step], held: Sequence[Tensor], leaves: Mapping[str, Tensor]) -> Any:
+    """Runs a prologue; returns ``tensor(source)``."""
+    results: list[Any] = []
+
+    def tensor(source: Source) -> Tensor:
+        if source.kind == "leaf":
+            return leaves[str(source.name)]
+        if source.kind == "held":
+            return held[int(source.name)]
+        found = results[int(source.name)]
+        return found if source.item < 0 else found[source.item]
+
+    def filled(value: Any) -> Any:
+        if isinstance(value, Source):
+            return tensor(value)
+        return type(value)(filled(x) for x in value) if isinstance(value, list | tuple) else value
+
+    with torch.no_grad():
+        for step in steps:
+            results.append(step.function(*filled(step.args), **{k: filled(v) for k, v in step.kwargs.items()}))
+    return tensor
+
+
+def laid_out(tensor: Tensor, axis: int | None) -> Tensor:
+    """A table as kernels read it: entries first, contiguous, integers and truth values in 32 bits.
+
+    Raises:
+        Unsupported: numbers beyond 32 bits.
+    """
+    tensor = tensor.detach()
+    if axis is not None and tensor.dim() > 1:
+        tensor = tensor.movedim(axis, 0)
+    if tensor.dtype == torch.int64:
+        if tensor.numel() and (int(tensor.max()) >= 1 << 31 or int(tensor.min()) < -(1 << 31)):
+            raise Unsupported("a table of integers beyond 32 bits")
+        tensor = tensor.to(torch.int32)
+    elif tensor.dtype in (torch.bool, torch.uint8):
+        tensor = tensor.to(torch.int32)
+    return tensor.contiguous()
+
+
+def bound(
+    tables: Sequence[Table],
+    steps: Sequence[Step],
+    held: Sequence[Tensor],
+    leaves: Mapping[str, Tensor],
+    known: dict[Any, Tensor] | None = None,
+) -> Tables:
+    """The tables of a kernel for one scene.
+
+    Args:
+        tables: of the trace.
+        steps: its prologue.
+        held: its own tensors.
+        leaves: the scene's tensors by path.
+        known: leaves that were laid out before, by path and axis; filled.
+    """
+    known = {} if known is None else known
+    tensor = replayed(steps, held, leaves)
+    words: list[int] = []
+    keep: list[Tensor] = []
+    for table in tables:
+        key = (table.source.name, table.axis) if table.source.kind == "leaf" else None
+        found = known.get(key) if key is not None else None
+        plain = tensor(table.source)
+        if found is None:
+            found = laid_out(plain, table.axis)
+            if key is not None:
+                known[key] = found
+        keep.append(found)
+        words += [found.data_ptr(), plain.numel() if table.axis is None else plain.shape[table.axis]]
+    block = (ctypes.c_int64 * max(len(words), 1))(*words)
+    return Tables(ctypes.addressof(block), (block, keep))
