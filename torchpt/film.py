@@ -70,6 +70,10 @@ class Filter:
         self._lobe = round(float(np.abs(weight[: 1 << 15]).dot(weight[: 1 << 15] < 0)) / cdf[-1] * _STEPS) / _STEPS
         self.signed = self._lobe > 0
 
+    def kind_of(self) -> tuple[object, ...]:
+        """What is not a tensor: kernels are made anew where it differs."""
+        return self.kind, self.radius, self._lobe if self.signed else None
+
     def tensors(self) -> dict[str, Tensor]:
         """What lanes read."""
         return {} if self._inverse is None else {"inverse": self._inverse}
@@ -124,6 +128,19 @@ class Film:
             group = (first_sample + s) % self.randomizations
             self._sums[group, :, pixels] += radiance[:, s]
             self._counts[group, pixels] += 1
+
+    @property
+    def sums(self) -> Tensor:
+        """``(randomizations, C, pixels)`` float64."""
+        return self._sums
+
+    def counted(self, first_pixel: int, pixels: int, group: int) -> None:
+        """Say that a sample of a randomization was added to the sums of consecutive pixels."""
+        self._counts[group, first_pixel : first_pixel + pixels] += 1
+
+    def keep_first(self, values: np.ndarray, first_pixel: int) -> None:
+        """Keep the first samples ``(C, n)`` of consecutive pixels."""
+        self._first[:, first_pixel : first_pixel + values.shape[1]] = torch.from_numpy(values)
 
     def mean(self) -> Tensor:
         """The picture ``(H, W, C)`` in float64; pixels without samples are black."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -19,10 +20,13 @@ from torchpt.errors import RenderError
 from torchpt.film import Film, Filter
 from torchpt.integrators import Wave
 from torchpt.integrators.aov import CHANNELS, NAMES
-from torchpt.integrators.compiled import CompiledStages, Stages, can_compile
+from torchpt.integrators.compiled import CompiledStages, Stages
 from torchpt.integrators.ibl import Preview
+from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.loop.schedule import Loop, Share
 from torchpt.integrators.path import Limits, Tally
 from torchpt.integrators.stages import Plan
+from torchpt.lanes.graph import Unsupported
 from torchpt.records import World
 from torchpt.samplers import Sampler
 from torchpt.scene import Scene
@@ -64,7 +68,9 @@ LARGEST_PASS = 64
 COMPILE_REPAYS = 200_000_000
 
 _compiled: WeakKeyDictionary[Scene, dict[Plan, CompiledStages]] = WeakKeyDictionary()
+_kernels: WeakKeyDictionary[Scene, Kernels] = WeakKeyDictionary()
 _previews: WeakKeyDictionary[Scene, tuple[World, Preview]] = WeakKeyDictionary()
+_said: set[str] = set()
 _forked = False
 _threads_lock = threading.Lock()
 _threads_before, _renders = 0, 0
@@ -94,6 +100,7 @@ class Rendering:
         clamped: fraction of the light that ``integrator.clamp`` took away; None where it is off.
         relmse: the picture's estimate of its own relMSE; None for a single randomization.
         complete: whether all samples asked for were taken.
+        eager: stages that ran as tensor operations although kernels were wanted, and why.
     """
 
     image: Tensor
@@ -107,6 +114,7 @@ class Rendering:
     clamped: float | None = None
     relmse: float | None = None
     complete: bool = True
+    eager: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """The facts as plain values, ready for JSON."""
@@ -125,6 +133,8 @@ class Rendering:
             facts["clamped"] = self.clamped
         if not self.complete:
             facts["complete"] = False
+        if self.eager:
+            facts["eager"] = list(self.eager)
         return facts
 
 
@@ -230,7 +240,7 @@ def pixel_of(world: World, camera: Camera) -> Tensor | None:
 
 
 def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: Tensor | None, own: bool) -> Stages:
-    """Eager or compiled stages; compiled ones are kept with the scene, unless the world is not the scene's ``own``."""
+    """Eager stages; on CUDA compiled ones, which are kept with the scene unless the world is not the scene's ``own``."""
     mode = settings.render.compile
     if mode == "auto":
         _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
@@ -241,10 +251,9 @@ def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: T
             and work >= COMPILE_REPAYS * len(world.models)  # each has graphs of its own
             and plan.dtype == torch.float32
             and not scene.own_models  # code of the user's own may hold what cannot be compiled
-            and can_compile(scene.device)
             else "off"
         )
-    if mode == "off" or plan.tape or torch.is_grad_enabled():
+    if scene.device.type == "cpu" or mode == "off" or plan.tape or torch.is_grad_enabled():
         return Stages(plan, world, pixel)
     if not own:
         return CompiledStages(plan, world, pixel)
@@ -252,6 +261,36 @@ def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: T
     if plan not in kept or kept[plan].world is not world:
         kept[plan] = CompiledStages(plan, world)
     return kept[plan].through(pixel)
+
+
+def looped(wave: Wave, settings: Settings, device: torch.device) -> bool:
+    """Whether a render takes the compiled loop: on a CPU, in float32, and without a tape."""
+    plan = wave.stages.plan
+    return device.type == "cpu" and settings.render.compile != "off" and plan.dtype == torch.float32 and not plan.tape
+
+
+def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
+    """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
+    kernels = Kernels(wave, is_fused(wave), before)
+    own = [k for k, model in enumerate(wave.stages.world.models) if any(model is mine for mine in scene.own_models)]
+    eager = kernels.probe(own) if wave.limits is not None else {}
+    if eager and kernels.fused:  # what runs as tensor operations hands its rays to the search structure
+        kernels = Kernels(wave, False)
+    kernels.eager = eager
+    return kernels
+
+
+def say_once(text: str) -> None:
+    """A line on stderr, the first time only."""
+    if text not in _said:
+        _said.add(text)
+        print(text, file=sys.stderr, flush=True)
+
+
+def is_fused(wave: Wave) -> bool:
+    """Whether rays are searched for inside the kernels: few primitives, none of them a quadric, all opaque."""
+    world = wave.stages.world
+    return wave.accel.name == "brute" and world.opacity is None and not world.counts[4] and wave.preview is None
 
 
 def _passes(spp: int, randomizations: int) -> Iterator[tuple[int, int]]:
@@ -297,32 +336,86 @@ class Run:
         self.wave = make_wave(scene, settings, params, dtype)
         _, _, self.width, self.height = self.wave.crop
         self.dtype = dtype
-        groups = self.wave.sampler.randomizations
-        self.film = Film(self.width, self.height, groups, self.device)
         self.names = tuple(name for name in settings.film.aovs if name in CHANNELS)
         if isinstance(settings.integrator, AovIntegrator) and not settings.film.aovs:
             self.names = ("albedo",)
-        self.layers = {name: Film(self.width, self.height, 1, self.device, CHANNELS[name]) for name in self.names}
+        self.on_progress: Callable[[Progress], bool | None] | None = None
+        self.eager: list[str] = []
+        self._begin()
+        self.loop = self._loop(scene) if looped(self.wave, settings, self.device) else None
+
+    def _begin(self) -> None:
+        """Nothing is sampled yet."""
+        width, height, device = self.width, self.height, self.device
+        self.film = Film(width, height, self.wave.sampler.randomizations, device)
+        self.layers = {name: Film(width, height, 1, device, CHANNELS[name]) for name in self.names}
         self.tally, self.done = Tally(), 0
-        self.bad = torch.zeros((), dtype=torch.int64, device=self.device)
-        self.light = torch.zeros(2, dtype=torch.float64, device=self.device)  # before and after the clamp
+        self.bad = torch.zeros((), dtype=torch.int64, device=device)
+        self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
+
+    def _loop(self, scene: Scene) -> Loop:
+        """The compiled loop; its kernels are kept with the scene."""
+        kernels = _kernels[scene] = kernels_of(scene, self.wave, _kernels.get(scene))
+        for number, reason in kernels.eager.items():
+            name = str(self.wave.stages.world.models[number])
+            self.eager.append(f"{name}: {reason}")
+            say_once(
+                f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}"
+            )
+        settings, integrator = self.settings, self.settings.integrator
+        limited = settings.render.max_memory is not None
+        return Loop(
+            kernels,
+            self.film,
+            self.layers,
+            torch.get_num_threads(),
+            lanes_for(settings, self.device) if limited else None,
+            getattr(integrator, "clamp", None),
+            getattr(integrator, "strict", False),
+        )
 
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, or as many as ``on_progress`` lets."""
+        self.on_progress = on_progress
+        if self.loop is not None:
+            try:
+                self._looped(self.loop)
+                return self.result()
+            except Unsupported as error:
+                self.eager.append(f"all stages: {error}")
+                say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
+                self._begin()
         pixels = self.width * self.height
-        total = pixels * self.settings.render.spp
         lanes = lanes_for(self.settings, self.device)
         for first, count, sample, samples, ends in chunks_of(self.settings, lanes, self.film.randomizations, pixels):
             self._chunk(first, count, sample, samples)
-            self.done += count * samples
-            if on_progress is not None:
-                seconds = time.perf_counter() - self.start
-                if (
-                    on_progress(Progress(self.done, total, self.tally.rays, seconds, ends, self.result))
-                    and self.done < total
-                ):
-                    break
+            if self._advanced(count * samples, ends):
+                break
         return self.result()
+
+    def _advanced(self, samples: int, ends: bool) -> bool:
+        """Tell of progress; returns whether to stop."""
+        self.done += samples
+        total = self.width * self.height * self.settings.render.spp
+        if self.on_progress is None:
+            return False
+        seconds = time.perf_counter() - self.start
+        state = Progress(self.done, total, self.tally.rays, seconds, ends, self.result)
+        return bool(self.on_progress(state)) and self.done < total
+
+    def _looped(self, loop: Loop) -> None:
+        pixels = self.width * self.height
+
+        def each(share: Share) -> bool:
+            self.tally.rays += share.tally.rays
+            self.tally.truncated += share.tally.truncated
+            self.bad += share.bad
+            self.light += torch.tensor(share.light, dtype=torch.float64)
+            return self._advanced(share.samples, self.done + share.samples == pixels * (first + samples))
+
+        for first, samples in _passes(self.settings.render.spp, self.film.randomizations):
+            if not loop.run(first, samples, each):
+                break
 
     def _chunk(self, first: int, count: int, sample: int, samples: int) -> None:
         if self.wave.limits is not None:
@@ -385,4 +478,5 @@ class Run:
             clamped=clamped,
             relmse=None if aov else self.film.relmse(),
             complete=self.done == pixels * self.settings.render.spp,
+            eager=tuple(self.eager),
         )

@@ -9,10 +9,10 @@ from torchpt.integrators.path import partition
 from torchpt.integrators.search import Search
 from torchpt.integrators.surfaces import parameters_at, shading_normal, spot_at
 from torchpt.math.vectors import take
-from torchpt.records import PathState, World, rows
+from torchpt.records import Hit, PathState, World, rows
 from torchpt.shapes import interact, surface_uv
 
-__all__ = ["CHANNELS", "NAMES", "first_hit"]
+__all__ = ["CHANNELS", "NAMES", "first_hit", "values"]
 
 #: Layers and how many channels each has. A miss is 0 in all of them.
 CHANNELS = {"albedo": 3, "normal": 3, "depth": 1, "position": 3, "uv": 2, "object_id": 1}
@@ -39,22 +39,38 @@ def first_hit(
     _, groups = partition(world, hit)
     for model, index in groups:
         found = rows(hit, index)
-        at = interact(world, take(state.o, index), take(state.d, index), found)
-        spot = spot_at(world, model, at, pixel)
-        values: dict[str, Tensor] = {}
-        if "albedo" in names:
-            parameters = parameters_at(world, model, take(world.material, at.slot), at, spot)
-            values["albedo"] = world.models[model].albedo(parameters)
-        if "normal" in names:
-            values["normal"] = shading_normal(world, model, take(state.d, index), at, spot)
-        if "uv" in names:
-            values["uv"] = surface_uv(world, at)
-        if "depth" in names:
-            values["depth"] = found.t[None]
-        if "position" in names:
-            values["position"] = at.p + centre.to(dtype)[:, None]
-        if "object_id" in names:
-            values["object_id"] = take(world.object_id, at.slot).to(dtype)[None]
-        for name, value in values.items():
+        here = values(names, world, model, take(state.o, index), take(state.d, index), found, centre, dtype, pixel)
+        for name, value in here.items():
             layers[name].scatter_(1, index.expand(len(value), -1), value)
     return layers
+
+
+def values(
+    names: tuple[str, ...],
+    world: World,
+    model: int,
+    o: Tensor,
+    d: Tensor,
+    hit: Hit,
+    centre: Tensor,
+    dtype: torch.dtype,
+    pixel: Tensor | None,
+) -> dict[str, Tensor]:
+    """The layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of one model; see :func:`first_hit`."""
+    at = interact(world, o, d, hit)
+    spot = spot_at(world, model, at, pixel)
+    found: dict[str, Tensor] = {}
+    if "albedo" in names:
+        parameters = parameters_at(world, model, take(world.material, at.slot), at, spot)
+        found["albedo"] = world.models[model].albedo(parameters)
+    if "normal" in names:
+        found["normal"] = shading_normal(world, model, d, at, spot)
+    if "uv" in names:
+        found["uv"] = surface_uv(world, at)
+    if "depth" in names:
+        found["depth"] = hit.t[None]
+    if "position" in names:
+        found["position"] = at.p + centre.to(dtype)[:, None]
+    if "object_id" in names:
+        found["object_id"] = take(world.object_id, at.slot).to(dtype)[None]
+    return found

@@ -17,14 +17,15 @@ from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import Tally, gather_light, partition
 from torchpt.integrators.search import Search
 from torchpt.integrators.split_sum import under
+from torchpt.integrators.stages import Plan
 from torchpt.lights.choice import ByTree
 from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import dot
-from torchpt.records import Lights, PathState, World, rows
+from torchpt.records import Hit, Lights, PathState, Shadow, World, rows
 from torchpt.samplers import salts
 from torchpt.shapes import interact
 
-__all__ = ["Preview", "first_hit", "without_environment"]
+__all__ = ["Preview", "first_hit", "shaded", "without_environment"]
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,6 @@ def first_hit(stages: Stages, preview: Preview, accel: Accel, state: PathState) 
     """Radiance ``(3, N)`` along camera rays ``state``, and what it took."""
     plan, world = stages.plan, stages.world
     search = Search(accel, world, plan.sampler, plan.dtype)
-    local = replace(world, lights=without_environment(world.lights))
     slide = plan.attached or plan.dtype == torch.float64
     hit = search.nearest(state, 1)
     tally = Tally(rays=len(state.lane))
@@ -69,22 +69,40 @@ def first_hit(stages: Stages, preview: Preview, accel: Accel, state: PathState) 
     gather_light(stages, state, hit, ends, slide)
     salt = salts(1, state.lane.device)
     for model, index in groups:
-        here, met = rows(state, index), rows(hit, index)
-        if met.chance is not None:
-            here = replace(here, throughput=here.throughput * met.chance)
-        at = interact(world, here.o, here.d, met, slide)
-        surface, shadow = pure.shade(plan, local, model, here, at, salt, stages.pixel)
-        radiance = torch.zeros_like(here.radiance)
-        if preview.sky is not None:
-            n, v = preview.turned(surface.frame.n), preview.turned(-here.d)
-            radiance = here.throughput * under(preview.sky, world.models[model], surface.parameters, n, v)
-            if surface.shown is not None:
-                radiance = radiance * surface.shown
+        radiance, shadow = shaded(
+            plan, world, preview, model, rows(state, index), rows(hit, index), salt, stages.pixel, slide
+        )
         if shadow is not None:
             tally.rays += len(shadow.t_max)
             radiance = torch.addcmul(radiance, shadow.radiance, search.clear(shadow))
         state.radiance.scatter_add_(1, index.expand(3, -1), radiance)
     return state.radiance, tally
+
+
+def shaded(
+    plan: Plan,
+    world: World,
+    preview: Preview,
+    model: int,
+    state: PathState,
+    hit: Hit,
+    salts: Tensor,
+    pixel: Tensor | None,
+    slide: bool,
+) -> tuple[Tensor, Shadow | None]:
+    """What the environment brings to surfaces of one model ``(3, n)``, and the shadow rays to the other lights."""
+    local = replace(world, lights=without_environment(world.lights))
+    if hit.chance is not None:
+        state = replace(state, throughput=state.throughput * hit.chance)
+    at = interact(world, state.o, state.d, hit, slide)
+    surface, shadow = pure.shade(plan, local, model, state, at, salts, pixel)
+    radiance = torch.zeros_like(state.radiance)
+    if preview.sky is not None:
+        n, v = preview.turned(surface.frame.n), preview.turned(-state.d)
+        radiance = state.throughput * under(preview.sky, world.models[model], surface.parameters, n, v)
+        if surface.shown is not None:
+            radiance = radiance * surface.shown
+    return radiance, shadow
 
 
 def without_environment(lights: Lights | None) -> Lights | None:

@@ -149,9 +149,7 @@ def _remainder(block: Block, ty: str, a: str, b: str) -> str:
         return block.sub(ty, a, block.mul(ty, _quotient(block, ty, a, b, "floor"), b))
     r = block.op(f"frem {block.vector(ty)} {a}, {b}")
     zero = block.constant(ty, 0.0)
-    other = block.op(
-        f"xor <{WIDTH} x i1> {block.compare('olt', ty, r, zero)}, {block.compare('olt', ty, b, zero)}"
-    )
+    other = block.op(f"xor <{WIDTH} x i1> {block.compare('olt', ty, r, zero)}, {block.compare('olt', ty, b, zero)}")
     wrong = block.op(f"and <{WIDTH} x i1> {other}, {block.compare('une', ty, r, zero)}")
     return block.select(ty, wrong, block.add(ty, r, b), r)
 

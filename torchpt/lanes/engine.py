@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Function", "Target", "cache_folder", "compiled", "host", "seconds"]
+__all__ = ["Function", "Target", "cache_folder", "compiled", "counts", "estimates", "host", "seconds"]
 
 #: Enters every key: entries of another form are never read.
 _FORM = "1"
@@ -47,7 +47,7 @@ class Function:
 
 
 def _llvm() -> Any:
-    """llvmlite's binding, ready for this machine."""
+    """Llvmlite's binding, ready for this machine."""
     import llvmlite.binding as llvm
 
     if not _state["ready"]:
@@ -63,6 +63,11 @@ def host() -> Target:
         llvm = _llvm()
         _state["host"] = Target(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
     return _state["host"]
+
+
+def estimates() -> bool:
+    """Whether this machine has AVX-512's estimates of reciprocals."""
+    return "+avx512f" in host().features.split(",")
 
 
 def seconds() -> float:

@@ -49,9 +49,7 @@ def lanewise(
     def run(*arguments: Tensor) -> list[Tensor]:
         inputs = [x.contiguous() for x in arguments]
         count = inputs[0].shape[-1]
-        outputs = [
-            torch.empty(*shape, count, dtype=x.dtype) for shape, x in zip(shapes, results, strict=True)
-        ]
+        outputs = [torch.empty(*shape, count, dtype=x.dtype) for shape, x in zip(shapes, results, strict=True)]
         words = [0] * len(HEAD)
         words[HEAD.index("tables")] = tables.address
         for x in (*inputs, *outputs):

@@ -247,9 +247,7 @@ def _pow(b: Block, ty: str, x: str, y: str) -> str:
     negative = b.compare("olt", "d", p, zero)
     whole = b.compare("oeq", "d", b.call("llvm.rint", "d", q), q)
     half = b.mul("d", q, b.constant("d", 0.5))
-    odd = b.op(
-        f"and <{WIDTH} x i1> {whole}, " + b.compare("one", "d", b.call("llvm.rint", "d", half), half)
-    )
+    odd = b.op(f"and <{WIDTH} x i1> {whole}, " + b.compare("one", "d", b.call("llvm.rint", "d", half), half))
     mirrored = b.select("d", odd, b.negative("d", found), found)
     missing = b.op(
         f"and <{WIDTH} x i1> {b.compare('one', 'd', b.call('llvm.rint', 'd', q), q)}, "
@@ -314,9 +312,7 @@ def _atan2(b: Block, ty: str, y: str, x: str) -> str:
     u, v = _absolute(b, ty, y), _absolute(b, ty, x)
     inf = b.constant(ty, math.inf)
     # Both infinite: as if both were 1. Both zero: as if the quotient were 0.
-    both = b.op(
-        f"and <{WIDTH} x i1> {b.compare('oeq', ty, u, inf)}, {b.compare('oeq', ty, v, inf)}"
-    )
+    both = b.op(f"and <{WIDTH} x i1> {b.compare('oeq', ty, u, inf)}, {b.compare('oeq', ty, v, inf)}")
     u, v = (b.select(ty, both, b.constant(ty, 1.0), w) for w in (u, v))
     none = b.compare("oeq", ty, b.extreme("max", ty, u, v), b.constant(ty, 0.0))
     v = b.select(ty, none, b.constant(ty, 1.0), v)

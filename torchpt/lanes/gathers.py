@@ -145,7 +145,7 @@ def _matrix(tracer: Tracer, tensor: Tensor) -> np.ndarray:
 
 def _product(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, start: Tensor | None) -> None:
     graph, ty = tracer.graph, DTYPES[out.dtype]
-    if tracer.is_traced(a) and tracer.get(a).lane == 1 or tracer.is_traced(b) and tracer.get(b).lane == 0:
+    if (tracer.is_traced(a) and tracer.get(a).lane == 1) or (tracer.is_traced(b) and tracer.get(b).lane == 0):
         raise Unsupported("a sum over lanes")
     x, y = _matrix(tracer, a), _matrix(tracer, b)
     lane = tracer.lane_axis(out.shape)

@@ -74,6 +74,7 @@ class Sinks:
         count: masks whose lanes are counted, and by which counter.
         store: result tensors.
         shift: counter whose first value is added to the places of ``write``.
+        shadows: how many shadow rays each lane asks for.
     """
 
     write: list[tuple[int, int]] = field(default_factory=list)
@@ -83,6 +84,7 @@ class Sinks:
     count: list[tuple[int, int]] = field(default_factory=list)
     store: list[Store] = field(default_factory=list)
     shift: int | None = None
+    shadows: int = 0
 
     def roots(self) -> list[int]:
         """The nodes that are asked for."""
@@ -214,7 +216,9 @@ def _entry(
     for k in range(len(sinks.store)):
         argument(f"out{k}")
         argument(f"out{k}s", "i64")
-    read = {extra[0] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op in ("gather", "element", "search")}
+    read = {
+        extra[0] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op in ("gather", "element", "search")
+    }
     for k in sorted(read):
         if k >= tables:
             raise Unsupported("a table that is not there")
@@ -385,7 +389,9 @@ def _sorted(graph: Graph, needed: list[int]) -> Block:
         ]
         at = block.call("llvm.umin", "i", block.add("i", "%base", block.splat("i", "%step")), last)
         entry = block.gather(element, "%table", at)
-        below = block.compare(("ole" if right else "olt") if ty in "fd" else ("sle" if right else "slt"), ty, entry, "%value")
+        below = block.compare(
+            ("ole" if right else "olt") if ty in "fd" else ("sle" if right else "slt"), ty, entry, "%value"
+        )
         further = block.add("i", "%base", block.splat("i", "%half"))
         block.lines += [
             f"  %better = select <{WIDTH} x i1> {below}, {places} {further}, {places} %base",

@@ -104,7 +104,10 @@ class _Search(Block):
             f"  %{kind}_p = phi {_I} [ {prim}, %{before} ], [ %{kind}_p1, %{kind} ]",
         ]
         found, hit = self._ball(kind) if kind == "sphere" else self._planar(kind)
-        tests = [self.compare("ogt", "f", found, self.constant("f", 0.0)), self.compare("olt", "f", found, f"%{kind}_t")]
+        tests = [
+            self.compare("ogt", "f", found, self.constant("f", 0.0)),
+            self.compare("olt", "f", found, f"%{kind}_t"),
+        ]
         for test in tests:
             hit = test if hit is None else self.op(f"and {_B} {hit}, {test}")
         # A ray that meets anything at all is done: no distance is below the one it has then.

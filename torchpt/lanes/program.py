@@ -4,16 +4,66 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpt.lanes.graph import Unsupported
-from torchpt.lanes.tracing import Source, Step, Table
+from torchpt.lanes.tracing import Guard, Source, Step, Table
 
-__all__ = ["Tables", "bound", "laid_out", "replayed"]
+__all__ = ["Program", "Tables", "bound", "holds", "laid_out", "replayed", "signature"]
+
+
+@dataclass(frozen=True)
+class Program:
+    """A stage compiled for all records of one structure.
+
+    Attributes:
+        call: its machine code, see :class:`torchpt.lanes.engine.Function`.
+        tables: what it reads.
+        steps: the prologue, which makes some of that from leaves.
+        held: tensors of the program's own.
+        guards: numbers that must be what they were.
+        uniforms: names of the inputs that all lanes share.
+        lists: how many lists of places it writes.
+        counters: how many counters it has.
+        tensors: how many input tensors.
+        results: how many result tensors.
+        shadows: how many shadow rays each lane asks for.
+        nodes: how many of its nodes each file of the package asked for.
+    """
+
+    call: Any
+    tables: tuple[Table, ...]
+    steps: tuple[Step, ...]
+    held: tuple[Tensor, ...]
+    guards: tuple[Guard, ...]
+    uniforms: tuple[str, ...]
+    lists: int
+    counters: int
+    tensors: int
+    results: int
+    shadows: int
+    nodes: Mapping[str, int]
+
+    def leaves(self) -> set[str]:
+        """Paths of the leaves that enter its tables."""
+        found: set[str] = set()
+
+        def visit(value: Any) -> None:
+            if isinstance(value, Source):
+                if value.kind == "leaf":
+                    found.add(str(value.name))
+            elif isinstance(value, list | tuple):
+                for x in value:
+                    visit(x)
+
+        for step in self.steps:
+            visit((step.args, tuple(step.kwargs.values())))
+        visit([table.source for table in self.tables])
+        return found
 
 
 @dataclass(frozen=True)
@@ -102,3 +152,25 @@ def bound(
         words += [found.data_ptr(), plain.numel() if table.axis is None else plain.shape[table.axis]]
     block = (ctypes.c_int64 * max(len(words), 1))(*words)
     return Tables(ctypes.addressof(block), (block, keep))
+
+
+def holds(program: Program, leaves: Mapping[str, Tensor]) -> bool:
+    """Whether the numbers that a trace relied on are the same for other leaves."""
+    if not program.guards:
+        return True
+    tensor = replayed(program.steps, program.held, leaves)
+    return all(tensor(guard.source).item() == guard.value for guard in program.guards)
+
+
+def signature(record: Any) -> Any:
+    """What a trace may ask of a record beside the numbers in its tensors: hashable."""
+    if isinstance(record, Tensor):
+        return record.dtype, tuple(record.shape)
+    if isinstance(record, dict):
+        return tuple((key, signature(value)) for key, value in record.items())
+    if isinstance(record, tuple | list):
+        return tuple(signature(value) for value in record)
+    if is_dataclass(record) and not isinstance(record, torch.nn.Module | type):
+        values = tuple((field.name, signature(getattr(record, field.name))) for field in fields(record))
+        return type(record), values
+    return record

@@ -23,10 +23,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchpt.lanes.tracing import tracing
 from torchpt.math.angles import azimuth
 from torchpt.math.vectors import cross, dot
 from torchpt.math.warps import uniform_triangle
-from torchpt.lanes.tracing import tracing
 from torchpt.native.operators import choose, operator
 
 __all__ = [

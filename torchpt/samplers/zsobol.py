@@ -51,7 +51,7 @@ def key(pixel: Tensor, point: Tensor, seed: Tensor, bits: Tensor, width: Tensor)
     size = odd + 2 * DIGITS
     place = (curve & ((torch.ones_like(size) << size) - 1)) << (1 - odd)
     block = mix(mix((curve >> size).to(torch.int32)) + ((curve >> (size + 32)).to(torch.int32) << 16))
-    return torch.stack((mix(block ^ seed), (place - (odd << 31)).to(torch.int32)))
+    return torch.stack((mix(block ^ seed), (place | -(odd << 31)).to(torch.int32)))
 
 
 def _index(word: Tensor, state: Tensor) -> Tensor:

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import torch
 
 from torchpt.accel import Accel
+from torchpt.integrators.aov import CHANNELS
 from torchpt.integrators.loop.kernels import PLACE, Kernel, Kernels
-from torchpt.integrators.loop.rows import Rows
+from torchpt.integrators.loop.rows import HIT, Memory, Rows
 from torchpt.integrators.path import ENDLESS, Tally
 from torchpt.integrators.search import PASSES
 from torchpt.lanes.block import WIDTH
 from torchpt.lanes.kernel import CAPACITY, HEAD
+from torchpt.records import Hit, PathState
 from torchpt.samplers import salts
 
 __all__ = ["LANES", "Chunk", "Worker"]
 
 #: Lanes of a chunk.
 LANES = CAPACITY - WIDTH
+_STATE = tuple(field.name for field in fields(PathState))
 _WORD = {name: k for k, name in enumerate(HEAD)}
 
 
@@ -35,13 +38,8 @@ class Chunk:
     samples: int
 
 
-class _Memory:
-    """Rows of 32-bit words, each with some to spare: kernels write whole vectors."""
-
-    def __init__(self, rows: int, columns: int = CAPACITY) -> None:
-        self.words = np.zeros((rows, columns), np.int32)
-        self.floats = self.words.view(np.float32)
-        self.address = self.words.ctypes.data
+def _none(state: PathState) -> Hit:
+    raise AssertionError("hits are found between stages where there is no tape")
 
 
 class Worker:
@@ -53,11 +51,12 @@ class Worker:
 
     def __init__(self, kernels: Kernels) -> None:
         self.kernels, self.wave = kernels, kernels.wave
-        self._arenas = [_Memory(kernels.state.count) for _ in range(2)]
-        self._passed = [_Memory(kernels.passed.count) for _ in range(2)] if kernels.veiled else []
+        self._arenas = [Memory(kernels.state.count) for _ in range(2)]
+        self._passed = [Memory(kernels.passed.count) for _ in range(2)] if kernels.veiled else []
         count = kernels.models + 2
-        self._lists = [[_Memory(1) for _ in range(count)] for _ in range(2)]
-        self.slots = _Memory(3)
+        self._lists = [[Memory(1) for _ in range(count)] for _ in range(2)]
+        self.slots = Memory(3)
+        self.shown: Memory | None = None
         self._counters = np.zeros(count + 4, np.int64)
         self._place = np.zeros(len(PLACE), np.int32)
         self._calls: dict[int, tuple[Any, Any, int]] = {}
@@ -69,13 +68,68 @@ class Worker:
         self._start(chunk)
         tally = Tally()
         count = chunk.pixels * chunk.samples
-        if self.kernels.fused:
+        if self.wave.preview is not None:
+            self._previewed(count, tally)
+        elif self.kernels.fused:
             self._fused(count, tally)
         else:
             self._searched(count, tally)
         return tally
 
+    def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
+        """Fills ``shown`` with layers of the first surfaces, channel after channel; returns how many rays it took."""
+        self._start(chunk)
+        kernels, count = self.kernels, chunk.pixels * chunk.samples
+        channels = sum(CHANNELS[name] for name in names)
+        if self.shown is None or len(self.shown.words) != channels:
+            self.shown = Memory(channels)
+        self.shown.words[:, :count] = 0
+        here, lists = self._arenas[0], self._lists[0]
+        self._clear()
+        self._name_salts(0)
+        self._run(kernels.generate(), count, here, here, lists=lists)
+        if not kernels.fused:
+            self._nearest(here, count, 1)
+            self._clear()
+            self._run(kernels.settle(False), count, here, here, lists=lists)
+        _, places = self._found()
+        for model, lanes in enumerate(self._groups(places)):
+            if lanes:
+                named = lists[model] if kernels.listed else None
+                self._run(kernels.layers(model, names), lanes, here, here, named, slots=self.shown)
+        return count
+
     # -- the loop over depth
+
+    def _previewed(self, count: int, tally: Tally) -> None:
+        """The first surfaces under prefiltered maps, and other lights with their shadows."""
+        kernels = self.kernels
+        here, there = self._arenas
+        now, then = self._lists
+        self._name_salts(0)
+        self._run(kernels.generate(), count, here, here)
+        tally.rays += count
+        self._nearest(here, count, 1)
+        self._clear()
+        self._run(kernels.settle(False), count, here, here, lists=now)
+        _, places = self._found()
+        if not self._ends(here, now, count, places, 1, tally):
+            return
+        self._name_salts(1)
+        done = 0
+        for model, lanes in enumerate(places[: kernels.models]):
+            if lanes:
+                self._counters[0] = done
+                kernel = kernels.preview(model)
+                self._run(kernel, lanes, here, there, now[model])
+                tally.rays += lanes * kernel.program.shadows
+                done += lanes
+        shadow = "shadow_o" in kernels.state
+        if shadow:
+            self._light(there, done)
+        _row(there.words, kernels.state, "prim", 1)[0][:done] = -1
+        self._clear()
+        self._run(kernels.settle(shadow), done, there, there, lists=then)
 
     def _start(self, chunk: Chunk) -> None:
         wave, sampler = self.wave, self.wave.sampler
@@ -102,9 +156,9 @@ class Worker:
             live, places = self._found()
             if not self._ends(here, now, live, places, depth, tally):
                 return
-            tally.rays += self._bounced(places) * (2 if self.wave.stages.world.lights is not None else 1)
+            tally.rays += self._bounced(places)
             self._clear()
-            self._bounce(here, there, now, then, places, depth)
+            tally.rays += self._bounce(here, there, now, then, places, depth)
             here, there, now, then = there, here, then, now
             depth += 1
 
@@ -125,17 +179,14 @@ class Worker:
                 return
             self._clear()
             count = self._bounced(places)
-            self._bounce(here, there, now, then, places, depth)
+            tally.rays += self._bounce(here, there, now, then, places, depth)
             shadow = "shadow_o" in kernels.state
             if shadow:
-                tally.rays += count
                 self._light(there, count)
             here, there, now, then = there, here, then, now
             depth += 1
 
-    def _ends(
-        self, here: _Memory, lists: list[_Memory], live: int, places: list[int], depth: int, tally: Tally
-    ) -> bool:
+    def _ends(self, here: Memory, lists: list[Memory], live: int, places: list[int], depth: int, tally: Tally) -> bool:
         """Gathers light where lanes met it, and ends paths; returns whether any go on."""
         kernels, limits = self.kernels, self.wave.limits
         assert limits is not None
@@ -160,26 +211,66 @@ class Worker:
         return sum(self._groups(places))
 
     def _bounce(
-        self, here: _Memory, there: _Memory, now: list[_Memory], then: list[_Memory], places: list[int], depth: int
-    ) -> None:
-        """One vertex of all paths; those that go on are together in the other arena."""
+        self, here: Memory, there: Memory, now: list[Memory], then: list[Memory], places: list[int], depth: int
+    ) -> int:
+        """One vertex of all paths, which are together in the other arena then; returns how many shadow rays they ask for."""
         kernels, limits = self.kernels, self.wave.limits
         assert limits is not None
         self._name_salts(depth)
-        done = 0
+        done = shadows = 0
         groups = [self._live] if not kernels.listed else places[: kernels.models]
         for model, count in enumerate(groups):
             if not count:
                 continue
             if not kernels.fused:
                 self._counters[0] = done
-            kernel = kernels.bounce(model, depth >= limits.rr_depth)
-            self._run(kernel, count, here, there, now[model] if kernels.listed else None, lists=then)
+            roulette = depth >= limits.rr_depth
+            if model in kernels.eager:
+                shadows += self._bounce_eagerly(model, roulette, here, there, now[model], count, done, depth)
+            else:
+                kernel = kernels.bounce(model, roulette)
+                self._run(kernel, count, here, there, now[model] if kernels.listed else None, lists=then)
+                shadows += count * kernel.program.shadows
             done += count
+        return shadows
+
+    def _bounce_eagerly(
+        self,
+        model: int,
+        roulette: bool,
+        here: Memory,
+        there: Memory,
+        places: Memory,
+        count: int,
+        done: int,
+        depth: int,
+    ) -> int:
+        """The same by tensor operations, for a model that no kernel can be made of."""
+        kernels, rows = self.kernels, self.kernels.state
+        lanes = places.words[0, :count]
+        with torch.no_grad():
+            state = PathState(**{"eta": None, "p": None, "n": None, **rows.take(here, lanes, _STATE)})  # type: ignore[arg-type]
+            hit = Hit(**rows.take(here, lanes, tuple(HIT)))
+            after, _, shadow = self.wave.stages.bounce(
+                model, roulette, False, _none, state, hit, torch.arange(count), salts(depth, torch.device("cpu"))
+            )
+        values = {name: getattr(after, name) for name in _STATE}
+        values |= rows.take(here, lanes, ("weight",))
+        if "shadow_o" in rows:
+            light = torch.zeros_like(after.o) if shadow is None else shadow.radiance
+            values |= {
+                "shadow_o": after.o if shadow is None else shadow.o,
+                "shadow_d": after.d if shadow is None else shadow.d,
+                "shadow_t": torch.zeros_like(after.t_max) if shadow is None else shadow.t_max,
+                "shadow_radiance": light,
+                "clear": torch.ones_like(after.t_max),
+            }
+        rows.put(there, done, values)
+        return 0 if shadow is None else count
 
     # -- the search
 
-    def _nearest(self, here: _Memory, count: int, depth: int) -> None:
+    def _nearest(self, here: Memory, count: int, depth: int) -> None:
         rows = self.kernels.state
         self._search(here, rows, "o", "d", "t_max", count)
         if not self.kernels.veiled:
@@ -197,7 +288,7 @@ class Worker:
             self._run(self.kernels.meet(True), left, source, target, slots=here)
             source, target = target, source
 
-    def _light(self, there: _Memory, count: int) -> None:
+    def _light(self, there: Memory, count: int) -> None:
         """How much of the light of shadow rays arrives."""
         rows = self.kernels.state
         if not self.kernels.veiled:
@@ -213,7 +304,7 @@ class Worker:
             self._run(self.kernels.through(), left, source, target, slots=there)
             source, target = target, source
 
-    def _search(self, memory: _Memory, rows: Rows, o: str, d: str, t_max: str, count: int) -> None:
+    def _search(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: int) -> None:
         accel: Accel = self.wave.accel
         floats, words = memory.floats, memory.words
         accel.nearest(
@@ -247,15 +338,16 @@ class Worker:
         self,
         kernel: Kernel,
         count: int,
-        source: _Memory,
-        target: _Memory,
-        places: _Memory | None = None,
-        lists: list[_Memory] | None = None,
-        slots: _Memory | None = None,
+        source: Memory,
+        target: Memory,
+        places: Memory | None = None,
+        lists: list[Memory] | None = None,
+        slots: Memory | None = None,
     ) -> None:
+        program = kernel.program
         prepared = self._calls.get(id(kernel))
         if prepared is None:
-            words = (ctypes.c_int64 * (len(HEAD) + len(kernel.uniforms) + kernel.lists))()
+            words = (ctypes.c_int64 * (len(HEAD) + len(program.uniforms) + program.lists))()
             words[_WORD["counters"]] = self._counters.ctypes.data
             words[_WORD["tables"]] = kernel.tables.address
             if self.kernels.search is not None:
@@ -267,12 +359,12 @@ class Worker:
             words[2] = places.address
         out = self.slots if slots is None else slots
         words[3], words[4] = out.address, out.words.shape[1]
-        for k, name in enumerate(kernel.uniforms):
+        for k, name in enumerate(program.uniforms):
             words[len(HEAD) + k] = self._uniforms[name]
         if lists is not None:
-            for k in range(kernel.lists):
-                words[len(HEAD) + len(kernel.uniforms) + k] = lists[k].address
-        kernel.call(address, count)
+            for k in range(program.lists):
+                words[len(HEAD) + len(program.uniforms) + k] = lists[k].address
+        program.call(address, count)
 
 
 def _row(memory: np.ndarray, rows: Rows, name: str, count: int) -> np.ndarray:

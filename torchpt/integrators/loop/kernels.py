@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,15 +13,16 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
-from torchpt.integrators import stages
+from torchpt.integrators import aov, ibl, stages
 from torchpt.integrators.loop.rows import HIT, PASS, SHADOW, Rows
 from torchpt.integrators.search import beyond, passing
 from torchpt.lanes import engine, gathers, pointwise, views  # noqa: F401  (they register what they lower)
-from torchpt.lanes.kernel import CAPACITY, HEAD, Note, Pack, Scatter, Sinks, Store, text
+from torchpt.lanes.graph import Unsupported
+from torchpt.lanes.kernel import Note, Pack, Scatter, Sinks, Store, text
 from torchpt.lanes.packet import KINDS, packet_search
-from torchpt.lanes.program import Tables, bound
+from torchpt.lanes.program import Program, Tables, bound, holds, signature
 from torchpt.lanes.tracing import LANES, Tracer
-from torchpt.records import Hit, PathState
+from torchpt.records import Hit, PathState, Shadow
 from torchpt.samplers import KINDS as SAMPLERS
 from torchpt.samplers import Dimension, Draws, key_of
 
@@ -36,27 +38,16 @@ PLACE = ("first", "pixels", "group", "point", "randomizations", "x", "y", "crop"
 
 @dataclass(frozen=True)
 class Kernel:
-    """A stage's machine code with its tables.
+    """A stage's machine code with the tables of one scene."""
 
-    Attributes:
-        call: ``call(address of the arguments, lanes)``.
-        tables: what it reads.
-        uniforms: names of the inputs that all lanes share.
-        lists: how many lists of places it writes.
-        counters: how many counters it has.
-        tensors: how many input tensors.
-        results: how many result tensors.
-        nodes: how many of its nodes each file of the package asked for.
-    """
-
-    call: Any
+    program: Program
     tables: Tables
-    uniforms: tuple[str, ...]
-    lists: int
-    counters: int
-    tensors: int
-    results: int
-    nodes: dict[str, int]
+
+
+#: Programs by what they were traced for, the latest last; more than this many are not kept.
+MOST_PROGRAMS = 512
+_programs: dict[Any, Program] = {}
+_tracing = threading.Lock()
 
 
 def leaves_of(record: Any, path: str) -> Iterator[tuple[str, Tensor]]:
@@ -80,6 +71,7 @@ class Kernels:
     Args:
         wave: the render.
         fused: whether few primitives are searched inside the kernels; else rays are handed to the search structure.
+        before: kernels of another render, whose tables are taken over where they are made of the same tensors.
 
     Attributes:
         state: rows of a path.
@@ -88,9 +80,11 @@ class Kernels:
         around: whether something shines from outside.
         emitters: whether a ray may meet an emitter.
         listed: whether lanes are taken by lists: else all lanes of the arena are of the one model.
+        eager: models whose stage does what no kernel can, and what that is; they run as tensor operations.
+        seconds: spent on making kernels.
     """
 
-    def __init__(self, wave: Wave, fused: bool) -> None:
+    def __init__(self, wave: Wave, fused: bool, before: Kernels | None = None) -> None:
         self.wave, self.fused = wave, fused
         self.plan, self.world = wave.stages.plan, wave.stages.world
         self.numbers = wave.sampler.numbers(torch.device("cpu"))
@@ -100,7 +94,10 @@ class Kernels:
         self.emitters = table is not None and table.row_of_prim is not None
         self.listed = not fused or self.models > 1 or self.around
         self.veiled = world.opacity is not None
-        self.state, self.passed = _state_rows(wave, fused, self.veiled), Rows({**PASS, "clear": ((), "f"), **_key(wave), **HIT})
+        self.state, self.passed = (
+            _state_rows(wave, fused, self.veiled),
+            Rows({**PASS, "clear": ((), "f"), **_key(wave), **HIT}),
+        )
         self._leaves = dict(
             item
             for name, record in (
@@ -115,10 +112,32 @@ class Kernels:
             for item in leaves_of(record, name)
         )
         self._ids = {id(tensor): (path, tensor) for path, tensor in self._leaves.items()}
+        self._structure = (
+            signature(world), wave.camera.kind(), wave.filter.kind_of(), wave.sampler.kind, self.plan, fused,
+            signature(wave.preview), signature(self._leaves),
+        )  # fmt: skip
+        self._before = before if before is not None and before._structure == self._structure else None
         self._laid_out: dict[Any, Tensor] = {}
+        if self._before is not None:
+            old = self._before
+            same = {path for path, tensor in self._leaves.items() if old._leaves[path] is tensor}
+            self._laid_out |= {key: table for key, table in old._laid_out.items() if key[0] in same}
+            self._same, old._before = same, None
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
         self.search = _search_words(wave) if fused else None
+        self.seconds = 0.0
+        self.eager: dict[int, str] = {}
+
+    def probe(self, numbers: Iterable[int]) -> dict[int, str]:
+        """Which of the models' stages no kernel can be made of, and why."""
+        found = {}
+        for number in numbers:
+            try:
+                self.bounce(number, False)
+            except Unsupported as error:
+                found[number] = str(error)
+        return found
 
     # -- which list and counter is which
 
@@ -172,6 +191,16 @@ class Kernels:
         """How much light surfaces let through."""
         return self._get(("through",), self._through, fused=False)
 
+    def layers(self, model: int, names: tuple[str, ...]) -> Kernel:
+        """What the first surfaces are, where they are of a model."""
+        return self._get(
+            ("layers", model, names), lambda tracer: self._layers(tracer, model, names), listed=self.listed
+        )
+
+    def preview(self, model: int) -> Kernel:
+        """The first surfaces of a model under the environment's prefiltered maps."""
+        return self._get(("preview", model), lambda tracer: self._preview(tracer, model), listed=True, fused=False)
+
     def deposit(self, channels: int, clamp: bool) -> Kernel:
         """One sample of each pixel added to sums; those that are not finite are counted, and taken as black."""
         return self._get(
@@ -187,13 +216,34 @@ class Kernels:
         listed: bool = False,
         fused: bool | None = None,
     ) -> Kernel:
+        made = self._made.get(key)
+        if made is not None:
+            return made
         with self._lock:
             made = self._made.get(key)
             if made is None:
-                made = self._made[key] = self._make(build, listed, self.fused if fused is None else fused)
+                begin = time.perf_counter()
+                made = self._made[key] = self._make(key, build, listed, self.fused if fused is None else fused)
+                self.seconds += time.perf_counter() - begin
             return made
 
-    def _make(self, build: Callable[[Tracer], Sinks], listed: bool, fused: bool) -> Kernel:
+    def _make(self, key: tuple[Any, ...], build: Callable[[Tracer], Sinks], listed: bool, fused: bool) -> Kernel:
+        whole = key, self._structure
+        with _tracing:  # one at a time in a process: see torchpt.lanes.tracing.tracing
+            program = _programs.get(whole)
+            if program is None or not holds(program, self._leaves):
+                program = self._traced(build, listed, fused)
+                _programs.pop(whole, None)
+                _programs[whole] = program
+                if len(_programs) > MOST_PROGRAMS:
+                    del _programs[next(iter(_programs))]
+        before = None if self._before is None else self._before._made.get(key)
+        if before is not None and before.program is program and not program.held and program.leaves() <= self._same:
+            return before
+        tables = bound(program.tables, program.steps, program.held, self._leaves, self._laid_out)
+        return Kernel(program, tables)
+
+    def _traced(self, build: Callable[[Tracer], Sinks], listed: bool, fused: bool) -> Program:
         lanes = next(n for n in LANES if all(size % n for t in self._leaves.values() for size in t.shape))
         tracer = Tracer(lanes, self._ids)
         self._uniforms: list[str] = []
@@ -202,23 +252,25 @@ class Kernels:
             sinks = build(tracer)
         search = None
         if fused and any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes):
-            search = packet_search(_kinds(self.world.counts), "avx512f" in engine.host().features.split(",+"))
-        ir, needed = text(
-            tracer.graph, sinks, len(tracer.tables), len(self._uniforms), self._tensors, listed, search
-        )
+            search = packet_search(_kinds(self.world.counts), engine.estimates())
+        ir, needed = text(tracer.graph, sinks, len(tracer.tables), len(self._uniforms), self._tensors, listed, search)
         made = engine.compiled(ir)
         nodes: dict[str, int] = {}
         for node in needed:
             for file in tracer.graph.origins[node]:
                 nodes[file] = nodes.get(file, 0) + 1
-        return Kernel(
+        return Program(
             call=made.call,
-            tables=bound(tracer.tables, tracer.steps, tracer.held, self._leaves, self._laid_out),
+            tables=tuple(tracer.tables),
+            steps=tuple(tracer.steps),
+            held=tuple(tracer.held),
+            guards=tuple(tracer.guards),
             uniforms=tuple(self._uniforms),
             lists=sinks.lists(),
             counters=sinks.counters(),
             tensors=self._tensors,
             results=len(sinks.store),
+            shadows=sinks.shadows,
             nodes=nodes,
         )
 
@@ -260,7 +312,7 @@ class Kernels:
         Returns:
             The mask of the lanes that go on, and the notes of their places.
         """
-        graph, world = tracer.graph, self.world
+        world = self.world
         with tracer:
             key = torch.index_select(world.key, 0, world.slot(prim) + 1)
             met, alive = prim >= 0, state.t_max > 0
@@ -279,7 +331,6 @@ class Kernels:
         if self.around:
             notes.append(Note(tracer.nodes(out)[0], self.missed, counter + self.missed))
         sinks.scatter.append(self._ended(tracer, tracer.nodes(off)[0], state.lane, state.radiance, rest))
-        del graph
         return tracer.nodes(on)[0], notes
 
     def _with_hit(self, tracer: Tracer, sinks: Sinks, state: PathState, rest: dict[str, Tensor]) -> None:
@@ -370,8 +421,8 @@ class Kernels:
             after, _, shadow = stages.bounce(
                 self.plan, self.world, model, roulette, False, _none, state, hit, index, salts, self.wave.stages.pixel
             )
-        sinks = Sinks()
         if self.fused:
+            sinks = Sinks(shadows=int(shadow is not None))
             if shadow is not None:
                 blocked = _occluded(tracer, shadow.o, shadow.d, shadow.t_max)
                 with tracer:
@@ -379,22 +430,53 @@ class Kernels:
                 after = replace(after, radiance=light)
             self._with_hit(tracer, sinks, after, rest)
             return sinks
-        sinks.shift = 0
-        sinks.write += self._kept(tracer, after, rest)
-        if "shadow_o" in self.state:
-            with tracer:
-                one = torch.ones_like(state.t_max)
-                if shadow is None:
-                    nothing = torch.zeros_like(state.o)
-                    o, d, t_max, radiance = nothing, nothing, torch.zeros_like(state.t_max), nothing
-                else:
-                    o, d, t_max, radiance = shadow.o, shadow.d, shadow.t_max, shadow.radiance
-            sinks.write += self.state.nodes(
-                tracer, shadow_o=o, shadow_d=d, shadow_t=t_max, shadow_radiance=radiance
-            )
-            if "clear" in self.state:
-                sinks.write += self.state.nodes(tracer, clear=one)
+        return self._with_shadow(tracer, after, shadow, rest)
+
+    def _with_shadow(self, tracer: Tracer, state: PathState, shadow: Shadow | None, rest: dict[str, Tensor]) -> Sinks:
+        """Keep all lanes, with the shadow rays that are still to be searched."""
+        sinks = Sinks(shift=0, write=self._kept(tracer, state, rest), shadows=int(shadow is not None))
+        if "shadow_o" not in self.state:
+            return sinks
+        with tracer:
+            if shadow is None:
+                nothing = torch.zeros_like(state.o)
+                shadow = Shadow(nothing, nothing, torch.zeros_like(state.t_max), nothing)
+            one = torch.ones_like(state.t_max)
+        sinks.write += self.state.nodes(
+            tracer,
+            shadow_o=shadow.o,
+            shadow_d=shadow.d,
+            shadow_t=shadow.t_max,
+            shadow_radiance=shadow.radiance,
+            **({"clear": one} if "clear" in self.state else {}),
+        )
         return sinks
+
+    def _layers(self, tracer: Tracer, model: int, names: tuple[str, ...]) -> Sinks:
+        state, rest = self._state(tracer)
+        hit = self._hit(tracer)
+        wave = self.wave
+        with tracer:
+            found = aov.values(
+                names, self.world, model, state.o, state.d, hit, wave.centre, self.plan.dtype, wave.stages.pixel
+            )
+            if "weight" in rest:
+                found = {name: value if name in aov.NAMES else value * rest["weight"] for name, value in found.items()}
+        nodes = [node for name in names for node in tracer.nodes(found[name])]
+        return Sinks(scatter=[Scatter(-1, tracer.nodes(state.lane)[0], tuple(enumerate(nodes)), slots=True)])
+
+    def _preview(self, tracer: Tracer, model: int) -> Sinks:
+        salts = self._salts(tracer)
+        state, rest = self._state(tracer)
+        hit = self._hit(tracer)
+        assert self.wave.preview is not None
+        with tracer:
+            radiance, shadow = ibl.shaded(
+                self.plan, self.world, self.wave.preview, model, state, hit, salts, self.wave.stages.pixel, False
+            )
+            # No ray goes on: the lane ends where its shadow ray is known.
+            after = replace(state, radiance=state.radiance + radiance, t_max=torch.zeros_like(state.t_max))
+        return self._with_shadow(tracer, after, shadow, rest)
 
     def _meet(self, tracer: Tracer, again: bool) -> Sinks:
         salts = self._salts(tracer)
@@ -416,9 +498,7 @@ class Kernels:
             on = ~met
             behind = beyond(self.world, o, d, hit)
             whole = hit.t if before is None else hit.t + before
-        rows_on = self.passed.nodes(
-            tracer, pass_o=behind, pass_d=d, pass_t=t_max, before=whole, home=home, key=key
-        )
+        rows_on = self.passed.nodes(tracer, pass_o=behind, pass_d=d, pass_t=t_max, before=whole, home=home, key=key)
         sinks = Sinks(pack=[Pack(tracer.nodes(on)[0], tuple(rows_on), 0)])
         if again:
             found = self.state.nodes(tracer, t=whole, prim=hit.prim, u=hit.u, v=hit.v)
@@ -454,9 +534,7 @@ class Kernels:
     def _deposit(self, tracer: Tracer, channels: int, clamp: bool) -> Sinks:
         graph = tracer.graph
         self._tensors = 2
-        sample = tracer.lane(
-            torch.zeros(channels, tracer.lanes), lambda k: graph.node("tensor", "f", extra=(0, k))
-        )
+        sample = tracer.lane(torch.zeros(channels, tracer.lanes), lambda k: graph.node("tensor", "f", extra=(0, k)))
         total = tracer.lane(
             torch.zeros(channels, tracer.lanes, dtype=torch.float64), lambda k: graph.node("tensor", "d", extra=(1, k))
         )
@@ -535,7 +613,9 @@ def _nearest(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> tuple[Tenso
     graph = tracer.graph
     found = graph.node("nearest", "S", *_seven(tracer, o, d, t_max))
     results = []
-    for k, (dtype, ty) in enumerate(((torch.float32, "f"), (torch.int64, "l"), (torch.float32, "f"), (torch.float32, "f"))):
+    for k, (dtype, ty) in enumerate(
+        ((torch.float32, "f"), (torch.int64, "l"), (torch.float32, "f"), (torch.float32, "f"))
+    ):
         node = graph.node("part", ty, found, extra=k)
         results.append(tracer.lane(torch.zeros(tracer.lanes, dtype=dtype), lambda _, node=node: node))
     return results[0], results[1], results[2], results[3]
@@ -545,6 +625,3 @@ def _occluded(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
     """Whether shadow rays are blocked, found inside the kernel."""
     node = tracer.graph.node("occluded", "b", *_seven(tracer, o, d, t_max))
     return tracer.lane(torch.zeros(tracer.lanes, dtype=torch.bool), lambda _: node)
-
-
-assert CAPACITY and HEAD

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchpt.lanes.graph import DTYPES
+from torchpt.lanes.kernel import CAPACITY
 from torchpt.lanes.tracing import Tracer
 
-__all__ = ["HIT", "PASS", "SHADOW", "Rows"]
+__all__ = ["HIT", "PASS", "SHADOW", "Memory", "Rows"]
 
 #: Fields of a hit, of a shadow ray, and of a ray that goes on behind a surface that it passed.
 HIT = {"t": ((), "f"), "prim": ((), "l"), "u": ((), "f"), "v": ((), "f")}
@@ -18,6 +20,15 @@ SHADOW = {"shadow_o": ((3,), "f"), "shadow_d": ((3,), "f"), "shadow_t": ((), "f"
 PASS = {"pass_o": ((3,), "f"), "pass_d": ((3,), "f"), "pass_t": ((), "f"), "before": ((), "f"), "home": ((), "l")}
 
 _DTYPES = {ty: dtype for dtype, ty in DTYPES.items()}
+
+
+class Memory:
+    """Rows of 32-bit words, each with some to spare: kernels write whole vectors."""
+
+    def __init__(self, rows: int) -> None:
+        self.words = np.zeros((rows, CAPACITY), np.int32)
+        self.floats = self.words.view(np.float32)
+        self.address = self.words.ctypes.data
 
 
 class Rows:
@@ -62,6 +73,28 @@ class Rows:
 
             found[name] = tracer.lane(like, node)
         return found
+
+    def take(self, memory: Memory, lanes: np.ndarray, names: tuple[str, ...]) -> dict[str, Tensor]:
+        """Fields of some lanes as tensors; those that there are not are left out."""
+        found = {}
+        for name in names:
+            if name in self._fields:
+                shape, ty = self._fields[name]
+                held = memory.floats if ty == "f" else memory.words
+                first = self._first[name]
+                value = torch.from_numpy(held[first : first + math.prod(shape), lanes]).to(_DTYPES[ty])
+                found[name] = value.view(*shape, len(lanes))
+        return found
+
+    def put(self, memory: Memory, start: int, values: dict[str, Tensor | None]) -> None:
+        """Fields of consecutive lanes from tensors; those that there are not are left out."""
+        for name, value in values.items():
+            if name in self._fields and value is not None:
+                shape, ty = self._fields[name]
+                held = memory.floats if ty == "f" else memory.words
+                first = self._first[name]
+                rows = value.reshape(math.prod(shape), -1)
+                held[first : first + len(rows), start : start + rows.shape[1]] = rows.numpy()
 
     def nodes(self, tracer: Tracer, **fields: Tensor) -> list[tuple[int, int]]:
         """Rows and nodes of results by field; numbers that all lanes share are spread."""

@@ -1,0 +1,201 @@
+"""Which thread takes which samples, and how they add up to a picture."""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchpt.errors import RenderError
+from torchpt.film import Film
+from torchpt.integrators.aov import CHANNELS
+from torchpt.integrators.loop.chunk import LANES, Chunk, Worker
+from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.path import Tally
+from torchpt.lanes.block import WIDTH
+from torchpt.lanes.kernel import CAPACITY, HEAD
+
+__all__ = ["Loop", "Share"]
+
+#: Tasks of a pass for each thread, so that none waits long for the last one.
+TASKS = 6
+#: Fewest lanes that repay a task.
+FEWEST = 1024
+#: Seconds between two looks at signals.
+PATIENCE = 0.05
+
+
+@dataclass
+class Share:
+    """What a task brought beside its samples.
+
+    Attributes:
+        tally: rays and paths.
+        samples: camera samples taken.
+        bad: samples that were not finite.
+        light: before and after the clamp.
+    """
+
+    tally: Tally
+    samples: int = 0
+    bad: int = 0
+    light: tuple[float, float] = (0.0, 0.0)
+
+
+class Loop:
+    """A render's tasks over threads. A pixel's samples are summed in their order, whichever thread takes them.
+
+    Args:
+        kernels: of the render.
+        film: sums of radiance.
+        layers: sums of layers by name.
+        threads: how many.
+        lanes: most of a chunk; None: as many as caches like.
+        clamp: largest contribution of a path, or None.
+        strict: whether a sample that is not finite ends the render.
+    """
+
+    def __init__(
+        self,
+        kernels: Kernels,
+        film: Film,
+        layers: dict[str, Film],
+        threads: int,
+        lanes: int | None,
+        clamp: float | None,
+        strict: bool,
+    ) -> None:
+        self.kernels, self.film, self.layers = kernels, film, layers
+        self.threads, self.clamp, self.strict = threads, clamp, strict
+        self.lanes = LANES if lanes is None else max(1, min(lanes, LANES))
+        self._workers: list[Worker] = []
+        self._lock = threading.Lock()
+        self._stopped = False
+
+    def run(self, first: int, count: int, each: Callable[[Share], bool]) -> bool:
+        """Takes samples ``first .. first + count`` of every pixel.
+
+        Args:
+            first: sample.
+            count: how many.
+            each: called after every task, in the calling thread; returning True stops early.
+
+        Returns:
+            Whether all were taken.
+        """
+        pixels = list(self._blocks(count))
+        if self.threads == 1 or len(pixels) == 1:
+            return not any(each(self._task(start, size, first, count)) for start, size in pixels)
+        pool = ThreadPoolExecutor(min(self.threads, len(pixels)), thread_name_prefix="torchpt")
+        try:
+            waiting: set[Future[Share]] = {pool.submit(self._task, start, size, first, count) for start, size in pixels}
+            while waiting:
+                done, waiting = wait(waiting, PATIENCE, FIRST_COMPLETED)
+                for future in done:
+                    if not future.cancelled() and each(future.result()):
+                        self._stopped = True
+                        for other in waiting:
+                            other.cancel()
+            return not self._stopped
+        except BaseException:
+            self._stopped = True
+            raise
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def _blocks(self, samples: int) -> Iterator[tuple[int, int]]:
+        """Consecutive pixels of each task."""
+        pixels = self.film.width * self.film.height
+        size = -(-pixels // (self.threads * TASKS)) if self.threads > 1 else pixels
+        size = max(size, -(-FEWEST // samples))
+        size = min(-(-size // WIDTH) * WIDTH, self.lanes)
+        for start in range(0, pixels, size):
+            yield start, min(size, pixels - start)
+
+    def _task(self, start: int, size: int, first: int, count: int) -> Share:
+        with self._lock:
+            worker = self._workers.pop() if self._workers else Worker(self.kernels)
+        share = Share(Tally())
+        try:
+            step = max(self.lanes // size, 1)
+            for sample in range(first, first + count, step):
+                chunk = Chunk(start, size, sample, min(step, first + count - sample))
+                if self.kernels.wave.limits is not None:
+                    self._radiance(worker, chunk, share)
+                if self.layers:
+                    self._layers(worker, chunk, share)
+                share.samples += size * chunk.samples
+        finally:
+            with self._lock:
+                self._workers.append(worker)
+        return share
+
+    def _radiance(self, worker: Worker, chunk: Chunk, share: Share) -> None:
+        tally = worker.trace(chunk)
+        share.tally.rays += tally.rays
+        share.tally.truncated += tally.truncated
+        values = worker.slots.floats
+        used = values[:, : chunk.pixels * chunk.samples]
+        before = _total(used) if self.clamp is not None else 0.0
+        bad = self._deposit(worker, values, chunk, self.film, 3, self.clamp)
+        share.bad += bad
+        if self.clamp is not None:
+            share.light = share.light[0] + before, share.light[1] + _total(used)
+        if bad and self.strict:
+            raise self._not_finite(used, chunk)
+
+    def _layers(self, worker: Worker, chunk: Chunk, share: Share) -> None:
+        names = tuple(self.layers)
+        share.tally.rays += worker.layers(chunk, names)
+        assert worker.shown is not None
+        at = 0
+        for name in names:
+            channels = CHANNELS[name]
+            values = worker.shown.floats[at : at + channels]
+            self._deposit(worker, values, chunk, self.layers[name], channels, None)
+            at += channels
+
+    def _deposit(
+        self, worker: Worker, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None
+    ) -> int:
+        """Adds samples to a film in their order; returns how many were not finite."""
+        made = self.kernels.deposit(channels, clamp is not None)
+        kernel = made.program
+        counters = np.zeros(1, np.int64)
+        limit = np.array([clamp or 0.0], np.float32)
+        words = (ctypes.c_int64 * (len(HEAD) + len(kernel.uniforms) + 2 * (kernel.tensors + kernel.results)))()
+        words[HEAD.index("counters")] = counters.ctypes.data
+        words[HEAD.index("tables")] = made.tables.address
+        if kernel.uniforms:
+            words[len(HEAD)] = limit.ctypes.data
+        at = len(HEAD) + len(kernel.uniforms)
+        sums, n = film.sums, chunk.pixels
+        pixels = sums.shape[2]
+        for k in range(chunk.samples):
+            group = (chunk.first_sample + k) % film.randomizations
+            source = values.ctypes.data + 4 * k * n
+            total = sums.data_ptr() + 8 * (group * channels * pixels + chunk.first_pixel)
+            words[at : at + 6] = (source, CAPACITY, total, pixels, total, pixels)
+            if clamp is not None:
+                words[at + 6], words[at + 7] = source, CAPACITY
+            kernel.call(ctypes.addressof(words), n)
+            film.counted(chunk.first_pixel, n, group)
+            if chunk.first_sample + k == 0:
+                film.keep_first(values[:, :n], chunk.first_pixel)
+        return int(counters[0])
+
+    def _not_finite(self, used: np.ndarray, chunk: Chunk) -> RenderError:
+        place = int(np.flatnonzero(~np.isfinite(used).all(0))[0])
+        sample, pixel = divmod(place, chunk.pixels)
+        x0, y0, width, _ = self.kernels.wave.crop
+        pixel += chunk.first_pixel
+        x, y = pixel % width + x0, pixel // width + y0
+        return RenderError(f"integrator.strict: sample {chunk.first_sample + sample} of pixel ({x}, {y}) is not finite")
+
+
+def _total(values: np.ndarray) -> float:
+    return float(np.where(np.isfinite(values).all(0), values, 0.0).sum(dtype=np.float64))
