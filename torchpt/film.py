@@ -55,7 +55,8 @@ class Filter:
     def __init__(
         self, kind: str, radius: float, stddev: float, device: torch.device, b: float = 1 / 3, c: float = 1 / 3
     ) -> None:
-        self.kind, self.radius, self.signed, self._inverse = kind, radius, False, None
+        self.kind, self.signed, self._inverse = kind, False, None
+        self.radius = torch.tensor(radius, dtype=torch.float32, device=device)
         if kind in ("box", "tent"):
             return
         # Inverse of the cumulative profile, tabulated in float64 and read linearly.
@@ -67,16 +68,18 @@ class Filter:
         self._inverse = torch.from_numpy(inverse.astype(np.float32)).to(device)
         # The negative lobes are the outermost, each with a share of the numbers, in whole steps of 2^-24. Both are drawn by
         # the lowest numbers: the fewer ends of intervals, the more evenly stratified points share them out.
-        self._lobe = round(float(np.abs(weight[: 1 << 15]).dot(weight[: 1 << 15] < 0)) / cdf[-1] * _STEPS) / _STEPS
-        self.signed = self._lobe > 0
+        lobe = round(float(np.abs(weight[: 1 << 15]).dot(weight[: 1 << 15] < 0)) / cdf[-1] * _STEPS) / _STEPS
+        self._lobe = torch.tensor(lobe, dtype=torch.float32, device=device)
+        self.signed = bool(self._lobe > 0)
 
     def kind_of(self) -> tuple[object, ...]:
         """What is not a tensor: kernels are made anew where it differs."""
-        return self.kind, self.radius, self._lobe if self.signed else None
+        return self.kind, self.signed
 
     def tensors(self) -> dict[str, Tensor]:
         """What lanes read."""
-        return {} if self._inverse is None else {"inverse": self._inverse}
+        found = {"radius": self.radius}
+        return found if self._inverse is None else {**found, "inverse": self._inverse, "lobe": self._lobe}
 
     def offset(self, u: Tensor) -> Tensor:
         """Offsets from the pixel's centre, in pixels, for ``u`` in [0, 1): any shape."""

@@ -142,6 +142,7 @@ class Lights:
     solid: (
         Tensor | None
     )  # (K, 14) float64, see torchpt.lights.solid_angle.table_of; None without triangles and rectangles
+    shapes: tuple[int, ...]  # codes of the shapes in `solid`; static
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,8 @@ class World:
     P primitives, and I copies (see :class:`Copies`).
     """
 
-    counts: tuple[int, int, int, int, int]  # as in Geometry
+    counts: tuple[int, int, int, int, int]  # as in Geometry; static: lanes read `ends`
+    ends: Tensor  # (5,) int64 the id after the last primitive of each kind
     p0: Tensor  # (3, P)
     e1: Tensor  # (3, P)
     e2: Tensor  # (3, P)
@@ -189,7 +191,7 @@ class World:
         import torch
 
         copy = self.copy(prim)
-        return torch.where(copy > 0, copy + (len(self.bound) - 1), prim)
+        return torch.where(copy > 0, copy + (self.ends[4] - 1), prim)
 
     def copy(self, prim: Tensor) -> Tensor:
         """Columns ``(N,)`` of ``copies`` for ids of primitives as the search gives them."""

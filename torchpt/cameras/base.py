@@ -21,12 +21,14 @@ class Camera(ABC):
         to_world: pose ``(4, 4)``; its scale is ignored, as only the axes' directions and the origin matter.
         width: of the whole film in pixels.
         height: of the whole film in pixels.
+        film: the same two as ``(2,)`` numbers of the lanes' dtype.
         lens: whether rays also depend on a place on a lens.
     """
 
     to_world: Tensor
     width: int
     height: int
+    film: Tensor
 
     lens: ClassVar[bool] = False
 
@@ -55,13 +57,14 @@ class Camera(ABC):
 
     def kind(self) -> tuple[object, ...]:
         """What is not a tensor: the stages are compiled anew where it differs."""
-        values = (getattr(self, field.name) for field in fields(self))
+        values = (getattr(self, field.name) for field in fields(self) if field.name not in ("width", "height"))
         return (type(self).__name__, *(value for value in values if not isinstance(value, Tensor)))
 
     def place(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Film positions in pixels as ``right`` and ``up`` of the film's middle, in half widths of the film."""
-        right = x * (2.0 / self.width) - 1.0
-        return right, (1.0 - y * (2.0 / self.height)) * (self.height / self.width)
+        width, height = self.film[0], self.film[1]
+        right = x * (2.0 / width) - 1.0
+        return right, (1.0 - y * (2.0 / height)) * (height / width)
 
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
         """Unit vectors ``(3, 1)`` in the world: right in the picture, up, and where the camera looks."""

@@ -32,5 +32,5 @@ class Orthographic(Camera):
 
     def pixel(self) -> Tensor:
         """See :meth:`Camera.pixel`."""
-        spread = self.extent / self.width
+        spread = self.extent / self.film[0]
         return torch.cat((-self.axes()[2][:, 0], torch.stack((torch.zeros_like(spread), spread))))

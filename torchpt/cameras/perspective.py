@@ -32,13 +32,15 @@ class Perspective(Camera):
     def half_width(self) -> Tensor:
         """Tangent of half the horizontal angle of view."""
         half = torch.tan(self.fov * (math.pi / 360.0))
-        w, h = self.width, self.height
+        w, h = self.film[0], self.film[1]
+        if self.fov_axis == "x":
+            return half
         if self.fov_axis == "diagonal":
-            return half * (w / math.hypot(w, h))
-        vertical = (
-            self.fov_axis == "y" or (self.fov_axis == "smaller" and h < w) or (self.fov_axis == "larger" and h > w)
-        )
-        return half * (w / h) if vertical else half
+            return half * (w / (w * w + h * h).sqrt())
+        if self.fov_axis == "y":
+            return half * (w / h)
+        other = h < w if self.fov_axis == "smaller" else h > w
+        return torch.where(other, half * (w / h), half)
 
     def slopes(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """How far ``right`` and ``up`` a ray through the film goes for each unit of depth, each ``(N,)``."""
@@ -54,5 +56,5 @@ class Perspective(Camera):
 
     def pixel(self) -> Tensor:
         """See :meth:`Camera.pixel`."""
-        spread = self.half_width() * (2.0 / self.width)
+        spread = self.half_width() * (2.0 / self.film[0])
         return torch.cat((self.origin()[:, 0], torch.stack((torch.ones_like(spread), spread))))

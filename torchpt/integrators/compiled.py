@@ -114,7 +114,7 @@ class CompiledStages(Stages):
         def stage(camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
             return stages.generate(self.plan, camera, filter, x, y, key, salts)
 
-        variant = (*camera.kind(), filter.kind, filter.radius)
+        variant = (*camera.kind(), *filter.kind_of())
         return self._get("generate", variant, stage)(camera, filter, x, y, key, salts)
 
     def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:

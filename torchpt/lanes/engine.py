@@ -18,7 +18,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Function", "Target", "cache_folder", "compiled", "counts", "estimates", "host", "seconds"]
+__all__ = [
+    "Function",
+    "Target",
+    "cache_folder",
+    "compiled",
+    "counts",
+    "estimates",
+    "host",
+    "identity",
+    "kept",
+    "read",
+    "seconds",
+    "write",
+]
 
 #: Enters every key: entries of another form are never read.
 _FORM = "1"
@@ -44,6 +57,7 @@ class Function:
     call: Any
     code: bytes
     engine: Any  # keeps the code in memory
+    key: str = ""  # its name on disk
 
 
 def _llvm() -> Any:
@@ -88,18 +102,37 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         key = _key(ir, target)
         found = _functions.get(key)
         if found is None:
-            path = _path(key)
-            code = None if path is None else _read(path)
+            code = read(f"{key[:40]}.o")
             if code is None:
                 code = _object(ir, target)
                 _state["compiled"] += 1
-                if path is not None:
-                    _write(path, code)
+                write(f"{key[:40]}.o", code)
             else:
                 _state["loaded"] += 1
-            found = _functions[key] = _loaded(code, target)
+            found = _functions[key] = _loaded(code, target, key)
         _state["seconds"] += time.perf_counter() - begin
         return found
+
+
+def kept(key: str) -> Function | None:
+    """A function of this machine by its key, from this process or from disk; None where there is none."""
+    with _lock:
+        begin = time.perf_counter()
+        found = _functions.get(key)
+        code = read(f"{key[:40]}.o") if found is None else None
+        if code is not None:
+            _state["loaded"] += 1
+            found = _functions[key] = _loaded(code, host(), key)
+        _state["seconds"] += time.perf_counter() - begin
+        return found
+
+
+def identity() -> str:
+    """What machine code depends on beside the IR."""
+    import llvmlite
+
+    target = host()
+    return "\n".join((_FORM, llvmlite.__version__, target.cpu, target.features))
 
 
 def _key(ir: str, target: Target) -> str:
@@ -135,15 +168,15 @@ def _object(ir: str, target: Target) -> bytes:
     return machine.emit_object(module)
 
 
-def _loaded(code: bytes, target: Target) -> Function:
+def _loaded(code: bytes, target: Target, key: str) -> Function:
     if target.triple is not None:
-        return Function(None, code, None)  # for another machine: not to be run here
+        return Function(None, code, None, key)  # for another machine: not to be run here
     llvm = _llvm()
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(target))
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(engine.get_function_address("kernel"))
-    return Function(call, code, engine)
+    return Function(call, code, engine, key)
 
 
 def cache_folder() -> Path | None:
@@ -165,26 +198,31 @@ def cache_folder() -> Path | None:
     return folder
 
 
-def _path(key: str) -> Path | None:
+def _folder() -> Path | None:
     if "folder" not in _state:
         _state["folder"] = cache_folder()
-    folder = _state["folder"]
-    return None if folder is None else folder / f"{key[:40]}.o"
+    return _state["folder"]
 
 
-def _read(path: Path) -> bytes | None:
-    """An entry; None where there is none, or a damaged one, which is made again."""
+def read(name: str) -> bytes | None:
+    """An entry of the cache; None where there is none, or a damaged one, which is made again."""
+    folder = _folder()
+    if folder is None:
+        return None
     try:
-        content = path.read_bytes()
+        content = (folder / name).read_bytes()
     except OSError:
         return None
     check, code = content[:32], content[32:]
     return code if hashlib.sha256(code).digest() == check else None
 
 
-def _write(path: Path, code: bytes) -> None:
+def write(entry: str, code: bytes) -> None:
     """Put an entry in its place at once or not at all; a full disk is no reason to stop."""
-    name = None
+    folder = _folder()
+    if folder is None:
+        return
+    path, name = folder / entry, None
     try:
         handle, name = tempfile.mkstemp(dir=path.parent)
         with os.fdopen(handle, "wb") as file:

@@ -14,7 +14,7 @@ from torchpt.lanes.engine import Target
 from torchpt.lanes.graph import DTYPES
 from torchpt.lanes.kernel import HEAD, Sinks, Store, text
 from torchpt.lanes.program import bound
-from torchpt.lanes.tracing import LANES, Tracer
+from torchpt.lanes.tracing import Tracer, lanes_for
 
 __all__ = ["lanewise"]
 
@@ -32,7 +32,7 @@ def lanewise(
     Raises:
         Unsupported: for what the lane compiler does not know.
     """
-    lanes = next(n for n in LANES if all(size % n for x in like for size in x.shape[:-1]))
+    lanes = lanes_for([x[..., 0] for x in like if x.numel()])
     tracer = Tracer(lanes, {})
     given = [_sample(x, lanes) for x in like]
     for slot, x in enumerate(given):

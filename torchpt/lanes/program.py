@@ -22,6 +22,7 @@ class Program:
 
     Attributes:
         call: its machine code, see :class:`torchpt.lanes.engine.Function`.
+        code: the name of that on disk.
         tables: what it reads.
         steps: the prologue, which makes some of that from leaves.
         held: tensors of the program's own.
@@ -36,6 +37,7 @@ class Program:
     """
 
     call: Any
+    code: str
     tables: tuple[Table, ...]
     steps: tuple[Step, ...]
     held: tuple[Tensor, ...]

@@ -19,7 +19,19 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchpt.lanes.graph import DTYPES, Graph, Unsupported
 
-__all__ = ["HANDLERS", "LANES", "Guard", "Source", "Step", "Table", "Tracer", "Value", "handles", "tracing"]
+__all__ = [
+    "HANDLERS",
+    "LANES",
+    "Guard",
+    "Source",
+    "Step",
+    "Table",
+    "Tracer",
+    "Value",
+    "handles",
+    "lanes_for",
+    "tracing",
+]
 
 #: Candidates for the number of lanes that a stage is traced on. An axis of a tensor that has this length is taken for the
 #: lanes', so it must divide no axis of a table.
@@ -42,6 +54,19 @@ def handles(*names: str) -> Callable[[Handler], Handler]:
         return handler
 
     return register
+
+
+def lanes_for(tables: Iterable[Tensor]) -> int:
+    """A number of :data:`LANES` that is the length of no axis of the tables, nor divides one.
+
+    Raises:
+        Unsupported: where there is none.
+    """
+    sizes = {size for table in tables for size in table.shape if size}
+    for lanes in LANES:
+        if all(size % lanes for size in sizes):
+            return lanes
+    raise Unsupported("tables of so many lengths that none is left for the lanes to be traced on")
 
 
 def tracing() -> bool:

@@ -37,7 +37,7 @@ class ByTree:
     tree: LightTree
     beside: Discrete | None  # over the tree and the rows after its own; None where there are none
     even: Discrete | None  # over the rows of the tree; None where all draws are the tree's own
-    share: float  # of the draws of a row of the tree that are taken from `even`
+    share: Tensor  # () float64, of the draws of a row of the tree that are taken from `even`
 
 
 def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str) -> Discrete | ByTree | None:
@@ -64,7 +64,8 @@ def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: 
     shining = (power[:count] > 0).double()
     few = count <= FEW
     share = min(EVEN, EACH / max(float(shining.sum()), 1.0)) if few else 0.0
-    return ByTree(tree.build(*astuple(bounds)), beside, Discrete.of(shining, dtype) if few else None, share)
+    part = torch.tensor(share, dtype=torch.float64, device=power.device)
+    return ByTree(tree.build(*astuple(bounds)), beside, Discrete.of(shining, dtype) if few else None, part)
 
 
 def local(lights: Lights | None) -> bool:
@@ -88,7 +89,7 @@ def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> t
         return row, take(choice.pmf, row), rest
     if choice.beside is None:
         return _near(choice, u, x, n)
-    beside, first = choice.beside, len(choice.tree.depth)
+    beside, first = choice.beside, choice.tree.count
     outcome, left = _by_power(beside, u)
     row, p, rest = _near(choice, left, x, n)
     near = outcome == 0
@@ -114,7 +115,8 @@ def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     p = tree.probability(choice.tree, row, x, n)
     if choice.even is None:
         return p
-    return p * (1.0 - choice.share) + take(choice.even.pmf, row) * choice.share
+    share = choice.share.to(p.dtype)
+    return p * (1.0 - share) + take(choice.even.pmf, row) * share
 
 
 def _by_power(choice: Discrete, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -130,8 +132,8 @@ def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | N
         return take(choice.pmf, row)
     if choice.beside is None:
         return _chance(choice, row, x, n)
-    first = len(choice.tree.depth)
-    p = _chance(choice, row.clamp_max(first - 1), x, n)
+    first = choice.tree.count
+    p = _chance(choice, torch.minimum(row, first - 1), x, n)
     return torch.where(row < first, p, 1.0) * take(choice.beside.pmf, (row - (first - 1)).clamp_min(0))
 
 

@@ -58,8 +58,9 @@ class EnvironmentMap:
 
     Attributes:
         texels: ``(3, H W)`` linear RGB.
-        height: H.
+        height: H, static; lanes read ``size``.
         width: W.
+        size: ``(2,)`` int64 H and W.
         turn: ``(3, 3)`` orthogonal, from the world to the map's own space.
         scale: ``()`` factor of the texels.
         halves: ``(2, H)`` ``sin^2(theta / 2)`` and ``cos^2(theta / 2)`` of the rows: differences of either keep their
@@ -73,6 +74,7 @@ class EnvironmentMap:
     texels: Tensor
     height: int
     width: int
+    size: Tensor
     turn: Tensor
     scale: Tensor
     halves: Tensor
@@ -123,6 +125,7 @@ def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None
         texels=planes,
         height=height,
         width=width,
+        size=torch.tensor((height, width), dtype=torch.int64, device=texels.device),
         turn=turn,
         scale=scale,
         halves=halves.to(texels.dtype),
@@ -167,13 +170,14 @@ def _place(map: EnvironmentMap, d: Tensor) -> _Place:
     square = torch.addcmul(local[0] * local[0], local[2], local[2])
     radius = square.clamp_min(torch.finfo(d.dtype).tiny).sqrt()
     # Not by acos, which near the poles knows an angle only to a square root of the rounding.
-    y = azimuth(local[1], radius) * ((map.height - 1) / math.pi)
-    x = azimuth(-local[2], local[0]) * (map.width / (2.0 * math.pi)) - 0.5
-    row = y.detach().floor().clamp(0, map.height - 2)
-    column = x.detach().floor().clamp(-1, map.width - 1)
+    tall, wide = map.size[0].to(d.dtype), map.size[1].to(d.dtype)
+    y = azimuth(local[1], radius) * ((tall - 1.0) * (1.0 / math.pi))
+    x = azimuth(-local[2], local[0]) * (wide * (0.5 / math.pi)) - 0.5
+    row = torch.minimum(y.detach().floor().clamp_min(0.0), tall - 2.0)
+    column = torch.minimum(x.detach().floor().clamp_min(-1.0), wide - 1.0)
     x, y = x - column, (y - row).clamp_max(1.0)
     column = column.to(torch.int64)
-    return _Place(row.to(torch.int64), torch.where(column < 0, map.width - 1, column), x, y)
+    return _Place(row.to(torch.int64), torch.where(column < 0, map.size[1] - 1, column), x, y)
 
 
 #: Colours ``(3, N)`` of a cell's texels: two of the upper row, two of the lower one.
@@ -181,10 +185,10 @@ _Corners = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def _corners(map: EnvironmentMap, row: Tensor, column: Tensor) -> _Corners:
-    size = map.height * map.width
-    right = torch.where(column == map.width - 1, 0, column + 1)
-    first = row * map.width
-    planes = torch.arange(3, device=row.device)[:, None] * size
+    width = map.size[1]
+    right = torch.where(column == width - 1, 0, column + 1)
+    first = row * width
+    planes = torch.arange(3, device=row.device)[:, None] * (map.size[0] * width)
 
     def colour(texel: Tensor) -> Tensor:
         return take(map.texels.reshape(-1), (planes + texel).reshape(-1)).view(3, -1)
@@ -192,8 +196,8 @@ def _corners(map: EnvironmentMap, row: Tensor, column: Tensor) -> _Corners:
     return (
         colour(first + column),
         colour(first + right),
-        colour(first + map.width + column),
-        colour(first + map.width + right),
+        colour(first + width + column),
+        colour(first + width + right),
     )
 
 
@@ -210,7 +214,7 @@ def _values(grid: Grid, corners: _Corners) -> tuple[Tensor, Tensor, Tensor, Tens
 
 
 def _density(map: EnvironmentMap, grid: Grid, at: _Place, corners: _Corners) -> Tensor:
-    step = math.pi / (map.height - 1)
+    step = math.pi / (map.size[0] - 1).to(at.y.dtype)
     y = at.y.detach()
     # A difference of cosines as a product, which does not cancel.
     down = torch.sin((0.5 * step) * y) * torch.sin(step * (at.row + 0.5 * y)) * take(map.steps, at.row)
@@ -258,13 +262,14 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
         density = _mix((a, b, c, d), x, down) * grid.factor
         above, below = take(map.halves, row), take(map.halves, row + 1)
         half = above + (below - above) * down
-        phi = (x + (column + 0.5)) * (2.0 * math.pi / map.width)
+        tall, wide = map.size[0].to(u.dtype), map.size[1].to(u.dtype)
+        phi = (x + (column + 0.5)) * (2.0 * math.pi / wide)
         radius = 2.0 * (half[0] * half[1]).sqrt()
         local = (radius * torch.sin(phi), half[1] - half[0], radius * -torch.cos(phi))
         # The inverse of an orthogonal map is its transpose.
         turn = map.turn
         wi = torch.stack([local[0] * turn[0, k] + local[1] * turn[1, k] + local[2] * turn[2, k] for k in range(3)])
-        y = (azimuth(local[1], radius) * ((map.height - 1) / math.pi) - row).clamp(0.0, 1.0)
+        y = (azimuth(local[1], radius) * ((tall - 1.0) * (1.0 / math.pi)) - row).clamp(0.0, 1.0)
     if map.turn.requires_grad:
         return wi, density, radiance(map, wi)  # which follows the turn
     return wi, density, _mix(corners, x, y) * map.scale

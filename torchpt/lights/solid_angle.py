@@ -41,6 +41,7 @@ __all__ = [
     "angles",
     "inverse_pdf",
     "sample",
+    "shapes_of",
     "table_of",
     "tensor_angles",
     "tensor_sample",
@@ -87,7 +88,16 @@ def table_of(kinds: Sequence[str], p0: Tensor, e1: Tensor, e2: Tensor, near: flo
     return torch.cat((code.double()[None], reach[None], p + centre, p, a, b)).T.contiguous()
 
 
-def sample(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+def shapes_of(table: Tensor | None) -> tuple[int, ...]:
+    """Codes of the shapes in a table that are sampled here."""
+    if table is None:
+        return ()
+    return tuple(code for code in (TRIANGLE, RECTANGLE, SKEW) if bool((table[:, 0] == code).any()))
+
+
+def sample(
+    table: Tensor, row: Tensor | None, x: Tensor, u: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)
+) -> tuple[Tensor, Tensor]:
     """Points on lights, seen from ``x``; nothing of it is differentiable.
 
     Args:
@@ -95,6 +105,7 @@ def sample(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Ten
         row: of each lane ``(N,)`` int64; None where the table has one row.
         x: reference points ``(3, N)``.
         u: ``(2, N)`` in [0, 1).
+        shapes: codes of those in the table; the others cost nothing.
 
     Returns:
         The primitive's own ``(u, v)`` of the points ``(2, N)``, and as :func:`angles` the solid angles ``(N,)``: where they
@@ -102,17 +113,17 @@ def sample(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Ten
     """
     if x.device.type == "cpu" and not tracing():
         return choose(_sample_on_cpu, _sample_operator)(table, row, x, u)
-    return tensor_sample(table, row, x, u)
+    return tensor_sample(table, row, x, u, shapes)
 
 
-def angles(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
+def angles(table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)) -> Tensor:
     """Solid angles ``(N,)`` by which :func:`sample` draws from these lights at ``x``, 0 where it draws by area.
 
     From behind a light fills the same angle; it is the caller who knows which side emits.
     """
     if x.device.type == "cpu" and not tracing():
         return choose(_angles_on_cpu, _angles_operator)(table, row, x)
-    return tensor_angles(table, row, x)
+    return tensor_angles(table, row, x, shapes)
 
 
 def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
@@ -158,26 +169,25 @@ def _(table, row, x):
 
 
 @torch.no_grad()
-def tensor_sample(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+def tensor_sample(
+    table: Tensor, row: Tensor | None, x: Tensor, u: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)
+) -> tuple[Tensor, Tensor]:
     """:func:`sample` by tensor operations."""
     shape, near, a, e, f = _seen(table, row, x)
     w = u.double()
-    triangle, angle = _triangle(a, e, f, w)
-    rectangle, of_rectangle = _rectangle(a, e, f, w)
-    skew, of_skew = _skew(a, e, f, w)
-    angle = torch.where(near, _of_shape(shape, angle, of_rectangle, of_skew), 0.0)
-    uv = _of_shape(shape, triangle, rectangle, skew)
-    by_area = torch.where(shape == TRIANGLE, uniform_triangle(w), w)
+    uv, angle = _of_shapes(shapes, shape, a, e, f, w)
+    angle = torch.where(near, angle, 0.0)
+    by_area = torch.where(shape == TRIANGLE, uniform_triangle(w), w) if TRIANGLE in shapes else w
     return torch.where(angle > 0, uv, by_area).to(u.dtype), angle.to(x.dtype)
 
 
 @torch.no_grad()
-def tensor_angles(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
+def tensor_angles(
+    table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)
+) -> Tensor:
     """:func:`angles` by tensor operations."""
     shape, near, a, e, f = _seen(table, row, x)
-    w = torch.zeros_like(a[:2])
-    _, of_triangle = _triangle(a, e, f, w)
-    angle = _of_shape(shape, of_triangle, _rectangle(a, e, f, w)[1], _skew(a, e, f, w)[1])
+    angle = _of_shapes(shapes, shape, a, e, f, torch.zeros_like(a[:2]))[1]
     return torch.where(near, angle, 0.0).to(x.dtype)
 
 
@@ -189,8 +199,18 @@ def _seen(table: Tensor, row: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor,
     return lanes[0], near, lanes[5:8] - x.double(), lanes[8:11], lanes[11:14]
 
 
-def _of_shape(shape: Tensor, triangle: Tensor, rectangle: Tensor, skew: Tensor) -> Tensor:
-    return torch.where(shape == TRIANGLE, triangle, torch.where(shape == RECTANGLE, rectangle, skew))
+def _of_shapes(
+    shapes: Sequence[int], shape: Tensor, a: Tensor, e: Tensor, f: Tensor, u: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Points and solid angles, each lane by the form of its shape."""
+    forms = {TRIANGLE: _triangle, RECTANGLE: _rectangle, SKEW: _skew}
+    if not shapes:
+        return torch.zeros_like(a[:2]), torch.zeros_like(a[0])
+    uv, angle = forms[shapes[-1]](a, e, f, u)
+    for code in shapes[-2::-1]:
+        other, of_other = forms[code](a, e, f, u)
+        uv, angle = torch.where(shape == code, other, uv), torch.where(shape == code, of_other, angle)
+    return uv, angle
 
 
 def _reciprocal(a: Tensor) -> Tensor:

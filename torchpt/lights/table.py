@@ -116,7 +116,7 @@ def _on_surfaces(
     bent: Quadrics | None = None
     place, angle = torch.zeros_like(u), None
     if lights.solid is not None:
-        place, angle = solid_angle.sample(lights.solid, row, x, u)
+        place, angle = solid_angle.sample(lights.solid, row, x, u, lights.shapes)
         target, normal = area.point(at.p0, at.e1, at.e2, place), at.normal.expand_as(x)
     for kind in lights.kinds:
         if kind not in KINDS or kind in solid_angle.KINDS:
@@ -231,7 +231,7 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | 
             size = _pick(_is(lights, "quadric", row), found, size)
         inverse = area.inverse_pdf(at.ng, size, wi, dot(to, to))
         if lights.solid is not None:
-            inverse = solid_angle.inverse_pdf(solid_angle.angles(lights.solid, row, x), inverse)
+            inverse = solid_angle.inverse_pdf(solid_angle.angles(lights.solid, row, x, lights.shapes), inverse)
         if "sphere" in lights.kinds:
             ball = sphere.inverse_pdf(x, table.p0, table.e1[0], at.ng, wi, dot(to, to))
             inverse = _pick(_is(lights, "sphere", row), ball, inverse)

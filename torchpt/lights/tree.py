@@ -37,7 +37,8 @@ class LightTree:
     full: Tensor  # (M,) int32 how many children there are
     trail: Tensor  # (K,) int64 the way from the root, three bits a step, the first lowest
     depth: Tensor  # (K,) int32 how many steps; 0 where a light is left out, since it does not shine
-    levels: int  # the largest of them
+    count: Tensor  # () int64 K
+    levels: int  # the largest of `depth`
 
 
 def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor, intensity: Tensor) -> LightTree:
@@ -82,7 +83,8 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
         torch.from_numpy(a).to(device)
         for a in (nodes[:used].copy(), child[:used].copy(), full[:used].copy(), trail, depth)
     )
-    return LightTree(*parts, levels=int(depth.max()))
+    number = torch.tensor(count, dtype=torch.int64, device=device)
+    return LightTree(*parts, count=number, levels=int(depth.max()))
 
 
 def fine(u: Tensor) -> Tensor:

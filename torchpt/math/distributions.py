@@ -47,8 +47,8 @@ class Discrete:
         return Discrete(cdf, w.to(dtype))
 
     def sample(self, u: Tensor) -> Tensor:
-        """Outcomes ``(N,)`` int64 for ``u`` in ``[0, 1)``; one of probability 0 is never drawn."""
-        return torch.searchsorted(self.cdf, u.double(), right=True).clamp_max(len(self.cdf) - 1)
+        """Outcomes ``(N,)`` int64 for ``u`` in ``[0, 1]``; one of probability 0 is never drawn."""
+        return torch.searchsorted(self.cdf, u.double().clamp_max(1.0 - 2.0**-53), right=True)
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,12 @@ class Cells:
         rows: ``(R + 1,)`` float64 cumulative sums over the rows, from 0 to 1.
         columns: ``(R C + 1,)`` float64: row number plus the cumulative sums within that row. It never falls, so that one
             binary search finds a cell of any row.
+        width: ``()`` int64 C.
     """
 
     rows: Tensor
     columns: Tensor
+    width: Tensor
 
     @staticmethod
     def of(weights: Tensor) -> Cells:
@@ -78,22 +80,21 @@ class Cells:
         along += torch.arange(number, dtype=w.dtype, device=w.device)[:, None]
         down = torch.cumsum(total[:, 0], 0)
         zero = down.new_zeros(1)
-        return Cells(torch.cat((zero, down / down[-1])), torch.cat((zero, along.reshape(-1))))
+        width = torch.tensor(w.shape[1], dtype=torch.int64, device=w.device)
+        return Cells(torch.cat((zero, down / down[-1])), torch.cat((zero, along.reshape(-1))), width)
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Rows and columns ``(N,)`` int64 for ``u (2, N)`` in ``[0, 1)``, and what is left ``(2, N)``: columns by ``u[0]``.
 
         A cell without weight is never drawn.
         """
-        number = len(self.rows) - 1
-        width = (len(self.columns) - 1) // number
         # Just below 1 a row number plus u would round to the next row.
         v = u.double().contiguous().clamp_max(1.0 - 2.0**-32)
         row = torch.searchsorted(self.rows, v[1], right=True) - 1
         across = v[0] + row
         cell = torch.searchsorted(self.columns, across, right=True) - 1
         rest = torch.stack((_within(self.columns, cell, across), _within(self.rows, row, v[1])))
-        return row, cell - row * width, rest.to(u.dtype)
+        return row, cell - row * self.width, rest.to(u.dtype)
 
 
 def _within(cdf: Tensor, index: Tensor, v: Tensor) -> Tensor:

@@ -212,7 +212,12 @@ class Scene:
         shift[:3, 3] = self._centre
         kind = self.description.camera
         number: dict[str, Any] = {name: params[f"camera.{name}"].to(dtype) for name in kind.numbers()}
-        placed: dict[str, Any] = {"to_world": (pose - shift).to(dtype), "width": film.width, "height": film.height}
+        placed: dict[str, Any] = {
+            "to_world": (pose - shift).to(dtype),
+            "width": film.width,
+            "height": film.height,
+            "film": torch.tensor((film.width, film.height), dtype=dtype, device=self.device),
+        }
         if isinstance(kind, schema.Orthographic):
             return Orthographic(**placed, extent=number["width"])
         if isinstance(kind, schema.ThinLens):

@@ -90,7 +90,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
     """
     place = _placed(world, hit.prim)
     prim, p0, e1, e2, u, v = place.prim, place.p0, place.e1, place.e2, hit.u, hit.v
-    triangles, ball, curved = world.counts[0], _spheres(world, prim), _quadrics(world, prim)
+    ball, curved = _spheres(world, prim), _quadrics(world, prim)
     if slide:
         u, v = _slide(o, d, p0, e1, e2)
     for other in (ball, curved):
@@ -126,8 +126,8 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         if place.copies is not None:
             corners = [place.turned(n) for n in corners]
         ns = normalize(affine(corners[0] * (1.0 - u - v), corners[1], u, corners[2], v))
-        if triangles < len(world.bound):
-            ns = torch.where(prim < triangles, ns, ng)
+        if any(world.counts[1:]):
+            ns = torch.where(prim < world.ends[0], ns, ng)
     tangent, bitangent = _tangents(world, prim, u, v, e1, e2, ng)
     if tangent is not None and place.copied is not None:
         tangent = torch.where(place.copied, place.moved(tangent), tangent)
@@ -143,14 +143,13 @@ def _spheres(world: World, prim: Tensor) -> Tensor | None:
     """Which of the primitives are spheres; None where the scene has none."""
     if not world.counts[3]:
         return None
-    first = sum(world.counts[:3])
-    found = prim >= first
-    return found if not world.counts[4] else found & (prim < first + world.counts[3])
+    found = prim >= world.ends[2]
+    return found if not world.counts[4] else found & (prim < world.ends[3])
 
 
 def _quadrics(world: World, prim: Tensor) -> Tensor | None:
     """Which of the primitives are quadrics; None where the scene has none."""
-    return prim >= sum(world.counts[:4]) if world.counts[4] else None
+    return prim >= world.ends[3] if world.counts[4] else None
 
 
 def _tangents(
@@ -161,16 +160,14 @@ def _tangents(
         return None, None
     tangent = take(world.tangents, prim)
     bitangent = None if world.bitangents is None else take(world.bitangents, prim)
-    triangles, rectangles, disks = world.counts[:3]
     ball = _spheres(world, prim)
     if ball is not None:
         around = cross(tangent, ng)
         if bitangent is not None:
             bitangent = torch.where(ball, cross(normalize(around), ng) * bitangent[0], bitangent)
         tangent = torch.where(ball, around, tangent)
-    if disks:
-        first = triangles + rectangles
-        disk = (prim >= first) & (prim < first + disks)
+    if world.counts[2]:
+        disk = (prim >= world.ends[1]) & (prim < world.ends[2])
         away = torch.addcmul(e1 * u, e2, v)
         square = torch.where(disk, u * u + v * v, 1.0)
         some = square > 0

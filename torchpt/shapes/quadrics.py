@@ -40,7 +40,7 @@ _ELLIPSOID, _CYLINDER, _CONE = range(len(QUADRICS))
 def rows(world: World, prim: Tensor) -> Quadrics:
     """The columns ``(., N)`` of primitives ``prim (N,)``; any where one is no quadric."""
     assert world.quadrics is not None
-    index = (prim - sum(world.counts[:4])).clamp_min(0)
+    index = (prim - world.ends[3]).clamp_min(0)
     return columns(world.quadrics, index)
 
 

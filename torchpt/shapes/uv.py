@@ -25,8 +25,7 @@ def surface_uv(world: World, at: Interaction) -> Tensor:
     assert world.uvs is not None
     a, b, c = (take(x, at.prim) for x in world.uvs)
     uv = torch.addcmul(torch.addcmul(a * (1.0 - at.u - at.v), b, at.u), c, at.v)
-    flat = world.counts[0] + world.counts[1]
-    if flat == len(world.bound):
+    if not any(world.counts[2:]):
         return uv
     x, y, z, level = _own(world, at)
     square = torch.addcmul(x * x, y, y)
@@ -37,27 +36,27 @@ def surface_uv(world: World, at: Interaction) -> Tensor:
     first = torch.where(disk, across, turn)
     # On sides the height, on balls the angle from the pole.
     second = torch.where(disk, turn, torch.where(level > 1, azimuth(z, across) * (1.0 / math.pi), z))
-    return torch.where(at.prim >= flat, torch.stack((first, second)), uv)
+    return torch.where(at.prim >= world.ends[1], torch.stack((first, second)), uv)
 
 
 def _own(world: World, at: Interaction) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points ``x, y, z (N,)`` of round shapes in their own space, and 0 on disks, 1 on sides, 2 on balls."""
-    triangles, rectangles, disks, spheres, curved = world.counts
+    spheres, curved = world.counts[3:]
     x, y, z, level = at.u, at.v, torch.zeros_like(at.u), torch.zeros_like(at.prim)
     if world.mirrored is not None:
         turned = take(world.mirrored, at.prim)
         x, y = torch.where(turned, y, x), torch.where(turned, x, y)
     if spheres:
         assert world.axes is not None
-        first = triangles + rectangles + disks
-        ball = (at.prim >= first) & (at.prim < first + spheres)
-        row = (at.prim - first).clamp(0, spheres - 1)
+        first, end = world.ends[2], world.ends[3]
+        ball = (at.prim >= first) & (at.prim < end)
+        row = torch.minimum((at.prim - first).clamp_min(0), end - first - 1)
         away = at.p - take(world.p0, at.prim)
         axes = [dot(take(axis, row), away) for axis in world.axes]
         x, y, z = (torch.where(ball, axis, other) for axis, other in zip(axes, (x, y, z), strict=True))
         level = torch.where(ball, 2, level)
     if curved and at.own is not None:  # a point on lights of other kinds has none
-        other = at.prim >= len(world.bound) - curved
+        other = at.prim >= world.ends[3]
         x, y, z = (torch.where(other, own, value) for own, value in zip(at.own, (x, y, z), strict=True))
         code = quadrics.rows(world, at.prim).code
         level = torch.where(other, torch.where(code == 0, 2, 1), level)

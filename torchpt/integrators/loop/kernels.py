@@ -16,12 +16,12 @@ from torchpt import lights
 from torchpt.integrators import aov, ibl, stages
 from torchpt.integrators.loop.rows import HIT, PASS, SHADOW, Rows
 from torchpt.integrators.search import beyond, passing
-from torchpt.lanes import engine, gathers, pointwise, views  # noqa: F401  (they register what they lower)
+from torchpt.lanes import engine, gathers, pointwise, shelf, views  # noqa: F401  (they register what they lower)
 from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.kernel import Note, Pack, Scatter, Sinks, Store, text
 from torchpt.lanes.packet import KINDS, packet_search
 from torchpt.lanes.program import Program, Tables, bound, holds, signature
-from torchpt.lanes.tracing import LANES, Tracer
+from torchpt.lanes.tracing import Tracer, lanes_for
 from torchpt.records import Hit, PathState, Shadow
 from torchpt.samplers import KINDS as SAMPLERS
 from torchpt.samplers import Dimension, Draws, key_of
@@ -113,7 +113,7 @@ class Kernels:
         )
         self._ids = {id(tensor): (path, tensor) for path, tensor in self._leaves.items()}
         self._structure = (
-            signature(world), wave.camera.kind(), wave.filter.kind_of(), wave.sampler.kind, self.plan, fused,
+            signature(world), wave.camera.kind(), wave.filter.kind_of(), wave.sampler.kind, signature(self.plan), fused,
             signature(wave.preview), signature(self._leaves),
         )  # fmt: skip
         self._before = before if before is not None and before._structure == self._structure else None
@@ -231,8 +231,13 @@ class Kernels:
         whole = key, self._structure
         with _tracing:  # one at a time in a process: see torchpt.lanes.tracing.tracing
             program = _programs.get(whole)
+            name = shelf.key_of(whole) if program is None else None
+            if program is None and name is not None:
+                program = shelf.load(name)
             if program is None or not holds(program, self._leaves):
                 program = self._traced(build, listed, fused)
+                if name is not None:
+                    shelf.store(name, program)
                 _programs.pop(whole, None)
                 _programs[whole] = program
                 if len(_programs) > MOST_PROGRAMS:
@@ -244,8 +249,7 @@ class Kernels:
         return Kernel(program, tables)
 
     def _traced(self, build: Callable[[Tracer], Sinks], listed: bool, fused: bool) -> Program:
-        lanes = next(n for n in LANES if all(size % n for t in self._leaves.values() for size in t.shape))
-        tracer = Tracer(lanes, self._ids)
+        tracer = Tracer(lanes_for(self._leaves.values()), self._ids)
         self._uniforms: list[str] = []
         self._tensors = 0
         with torch.no_grad():
@@ -261,6 +265,7 @@ class Kernels:
                 nodes[file] = nodes.get(file, 0) + 1
         return Program(
             call=made.call,
+            code=made.key,
             tables=tuple(tracer.tables),
             steps=tuple(tracer.steps),
             held=tuple(tracer.held),

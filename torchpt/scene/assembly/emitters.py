@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.accel.bounds import primitive_bounds
 from torchpt.lights import choice_of, envmap
-from torchpt.lights.solid_angle import table_of
+from torchpt.lights.solid_angle import shapes_of, table_of
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Geometry, Lights
 from torchpt.scene.assembly.curved import quadric_area
@@ -115,6 +115,7 @@ def lights_of(
         column = torch.cat((column, column.new_zeros(rest)))
     textured = veiled or any(part.glow is not None for part, _ in glowing)
     many = len(names) > 1
+    solid = table_of(names, joined["p0"], joined["e1"], joined["e2"])
     lights = Lights(
         choice=None,
         kinds=kinds,
@@ -126,7 +127,8 @@ def lights_of(
         quadric=column,
         quadrics=None if column is None else primitives.quadrics,
         prim=torch.cat((prim, prim.new_zeros(rest))) if textured else None,
-        solid=table_of(names, joined["p0"], joined["e1"], joined["e2"]),
+        solid=solid,
+        shapes=shapes_of(solid),
     )
     boxes = low.index_select(1, prim), high.index_select(1, prim)
     return replace(lights, choice=choice_of(lights, power, boxes, choice))

@@ -70,6 +70,7 @@ def assemble(
     geometry = primitives.geometry(maps)
     world = World(
         counts=primitives.counts,
+        ends=torch.tensor(primitives.counts, dtype=torch.int64, device=device).cumsum(0),
         p0=primitives.p0,
         e1=primitives.e1,
         e2=primitives.e2,

@@ -1,0 +1,162 @@
+"""Programs on disk: what a stage was traced to, so that another process need not trace it again.
+
+An entry says which machine code it belongs to, which tables that reads and by which operators of torch they are made. It is
+JSON; operators are looked up by name among torch's own, and nothing of it is code.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.lanes import engine
+from torchpt.lanes.graph import DTYPES
+from torchpt.lanes.program import Program
+from torchpt.lanes.tracing import Guard, Source, Step, Table
+
+__all__ = ["key_of", "load", "store"]
+
+#: Largest tensor of a program's own that is written.
+_MOST = 1 << 16
+_PLAIN = ("uniforms", "lists", "counters", "tensors", "results", "shadows", "nodes")
+
+
+class _NotKept(Exception):
+    """Something that no entry can hold."""
+
+
+@lru_cache(maxsize=1)
+def _sources() -> str:
+    """This version of the package: names, sizes and times of its files."""
+    root = Path(__file__).parent.parent
+    facts = []
+    for folder, _, names in os.walk(root):
+        for name in names:
+            if name.endswith(".py"):
+                path = os.path.join(folder, name)
+                state = os.stat(path)
+                facts.append((os.path.relpath(path, root), state.st_size, state.st_mtime_ns))
+    return repr(sorted(facts))
+
+
+def key_of(structure: Any) -> str | None:
+    """The name of an entry; None where the structure holds objects that only this process knows."""
+    try:
+        text = "\n".join((_sources(), torch.__version__, engine.identity(), _canonical(structure)))
+    except _NotKept:
+        return None
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _canonical(value: Any) -> str:
+    if isinstance(value, tuple | list):
+        return f"({','.join(map(_canonical, value))})"
+    if value is None or isinstance(value, bool | int | float | str | torch.dtype):
+        return repr(value)
+    if isinstance(value, type):
+        return f"{value.__module__}.{value.__qualname__}"
+    raise _NotKept
+
+
+def load(key: str) -> Program | None:
+    """A program from disk; None where there is none that can be used."""
+    content = engine.read(f"{key[:40]}.json")
+    if content is None:
+        return None
+    facts = json.loads(content)
+    function = engine.kept(facts["code"])
+    if function is None:
+        return None
+    return Program(
+        call=function.call,
+        code=function.key,
+        tables=tuple(Table(_source(x), axis) for x, axis in facts["tables"]),
+        steps=tuple(_step(x) for x in facts["steps"]),
+        held=tuple(_tensor(x) for x in facts["held"]),
+        guards=tuple(Guard(_source(x), value) for x, value in facts["guards"]),
+        **{name: _frozen(facts[name]) for name in _PLAIN},
+    )
+
+
+def store(key: str, program: Program) -> None:
+    """Writes a program, where it can be written."""
+    try:
+        facts = {
+            "code": program.code,
+            "tables": [[_source_out(t.source), t.axis] for t in program.tables],
+            "steps": [[str(s.function), _out(s.args), _out(s.kwargs)] for s in program.steps],
+            "held": [_tensor_out(t) for t in program.held],
+            "guards": [[_source_out(g.source), g.value] for g in program.guards],
+            **{name: getattr(program, name) for name in _PLAIN},
+        }
+    except _NotKept:
+        return
+    engine.write(f"{key[:40]}.json", json.dumps(facts).encode())
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _source_out(source: Source) -> list[Any]:
+    return [source.kind, source.name, source.item]
+
+
+def _source(value: list[Any]) -> Source:
+    return Source(*value)
+
+
+def _tensor_out(tensor: Tensor) -> list[Any]:
+    if tensor.numel() > _MOST or tensor.requires_grad or tensor.dtype not in DTYPES:
+        raise _NotKept
+    data = base64.b64encode(tensor.detach().contiguous().numpy().tobytes()).decode()
+    return [str(tensor.dtype).removeprefix("torch."), list(tensor.shape), data]
+
+
+def _tensor(value: list[Any]) -> Tensor:
+    name, shape, data = value
+    return torch.from_numpy(np.frombuffer(base64.b64decode(data), name).reshape(shape).copy())
+
+
+def _out(value: Any) -> Any:
+    if isinstance(value, Source):
+        return {"source": _source_out(value)}
+    if isinstance(value, torch.dtype | torch.device | torch.layout | torch.memory_format):
+        return {type(value).__name__: str(value).removeprefix("torch.")}
+    if isinstance(value, dict):
+        return {"dict": {name: _out(item) for name, item in value.items()}}
+    if isinstance(value, tuple | list):
+        return [_out(item) for item in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise _NotKept
+
+
+def _in(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_in(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    ((kind, content),) = value.items()
+    if kind == "source":
+        return _source(content)
+    if kind == "dict":
+        return {name: _in(item) for name, item in content.items()}
+    return torch.device(content) if kind == "device" else getattr(torch, content)
+
+
+def _step(value: list[Any]) -> Step:
+    name, args, kwargs = value
+    space, operator, overload = name.split(".")
+    if space != "aten":
+        raise ValueError(f"{name} is none of torch's operators")
+    return Step(getattr(getattr(torch.ops.aten, operator), overload), tuple(_in(args)), _in(kwargs))
