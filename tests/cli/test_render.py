@@ -196,11 +196,12 @@ def test_multirun_over_groups_without_out(folder: Path, renderer: Renderer) -> N
     assert kinds == [(s, i) for s in ("sobol", "independent") for i in ("path", "direct")]
 
 
-def test_a_defect_keeps_its_trace(folder: Path, renderer: Renderer) -> None:
+@pytest.mark.parametrize("word", ["render.spp=4", "++render.spp=4"])  # the second one needs Hydra
+def test_a_defect_keeps_its_trace(folder: Path, renderer: Renderer, word: str) -> None:
     def broken(done: int) -> None:
         raise RuntimeError("a defect")
 
     renderer.after_pass = broken
     with pytest.raises(RuntimeError, match="a defect"):
-        main(["render", "scene=s.yaml"])
+        main(["render", "scene=s.yaml", word])
     assert files(folder) == set()
