@@ -36,8 +36,9 @@ NOT_PLAIN = [
     "film.widht=3", "film.filter.foo=3", "film.filter.type.x=3", "+film.width=3", "++film.width=3", "~film.width",
     "film.width=", "film.width=1,2", "film.width=1_000", "film.width=01", "film.width=+1", "film.width=.5", "film.width=5.",
     "film.width=nan", "film.width=Inf", "film.width='3'", "film.width=a b", "film.width=a-b", "film.width=4GB",
-    "film.width=${render.spp}", "film.width=???", "film.width=int(3)", "film.width={a: 1}", "film.filter=[box]", "film.crop=[[1]]",
-    "film.crop=[1, 2]", "film.crop=[1,]", "film.width=1" + "0" * 400, "render.device=cuda:0", "film.width=ü", "film.width=1\n", "film.x.y=3", "film",
+    "film.width=${render.spp}", "film.width=???", "film.width=int(3)", "film.width={a: 1}", "film.filter=[box]",
+    "film.crop=[[1]]", "film.crop=[1, 2]", "film.crop=[1,]", "film.width=1" + "0" * 400, "render.device=cuda:0",
+    "film.width=ü", "film.width=1\n", "film.x.y=3", "film",
     "integrator=bogus", "integrator=[path]", "integrator@x=path", "spp=3", "scene_number=1", "hydra.run.dir=x", "defaults=3",
 ]  # fmt: skip
 
