@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpt import __version__
+from torchpt.commands import collector
 from torchpt.commands.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.plain_words import compose_plainly
@@ -69,6 +70,7 @@ torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
 
 def run() -> None:
     """The console script."""
+    collector.pause()
     sys.exit(main())
 
 
