@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import json
+import resource
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -14,6 +17,17 @@ def loaded(code: str) -> tuple[str, float]:
     start = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", f"{code}\n{PROBE}"], capture_output=True, text=True, check=True)
     return done.stdout.strip(), time.perf_counter() - start
+
+
+#: What a small render to a PNG file has no use for.
+NEEDLESS = (
+    *(name for name in HEAVY if name != "numba"),
+    *("antlr4", "networkx", "pandas", "rich", "scipy", "sympy", "triton"),
+    *("torch._dynamo", "torch._inductor", "torch.onnx", "torch.utils.tensorboard"),
+    *("hydra_plugins", "hydra._internal.core_plugins", "PIL.TiffImagePlugin", "logging.config"),
+    *(f"torchpt.scene.loaders.{name}" for name in ("gltf", "obj", "ply", "stl")),
+)
+SMALL = ("render", "scene=cornell_box", "render.spp=1", "film.width=64", "film.height=64")
 
 
 def test_import_is_quick_and_light() -> None:
@@ -37,3 +51,35 @@ def test_unknown_names() -> None:
     assert set(torchpt.__all__) <= set(dir(torchpt))
     with pytest.raises(AttributeError, match="nonsense"):
         _ = torchpt.nonsense
+
+
+def cpu_seconds(*words: str) -> float:
+    """Of a process of its own."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, *words], check=True, stdout=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def test_a_small_render_imports_nothing_needless(tmp_path: Path) -> None:
+    code = (
+        "import json, sys; from torchpt.cli import main\n"
+        f"assert main([*{SMALL!r}, 'out={tmp_path}/a.png']) == 0\n"
+        f"print(json.dumps([name for name in {NEEDLESS!r} if name in sys.modules]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout.splitlines()[-1]) == []
+
+
+def test_the_first_pixel_is_not_far_behind_torch(tmp_path: Path) -> None:
+    words = ("-m", "torchpt", *SMALL, f"out={tmp_path}/a.png")
+    cpu_seconds(*words)  # may compile
+    assert cpu_seconds(*words) <= 1.5 * cpu_seconds("-c", "import torch") + 2.0
+
+
+@pytest.mark.slow
+def test_the_first_pixel_is_close_behind_torch(tmp_path: Path) -> None:
+    words = ("-m", "torchpt", *SMALL, f"out={tmp_path}/a.png")
+    cpu_seconds(*words)  # may compile
+    torch, render = (min(cpu_seconds(*each) for _ in range(7)) for each in (("-c", "import torch"), words))
+    assert render <= torch + 0.6

@@ -1,7 +1,8 @@
 """The command line: words to a Hydra composition, to jobs, to an exit code. The only file that imports Hydra.
 
 Hydra composes the *run* settings (groups ``film integrator sampler render``), sweeps over them (``--multirun``), shows
-them (``--cfg job``) and launches the jobs. Scenes and file names stay outside (`torchpt.commands.arguments`). Whatever
+them (``--cfg job``) and launches the jobs; the plain words of a single job do without it (`torchpt.commands.plain_words`),
+with the same outcome. Scenes and file names stay outside (`torchpt.commands.arguments`). Whatever
 is wrong with the input ends as one line on stderr and exit code 2.
 """
 
@@ -12,19 +13,23 @@ import re
 import sys
 import tempfile
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpt import __version__
+from torchpt.commands import collector
 from torchpt.commands.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.commands.interrupt import Interrupt, Interrupted
+from torchpt.commands.plain_words import compose_plainly
 from torchpt.errors import TorchptError
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+
+    from torchpt.commands.render import Job
 
 __all__ = ["main", "run"]
 
@@ -65,6 +70,7 @@ torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
 
 def run() -> None:
     """The console script."""
+    collector.pause()
     sys.exit(main())
 
 
@@ -111,28 +117,34 @@ class _Task:
 
     def __call__(self, cfg: DictConfig) -> int:
         """Do one job. Ends the process (of this job) where it does not end well."""
+        code = self._ended(lambda: self._of_hydra(cfg))
+        if code:
+            raise SystemExit(code)
+        return code
+
+    def plainly(self, composed: dict[str, Any], words: list[str]) -> int:
+        """Do the one job of a composition that did not need Hydra; returns the exit code."""
+        return self._ended(lambda: self._job(composed, words, None))
+
+    def _ended(self, make_job: Callable[[], Job]) -> int:
+        """Make and do a job; returns the exit code."""
         from torchpt.commands.info import info
         from torchpt.commands.render import render
 
         with Interrupt() as interrupt:
             try:
-                job = self._job(cfg)
-                code = info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
+                job = make_job()
+                return info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
             except TorchptError as error:
-                code = _refuse(str(error))
+                return _refuse(str(error))
             except Interrupted as interrupted:
-                code = interrupted.exit_code
-        if code:
-            raise SystemExit(code)
-        return code
+                return interrupted.exit_code
 
-    def _job(self, cfg: DictConfig) -> Any:
+    def _of_hydra(self, cfg: DictConfig) -> Job:
         from hydra.core.hydra_config import HydraConfig
         from hydra.types import RunMode
         from omegaconf import OmegaConf
         from omegaconf.errors import OmegaConfBaseException
-
-        from torchpt.commands.render import Job
 
         hydra = HydraConfig.get()
         try:
@@ -140,12 +152,17 @@ class _Task:
         except OmegaConfBaseException as error:
             raise UsageError(f"{error.full_key or 'settings'}: {_first_line(error)}") from error
         assert isinstance(composed, dict)
+        number = hydra.job.num if hydra.mode == RunMode.MULTIRUN else None
+        return self._job(composed, list(hydra.overrides.task), number)
+
+    def _job(self, composed: dict[Any, Any], words: list[str], number: int | None) -> Job:
+        from torchpt.commands.render import Job
+
         scene = self.scenes[composed.pop("scene_number", 0)]
-        overrides = _given(composed, list(hydra.overrides.task))
+        overrides = _given(composed, words)
         for key, path in self.paths.items():
             group, _, name = key.partition(".")
             overrides.setdefault(group, {})[name] = path
-        number = hydra.job.num if hydra.mode == RunMode.MULTIRUN else None
         return Job(scene, overrides, tuple(self.outs), number)
 
 
@@ -189,12 +206,16 @@ def _refuse_targets(value: Any, where: str) -> None:
 
 
 def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
-    """Hand over to Hydra; returns the exit code."""
+    """Compose plain words here and hand all others over to Hydra; returns the exit code."""
+    task = _Task(arguments.command, arguments.scenes, arguments.outs, arguments.paths, arguments.json)
+    if not arguments.options and not arguments.multirun:
+        composed = compose_plainly(arguments.overrides, _configs())
+        if composed is not None:
+            return task.plainly(composed, arguments.overrides)
     import hydra
     from hydra.core.global_hydra import GlobalHydra
 
     _check_grammar(arguments.overrides)
-    task = _Task(arguments.command, arguments.scenes, arguments.outs, arguments.paths, arguments.json)
     words = [*arguments.options, *arguments.overrides]
     with tempfile.TemporaryDirectory(prefix="torchpt-sweep-") as folder:
         if arguments.multirun:  # the sweeper writes a multirun.yaml: not beside the pictures

@@ -7,6 +7,8 @@ sum for each randomization of the sampler: their spread is the picture's own err
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -31,6 +33,20 @@ def _mitchell(x: np.ndarray, b: float, c: float) -> np.ndarray:
     inner = (12 - 9 * b - 6 * c) * x**3 + (-18 + 12 * b + 6 * c) * x**2 + (6 - 2 * b)
     outer = (-b - 6 * c) * x**3 + (6 * b + 30 * c) * x**2 + (-12 * b - 48 * c) * x + (8 * b + 24 * c)
     return np.where(x < 1, inner, np.where(x < 2, outer, 0.0)) / 6
+
+
+@lru_cache(maxsize=16)  # takes milliseconds, which small renders repeated in a loop would notice
+def _tables(kind: str, radius: float, stddev: float, b: float, c: float) -> tuple[np.ndarray, float]:
+    """The inverse of the cumulative profile, made in float64 to be read linearly, and the share of each negative lobe."""
+    x = np.linspace(-radius, radius, (1 << 16) + 1)
+    middle = 0.5 * (x[1:] + x[:-1])
+    weight = _gaussian(middle, radius, stddev) if kind == "gaussian" else _mitchell(middle, b, c)
+    cdf = np.concatenate(([0.0], np.cumsum(np.abs(weight))))
+    inverse = np.interp(np.linspace(0.0, 1.0, _CELLS + 1), cdf / cdf[-1], x)
+    # The negative lobes are the outermost, each with a share of the numbers, in whole steps of 2^-24. Both are drawn by
+    # the lowest numbers: the fewer ends of intervals, the more evenly stratified points share them out.
+    lobe = round(float(np.abs(weight[: 1 << 15]).dot(weight[: 1 << 15] < 0)) / cdf[-1] * _STEPS) / _STEPS
+    return inverse.astype(np.float32), lobe
 
 
 class Filter:
@@ -59,18 +75,10 @@ class Filter:
         self.radius = torch.tensor(radius, dtype=torch.float32, device=device)
         if kind in ("box", "tent"):
             return
-        # Inverse of the cumulative profile, tabulated in float64 and read linearly.
-        x = np.linspace(-radius, radius, (1 << 16) + 1)
-        middle = 0.5 * (x[1:] + x[:-1])
-        weight = _gaussian(middle, radius, stddev) if kind == "gaussian" else _mitchell(middle, b, c)
-        cdf = np.concatenate(([0.0], np.cumsum(np.abs(weight))))
-        inverse = np.interp(np.linspace(0.0, 1.0, _CELLS + 1), cdf / cdf[-1], x)
-        self._inverse = torch.from_numpy(inverse.astype(np.float32)).to(device)
-        # The negative lobes are the outermost, each with a share of the numbers, in whole steps of 2^-24. Both are drawn by
-        # the lowest numbers: the fewer ends of intervals, the more evenly stratified points share them out.
-        lobe = round(float(np.abs(weight[: 1 << 15]).dot(weight[: 1 << 15] < 0)) / cdf[-1] * _STEPS) / _STEPS
+        inverse, lobe = _tables(kind, radius, stddev, b, c)
+        self._inverse = torch.from_numpy(inverse).to(device)
         self._lobe = torch.tensor(lobe, dtype=torch.float32, device=device)
-        self.signed = bool(self._lobe > 0)
+        self.signed = lobe > 0
 
     def kind_of(self) -> tuple[object, ...]:
         """What is not a tensor: kernels are made anew where it differs."""

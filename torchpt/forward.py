@@ -93,6 +93,8 @@ class Rendering:
         layers: what ``film.aovs`` asked for, each ``(H, W, C)``.
         spp: samples a pixel that the picture holds.
         seconds: wall time.
+        build_seconds: of it, for the world and its search structure.
+        compile_seconds: of it, for compiling.
         paths: camera samples traced.
         rays: rays traced, shadow rays included.
         nonfinite_samples: samples that were NaN or infinite, and counted as black.
@@ -107,6 +109,8 @@ class Rendering:
     layers: dict[str, Tensor] = field(default_factory=dict)
     spp: int = 0
     seconds: float = 0.0
+    build_seconds: float = 0.0
+    compile_seconds: float = 0.0
     paths: int = 0
     rays: int = 0
     nonfinite_samples: int = 0
@@ -120,6 +124,8 @@ class Rendering:
         """The facts as plain values, ready for JSON."""
         facts: dict[str, Any] = {
             "spp": self.spp,
+            "build_seconds": round(self.build_seconds, 4),
+            "compile_seconds": round(self.compile_seconds, 4),
             "seconds": round(self.seconds, 4),
             "paths_per_second": round(self.paths / max(self.seconds, 1e-9)),
             "rays": self.rays,
@@ -334,6 +340,7 @@ class Run:
         self.start = time.perf_counter()
         self.settings, self.device = settings, scene.device
         self.wave = make_wave(scene, settings, params, dtype)
+        self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
         self.dtype = dtype
         self.names = tuple(name for name in settings.film.aovs if name in CHANNELS)
@@ -471,6 +478,8 @@ class Run:
             layers=layers,
             spp=self.done // pixels,
             seconds=time.perf_counter() - self.start,
+            build_seconds=self.build_seconds,
+            compile_seconds=0.0 if self.loop is None else self.loop.kernels.seconds,
             paths=self.done,
             rays=self.tally.rays,
             nonfinite_samples=int(self.bad),

@@ -27,7 +27,8 @@ def test_a_real_render(tmp_path: Path) -> None:
     assert done.returncode == 0 and done.stderr == ""
     facts = json.loads(done.stdout.splitlines()[-1])
     assert facts["out"] == ["a.exr", "a.png"] and facts["spp"] == 4 and facts["nonfinite_samples"] == 0
-    assert {"seconds", "paths_per_second", "rays", "mean"} <= set(facts)
+    assert {"paths_per_second", "rays", "mean"} <= set(facts)
+    assert facts["load_seconds"] > 0 and 0 < facts["build_seconds"] + facts["compile_seconds"] < facts["seconds"]
     layers = read_layers(tmp_path / "a.exr")
     assert set(layers) == {"image", "albedo", "normal", "depth", "variance"}
     assert layers["depth"].shape == (16, 16, 1) and layers["normal"].abs().max() <= 1.001

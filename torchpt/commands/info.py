@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
+from torchpt.commands import collector
 from torchpt.commands.interrupt import Interrupt
 from torchpt.commands.notices import notices
 from torchpt.commands.render import Job, described, plain
@@ -23,6 +24,7 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
     """
     from torchpt.scene.scene import Scene, device_of
 
+    collector.resume()
     with notices():
         description, wishes = described(job)
         facts = Scene(description, device_of(wishes.render.device)).info(wishes)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from torchpt.commands import collector
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.notices import notices
 from torchpt.commands.progress import Bar
@@ -51,18 +53,19 @@ def render(job: Job, interrupt: Interrupt) -> int:
         Interrupted: a signal came while there was no picture to keep.
     """
     from torchpt.images import check_writable
+    from torchpt.render import first_hit, render_scene
+    from torchpt.scene.scene import Scene, device_of
 
+    collector.resume()
+    start = time.perf_counter()
     with notices():
         description, wishes = described(job)
         outs = _outputs(job, wishes)
         preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
         for path in (*outs, *(_preview_files(preview) if preview else ())):
             check_writable(path)
-
-        from torchpt.render import first_hit, render_scene
-        from torchpt.scene.scene import Scene, device_of
-
         scene = Scene(description, device_of(wishes.render.device))
+    load_seconds = time.perf_counter() - start
     if preview:
         hits = first_hit(scene, wishes)
         for path, name in zip(_preview_files(preview), ("albedo", "normal"), strict=False):
@@ -78,7 +81,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
 
         rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress))
     _write_all([*outs, *((preview,) if preview else ())], rendering, wishes)
-    print(_summary(rendering, outs), flush=True)
+    print(_summary(rendering, outs, load_seconds), flush=True)
     if interrupt.signum is None:
         return 0
     print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far", file=sys.stderr)
@@ -161,9 +164,9 @@ def _write_layer(path: str, name: str, layer: Any) -> None:
     write_image(path, shown, gamma=1.0 if name == "normal" else "srgb")
 
 
-def _summary(rendering: Any, outs: list[str]) -> str:
+def _summary(rendering: Any, outs: list[str], load_seconds: float) -> str:
     """The last line on stdout."""
-    facts = {"out": outs[0] if len(outs) == 1 else outs, **rendering.summary()}
+    facts = {"out": outs[0] if len(outs) == 1 else outs, "load_seconds": round(load_seconds, 4), **rendering.summary()}
     if not rendering.complete:
         facts["complete"] = False
     return json.dumps(plain(facts), allow_nan=False)

@@ -10,6 +10,7 @@ import os
 import secrets
 from contextlib import suppress
 from functools import partial
+from io import BytesIO
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -152,10 +153,13 @@ def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str]) -> N
 
 
 def _encode_integer(temporary: Path, levels: np.ndarray) -> None:
-    import imageio.v3 as iio
+    from PIL import Image
 
-    options: dict[str, Any] = {"quality": 95} if temporary.suffix in (".jpg", ".jpeg") else {}
-    temporary.write_bytes(iio.imwrite("<bytes>", levels, plugin="pillow", extension=temporary.suffix, **options))
+    kind = {".png": "PNG", ".ppm": "PPM"}.get(temporary.suffix, "JPEG")
+    options: dict[str, Any] = {"quality": 95} if kind == "JPEG" else {}
+    encoded = BytesIO()
+    Image.fromarray(levels).save(encoded, kind, **options)  # a kind by name: else Pillow imports all that it knows
+    temporary.write_bytes(encoded.getbuffer())
 
 
 def _levels(pixels: np.ndarray, alpha: bool, exposure: float, tonemap: str, gamma: str | float) -> np.ndarray:

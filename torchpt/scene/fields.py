@@ -7,22 +7,39 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from itertools import chain
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PlainValidator
-from pydantic_core import PydanticCustomError
+from pydantic_core import CoreSchema, PydanticCustomError
+from pydantic_core.core_schema import no_info_plain_validator_function
 
 from torchpt.errors import SceneError
 from torchpt.math import transforms
 
 __all__ = [
-    "Affine", "Color", "FaceArray", "Flag", "Rows2", "Rows3", "Text", "Transform", "Vec3",
+    "Affine", "Check", "Color", "FaceArray", "Flag", "Rows2", "Rows3", "Text", "Transform", "Vec3",
     "bounded", "choice", "color", "file_paths", "integer", "memory_size",
     "number", "number_field", "pair", "scalar", "vector", "wrong",
 ]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """Beside a field's type: the function that takes a raw value to it.
+
+    Pydantic's ``PlainValidator``, which in addition works out how a value of the type would be written. Nothing asks for
+    that, and it takes more time than all the rest of a model.
+    """
+
+    function: Callable[[Any], Any]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        """What pydantic calls the function through."""
+        return no_info_plain_validator_function(self.function)
+
 
 _LARGEST = float(np.finfo(np.float32).max)
 _OR_TEXTURE = ", or a texture"
@@ -46,9 +63,7 @@ def number(value: Any, expected: str = "a finite number") -> float:
     return float(value)
 
 
-def number_field(
-    expected: str, accept: Callable[[float], bool] = lambda _: True, *, optional: bool = False
-) -> PlainValidator:
+def number_field(expected: str, accept: Callable[[float], bool] = lambda _: True, *, optional: bool = False) -> Check:
     """A validator for one number that ``accept`` allows; with ``optional`` None stays None."""
 
     def check(value: Any) -> float | None:
@@ -59,10 +74,10 @@ def number_field(
             raise wrong(expected)
         return result
 
-    return PlainValidator(check)
+    return Check(check)
 
 
-def integer(low: int, high: int, *, also: tuple[Any, ...] = ()) -> PlainValidator:
+def integer(low: int, high: int, *, also: tuple[Any, ...] = ()) -> Check:
     """A validator for a whole number in ``low..high``, or one of the values in ``also``."""
     words = "".join(f" or {'null' if item is None else item}" for item in also)
     expected = f"a whole number {low}..{high}{words}"
@@ -78,10 +93,10 @@ def integer(low: int, high: int, *, also: tuple[Any, ...] = ()) -> PlainValidato
             raise wrong(expected)
         return int(value)
 
-    return PlainValidator(check)
+    return Check(check)
 
 
-def choice(*names: str, booleans: Mapping[bool, str] | None = None) -> PlainValidator:
+def choice(*names: str, booleans: Mapping[bool, str] | None = None) -> Check:
     """A validator for one of some words; ``booleans`` says which word a YAML boolean stands for."""
     expected = f"one of {', '.join(names)}"
 
@@ -92,7 +107,7 @@ def choice(*names: str, booleans: Mapping[bool, str] | None = None) -> PlainVali
             raise wrong(expected)
         return value
 
-    return PlainValidator(check)
+    return Check(check)
 
 
 def vector(value: Any, expected: str = "three finite numbers [x, y, z]") -> tuple[float, float, float]:
@@ -103,7 +118,7 @@ def vector(value: Any, expected: str = "three finite numbers [x, y, z]") -> tupl
     return x, y, z
 
 
-def pair(expected: str, *, single: bool = False) -> PlainValidator:
+def pair(expected: str, *, single: bool = False) -> Check:
     """A validator for two finite numbers; with ``single`` one number stands for both."""
 
     def check(value: Any) -> tuple[float, float]:
@@ -113,7 +128,7 @@ def pair(expected: str, *, single: bool = False) -> PlainValidator:
             raise wrong(expected)
         return number(value[0], expected), number(value[1], expected)
 
-    return PlainValidator(check)
+    return Check(check)
 
 
 def bounded(value: Any, low: float, high: float, expected: str) -> float:
@@ -124,9 +139,7 @@ def bounded(value: Any, low: float, high: float, expected: str) -> float:
     return result
 
 
-def scalar(
-    low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False, texture: bool = False
-) -> PlainValidator:
+def scalar(low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False, texture: bool = False) -> Check:
     """A validator for a number in ``low..high`` (any, where ``low`` is None), or a texture that gives it."""
     floor = -_LARGEST if low is None else low
     expected = f"a finite number{_bound(low, high)}{_OR_TEXTURE if texture else ''}"
@@ -138,12 +151,10 @@ def scalar(
             return _slot(value, False, floor, high)
         return bounded(value, floor, high, expected)
 
-    return PlainValidator(check)
+    return Check(check)
 
 
-def color(
-    low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False, texture: bool = False
-) -> PlainValidator:
+def color(low: float | None = 0.0, high: float = _LARGEST, *, optional: bool = False, texture: bool = False) -> Check:
     """A validator for a linear RGB colour: three numbers or one for all, each in ``low..high``, or a texture."""
     floor = -_LARGEST if low is None else low
     bound = _bound(low, high)
@@ -163,7 +174,7 @@ def color(
             raise wrong(expected)
         return rgb
 
-    return PlainValidator(check)
+    return Check(check)
 
 
 def _bound(low: float | None, high: float) -> str:
@@ -219,7 +230,7 @@ def _affine(value: Any) -> NDArray[np.float64] | None:
         raise _relocated(error) from None
 
 
-def _rows(columns: int, what: str) -> PlainValidator:
+def _rows(columns: int, what: str) -> Check:
     """A validator for ``(V, columns)`` float64 from nested lists or an array; checked and converted in bulk."""
     expected = f"a list of {what}, finite numbers each"
 
@@ -245,7 +256,7 @@ def _rows(columns: int, what: str) -> PlainValidator:
             raise wrong(expected, rows[bad[0]].tolist(), (int(bad[0]),))
         return rows
 
-    return PlainValidator(check)
+    return Check(check)
 
 
 def _first_bad(value: Any, columns: int, expected: str) -> None:
@@ -300,12 +311,12 @@ def memory_size(value: Any) -> int | None:
     return value
 
 
-Vec3 = Annotated[tuple[float, float, float], PlainValidator(lambda value: vector(value))]
+Vec3 = Annotated[tuple[float, float, float], Check(lambda value: vector(value))]
 Color = Annotated[tuple[float, float, float], color()]
-Flag = Annotated[bool, PlainValidator(_flag)]
-Text = Annotated[str, PlainValidator(_text)]
-Transform = Annotated[NDArray[np.float64], PlainValidator(_transform)]
-Affine = Annotated[NDArray[np.float64] | None, PlainValidator(_affine)]
+Flag = Annotated[bool, Check(_flag)]
+Text = Annotated[str, Check(_text)]
+Transform = Annotated[NDArray[np.float64], Check(_transform)]
+Affine = Annotated[NDArray[np.float64] | None, Check(_affine)]
 Rows3 = Annotated[NDArray[np.float64] | None, _rows(3, "[x, y, z]")]
 Rows2 = Annotated[NDArray[np.float64] | None, _rows(2, "[u, v]")]
-FaceArray = Annotated[NDArray[np.int64] | None, PlainValidator(_faces)]
+FaceArray = Annotated[NDArray[np.int64] | None, Check(_faces)]

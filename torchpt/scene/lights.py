@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PlainValidator, model_validator
+from pydantic import model_validator
 
 from torchpt.math.transforms import similarity_scale
-from torchpt.scene.fields import Color, Transform, Vec3, file_paths, number_field, scalar, wrong
+from torchpt.scene.fields import Check, Color, Transform, Vec3, file_paths, number_field, scalar, wrong
 from torchpt.scene.validate import Model
 
 __all__ = ["ENVIRONMENTS", "LIGHTS", "Light"]
@@ -109,7 +109,7 @@ class EnvmapLight(Light):
     """
 
     type: Literal["envmap"] = "envmap"
-    path: Annotated[tuple[str, ...], PlainValidator(file_paths)]
+    path: Annotated[tuple[str, ...], Check(file_paths)]
     scale: Annotated[float, scalar()] = 1.0
     transform: Transform | None = None
 

@@ -9,13 +9,13 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import PlainValidator, create_model, model_validator
+from pydantic import create_model, model_validator
 from pydantic_core import PydanticCustomError
 
 from torchpt import bsdfs
 from torchpt.bsdfs import Bsdf
 from torchpt.errors import EnergyWarning, NotBuiltError, SceneError
-from torchpt.scene.fields import Flag, bounded, color, number, scalar, vector, wrong
+from torchpt.scene.fields import Check, Flag, bounded, color, number, scalar, vector, wrong
 from torchpt.scene.parts import MaterialSlot, Reading
 from torchpt.scene.presets import INDICES, METALS, metal
 from torchpt.scene.textures import Named, Slot, Texture, VertexColor, slot_value
@@ -69,7 +69,7 @@ def _hint(name: str, known: Mapping[str, Any]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
-def _mirror_like(rough: str) -> PlainValidator:
+def _mirror_like(rough: str) -> Check:
     """A validator for the roughness of a type that has none: 0, which says nothing."""
     expected = f"0, as this type is smooth (use {rough})"
 
@@ -77,7 +77,7 @@ def _mirror_like(rough: str) -> PlainValidator:
         if value is not None and (isinstance(value, bool) or value != 0):
             raise wrong(expected)
 
-    return PlainValidator(check)
+    return Check(check)
 
 
 def _normals(value: Any) -> Slot | None:
@@ -105,7 +105,7 @@ MaybeFraction = Annotated[Number | None, scalar(0.0, 1.0, optional=True, texture
 Reflectance = Annotated[Color, color(0.0, 1.0, texture=True)]
 MaybeReflectance = Annotated[Color | None, color(0.0, 1.0, optional=True, texture=True)]
 MaybeColor = Annotated[Color | None, color(optional=True, texture=True)]
-Index = Annotated[Number, PlainValidator(_index)]
+Index = Annotated[Number, Check(_index)]
 
 
 class Material(Model):
@@ -127,9 +127,9 @@ class Material(Model):
     alpha_cutoff: Annotated[float | None, scalar(0.0, 1.0, optional=True)] = None
     emission: MaybeColor = None
     emission_strength: Annotated[float, scalar(0.0)] = 1.0
-    normal_map: Annotated[Slot | None, PlainValidator(_normals)] = None
+    normal_map: Annotated[Slot | None, Check(_normals)] = None
     normal_strength: Annotated[float, scalar(0.0)] = 1.0
-    bump_map: Annotated[Slot | None, PlainValidator(_heights)] = None
+    bump_map: Annotated[Slot | None, Check(_heights)] = None
 
     @model_validator(mode="after")
     def _asks_for_something(self) -> Material:
@@ -217,7 +217,7 @@ class BlinnPhong(Phong):
 class _Metal(Material):
     """What smooth and rough conductors share: one of three ways to say which metal it is."""
 
-    material: Annotated[str | None, PlainValidator(_metal)] = None
+    material: Annotated[str | None, Check(_metal)] = None
     eta: MaybeColor = None
     k: MaybeColor = None
     reflectance: MaybeReflectance = None
@@ -464,8 +464,8 @@ class Blend(Material):
     """A mixture: ``1 - weight`` of ``a`` and ``weight`` of ``b``."""
 
     type: Literal["blend"] = "blend"
-    a: Annotated[str | Material, PlainValidator(_inner)]
-    b: Annotated[str | Material, PlainValidator(_inner)]
+    a: Annotated[str | Material, Check(_inner)]
+    b: Annotated[str | Material, Check(_inner)]
     weight: Fraction
 
     def values(self) -> Values:

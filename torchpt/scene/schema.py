@@ -7,12 +7,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PlainValidator, model_validator
+from pydantic import model_validator
 
 from torchpt.errors import SceneError
 from torchpt.math import transforms
 from torchpt.scene.fields import (
     Affine,
+    Check,
     FaceArray,
     Flag,
     Rows2,
@@ -157,7 +158,7 @@ class Shape(Model):
         flip_normals: turn the front side around.
     """
 
-    material: Annotated[str | Material | None, PlainValidator(_material)] = None
+    material: Annotated[str | Material | None, Check(_material)] = None
     transform: Transform | None = None
     emission: Annotated[tuple[float, float, float] | None, color(optional=True)] = None
     flip_normals: Flag = False
@@ -188,7 +189,7 @@ _LARGEST = float(np.finfo(np.float32).max)
 class Displacement(Model):
     """How far vertices move along their normals: ``scale`` times a texture, after cutting triangles in four."""
 
-    texture: Annotated[Slot, PlainValidator(_heights)]
+    texture: Annotated[Slot, Check(_heights)]
     scale: Annotated[float, number_field("a finite number")] = 1.0
     subdivisions: Annotated[int, integer(0, 12)] = 0
 
@@ -216,13 +217,13 @@ class Mesh(Shape):
     """
 
     type: Literal["mesh"] = "mesh"
-    path: Annotated[tuple[str, ...] | None, PlainValidator(_path)] = None
+    path: Annotated[tuple[str, ...] | None, Check(_path)] = None
     vertices: Rows3 = None
     faces: FaceArray = None
     normals: Rows3 = None
     uvs: Rows2 = None
     face_normals: Flag = False
-    displacement: Annotated[Displacement | None, PlainValidator(_displacement)] = None
+    displacement: Annotated[Displacement | None, Check(_displacement)] = None
 
     @model_validator(mode="after")
     def _complete(self) -> Mesh:
@@ -334,7 +335,7 @@ class Instance(Shape):
     """
 
     type: Literal["instance"] = "instance"
-    of: Annotated[str, PlainValidator(_of)]
+    of: Annotated[str, Check(_of)]
 
     @model_validator(mode="after")
     def _dark(self) -> Instance:

@@ -6,12 +6,12 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import PlainValidator, model_validator
+from pydantic import model_validator
 
 from torchpt.errors import SceneError
 from torchpt.samplers import KINDS
 from torchpt.scene import not_built
-from torchpt.scene.fields import Flag, choice, integer, memory_size, number_field, wrong
+from torchpt.scene.fields import Check, Flag, choice, integer, memory_size, number_field, wrong
 from torchpt.scene.validate import Model, check_keys, construct, dotted, refuse_foreign, refuse_not_built, select
 
 __all__ = [
@@ -134,12 +134,12 @@ class Film(Model):
 
     width: Annotated[int, integer(1, MAX_SIDE)] = 512
     height: Annotated[int, integer(1, MAX_SIDE)] = 512
-    filter: Annotated[Filter, PlainValidator(_filter)] = GaussianFilter()
-    crop: Annotated[tuple[int, int, int, int] | None, PlainValidator(_crop)] = None
-    aovs: Annotated[tuple[str, ...], PlainValidator(_aovs)] = ()
+    filter: Annotated[Filter, Check(_filter)] = GaussianFilter()
+    crop: Annotated[tuple[int, int, int, int] | None, Check(_crop)] = None
+    aovs: Annotated[tuple[str, ...], Check(_aovs)] = ()
     exposure: Annotated[float, number_field("a number of stops in -64..64", lambda x: abs(x) <= 64)] = 0.0
     tonemap: Annotated[str, choice("none", "filmic", "aces", "reinhard")] = "none"
-    gamma: Annotated[float | str, PlainValidator(_gamma)] = "srgb"
+    gamma: Annotated[float | str, Check(_gamma)] = "srgb"
 
     @model_validator(mode="after")
     def _sizes(self) -> Film:
@@ -255,12 +255,12 @@ class Render(Model):
 
     spp: Annotated[int, integer(1, 2**31 - 1)] = 64
     seed: Annotated[int, integer(0, 2**63 - 1)] = 0
-    device: Annotated[str, PlainValidator(_device)] = "auto"
+    device: Annotated[str, Check(_device)] = "auto"
     accel: Annotated[str, choice("auto", "torch", "numba", "brute")] = "auto"
     compile: Annotated[str, choice("auto", "on", "off", booleans={True: "on", False: "off"})] = "auto"
     threads: Annotated[int | str, integer(1, 1024, also=("auto",))] = "auto"
-    max_memory: Annotated[int | None, PlainValidator(memory_size)] = None
-    preview: Annotated[str | None, PlainValidator(_preview)] = None
+    max_memory: Annotated[int | None, Check(memory_size)] = None
+    preview: Annotated[str | None, Check(_preview)] = None
 
 
 class Settings(Model):

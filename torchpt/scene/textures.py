@@ -10,12 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import PlainValidator
-
 from torchpt.errors import SceneError
 from torchpt.images import EncodedImage
 from torchpt.math.transforms import uv_matrix
-from torchpt.scene.fields import choice, color, file_paths, integer, number_field, pair, wrong
+from torchpt.scene.fields import Check, choice, color, file_paths, integer, number_field, pair, wrong
 from torchpt.scene.validate import Model, check_keys, select
 from torchpt.textures import WRAPS
 
@@ -57,7 +55,7 @@ def _uv_transform(value: Any) -> UvTransform:
         raise wrong(error.expected, error.value, tuple(error.key.split("."))) from None
 
 
-Uv = Annotated[UvTransform, PlainValidator(_uv_transform)]
+Uv = Annotated[UvTransform, Check(_uv_transform)]
 
 
 def _source(value: Any) -> tuple[str, ...] | EncodedImage:
@@ -82,7 +80,7 @@ class Image(Texture):
     """
 
     type: Literal["image"] = "image"
-    path: Annotated[tuple[str, ...] | EncodedImage, PlainValidator(_source)]
+    path: Annotated[tuple[str, ...] | EncodedImage, Check(_source)]
     wrap: Annotated[str, choice(*WRAPS)] = "repeat"
     filter: Annotated[str, choice("bilinear", "nearest", "trilinear")] = "bilinear"
     colorspace: Annotated[str, choice("auto", "srgb", "linear")] = "auto"

@@ -17,7 +17,7 @@ __all__ = ["Model", "check_keys", "construct", "dotted", "refuse_foreign", "refu
 class Model(BaseModel):
     """Base of the scene's models: immutable, unknown keys refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(extra="forbid", defer_build=True, frozen=True, arbitrary_types_allowed=True)
 
 
 M = TypeVar("M", bound=Model)

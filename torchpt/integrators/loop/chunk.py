@@ -246,7 +246,7 @@ class Worker:
         depth: int,
     ) -> int:
         """The same by tensor operations, for a model that no kernel can be made of."""
-        kernels, rows = self.kernels, self.kernels.state
+        rows = self.kernels.state
         lanes = places.words[0, :count]
         with torch.no_grad():
             state = PathState(**{"eta": None, "p": None, "n": None, **rows.take(here, lanes, _STATE)})  # type: ignore[arg-type]

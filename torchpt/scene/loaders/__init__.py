@@ -1,31 +1,21 @@
-"""Mesh files to plain arrays: OBJ with MTL, PLY, STL, glTF. One table of formats."""
+"""Mesh files to plain arrays: OBJ with MTL, PLY, STL, glTF. One table of formats; a scene imports those that it reads."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 
 from torchpt.errors import AssetError
 from torchpt.scene.loaders.cube import unit_cube
-from torchpt.scene.loaders.gltf import load_gltf
 from torchpt.scene.loaders.mesh_part import FileCamera, FileLight, FileMaterial, MeshPart, checked
 from torchpt.scene.loaders.normals import smooth_normals
-from torchpt.scene.loaders.obj import load_obj
-from torchpt.scene.loaders.ply import load_ply
-from torchpt.scene.loaders.stl import load_stl
 
 __all__ = ["FORMATS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals", "unit_cube"]
 
-#: File ending -> reader ``(path, data, materials) -> parts``.
-FORMATS: dict[str, Callable[[Path, bytes, bool], list[MeshPart]]] = {
-    ".obj": load_obj,
-    ".ply": load_ply,
-    ".stl": load_stl,
-    ".glb": load_gltf,
-    ".gltf": load_gltf,
-}
+#: File ending -> module here, whose ``load_<module>(path, data, materials)`` gives the parts.
+FORMATS = {".obj": "obj", ".ply": "ply", ".stl": "stl", ".glb": "gltf", ".gltf": "gltf"}
 
 
 def load_mesh(path: Path, *, materials: bool = True) -> list[MeshPart]:
@@ -39,12 +29,13 @@ def load_mesh(path: Path, *, materials: bool = True) -> list[MeshPart]:
         AssetError: the file cannot be read or is malformed; the message names the element.
     """
     path = Path(path)
-    reader = FORMATS.get(path.suffix.lower())
-    if reader is None:
+    kind = FORMATS.get(path.suffix.lower())
+    if kind is None:
         raise AssetError(path, f"expected a mesh file ending in {', '.join(FORMATS)}, got {path.suffix or 'no ending'}")
     try:
         data = path.read_bytes()
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror})") from None
+    reader = getattr(import_module(f"{__name__}.{kind}"), f"load_{kind}")
     with np.errstate(all="ignore"):  # what is not finite is found by the checks
         return checked(reader(path, data, materials), path)
