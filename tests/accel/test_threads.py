@@ -98,9 +98,9 @@ def test_no_folder_for_the_cache():
     body = """
     from numba.core import caching
     caching.CompileResultCacheImpl._locator_classes = []  # numba then raises "no locator available"
-    from torchpt.accel import kernels_brute, kernels_build, kernels_wide
+    from torchpt.accel import kernels_brute, kernels_build, kernels_search
     from torchpt.native.jit import jit
-    print(jit()(lambda x: x + 1)(1), type(kernels_wide.intersect._cache).__name__)
+    print(jit()(lambda x: x + 1)(1), type(kernels_search.nearest._cache).__name__)
     """
     assert _run(body) == ["2", "NullCache"]
 

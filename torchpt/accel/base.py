@@ -5,10 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Accel", "Hits"]
+__all__ = ["Accel", "Array", "Hits"]
+
+#: A numpy array, float32 or int32.
+Array = np.ndarray[Any, Any]
 
 #: ``t`` (N,) float32, ``prim`` (N,) int32, ``u`` (N,), ``v`` (N,).
 Hits = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -34,6 +38,28 @@ class Accel(ABC):
     def occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
         """Whether anything lies in the open interval ``(0, t_max)``: ``(N,)`` bool."""
         return self._occluded(*_rays(o, d, t_max))
+
+    def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
+        """The nearest hits of the first ``count`` rays of arrays, for loops outside of torch.
+
+        Serial, and without the GIL, so that several Python threads may search at once. Only lanes below ``count`` are read and
+        written. Misses are those of :meth:`intersect`.
+
+        Args:
+            o: origins ``(3, C)`` float32, C-contiguous, ``C >= count``.
+            d: directions, likewise.
+            t_max: ``(C,)`` float32.
+            count: how many rays.
+            t: ``(C,)`` float32, filled.
+            prim: ``(C,)`` int32, filled.
+            u: ``(C,)`` float32, filled.
+            v: ``(C,)`` float32, filled.
+        """
+        raise NotImplementedError(f"the search {self.name!r} takes tensors only; accel numba and brute take arrays")
+
+    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
+        """Whether anything lies in ``(0, t_max)``: 1 or 0 in ``out (C,)`` int32; else as :meth:`nearest`."""
+        raise NotImplementedError(f"the search {self.name!r} takes tensors only; accel numba and brute take arrays")
 
     @abstractmethod
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits: ...

@@ -5,18 +5,20 @@ Importing this module imports numba; only the numba backends do so.
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numba
 import torch
 from numba.core import config as numba_config
 
-__all__ = ["jit", "launch", "parallel_allowed", "thread_count"]
+__all__ = ["jit", "launch", "parallel_allowed", "part", "thread_count"]
 
 _lock = threading.Lock()
 _state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "pools": {}}
@@ -46,11 +48,29 @@ def jit(**options: Any) -> Callable[[Callable], Any]:
 
     def wrap(function: Callable) -> Any:
         try:
-            return numba.njit(cache=True, **settings)(function)
+            kernel = numba.njit(cache=True, **settings)(function)
+            if hasattr(kernel._cache, "_cache_file"):
+                kernel._cache._cache_file._source_stamp = _stamp()
+            return kernel
         except (RuntimeError, OSError):  # numba: "no locator available", no folder for its cache
             return numba.njit(**settings)(function)
 
     return wrap
+
+
+@functools.cache
+def _stamp() -> tuple[float, int]:
+    """When the package last changed and how large it is.
+
+    Numba keeps a kernel until the kernel's own file changes, and would not see that what is inlined into it has.
+    """
+    found = [path.stat() for path in Path(__file__).parents[1].rglob("*.py")]
+    return max(file.st_mtime for file in found), sum(file.st_size for file in found)
+
+
+def part(**options: Any) -> Callable[[Callable], Any]:
+    """:func:`jit` for what kernels alone call: without entries from Python and C, which would be compiled beside it."""
+    return jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
 def thread_count(threads: int | None) -> int:

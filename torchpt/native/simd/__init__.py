@@ -17,7 +17,7 @@ from torchpt.native.simd.lanes import (
     sort_descending,
     trailing_zeros,
 )
-from torchpt.native.simd.memory import gather, item, load, load_masked, prefetch, put, store, store_masked
+from torchpt.native.simd.memory import gather, item, load, load_masked, pointer, prefetch, put, store, store_masked
 from torchpt.native.simd.types import Vector, splat
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "mask",
     "maximum",
     "minimum",
+    "pointer",
     "population",
     "prefetch",
     "put",

@@ -117,9 +117,11 @@ def as_int(context, x):
 
 @intrinsic
 def as_float(context, x):
-    """int32, of a vector or a scalar, as the bits of float32."""
-    if x == types.int32:
-        return types.float32(x), lambda context, builder, signature, args: builder.bitcast(args[0], ir.FloatType())
+    """int32 lanes, or the low half of an integer, as the bits of float32."""
+    if isinstance(x, types.Integer):  # arithmetic of int32 scalars is int64 in numba
+        return types.float32(types.int32), lambda context, builder, signature, args: builder.bitcast(
+            args[0], ir.FloatType()
+        )
     if not (isinstance(x, Vector) and x.element == types.int32):
         return None
     kind = ir.VectorType(ir.FloatType(), x.lanes)

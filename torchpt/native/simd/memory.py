@@ -1,4 +1,4 @@
-"""Vectors in and out of contiguous arrays. Addresses need not be aligned."""
+"""Vectors in and out of contiguous arrays, or of pointers to their memory. Addresses need not be aligned."""
 
 from __future__ import annotations
 
@@ -10,23 +10,47 @@ from numba.extending import intrinsic
 
 from torchpt.native.simd.types import ELEMENTS, I32, Vector, lanes_of, splatted
 
-__all__ = ["gather", "item", "load", "load_masked", "prefetch", "put", "store", "store_masked"]
+__all__ = ["gather", "item", "load", "load_masked", "pointer", "prefetch", "put", "store", "store_masked"]
 
 _BYTES = 4  # of an element, and the alignment that is taken for granted
 _I64 = ir.IntType(64)
 
 
-def _address(context: Any, builder: Any, kind: Any, array: Any, i: Any, target: Any) -> Any:
-    place = builder.gep(context.make_array(kind)(context, builder, array).data, [i], inbounds=True)
-    return builder.bitcast(place, target.as_pointer())
+def _base(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    return value if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, value).data
+
+
+def _place(context: Any, builder: Any, kind: Any, value: Any, i: Any) -> Any:
+    return builder.gep(_base(context, builder, kind, value), [i], inbounds=True)
+
+
+def _address(context: Any, builder: Any, kind: Any, value: Any, i: Any, target: Any) -> Any:
+    return builder.bitcast(_place(context, builder, kind, value, i), target.as_pointer())
 
 
 def _llvm(kind: Vector) -> Any:
     return ir.VectorType(ELEMENTS[kind.element], kind.lanes)
 
 
+def _contiguous(array: Any) -> bool:
+    return isinstance(array, types.CPointer) or (isinstance(array, types.Array) and array.layout == "C")
+
+
 def _holds(array: Any) -> bool:
-    return isinstance(array, types.Array) and array.layout == "C" and array.dtype in (types.float32, types.int32)
+    return _contiguous(array) and array.dtype in (types.float32, types.int32)
+
+
+@intrinsic
+def pointer(context, array):
+    """The memory of a contiguous array, for everything here that takes an array.
+
+    A pointer may be passed on and kept in tuples at no cost, where numba counts references to an array in the innermost loop.
+    It does not keep the array alive: the function that made an array must mention it after the last use of its pointer.
+    """
+    if not (isinstance(array, types.Array) and array.layout == "C"):
+        return None
+    kind = types.CPointer(array.dtype)
+    return kind(array), lambda context, builder, signature, args: _base(context, builder, array, args[0])
 
 
 @intrinsic(prefer_literal=True)
@@ -61,11 +85,11 @@ def store(context, array, i, x):
 @intrinsic
 def item(context, array, i):
     """``item(a, i)``: one element at place ``i`` of a contiguous array's memory."""
-    if not (isinstance(array, types.Array) and array.layout == "C"):
+    if not _contiguous(array):
         return None
 
     def generate(context, builder, signature, args):
-        place = builder.gep(context.make_array(array)(context, builder, args[0]).data, [args[1]], inbounds=True)
+        place = _place(context, builder, array, args[0], args[1])
         return context.unpack_value(builder, array.dtype, place)
 
     return array.dtype(array, types.intp), generate
@@ -74,12 +98,11 @@ def item(context, array, i):
 @intrinsic
 def put(context, array, i, x):
     """``put(a, i, x)`` writes one element, converted to the array's own type."""
-    if not (isinstance(array, types.Array) and array.layout == "C"):
+    if not _contiguous(array):
         return None
 
     def generate(context, builder, signature, args):
-        place = builder.gep(context.make_array(array)(context, builder, args[0]).data, [args[1]], inbounds=True)
-        context.pack_value(builder, array.dtype, args[2], place)
+        context.pack_value(builder, array.dtype, args[2], _place(context, builder, array, args[0], args[1]))
         return context.get_dummy_value()
 
     return types.none(array, types.intp, array.dtype), generate
@@ -127,7 +150,7 @@ def gather(context, array, places, m, other):
     def generate(context, builder, signature, args):
         lanes = other.lanes
         wide = builder.sext(args[1], ir.VectorType(_I64, lanes))
-        base = builder.ptrtoint(context.make_array(array)(context, builder, args[0]).data, _I64)
+        base = builder.ptrtoint(_base(context, builder, array, args[0]), _I64)
         scaled = builder.mul(wide, splatted(builder, _I64(_BYTES), lanes))
         address = builder.add(splatted(builder, base, lanes), scaled)
         pointers = builder.inttoptr(address, ir.VectorType(ELEMENTS[other.element].as_pointer(), lanes))
@@ -142,7 +165,7 @@ def gather(context, array, places, m, other):
 @intrinsic
 def prefetch(context, array, i):
     """Asks for the cache line of place ``i``; any address is allowed."""
-    if not isinstance(array, types.Array):
+    if not _contiguous(array):
         return None
 
     def generate(context, builder, signature, args):
