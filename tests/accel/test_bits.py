@@ -109,6 +109,7 @@ print(*(name in code for name in ("zmm", "ymm", "xmm")))
 """
 
 
+@pytest.mark.slow  # compiles everything anew
 @pytest.mark.skipif(sys.platform != "linux" or os.uname().machine != "x86_64", reason="names of x86 processors")
 @pytest.mark.parametrize(
     ("cpu", "features", "registers"),
