@@ -15,7 +15,7 @@ __all__ = ["blocked", "blocked_parallel", "nearest", "nearest_parallel"]
 WAITING = 2048  # rays that are collected before they go in turn
 
 
-@part(forceinline=True)
+@part(inline="always")
 def _trace(first, last, rays, scene, room, chosen, work, spare, out, any_hit):
     """Both kernels, on pointers."""
     i = first

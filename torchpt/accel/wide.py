@@ -14,7 +14,7 @@ from torchpt.accel.base import Accel, Array, Hits
 from torchpt.accel.blocks import aligned, lines_of, mesh_tree, room_of, write
 from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.tables import inverses
-from torchpt.native.jit import launch, thread_count
+from torchpt.native.jit import compiled, launch, thread_count
 from torchpt.native.operators import choose, operator
 from torchpt.records import Geometry
 
@@ -53,11 +53,13 @@ class Wide(Accel):
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
-        kernels.nearest(0, count, o, d, t_max, *self.arrays, t, prim, u, v)
+        args = (o, d, t_max, *self.arrays, t, prim, u, v)
+        compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
     def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
         """See :meth:`Accel.blocked`."""
-        kernels.blocked(0, count, o, d, t_max, *self.arrays, out)
+        args = (o, d, t_max, *self.arrays, out)
+        compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; the cost is that of the binary tree before it was widened."""

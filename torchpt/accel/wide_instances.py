@@ -15,7 +15,7 @@ from torchpt.accel.blocks import Tree, aligned, lines_of, mesh_tree, room_of, wi
 from torchpt.accel.instances import CopyTables
 from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.wide import Wide
-from torchpt.native.jit import launch, thread_count
+from torchpt.native.jit import compiled, launch, thread_count
 from torchpt.records import Geometry
 
 __all__ = ["WideInstanced"]
@@ -72,12 +72,14 @@ class WideInstanced(Accel):
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
         self.base.nearest(o, d, t_max, count, t, prim, u, v)
-        kernels.nearest(0, count, o, d, t_max, *self.arrays, t, prim, u, v)
+        args = (o, d, t_max, *self.arrays, t, prim, u, v)
+        compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
     def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
         """See :meth:`Accel.blocked`."""
         self.base.blocked(o, d, t_max, count, out)
-        kernels.blocked(0, count, o, d, t_max, *self.arrays, out)
+        args = (o, d, t_max, *self.arrays, out)
+        compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost is that of what is no copy."""
