@@ -27,13 +27,13 @@ def work(seed=0, kind="numba"):
 """
 
 
-def _run(body, **env):
-    """Runs a script in its own process and returns what it prints."""
+def _run(body, errors=False, **env):
+    """Runs a script in its own process and returns the words it prints, and where asked what it prints to stderr."""
     code = PREAMBLE.format(tests=str(Path(__file__).parent)) + textwrap.dedent(body)
     settings = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_NUM_THREADS": "2", "OMP_NUM_THREADS": "2", **env}
     done = subprocess.run([sys.executable, "-c", code], env=settings, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout.split()
+    return (done.stdout.split(), done.stderr) if errors else done.stdout.split()
 
 
 @pytest.fixture(scope="module")
@@ -98,15 +98,35 @@ def test_no_folder_for_the_cache():
     body = """
     from numba.core import caching
     caching.CompileResultCacheImpl._locator_classes = []  # numba then raises "no locator available"
-    from torchpt.accel import kernels_brute, kernels_build, kernels_wide
+    from torchpt.accel import kernels_brute, kernels_build, kernels_search
     from torchpt.native.jit import jit
-    print(jit()(lambda x: x + 1)(1), type(kernels_wide.intersect._cache).__name__)
+    print(jit()(lambda x: x + 1)(1), type(kernels_search.nearest._cache).__name__)
     """
     assert _run(body) == ["2", "NullCache"]
 
 
-@pytest.mark.slow
-def test_a_second_process_reads_the_cache(tmp_path):
-    body = "import time; t = time.perf_counter(); work(); print(time.perf_counter() - t)"
-    first, second = (float(_run(body, NUMBA_CACHE_DIR=str(tmp_path / "cache"))[0]) for _ in range(2))
-    assert second < first / 2
+CACHE = """
+from numba.core import event
+
+class Compiled(event.Listener):
+    names = []
+    def on_start(self, event): pass
+    def on_end(self, event): self.names.append(str(event.data["dispatcher"]))
+
+event.register("numba:compile", Compiled())
+work()
+o, d, t_max = (x.numpy() for x in rays(7, 64))
+t, prim, out = t_max.copy(), t_max.astype("int32"), t_max.astype("int32")
+accel = build(soup(3), "numba", 1)
+accel.nearest(o, d, t_max, 64, t, prim, t.copy(), t.copy()), accel.blocked(o, d, t_max, 64, out)
+print(sum("torchpt" in name or "CPUDispatcher" in name for name in Compiled.names))
+"""
+
+
+@pytest.mark.slow  # compiles everything anew
+def test_a_second_process_compiles_nothing_and_says_nothing(tmp_path):
+    env = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    first, said = _run(CACHE, errors=True, **env)
+    assert int(first[0]) > 20 and said.count("compiling the search kernels") == 1
+    second, said = _run(CACHE, errors=True, **env)
+    assert second == ["0"] and "compiling" not in said

@@ -9,7 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Accel", "Hits"]
+__all__ = ["Accel", "Array", "Hits"]
+
+#: A numpy array, float32 or int32.
+Array = np.ndarray[Any, Any]
 
 #: ``t`` (N,) float32, ``prim`` (N,) int32, ``u`` (N,), ``v`` (N,).
 Hits = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -36,35 +39,28 @@ class Accel(ABC):
         """Whether anything lies in the open interval ``(0, t_max)``: ``(N,)`` bool."""
         return self._occluded(*_rays(o, d, t_max))
 
-    def nearest(
-        self,
-        o: np.ndarray,
-        d: np.ndarray,
-        t_max: np.ndarray,
-        count: int,
-        t: np.ndarray,
-        prim: np.ndarray,
-        u: np.ndarray,
-        v: np.ndarray,
-    ) -> None:
-        """:meth:`intersect` for the first ``count`` lanes of an arena, into the arena, in the calling thread alone.
+    def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
+        """The nearest hits of the first ``count`` rays of arrays, for loops outside of torch.
+
+        Serial and without the GIL in the numba backends, so that several Python threads may search at once. Only lanes below ``count`` are read and
+        written. Misses are those of :meth:`intersect`.
 
         Args:
-            o: ``(3, C)`` float32.
-            d: ``(3, C)`` float32.
+            o: origins ``(3, C)`` float32, C-contiguous, ``C >= count``.
+            d: directions, likewise.
             t_max: ``(C,)`` float32.
-            count: at most C.
-            t: ``(C,)`` float32, written.
-            prim: ``(C,)`` int32, written.
-            u: ``(C,)`` float32, written.
-            v: ``(C,)`` float32, written.
+            count: how many rays.
+            t: ``(C,)`` float32, filled.
+            prim: ``(C,)`` int32, filled.
+            u: ``(C,)`` float32, filled.
+            v: ``(C,)`` float32, filled.
         """
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         for out, found in zip((t, prim, u, v), self.intersect(*rays), strict=True):
             out[:count] = found.numpy()
 
-    def blocked(self, o: np.ndarray, d: np.ndarray, t_max: np.ndarray, count: int, out: np.ndarray) -> None:
-        """:meth:`occluded` likewise; ``out (C,)`` int32 becomes 1 or 0."""
+    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
+        """Whether anything lies in ``(0, t_max)``: 1 or 0 in ``out (C,)`` int32; else as :meth:`nearest`."""
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         out[:count] = self.occluded(*rays).numpy()
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import kernels_brute as kernels
-from torchpt.accel.base import Accel, Hits
+from torchpt.accel.base import Accel, Array, Hits
 from torchpt.accel.tables import extent, inverses, prepare, tolerances
 from torchpt.errors import SceneError
 from torchpt.native.jit import launch, thread_count
@@ -64,6 +64,7 @@ class Brute(Accel):
         self.counts = list(geometry.counts)
         self.extent = size
         self.threads = thread_count(threads)
+        self.arrays = _arrays(self.table, self.spheres, self.quadrics, self.counts, self.extent)
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
@@ -75,6 +76,16 @@ class Brute(Accel):
         return choose(_occluded, _occluded_operator)(
             o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, self.threads
         )
+
+    def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
+        """See :meth:`Accel.nearest`."""
+        blocks = -(-count // kernels.BLOCK)
+        results = (t[:count], prim[:count], u[:count], v[:count])
+        kernels.intersect(0, blocks, o, d, t_max[:count], *self.arrays, *results)
+
+    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
+        """See :meth:`Accel.blocked`."""
+        kernels.occluded(0, -(-count // kernels.BLOCK), o, d, t_max[:count], *self.arrays, out[:count])
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; there are no nodes, and the cost is one test a primitive."""
@@ -162,14 +173,10 @@ def _arguments(
     counts: list[int],
     extent: float,
 ) -> tuple:
-    rays = tuple(x.contiguous().numpy() for x in (o, d, t_max))
-    return (
-        *rays,
-        table.numpy(),
-        spheres.numpy(),
-        quadrics.numpy(),
-        counts[0],
-        counts[1],
-        counts[2],
-        np.float32(extent),
-    )
+    rays = (x.contiguous().numpy() for x in (o, d, t_max))
+    return (*rays, *_arrays(table, spheres, quadrics, counts, extent))
+
+
+def _arrays(table: Tensor, spheres: Tensor, quadrics: Tensor, counts: list[int], extent: float) -> tuple:
+    """What the kernels take of the primitives."""
+    return table.numpy(), spheres.numpy(), quadrics.numpy(), *counts[:3], np.float32(extent)

@@ -1,57 +1,109 @@
-"""Traversal of the copies (numba): a tree over their boxes, and for each that is met the tree of its mesh."""
+"""Copies of meshes (numba): a tree over their boxes, and for each that is met the tree of its mesh."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import prange
 
-from torchpt.accel.kernels_build import WIDTH
-from torchpt.accel.kernels_leaf import distance, setup
-from torchpt.accel.kernels_wide import LOWEST, SLACK, children, finite, inside, push
-from torchpt.native.jit import jit
+from torchpt.accel.kernels_blocks import IDS, SLACK, boxes, fits, place, push
+from torchpt.accel.kernels_leaf import setup
+from torchpt.accel.kernels_single import SCRATCH, nearest_of, pop
+from torchpt.native.jit import jit, part
+from torchpt.native.simd import item, pointer, put, splat
 
-__all__ = ["trace", "trace_parallel"]
+__all__ = ["blocked", "blocked_parallel", "nearest", "nearest_parallel"]
 
-_ZERO = np.float32(0.0)
+_ZERO, _INF = np.float32(0.0), np.float32(np.inf)
+
+
+@part(forceinline=True)
+def _row(table, k, x, y, z):
+    """Three float64 numbers of an affine map's row with a point, without its last number."""
+    return item(table, k) * x + item(table, k + 1) * y + item(table, k + 2) * z
+
+
+@part()
+def _moved(table, copy, o, d):
+    """A ray in the place of a copy's mesh: moved in float64, rounded to float32."""
+    k = 12 * copy
+    px, py, pz = np.float64(o[0]), np.float64(o[1]), np.float64(o[2])
+    rx, ry, rz = np.float64(d[0]), np.float64(d[1]), np.float64(d[2])
+    at = (
+        np.float32(_row(table, k, px, py, pz) + item(table, k + 3)),
+        np.float32(_row(table, k + 4, px, py, pz) + item(table, k + 7)),
+        np.float32(_row(table, k + 8, px, py, pz) + item(table, k + 11)),
+    )
+    along = (
+        np.float32(_row(table, k, rx, ry, rz)),
+        np.float32(_row(table, k + 4, rx, ry, rz)),
+        np.float32(_row(table, k + 8, rx, ry, rz)),
+    )
+    return at, along
+
+
+@part()
+def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
+    """The nearest hit of one ray among the copies where it is nearer than ``best``, or any such hit: ``t, prim, u, v``."""
+    tree, codes = upper
+    table, shift, roots = copies
+    keys, parents, scratch = work
+    _, _, _, _, _, _, ix, iy, iz = setup(d[0], d[1], d[2])
+    nx, ny, nz = 0 if ix > _ZERO else 24, 8 if iy > _ZERO else 32, 16 if iz > _ZERO else 40
+    u, v = _ZERO, _ZERO
+    top, code, first = np.int64(0), np.int64(0), prim
+    while top >= 0:
+        base = place(code)
+        if code >= 0:
+            a, met = boxes(
+                tree, base, nx, ny, nz, splat(o[0], 8), splat(o[1], 8), splat(o[2], 8),
+                splat(ix, 8), splat(iy, 8), splat(iz, 8), splat(best, 8),
+            )  # fmt: skip
+            top = push(keys, parents, top, base, a, met)
+        else:
+            for k in range(8):
+                copy = np.int64(-2) - item(codes, base + IDS + k)
+                if copy < 0:
+                    continue
+                at, along = _moved(table, copy, o, d)
+                had = prim
+                best, prim, a, b = nearest_of(
+                    lower[0], lower[1], item(roots, copy), at, along, best, prim, item(shift, copy),
+                    keys, parents, top, scratch, any_hit,
+                )  # fmt: skip
+                if prim != had:
+                    u, v = a, b
+            if any_hit and prim != first:
+                break
+        top, code, _ = pop(codes, keys, parents, top, 0, best * SLACK)
+    return best, prim, u, v
+
+
+@part(inline="always")
+def _search(
+    first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v, any_hit
+):
+    keys, parents, scratch = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(SCRATCH, np.float32)
+    work = (pointer(keys), pointer(parents), pointer(scratch))
+    above, below = (pointer(upper), pointer(upper_codes)), (pointer(lower), pointer(lower_codes))
+    copies = (pointer(table), pointer(shift), pointer(roots))
+    for i in range(first, last):
+        p, r = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i])
+        if not fits(p[0], p[1], p[2], r[0], r[1], r[2], t_max[i]):
+            continue
+        if any_hit:
+            if prim[i] == 0:
+                _, found, _, _ = _ray(p, r, t_max[i], np.int32(-1), above, below, copies, work, True)
+                prim[i] = 1 if found >= 0 else 0
+        else:
+            best, found, a, b = _ray(p, r, min(t[i], t_max[i]), prim[i], above, below, copies, work, False)
+            if found != prim[i]:
+                put(prim, i, found)
+                t[i], u[i], v[i] = best, a, b
+    keys[0], parents[0], scratch[0] = 0, 0, 0  # what pointers point to lives until here
 
 
 @jit()
-def _mesh(root, tree, o, d, best, prim, shift, near, stack, entry, bottom, unit, any_hit):
-    """The nearest hit of a ray in one mesh's tree where that is nearer than ``best``: ``t``, id, ``u``, ``v``; else id -1."""
-    boxes, child, leaves, ids, full, corner, rows, quadrics = tree
-    kx, ky, kz, sx, sy, sz, ix, iy, iz = setup(d[0], d[1], d[2])
-    px, py, pz = o[kx], o[ky], o[kz]
-    best_u, best_v, found = _ZERO, _ZERO, np.int32(-1)
-    most = corner.shape[0]
-    stack[bottom], entry[bottom] = root, _ZERO
-    top = bottom + 1
-    while top > bottom:
-        top -= 1
-        node = stack[top]
-        if entry[top] > best * SLACK:
-            continue
-        if node >= 0:
-            met = children(boxes, node, o, (ix, iy, iz), best, near, unit)
-            top = push(child, node, met, near, stack, entry, top)
-            continue
-        leaf = ~node
-        left = full[leaf]
-        if left < 0:
-            left = inside(leaves, leaf, px, py, pz, kx, ky, kz, sx, sy, unit)
-        while left != 0:
-            q = ids[leaf * WIDTH + LOWEST[left]]
-            left &= left - np.int32(1)
-            t, u, v = distance(q, corner, rows, quadrics, most, most, most, most, o, d, kx, ky, kz, sx, sy, sz)
-            if t > _ZERO and (t < best or (t == best and q + shift < prim)):
-                best, prim, best_u, best_v = t, np.int32(q + shift), u, v
-                found = prim
-                if any_hit:
-                    return best, found, best_u, best_v
-    return best, found, best_u, best_v
-
-
-@jit()
-def trace(first, last, o, d, t_max, upper, lower, table, shift, roots, room, unit, any_hit, t, prim, u, v):
+def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v):
     """Takes the copies into the hits of the rays ``first <= i < last``.
 
     Args:
@@ -60,72 +112,65 @@ def trace(first, last, o, d, t_max, upper, lower, table, shift, roots, room, uni
         o: origins ``(3, N)``.
         d: directions ``(3, N)``.
         t_max: ``(N,)``.
-        upper: boxes, children and ids of the tree over the copies.
-        lower: the trees of all meshes, one after the other; see :class:`torchpt.accel.wide.Wide`.
+        upper: blocks of the tree over the copies' boxes.
+        upper_codes: the same memory as int32.
+        lower: blocks of the trees of all meshes, one after the other.
+        lower_codes: the same memory as int32.
         table: ``(I, 12)`` float64 maps from the world to the meshes.
-        shift: ``(I,)`` from a triangle's row to its id in the copy.
-        roots: ``(I,)`` nodes where their trees begin.
-        room: entries on the stack.
-        unit: 1, see :func:`torchpt.accel.kernels_wide.intersect`.
-        any_hit: whether any hit will do; rays that have one are left alone.
+        shift: ``(I,)`` int32 from a triangle's number in its mesh to its id in the copy.
+        roots: ``(I,)`` int64 codes of the meshes' roots.
+        room: entries of the stack.
         t: found so far, inf for none.
         prim: found so far, -1 for none.
         u: found so far.
         v: found so far.
     """
-    boxes, child, ids = upper
-    stack, entry = np.empty(room, np.int32), np.empty(room, np.float32)
-    near = np.empty(WIDTH, np.float32)
-    for i in range(first, last):
-        p, r = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i])
-        if not (t_max[i] > _ZERO and finite(p[0], p[1], p[2]) and finite(r[0], r[1], r[2])):
-            continue
-        if any_hit and prim[i] >= 0:
-            continue
-        best = min(t[i], t_max[i])
-        _, _, _, _, _, _, ix, iy, iz = setup(r[0], r[1], r[2])
-        stack[0], entry[0] = 0, _ZERO
-        top = 1
-        while top > 0:
-            top -= 1
-            node = stack[top]
-            if entry[top] > best * SLACK:
-                continue
-            if node >= 0:
-                met = children(boxes, node, p, (ix, iy, iz), best, near, unit)
-                top = push(child, node, met, near, stack, entry, top)
-                continue
-            leaf = ~node
-            for k in range(WIDTH):
-                c = ids[leaf * WIDTH + k]
-                if c < 0:
-                    continue
-                px, py, pz = np.float64(p[0]), np.float64(p[1]), np.float64(p[2])
-                rx, ry, rz = np.float64(r[0]), np.float64(r[1]), np.float64(r[2])
-                at = (
-                    np.float32(table[c, 0] * px + table[c, 1] * py + table[c, 2] * pz + table[c, 3]),
-                    np.float32(table[c, 4] * px + table[c, 5] * py + table[c, 6] * pz + table[c, 7]),
-                    np.float32(table[c, 8] * px + table[c, 9] * py + table[c, 10] * pz + table[c, 11]),
-                )
-                along = (
-                    np.float32(table[c, 0] * rx + table[c, 1] * ry + table[c, 2] * rz),
-                    np.float32(table[c, 4] * rx + table[c, 5] * ry + table[c, 6] * rz),
-                    np.float32(table[c, 8] * rx + table[c, 9] * ry + table[c, 10] * rz),
-                )
-                distance_, found, a, b = _mesh(
-                    roots[c], lower, at, along, best, prim[i], shift[c], near, stack, entry, top, unit, any_hit
-                )
-                if found >= 0:
-                    best = distance_
-                    t[i], prim[i], u[i], v[i] = best, found, a, b
-                    if any_hit:
-                        top = 0
-                        break
+    _search(
+        first,
+        last,
+        o,
+        d,
+        t_max,
+        upper,
+        upper_codes,
+        lower,
+        lower_codes,
+        table,
+        shift,
+        roots,
+        room,
+        t,
+        prim,
+        u,
+        v,
+        False,
+    )
 
 
 @jit(parallel=True)
-def trace_parallel(chunks, items, o, d, t_max, upper, lower, table, shift, roots, room, unit, any_hit, t, prim, u, v):
-    """:func:`trace` over equal chunks of the rays, one a thread."""
+def nearest_parallel(
+    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v
+):
+    """:func:`nearest` over equal chunks of the rays, one a thread."""
     for c in prange(chunks):
-        first, last = c * items // chunks, (c + 1) * items // chunks
-        trace(first, last, o, d, t_max, upper, lower, table, shift, roots, room, unit, any_hit, t, prim, u, v)
+        a, b = c * items // chunks, (c + 1) * items // chunks
+        nearest(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v)
+
+
+@jit()
+def blocked(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out):
+    """Puts 1 in ``out (N,)`` for rays that hit a copy; those that have it already are left alone."""
+    _search(
+        first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room,
+        t_max, out, t_max, t_max, True,
+    )  # fmt: skip
+
+
+@jit(parallel=True)
+def blocked_parallel(
+    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out
+):
+    """:func:`blocked` over equal chunks of the rays, one a thread."""
+    for c in prange(chunks):
+        a, b = c * items // chunks, (c + 1) * items // chunks
+        blocked(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out)

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from torchpt.native.jit import jit
+from torchpt.native.jit import part
+from torchpt.native.simd import item
 
 __all__ = ["quadric_hit"]
 
@@ -14,12 +15,12 @@ _INF = np.float64(np.inf)
 _NAN32 = np.float32(np.nan)
 
 
-@jit(forceinline=True)
+@part(forceinline=True)
 def _sign(x):
     return math.copysign(1.0, x)
 
 
-@jit(forceinline=True)
+@part(forceinline=True)
 def _diamond(x, y):
     """Way along the square ``|x| + |y| = 1`` from +x to a direction: in [-2, 2], monotonic in the angle."""
     s = abs(x) + abs(y)
@@ -27,7 +28,7 @@ def _diamond(x, y):
     return (1.0 - c if x >= 0.0 else 1.0 + c) * _sign(y)
 
 
-@jit()
+@part()
 def quadric_hit(table, k, ox, oy, oz, dx, dy, dz):
     """``t, u, v`` as float32 of the nearest positive root on quadric ``k`` of ``table (Q, 13)``; ``t`` is NaN for a miss.
 
@@ -35,13 +36,28 @@ def quadric_hit(table, k, ox, oy, oz, dx, dy, dz):
     """
     px, py, pz = np.float64(ox), np.float64(oy), np.float64(oz)
     rx, ry, rz = np.float64(dx), np.float64(dy), np.float64(dz)
-    fx = table[k, 0] * px + table[k, 1] * py + table[k, 2] * pz + table[k, 3]
-    fy = table[k, 4] * px + table[k, 5] * py + table[k, 6] * pz + table[k, 7]
-    fz = table[k, 8] * px + table[k, 9] * py + table[k, 10] * pz + table[k, 11]
-    ex = table[k, 0] * rx + table[k, 1] * ry + table[k, 2] * rz
-    ey = table[k, 4] * rx + table[k, 5] * ry + table[k, 6] * rz
-    ez = table[k, 8] * rx + table[k, 9] * ry + table[k, 10] * rz
-    code = table[k, 12]
+    fx = (
+        item(table, 13 * k + 0) * px
+        + item(table, 13 * k + 1) * py
+        + item(table, 13 * k + 2) * pz
+        + item(table, 13 * k + 3)
+    )
+    fy = (
+        item(table, 13 * k + 4) * px
+        + item(table, 13 * k + 5) * py
+        + item(table, 13 * k + 6) * pz
+        + item(table, 13 * k + 7)
+    )
+    fz = (
+        item(table, 13 * k + 8) * px
+        + item(table, 13 * k + 9) * py
+        + item(table, 13 * k + 10) * pz
+        + item(table, 13 * k + 11)
+    )
+    ex = item(table, 13 * k + 0) * rx + item(table, 13 * k + 1) * ry + item(table, 13 * k + 2) * rz
+    ey = item(table, 13 * k + 4) * rx + item(table, 13 * k + 5) * ry + item(table, 13 * k + 6) * rz
+    ez = item(table, 13 * k + 8) * rx + item(table, 13 * k + 9) * ry + item(table, 13 * k + 10) * rz
+    code = item(table, 13 * k + 12)
     bend = 1.0 - code
     level = 0.0 if code == 2.0 else 1.0
     low = -_INF if code == 0.0 else 0.0

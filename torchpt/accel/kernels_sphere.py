@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from torchpt.native.jit import jit
+from torchpt.native.jit import part
 
 __all__ = ["sphere_distance"]
 
 
-@jit(forceinline=True)
+@part(forceinline=True)
 def sphere_distance(ox, oy, oz, dx, dy, dz, cx, cy, cz, radius):
     """Nearest positive ``t`` at which ``o + t d`` meets the sphere, as float32; NaN where it does not.
 

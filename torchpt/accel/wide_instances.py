@@ -1,4 +1,4 @@
-"""Copies on the CPU: a wide tree over their boxes above the wide trees of their meshes (numba)."""
+"""Copies on the CPU: a tree over their boxes above the trees of their meshes (numba)."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import kernels_instances as kernels
-from torchpt.accel.base import Accel, Hits
+from torchpt.accel.base import Accel, Array, Hits
+from torchpt.accel.blocks import Tree, aligned, lines_of, mesh_tree, room_of, wide_tree, write
 from torchpt.accel.instances import CopyTables
-from torchpt.accel.kernels_build import WIDTH
-from torchpt.accel.wide import Wide, wide_tree
-from torchpt.native.jit import launch, thread_count
+from torchpt.accel.kernels_blocks import LINE
+from torchpt.accel.wide import Wide
+from torchpt.native.jit import compiled, launch, thread_count
 from torchpt.records import Geometry
 
 __all__ = ["WideInstanced"]
@@ -38,69 +39,74 @@ class WideInstanced(Accel):
         self.threads = thread_count(threads)
         self.base = Wide(geometry, threads)
         tables = CopyTables(geometry)
-        trees = [Wide(mesh, threads) for mesh in tables.meshes]
-        self.lower, roots, rows = _concatenated(trees)
-        self.matrix = tables.inverse.numpy()
-        self.roots = roots[tables.mesh.numpy()]
-        self.shift = (tables.shift.numpy() - rows[tables.mesh.numpy()]).astype(np.int32)
+        trees, roots, lower = _meshes(tables.meshes)
         some = np.flatnonzero([tables.meshes[k].size > 0 for k in tables.mesh.tolist()]).astype(np.int32)
         boxes = torch.cat((tables.low, tables.high)).T.contiguous().numpy()[some]
-        upper = wide_tree(boxes, some.copy())
-        self.upper = (upper.boxes, upper.child, upper.ids)
-        self.depth = upper.depth + max(tree.depth for tree in trees)
-        self.room = self.depth * (WIDTH - 1) + 2 * (WIDTH + 1)
-        self.copies, self.trees = len(some), [tree.describe() for tree in trees]
+        top = wide_tree(boxes, some.copy())
+        upper = aligned(lines_of(top) * LINE)
+        write(top, _nothing(), np.zeros((0, 4), np.float32), 0, upper)
+        depth = top.depth + max(tree.depth for tree in trees)
+        self.arrays = (
+            upper, upper.view(np.int32), lower, lower.view(np.int32), tables.inverse.numpy(),
+            tables.shift.numpy().astype(np.int32), roots[tables.mesh.numpy()], room_of(depth),
+        )  # fmt: skip
+        self.depth, self.copies = depth, len(some)
+        self.nodes, self.leaves = (sum(getattr(x, part) for x in (top, *trees)) for part in ("nodes", "leaves"))
         self.ids = int(geometry.size + geometry.copies[13].sum())
         self.build_seconds = time.perf_counter() - start
 
-    def _run(self, o: Tensor, d: Tensor, t_max: Tensor, any_hit: bool, hits: Hits) -> None:
-        rays = tuple(x.contiguous().numpy() for x in (o, d, t_max))
-        tables = (self.upper, self.lower, self.matrix, self.shift, self.roots, self.room, 1, any_hit)
-        args = (*rays, *tables, *(x.numpy() for x in hits))
-        launch(kernels.trace, kernels.trace_parallel, t_max.shape[0], self.threads, _GRAIN, args)
-
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
         hits = self.base._intersect(o, d, t_max)
-        self._run(o, d, t_max, False, hits)
+        rays = (x.contiguous().numpy() for x in (o, d, t_max))
+        args = (*rays, *self.arrays, *(x.numpy() for x in hits))
+        launch(kernels.nearest, kernels.nearest_parallel, t_max.shape[0], self.threads, _GRAIN, args)
         return hits
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        prim = self.base._occluded(o, d, t_max).int() - 1
-        t, u, v = torch.full_like(t_max, torch.inf), torch.zeros_like(t_max), torch.zeros_like(t_max)
-        self._run(o, d, t_max, True, (t, prim, u, v))
-        return prim >= 0
+        out = self.base._occluded(o, d, t_max).int()
+        rays = (x.contiguous().numpy() for x in (o, d, t_max))
+        args = (*rays, *self.arrays, out.numpy())
+        launch(kernels.blocked, kernels.blocked_parallel, t_max.shape[0], self.threads, _GRAIN, args)
+        return out != 0
+
+    def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
+        """See :meth:`Accel.nearest`."""
+        self.base.nearest(o, d, t_max, count, t, prim, u, v)
+        args = (o, d, t_max, *self.arrays, t, prim, u, v)
+        compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
+
+    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
+        """See :meth:`Accel.blocked`."""
+        self.base.blocked(o, d, t_max, count, out)
+        args = (o, d, t_max, *self.arrays, out)
+        compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost is that of what is no copy."""
         base = self.base.describe()
-        above = (*self.upper, self.matrix, self.shift, self.roots)
+        upper, _, lower, _, *tables = self.arrays[:-1]
         return base | {
             "primitives": self.ids,
             "instances": self.copies,
-            "nodes": base["nodes"] + sum(tree["nodes"] for tree in self.trees) + len(self.upper[1]) // WIDTH,
-            "leaves": base["leaves"] + sum(tree["leaves"] for tree in self.trees) + len(self.upper[2]) // WIDTH,
-            "bytes": base["bytes"] + sum(x.nbytes for x in (*self.lower, *above)),
+            "nodes": base["nodes"] + self.nodes,
+            "leaves": base["leaves"] + self.leaves,
+            "bytes": base["bytes"] + sum(x.nbytes for x in (upper, lower, *tables)),
             "depth": max(base["depth"], self.depth),
             "build_seconds": self.build_seconds,
         }
 
 
-def _concatenated(trees: list[Wide]) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Trees one after the other, with their nodes, leaves and triangles renumbered; roots and first rows of each."""
-    columns: list[list[np.ndarray]] = [[] for _ in range(8)]
-    roots, rows = [], []
-    node = leaf = row = 0
-    for tree in trees:
-        boxes, child, leaves, ids, full, corner, planes, quadrics = (x.numpy() for x in tree.tensors)
-        roots.append(node)
-        rows.append(row)
-        child = np.where(child >= 0, child + node, child - leaf).astype(np.int32)
-        ids = np.where(ids >= 0, ids + row, ids).astype(np.int32)
-        for column, x in zip(columns, (boxes, child, leaves, ids, full, corner, planes, quadrics), strict=True):
-            column.append(x)
-        node, leaf, row = node + len(child) // WIDTH, leaf + len(full), row + len(corner)
-    return (
-        tuple(np.concatenate(column) for column in columns),
-        np.array(roots, np.int32),
-        np.array(rows, np.int64),
-    )
+def _nothing() -> Geometry:
+    """No primitive: what leaves of copies have for triangles."""
+    none = torch.zeros(3, 0)
+    return Geometry(none, none, none, (0, 0, 0, 0, 0))
+
+
+def _meshes(meshes: list[Geometry]) -> tuple[list[Tree], np.ndarray, np.ndarray]:
+    """The trees of all meshes, the codes of their roots, and their blocks one after the other."""
+    built = [mesh_tree(mesh) for mesh in meshes]
+    lines = np.cumsum([0, *(lines_of(tree) for tree, _ in built)])
+    memory = aligned(int(lines[-1]) * LINE)
+    for (tree, rows), mesh, line in zip(built, meshes, lines[:-1], strict=True):
+        write(tree, mesh, rows, int(line), memory)
+    return [tree for tree, _ in built], 2 * lines[:-1].astype(np.int64), memory

@@ -5,21 +5,26 @@ Importing this module imports numba; only the numba backends do so.
 
 from __future__ import annotations
 
+import functools
 import os
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numba
 import torch
 from numba.core import config as numba_config
 
-__all__ = ["jit", "launch", "parallel_allowed", "thread_count"]
+__all__ = ["compiled", "jit", "launch", "parallel_allowed", "part", "thread_count"]
 
 _lock = threading.Lock()
-_state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "pools": {}}
+_state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "pools": {}, "said": False}
+#: Seconds of compiling after which the user is told.
+_PATIENCE = 1.0
 
 
 def _after_fork() -> None:
@@ -46,11 +51,48 @@ def jit(**options: Any) -> Callable[[Callable], Any]:
 
     def wrap(function: Callable) -> Any:
         try:
-            return numba.njit(cache=True, **settings)(function)
+            kernel = numba.njit(cache=True, **settings)(function)
+            if hasattr(kernel._cache, "_cache_file"):
+                kernel._cache._cache_file._source_stamp = _stamp()
+            return kernel
         except (RuntimeError, OSError):  # numba: "no locator available", no folder for its cache
             return numba.njit(**settings)(function)
 
     return wrap
+
+
+@functools.cache
+def _stamp() -> tuple[float, int]:
+    """When the package last changed and how large it is.
+
+    Numba keeps a kernel until the kernel's own file changes, and would not see that what is inlined into it has.
+    """
+    found = [path.stat() for path in Path(__file__).parents[1].rglob("*.py")]
+    return max(file.st_mtime for file in found), sum(file.st_size for file in found)
+
+
+def part(**options: Any) -> Callable[[Callable], Any]:
+    """:func:`jit` for what kernels alone call: without entries from Python and C, which would be compiled beside it."""
+    return jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
+
+
+def compiled(kernel: Any, *args: Any) -> Any:
+    """The kernel, compiled for arguments with which it does nothing; says so on stderr, once, where that takes long."""
+    if not kernel.overloads:
+        timer = threading.Timer(_PATIENCE, _say)
+        timer.daemon = True
+        timer.start()
+        try:
+            kernel(*args)
+        finally:
+            timer.cancel()
+    return kernel
+
+
+def _say() -> None:
+    if not _state["said"]:
+        _state["said"] = True
+        print("torchpt: compiling the search kernels (once)...", file=sys.stderr, flush=True)
 
 
 def thread_count(threads: int | None) -> int:
@@ -111,18 +153,19 @@ def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, arg
     """
     threads = min(threads, max(1, items // grain))
     if threads == 1:
-        serial(0, items, *args)
+        compiled(serial, 0, 0, *args)(0, items, *args)
     elif parallel_allowed():
         threads = min(threads, _most_threads())
         before = numba.get_num_threads()
         numba.set_num_threads(threads)
         try:
-            parallel(threads, items, *args)
+            compiled(parallel, 0, 0, *args)(threads, items, *args)
         finally:
             numba.set_num_threads(before)
     else:
         cuts = [items * k // threads for k in range(threads + 1)]
         pool = _pool(threads - 1)
+        compiled(serial, 0, 0, *args)
         jobs = [pool.submit(serial, a, b, *args) for a, b in pairwise(cuts[1:])]
         serial(0, cuts[1], *args)
         for job in jobs:

@@ -1,0 +1,84 @@
+"""No ray escapes a closed mesh, however large the mesh, however far from the origin, however well aimed at its edges."""
+
+import numpy as np
+import pytest
+from accel_reference import sphere_mesh, triangles
+
+from torchpt.accel.wide import Wide
+
+FAR = (148376.0, 1234.0, -223423.0)
+BLOCK = 250_000
+
+
+def cube(cells):
+    """A closed cube of side 2 with ``12 cells^2`` triangles, vertices shared: vertices, faces."""
+    k = np.linspace(-1, 1, cells + 1)
+    a, b = (x.reshape(-1) for x in np.meshgrid(k, k, indexing="ij"))
+    sides, faces = [], []
+    i, j = np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")
+    corner = (i * (cells + 1) + j).reshape(-1)
+    quad = np.stack([corner, corner + 1, corner + cells + 2, corner + cells + 1], 1)
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            faces.append(quad + len(sides) * len(a))
+            sides.append(np.roll(np.stack([np.full_like(a, side), a, b], 1), axis, axis=1))
+    f = np.concatenate(faces)
+    return np.concatenate(sides).astype(np.float32), np.concatenate([f[:, [0, 1, 2]], f[:, [0, 2, 3]]])
+
+
+MESHES = {"sphere": lambda: sphere_mesh(144), "cube": lambda: cube(40)}
+
+
+def directions(rng, vertices, faces, o, n):
+    """Half of them at random, a quarter at vertices, a quarter at places on edges; sorted, so that packets take part."""
+    f = faces[rng.integers(len(faces), size=n // 2)]
+    w = np.where(np.arange(n // 2) % 2, rng.random(n // 2), 0.0)[:, None].astype(np.float32)
+    aims = (vertices[f[:, 0]] * (1 - w) + vertices[f[:, 1]] * w).T - o[:, : n // 2]
+    d = np.concatenate([aims, rng.normal(size=(3, n - n // 2)).astype(np.float32)], 1)
+    order = np.lexsort((*(np.signbit(d[c]) for c in range(3)), np.abs(d).argmax(0)))
+    return np.ascontiguousarray(o[:, order]), np.ascontiguousarray(d[:, order].astype(np.float32))
+
+
+def escapes(name, place, count):
+    """How many of ``count`` rays from inside miss, by either search."""
+    vertices, faces = MESHES[name]()
+    scale = 100.0 if any(place) else 1.0  # float32 is 1/64 apart there
+    vertices = (vertices * scale + np.array(place)).astype(np.float32)
+    accel = Wide(triangles(vertices, faces), 1)
+    t, u, v = np.empty((3, BLOCK), np.float32)
+    prim, out = np.empty((2, BLOCK), np.int32)
+    t_max = np.full(BLOCK, np.inf, np.float32)
+    nearest = anything = 0
+    for seed in range(-(-count // BLOCK)):
+        rng = np.random.default_rng(seed)
+        o = (rng.normal(size=(3, BLOCK)) * 0.15 * scale + np.array(place)[:, None]).astype(np.float32)
+        o, d = directions(rng, vertices, faces, o, BLOCK)
+        accel.nearest(o, d, t_max, BLOCK, t, prim, u, v)
+        accel.blocked(o, d, t_max, BLOCK, out)
+        nearest, anything = nearest + int((prim < 0).sum()), anything + int((out == 0).sum())
+        assert np.isfinite(t[prim >= 0]).all() and (u + v <= 1 + 1e-6).all() and min(u.min(), v.min()) >= 0
+    return nearest, anything
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), FAR])
+@pytest.mark.parametrize("name", MESHES)
+def test_no_ray_escapes(name, place):
+    assert escapes(name, place, BLOCK) == (0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), FAR])
+@pytest.mark.parametrize("name", MESHES)
+def test_none_of_a_hundred_million_rays_escapes(name, place):
+    assert escapes(name, place, 25_000_000) == (0, 0)
+
+
+def test_a_hole_is_seen():
+    """The count above is not zero by construction."""
+    vertices, faces = sphere_mesh(20)
+    accel = Wide(triangles(vertices, faces[:-1]), 1)
+    rng = np.random.default_rng(0)
+    o, d = directions(rng, vertices, faces, np.zeros((3, 100_000), np.float32), 100_000)
+    out = np.empty(100_000, np.int32)
+    accel.blocked(o, d, np.full(100_000, np.inf, np.float32), 100_000, out)
+    assert 0 < (out == 0).sum() < 1000

@@ -1,0 +1,142 @@
+"""Operators of vectors, lane by lane, and the choice between two vectors."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic, lower_builtin, type_callable
+
+from torchpt.native.simd.types import I32, Vector, splatted
+
+__all__ = ["absolute", "as_float", "as_int", "maximum", "minimum", "select"]
+
+
+def _is_float(kind: Any) -> bool:
+    return kind == types.float32 or getattr(kind, "element", None) == types.float32
+
+
+def _binary(symbol: Any, for_floats: str | None, for_others: str | None) -> None:
+    """Gives an operator to vectors; the arguments are names of LLVM's instructions."""
+
+    def typed(a, b):
+        if isinstance(a, Vector) and a == b and (for_floats if _is_float(a) else for_others):
+            return a
+        return None
+
+    type_callable(symbol)(lambda context: typed)
+
+    @lower_builtin(symbol, Vector, Vector)
+    def _(context, builder, signature, args):
+        return getattr(builder, for_floats if _is_float(signature.args[0]) else for_others)(*args)
+
+
+def _compare(symbol: Any, code: str) -> None:
+    def typed(a, b):
+        return Vector(types.boolean, a.lanes) if isinstance(a, Vector) and a == b else None
+
+    type_callable(symbol)(lambda context: typed)
+
+    @lower_builtin(symbol, Vector, Vector)
+    def _(context, builder, signature, args):
+        if not _is_float(signature.args[0]):
+            return builder.icmp_signed(code, *args)
+        # NaN differs from everything, itself included, and compares in no other way
+        return (builder.fcmp_unordered if code == "!=" else builder.fcmp_ordered)(code, *args)
+
+
+def _unary(symbol: Any, generate: Any, allowed: Any) -> None:
+    def typed(a):
+        return a if isinstance(a, Vector) and allowed(a) else None
+
+    type_callable(symbol)(lambda context: typed)
+    lower_builtin(symbol, Vector)(lambda context, builder, signature, args: generate(builder, args[0]))
+
+
+_binary(operator.add, "fadd", "add")
+_binary(operator.sub, "fsub", "sub")
+_binary(operator.mul, "fmul", "mul")
+_binary(operator.truediv, "fdiv", None)
+_binary(operator.and_, None, "and_")
+_binary(operator.or_, None, "or_")
+_binary(operator.xor, None, "xor")
+for _symbol, _code in (
+    (operator.lt, "<"),
+    (operator.le, "<="),
+    (operator.gt, ">"),
+    (operator.ge, ">="),
+    (operator.eq, "=="),
+    (operator.ne, "!="),
+):
+    _compare(_symbol, _code)
+_unary(operator.neg, lambda builder, x: builder.fneg(x), _is_float)
+_unary(operator.invert, lambda builder, x: builder.not_(x), lambda kind: not _is_float(kind))
+
+
+@intrinsic
+def select(context, m, a, b):
+    """``select(m, a, b)``: lanes of ``a`` where the mask is set, else of ``b``."""
+    if not (isinstance(a, Vector) and a == b and m == Vector(types.boolean, a.lanes)):
+        return None
+    return a(m, a, b), lambda context, builder, signature, args: builder.select(*args)
+
+
+def _chosen(builder: Any, code: str, kind: Any, a: Any, b: Any) -> Any:
+    met = builder.fcmp_ordered(code, a, b) if _is_float(kind) else builder.icmp_signed(code, a, b)
+    return builder.select(met, a, b)
+
+
+@intrinsic
+def minimum(context, a, b):
+    """The smaller lanes, those of ``b`` where either is NaN or both are equal (as 0 and -0 are)."""
+    if not (isinstance(a, Vector) and a == b):
+        return None
+    return a(a, b), lambda context, builder, signature, args: _chosen(builder, "<", signature.args[0], *args)
+
+
+@intrinsic
+def maximum(context, a, b):
+    """The larger lanes, those of ``b`` where either is NaN or both are equal (as 0 and -0 are)."""
+    if not (isinstance(a, Vector) and a == b):
+        return None
+    return a(a, b), lambda context, builder, signature, args: _chosen(builder, ">", signature.args[0], *args)
+
+
+@intrinsic
+def as_int(context, x):
+    """The bits of float32, of a vector or a scalar, as int32."""
+    if x == types.float32:
+        return types.int32(x), lambda context, builder, signature, args: builder.bitcast(args[0], I32)
+    if not (isinstance(x, Vector) and _is_float(x)):
+        return None
+    kind = ir.VectorType(I32, x.lanes)
+    return Vector(types.int32, x.lanes)(x), lambda context, builder, signature, args: builder.bitcast(args[0], kind)
+
+
+@intrinsic
+def as_float(context, x):
+    """int32 lanes, or the low half of an integer, as the bits of float32."""
+    if isinstance(x, types.Integer):  # arithmetic of int32 scalars is int64 in numba
+        return types.float32(types.int32), lambda context, builder, signature, args: builder.bitcast(
+            args[0], ir.FloatType()
+        )
+    if not (isinstance(x, Vector) and x.element == types.int32):
+        return None
+    kind = ir.VectorType(ir.FloatType(), x.lanes)
+    return Vector(types.float32, x.lanes)(x), lambda context, builder, signature, args: builder.bitcast(args[0], kind)
+
+
+@intrinsic
+def absolute(context, x):
+    """Float lanes without their sign bit."""
+    if not (isinstance(x, Vector) and _is_float(x)):
+        return None
+
+    def generate(context, builder, signature, args):
+        whole = ir.VectorType(I32, x.lanes)
+        kept = builder.and_(builder.bitcast(args[0], whole), splatted(builder, ir.Constant(I32, 0x7FFFFFFF), x.lanes))
+        return builder.bitcast(kept, args[0].type)
+
+    return x(x), generate
