@@ -4,7 +4,7 @@ Both render the same ten scenes, those of ``configs/scene`` under :func:`mitsuba
 max_depth 8, rr_depth 5, box filter. Every contender is a process of its own that has loaded and warmed up; they render in
 turn, round after round, each time with another seed. Medians are shown, and the median of the ratios within a round, which a
 machine that is busy now and then disturbs least. The means of both pictures stand beside them, with how many standard errors
-they are apart; ``compare_mitsuba.py`` looks closer.
+they are apart (from five rounds on); ``compare_mitsuba.py`` looks closer.
 
 Light that passes an opacity or ``null`` counts as a bounce in Mitsuba only, and Mitsuba's shadow rays stop there. At equal
 max_depth it traces less in such scenes, and less light arrives: 0.3 % in ``material_row``, next to nothing in the others.
@@ -41,7 +41,10 @@ GROUPS = {"simple": SIMPLE, "meshes": MESHES, "all": (*SIMPLE, *MESHES)}
 SCENES = GROUPS["all"]
 DEPTH = 8
 OURS, LLVM, SCALAR = "torchpt", "llvm_ad_rgb", "scalar_rgb"
+#: Processes that disturb.
 BUSY = 2
+#: Rounds from which on they tell how much means vary.
+ENOUGH = 5
 
 Turn = Callable[[], dict[str, Any]]
 
@@ -127,20 +130,21 @@ def race(arguments: argparse.Namespace) -> None:
             "replaced": replaced(scene),
         }
         cells = "".join(f"{found[scene][r]['rate']:13.3f}{found[scene][r]['ratio']:8.3f}" for r in rivals)
-        first = found[scene][LLVM]
-        print(
-            f"{scene:22s}{ours.rate:9.3f}{cells}    {ours.mean:.5f} {others[0].mean:.5f} {first['z']:5.1f}", flush=True
-        )
+        z = found[scene][LLVM]["z"]
+        means = f"{ours.mean:.5f} {others[0].mean:.5f}" + ("" if z is None else f" {z:5.1f}")
+        print(f"{scene:22s}{ours.rate:9.3f}{cells}    {means}", flush=True)
         for name, instead in found[scene]["replaced"].items():
             print(f"    {name}: {instead}")
-        means = {rival: geometric_means({name: row[rival]["ratio"] for name, row in found.items()}) for rival in rivals}
-        save(arguments, {"scenes": found, "geometric_means": means})
+        overall = {
+            rival: geometric_means({name: row[rival]["ratio"] for name, row in found.items()}) for rival in rivals
+        }
+        save(arguments, {"scenes": found, "geometric_means": overall})
     for group in GROUPS:
-        cells = "".join(f"{means[rival][group]:21.3f}" for rival in rivals if group in means[rival])
+        cells = "".join(f"{overall[rival][group]:21.3f}" for rival in rivals if group in overall[rival])
         if cells:
             print(f"{'geometric mean, ' + group:31s}{cells}")
     if arguments.markdown:
-        print(markdown(found, means, rivals))
+        print(markdown(found, rivals))
 
 
 def beside(ours: Record, theirs: Record) -> dict[str, Any]:
@@ -150,10 +154,10 @@ def beside(ours: Record, theirs: Record) -> dict[str, Any]:
     return {**vars(theirs), **facts, "z": deviate(ours.means, theirs.means)}
 
 
-def deviate(ours: list[list[float]], theirs: list[list[float]]) -> float:
-    """How many standard errors the means of pictures are apart, in the channel where it is most; 0 after a single round."""
-    if len(ours) < 2:
-        return 0.0
+def deviate(ours: list[list[float]], theirs: list[list[float]]) -> float | None:
+    """How many standard errors the means of pictures are apart, in the channel where it is most."""
+    if len(ours) < ENOUGH:
+        return None
     found = []
     for a, b in zip(zip(*ours, strict=True), zip(*theirs, strict=True), strict=True):
         error = math.sqrt((statistics.variance(a) + statistics.variance(b)) / len(a))
@@ -161,26 +165,26 @@ def deviate(ours: list[list[float]], theirs: list[list[float]]) -> float:
     return max(found, key=abs)
 
 
-def geometric_means(ratios: dict[str, float]) -> dict[str, float]:
-    """Of the groups that are complete."""
+def geometric_means(figures: dict[str, float]) -> dict[str, float]:
+    """Of the groups that are complete; figures by scene."""
     return {
-        group: math.exp(statistics.fmean(math.log(ratios[name]) for name in names))
+        group: math.exp(statistics.fmean(math.log(figures[name]) for name in names))
         for group, names in GROUPS.items()
-        if set(names) <= set(ratios)
+        if set(names) <= set(figures)
     }
 
 
-def markdown(found: dict[str, Any], means: dict[str, dict[str, float]], rivals: tuple[str, ...]) -> str:
-    """The table for the documentation."""
+def markdown(found: dict[str, Any], rivals: tuple[str, ...]) -> str:
+    """The table for the documentation, with geometric means of the groups that are complete."""
     lines = ["| scene | torchpt |" + "".join(f" `{rival}` | ratio |" for rival in rivals)]
     lines.append("|---|---|" + "---|---|" * len(rivals))
+    columns = [(OURS, "rate"), *((rival, key) for rival in rivals for key in ("rate", "ratio"))]
     for name, row in found.items():
-        cells = "".join(f" {row[rival]['rate']:.2f} | {row[rival]['ratio']:.2f} |" for rival in rivals)
-        lines.append(f"| `{name}` | {row[OURS]['rate']:.2f} |{cells}")
-    for group, names in GROUPS.items():
-        if group in means[LLVM]:
-            cells = "".join(f" | {means[rival][group]:.2f} |" for rival in rivals)
-            lines.append(f"| geometric mean of {len(names)} ({group}) | |{cells}")
+        lines.append(f"| `{name}` | " + " | ".join(f"{row[who][key]:.2f}" for who, key in columns) + " |")
+    means = [geometric_means({name: row[who][key] for name, row in found.items()}) for who, key in columns]
+    for group in means[0]:
+        title = f"geometric mean of {len(GROUPS[group])} ({group})"
+        lines.append(f"| {title} | " + " | ".join(f"{mean[group]:.2f}" for mean in means) + " |")
     return "\n".join(lines)
 
 
