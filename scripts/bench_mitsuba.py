@@ -1,222 +1,386 @@
-"""Throughput beside Mitsuba 3 in the same run: ``python scripts/bench_mitsuba.py [--compile] [--rounds 5] [--quick]``.
+"""Throughput beside Mitsuba 3 in the same run: ``python scripts/bench_mitsuba.py [scenes] [--json FILE] [--markdown]``.
 
-Every contender is a process of its own that has loaded and warmed up; they render in turn, round after round, and medians
-are compared, so that a noisy machine disturbs all alike. Box filter, max_depth 8, 256 x 256 on both sides. The ``torch``
-traversal is timed alone. Needs the extra ``bench``; the bunny needs ``$TORCHPT_ASSETS/bunny.ply`` (else its stand-in).
+Both render the same ten scenes, those of ``configs/scene`` under :func:`mitsuba_scene.nearest`: 256 x 256, 64 samples a pixel,
+max_depth 8, rr_depth 5, box filter. Every contender is a process of its own that has loaded and warmed up; they render in
+turn, round after round, each time with another seed. Medians are shown, and the median of the ratios within a round, which a
+machine that is busy now and then disturbs least. The means of both pictures stand beside them, with how many standard errors
+they are apart (from five rounds on); ``compare_mitsuba.py`` looks closer.
+
+Light that passes an opacity or ``null`` counts as a bounce in Mitsuba only, and Mitsuba's shadow rays stop there. At equal
+max_depth it traces less in such scenes, and less light arrives: 0.3 % in ``material_row``, next to nothing in the others.
+
+``--busy`` compares a quiet machine with one where two other processes are busy, ``--scaling`` one thread with two (or
+``--threads``), both on the Cornell box. Needs the extra ``bench``; the bunny and the teapot need ``$TORCHPT_ASSETS``, else
+their stand-ins are rendered.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.metadata
 import json
+import math
+import os
+import platform
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-SCENES = ("cornell_box", "cornell_bunny")
-MITSUBA = ("scalar_rgb", "llvm_ad_rgb")
-#: scene, contender, rival, least ratio of their rates.
-BARS = (
-    ("cornell_box", "eager sobol", "scalar_rgb", 0.6),
-    ("cornell_box", "eager independent", "scalar_rgb", 0.9),
-    ("cornell_box", "compiled sobol", "llvm_ad_rgb", 0.5),
-    ("cornell_bunny", "eager sobol", "scalar_rgb", 0.5),
-)
+#: Scenes of few primitives, and of meshes or many lights.
+SIMPLE = ("cornell_box", "veach_mis", "material_row", "cornell_transmissive")
+MESHES = ("cornell_bunny", "env_teapot", "studio", "many_lights", "clutter", "shapes_and_maps")
+GROUPS = {"simple": SIMPLE, "meshes": MESHES, "all": (*SIMPLE, *MESHES)}
+SCENES = GROUPS["all"]
+DEPTH = 8
+OURS, LLVM, SCALAR = "torchpt", "llvm_ad_rgb", "scalar_rgb"
+#: Processes that disturb.
+BUSY = 2
+#: Rounds from which on they tell how much means vary.
+ENOUGH = 5
+
+Turn = Callable[[], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A renderer, and how many threads it may use; None: as many as it likes."""
+
+    engine: str
+    threads: int | None = None
+
+    def __str__(self) -> str:
+        return self.engine if self.threads is None else f"{self.engine}, {self.threads} threads"
+
+
+@dataclass
+class Record:
+    """What a contender's turns came to.
+
+    Attributes:
+        rates: millions of camera paths a second.
+        means: of the pictures, by channel.
+    """
+
+    rates: list[float] = field(default_factory=list)
+    means: list[list[float]] = field(default_factory=list)
+
+    @property
+    def rate(self) -> float:
+        """The median."""
+        return statistics.median(self.rates)
+
+    @property
+    def mean(self) -> float:
+        """Of all pictures and channels."""
+        return statistics.fmean(statistics.fmean(mean) for mean in self.means)
 
 
 def main() -> None:
-    """Run all contenders in turn and print rates and ratios."""
+    """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="*", default=SCENES, help=f"of {', '.join(SCENES)}")
-    parser.add_argument("--compile", action="store_true", help="compiled stages too (half a minute to warm up)")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("scenes", nargs="*", help=f"of {', '.join(SCENES)}")
+    parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--spp", type=int, default=64)
+    parser.add_argument("--threads", type=int, help="of every contender; by default as many as it likes")
+    parser.add_argument("--sampler", default="sobol", help="ours; Mitsuba's is independent")
+    parser.add_argument("--compile", default="auto", choices=("auto", "on", "off"), help="off: eager")
+    parser.add_argument("--scalar", action="store_true", help=f"{SCALAR} too")
     parser.add_argument("--quick", action="store_true", help="one round of small pictures: that it works, no more")
-    parser.add_argument("--worker", nargs=2, metavar=("SCENE", "CONTENDER"), help=argparse.SUPPRESS)
+    parser.add_argument("--busy", action="store_true", help=f"the same with {BUSY} other processes busy")
+    parser.add_argument("--scaling", action="store_true", help="one thread beside two, or --threads")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="where the figures go")
+    parser.add_argument("--markdown", action="store_true", help="print a Markdown table as well")
+    parser.add_argument("--worker", nargs=2, metavar=("SCENE", "ENGINE"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.quick:
         arguments.rounds, arguments.size, arguments.spp = 1, 64, 4
     if arguments.worker:
-        scene, contender = arguments.worker
-        serve(scene, contender, arguments.size, arguments.spp)
+        scene, engine = arguments.worker
+        serve(scene, engine, arguments)
+    elif arguments.busy:
+        busy(arguments)
+    elif arguments.scaling:
+        scaling(arguments)
+    else:
+        race(arguments)
+
+
+def race(arguments: argparse.Namespace) -> None:
+    """All scenes, ours beside Mitsuba's."""
+    rivals = (LLVM, SCALAR) if arguments.scalar else (LLVM,)
+    contenders = [Contender(engine, arguments.threads) for engine in (OURS, *rivals)]
+    found: dict[str, Any] = {}
+    print(f"{'Mpaths/s':22s}{OURS:>9s}" + "".join(f"{rival:>13s}   ratio" for rival in rivals) + "    means, z")
+    for scene in arguments.scenes or SCENES:
+        with started(scene, contenders, arguments) as workers:
+            records = compete(workers, arguments.rounds)
+        ours, *others = records.values()
+        found[scene] = {
+            "torchpt": vars(ours) | {"rate": ours.rate},
+            **{rival: beside(ours, theirs) for rival, theirs in zip(rivals, others, strict=True)},
+            "replaced": replaced(scene),
+        }
+        cells = "".join(f"{found[scene][r]['rate']:13.3f}{found[scene][r]['ratio']:8.3f}" for r in rivals)
+        z = found[scene][LLVM]["z"]
+        means = f"{ours.mean:.5f} {others[0].mean:.5f}" + ("" if z is None else f" {z:5.1f}")
+        print(f"{scene:22s}{ours.rate:9.3f}{cells}    {means}", flush=True)
+        for name, instead in found[scene]["replaced"].items():
+            print(f"    {name}: {instead}")
+        overall = {
+            rival: geometric_means({name: row[rival]["ratio"] for name, row in found.items()}) for rival in rivals
+        }
+        save(arguments, {"scenes": found, "geometric_means": overall})
+    for group in GROUPS:
+        cells = "".join(f"{overall[rival][group]:21.3f}" for rival in rivals if group in overall[rival])
+        if cells:
+            print(f"{'geometric mean, ' + group:31s}{cells}")
+    if arguments.markdown:
+        print(markdown(found, rivals))
+
+
+def beside(ours: Record, theirs: Record) -> dict[str, Any]:
+    """A rival's figures: rates and means, and the ratio of ours to them within rounds."""
+    ratios = [a / b for a, b in zip(ours.rates, theirs.rates, strict=True)]
+    facts = {"rate": theirs.rate, "ratio": statistics.median(ratios), "ratios": ratios}
+    return {**vars(theirs), **facts, "z": deviate(ours.means, theirs.means)}
+
+
+def deviate(ours: list[list[float]], theirs: list[list[float]]) -> float | None:
+    """How many standard errors the means of pictures are apart, in the channel where it is most."""
+    if len(ours) < ENOUGH:
+        return None
+    found = []
+    for a, b in zip(zip(*ours, strict=True), zip(*theirs, strict=True), strict=True):
+        error = math.sqrt((statistics.variance(a) + statistics.variance(b)) / len(a))
+        found.append((statistics.fmean(a) - statistics.fmean(b)) / max(error, 1e-12))
+    return max(found, key=abs)
+
+
+def geometric_means(figures: dict[str, float]) -> dict[str, float]:
+    """Of the groups that are complete; figures by scene."""
+    return {
+        group: math.exp(statistics.fmean(math.log(figures[name]) for name in names))
+        for group, names in GROUPS.items()
+        if set(names) <= set(figures)
+    }
+
+
+def markdown(found: dict[str, Any], rivals: tuple[str, ...]) -> str:
+    """The table for the documentation, with geometric means of the groups that are complete."""
+    lines = ["| scene | torchpt |" + "".join(f" `{rival}` | ratio |" for rival in rivals)]
+    lines.append("|---|---|" + "---|---|" * len(rivals))
+    columns = [(OURS, "rate"), *((rival, key) for rival in rivals for key in ("rate", "ratio"))]
+    for name, row in found.items():
+        lines.append(f"| `{name}` | " + " | ".join(f"{row[who][key]:.2f}" for who, key in columns) + " |")
+    means = [geometric_means({name: row[who][key] for name, row in found.items()}) for who, key in columns]
+    for group in means[0]:
+        title = f"geometric mean of {len(GROUPS[group])} ({group})"
+        lines.append(f"| {title} | " + " | ".join(f"{mean[group]:.2f}" for mean in means) + " |")
+    return "\n".join(lines)
+
+
+def busy(arguments: argparse.Namespace) -> None:
+    """How much slower everyone is beside busy processes."""
+    contenders = [Contender(engine, arguments.threads) for engine in (OURS, LLVM)]
+    found: dict[str, Any] = {}
+    for scene in arguments.scenes or ("cornell_box",):
+        with started(scene, contenders, arguments) as workers:
+            quiet, slowed = ({name: Record() for name in workers} for _ in range(2))
+            for _ in range(arguments.rounds):
+                for name, worker in workers.items():
+                    note(quiet[name], ask(worker))
+                    with spinning(BUSY):
+                        note(slowed[name], ask(worker))
+        found[scene] = {}
+        for name, record in quiet.items():
+            ratios = [b / a for a, b in zip(record.rates, slowed[name].rates, strict=True)]
+            found[scene][name] = {"quiet": record.rates, "busy": slowed[name].rates, "ratio": statistics.median(ratios)}
+            rates = f"quiet {record.rate:7.3f}, busy {slowed[name].rate:7.3f} Mpaths/s"
+            print(f"{scene:22s}{name:24s}{rates}, ratio {found[scene][name]['ratio']:.3f}", flush=True)
+    save(arguments, {"busy": found})
+
+
+def scaling(arguments: argparse.Namespace) -> None:
+    """One thread beside several."""
+    several = arguments.threads or 2
+    contenders = [Contender(engine, threads) for engine in (OURS, LLVM) for threads in (1, several)]
+    found: dict[str, Any] = {}
+    for scene in arguments.scenes or ("cornell_box",):
+        with started(scene, contenders, arguments) as workers:
+            records = list(compete(workers, arguments.rounds).values())
+        found[scene] = {}
+        for engine, one, more in zip((OURS, LLVM), records[::2], records[1::2], strict=True):
+            gain = statistics.median(b / a for a, b in zip(one.rates, more.rates, strict=True))
+            found[scene][engine] = {"1": one.rates, str(several): more.rates, "ratio": gain}
+            rates = f"1 thread {one.rate:7.3f}, {several} threads {more.rate:7.3f} Mpaths/s"
+            print(f"{scene:22s}{engine:14s}{rates}, ratio {gain:.3f}", flush=True)
+    save(arguments, {"scaling": found})
+
+
+def save(arguments: argparse.Namespace, facts: dict[str, Any]) -> None:
+    """Write what is known so far, and how it came about."""
+    if arguments.json is None:
         return
-    modes = ("eager", "compiled") if arguments.compile else ("eager",)
-    contenders = [*MITSUBA, *(f"{mode} {sampler}" for mode in modes for sampler in ("sobol", "independent"))]
-    for scene in arguments.scenes:
-        report(scene, compete(scene, contenders, arguments))
-        searcher = start(scene, "traversal", arguments)
-        for kind, rate in ask(searcher).items():
-            print(f"  {kind:50s} {rate:7.2f} Mrays/s")
-        stop(searcher)
+    versions = {name: importlib.metadata.version(name) for name in ("torch", "mitsuba")}
+    machine = {"cores": os.cpu_count(), "architecture": platform.machine(), **versions}
+    names = ("rounds", "size", "spp", "threads", "sampler", "compile")
+    settings = {name: getattr(arguments, name) for name in names} | {"max_depth": DEPTH, "rr_depth": 5}
+    arguments.json.write_text(json.dumps({"settings": settings, "machine": machine, **facts}, indent=1) + "\n")
 
 
-def compete(scene: str, contenders: list[str], arguments: argparse.Namespace) -> dict[str, float]:
-    """Median Mpaths/s of each contender, over rounds in which all take their turn."""
-    workers = {name: start(scene, name, arguments) for name in contenders}
-    rates: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(arguments.rounds):
+@contextmanager
+def spinning(number: int) -> Iterator[None]:
+    """Other processes that are busy meanwhile."""
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(number)]
+    try:
+        time.sleep(0.2)  # they have to start
+        yield
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+
+
+@contextmanager
+def started(
+    scene: str, contenders: list[Contender], arguments: argparse.Namespace
+) -> Iterator[dict[str, subprocess.Popen[str]]]:
+    """Processes by name that have loaded and warmed up, and render once for every line they read."""
+    workers: dict[str, subprocess.Popen[str]] = {}
+    try:
+        for contender in contenders:
+            wishes = {"size": arguments.size, "spp": arguments.spp, "sampler": arguments.sampler}
+            wishes |= {"compile": arguments.compile, "threads": contender.threads}
+            given = [f"--{key}={value}" for key, value in wishes.items() if value is not None]
+            command = [sys.executable, __file__, *given, "--worker", scene, contender.engine]
+            worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            workers[str(contender)] = worker
+            if answer(worker) is None:
+                raise SystemExit(f"{contender} on {scene} did not start")
+        yield workers
+    finally:
+        for worker in workers.values():
+            assert worker.stdin is not None
+            worker.stdin.close()
+            worker.wait()
+
+
+def compete(workers: dict[str, subprocess.Popen[str]], rounds: int) -> dict[str, Record]:
+    """Rounds in which all take their turn."""
+    records = {name: Record() for name in workers}
+    for _ in range(rounds):
         for name, worker in workers.items():
-            rates[name].append(ask(worker)["rate"])
-    for worker in workers.values():
-        stop(worker)
-    return {name: statistics.median(values) for name, values in rates.items()}
+            note(records[name], ask(worker))
+    return records
 
 
-def report(scene: str, rates: dict[str, float]) -> None:
-    """Rates, ratios to both of Mitsuba's variants, and the bars of this scene."""
-    print(f"{scene:42s} {'Mpaths/s':>8s}" + "".join(f"  / {name}" for name in MITSUBA))
-    for name, rate in rates.items():
-        ratios = "".join(f"  {rate / rates[rival]:{len(rival) + 2}.2f}" for rival in MITSUBA)
-        print(f"  {name:40s} {rate:8.2f}{ratios}")
-    for where, name, rival, least in BARS:
-        if where == scene and name in rates:
-            ratio = rates[name] / rates[rival]
-            print(f"  {'ok  ' if ratio >= least else 'LOW '} {name} / {rival} = {ratio:.2f} (bar {least})", flush=True)
+def note(record: Record, turn: dict[str, Any]) -> None:
+    """Add a turn to a record."""
+    record.rates.append(turn["rate"])
+    record.means.append(turn["mean"])
 
 
-def start(scene: str, contender: str, arguments: argparse.Namespace) -> subprocess.Popen[str]:
-    """A process that has loaded and warmed up, and renders once for every line it reads."""
-    sizes = ["--size", str(arguments.size), "--spp", str(arguments.spp)]
-    command = [sys.executable, __file__, *sizes, "--worker", scene, contender]
-    worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    if answer(worker) != {"ready": 1}:
-        raise SystemExit(f"{contender} on {scene} did not start")
-    return worker
-
-
-def answer(worker: subprocess.Popen[str]) -> dict[str, float] | None:
+def answer(worker: subprocess.Popen[str]) -> dict[str, Any] | None:
     """The next JSON of a worker; libraries may write lines of their own in between."""
     assert worker.stdout is not None
     return next((json.loads(line) for line in worker.stdout if line.startswith("{")), None)
 
 
-def stop(worker: subprocess.Popen[str]) -> None:
-    """Let a worker end."""
-    assert worker.stdin is not None
-    worker.stdin.close()
-    worker.wait()
-
-
-def ask(worker: subprocess.Popen[str]) -> dict[str, float]:
+def ask(worker: subprocess.Popen[str]) -> dict[str, Any]:
     """One turn of a worker."""
     assert worker.stdin is not None
     worker.stdin.write("go\n")
     worker.stdin.flush()
-    rates = answer(worker)
-    if rates is None:
+    turn = answer(worker)
+    if turn is None:
         raise SystemExit("a contender ended before its turn")
-    return rates
+    return turn
 
 
-def serve(scene: str, contender: str, size: int, spp: int) -> None:
-    """The worker: warm up, then answer each line on stdin with a JSON of rates in millions a second."""
-    if contender == "traversal":
-        turn = traversal(scene, size)
-    elif contender in MITSUBA:
-        turn = partial(timed, mitsuba(scene, contender, size, spp), size * size * spp)
-    else:
-        turn = partial(timed, torchpt(scene, contender, size, spp), size * size * spp)
+def serve(scene: str, engine: str, arguments: argparse.Namespace) -> None:
+    """The worker: warm up, then answer each line on stdin with the JSON of a turn."""
+    turn = torchpt(scene, arguments) if engine == OURS else mitsuba(scene, engine, arguments)
     turn()
     print("\n" + json.dumps({"ready": 1}), flush=True)
     for _ in sys.stdin:
         print("\n" + json.dumps(turn()), flush=True)
 
 
-def timed(shoot: Callable[[], Any], paths: int) -> dict[str, float]:
-    """One render and its rate."""
-    begin = time.perf_counter()
-    shoot()
-    return {"rate": paths / (time.perf_counter() - begin) / 1e6}
-
-
-def wishes(size: int, spp: int, sampler: str = "sobol", compile: str = "off") -> dict[str, Any]:
-    """Settings that both sides render with."""
-    return {
-        "film": {"width": size, "height": size, "filter": "box"},
-        "integrator": {"type": "path", "max_depth": 8, "rr_depth": 5},
-        "sampler": sampler,
-        "render": {"spp": spp, "compile": compile},
-    }
-
-
-def mitsuba(name: str, variant: str, size: int, spp: int) -> Callable[[], Any]:
-    """A render of Mitsuba's, with a new seed each time."""
+def timed(shoot: Callable[[int], Any], arguments: argparse.Namespace) -> Turn:
+    """Turns of a renderer of pictures ``(H, W, 3)`` by seed."""
     import numpy as np
-    from mitsuba_scene import convert, load_mitsuba
 
-    from torchpt.scene import load
-    from torchpt.scene.description import settings
+    seeds, paths = count(1), arguments.size**2 * arguments.spp
 
-    module = load_mitsuba(variant)
-    scene = load(name, device="cpu")
-    with tempfile.TemporaryDirectory() as folder:
-        theirs = module.load_dict(convert(module, scene, settings(scene.description, wishes(size, spp)), Path(folder)))
-    seeds = iter(range(1_000_000))
-    return lambda: np.asarray(module.render(theirs, spp=spp, seed=next(seeds)))
-
-
-def torchpt(name: str, contender: str, size: int, spp: int) -> Callable[[], Any]:
-    """A render of torchpt's; ``contender`` is ``eager|compiled sobol|independent``."""
-    from torchpt.render import render_scene
-    from torchpt.scene import load
-    from torchpt.scene.description import settings
-
-    mode, sampler = contender.split()
-    scene = load(name, device="cpu")
-    wish = settings(scene.description, wishes(size, spp, sampler, "on" if mode == "compiled" else "off"))
-    return lambda: render_scene(scene, wish)
-
-
-def traversal(name: str, size: int) -> Callable[[], dict[str, float]]:
-    """Searches alone, over camera rays and over diffuse rays from what they hit."""
-    import torch
-
-    from torchpt.math.frames import Frame
-    from torchpt.math.warps import cosine_hemisphere
-    from torchpt.records import Hit
-    from torchpt.render import make_wave
-    from torchpt.scene import load
-    from torchpt.scene.description import settings
-    from torchpt.shapes import interact, offset_origin
-
-    scene = load(name, device="cpu")
-    wave = make_wave(scene, settings(scene.description, wishes(size, 1)), None, torch.float32, False)
-    first = wave.rays(0, size * size, 0, 1)
-    t, prim, u, v = scene.accel("torch", None).intersect(first.o, first.d, first.t_max)
-    seen = prim >= 0
-    world, _ = scene.world(torch.float32)
-    hit = Hit(t[seen], prim[seen].long(), u[seen], v[seen])
-    at = interact(world, first.o[:, seen], first.d[:, seen], hit)
-    frame = Frame.about(at.ns)
-    side = frame.to_local(-first.d[:, seen])[2]
-    local = cosine_hemisphere(torch.rand(2, len(side), generator=torch.Generator().manual_seed(0)))
-    local[2] *= torch.sign(side)
-    d = frame.to_world(local)
-    o = offset_origin(world, at, d)
-    rays = {"coherent": (first.o, first.d), "diffuse": (o, d)}
-
-    def turn() -> dict[str, float]:
-        rates = {}
-        for kind in ("torch", "auto"):
-            accel = scene.accel(kind, None)
-            for label, (origin, direction) in rays.items():
-                far = torch.full((origin.shape[1],), torch.inf)
-                for query in (accel.intersect, accel.occluded):
-                    query(origin, direction, far)  # warm
-                    begin = time.perf_counter()
-                    query(origin, direction, far)
-                    rate = origin.shape[1] / (time.perf_counter() - begin) / 1e6
-                    rates[f"traversal {accel.name}, {label} rays, {query.__name__}"] = rate
-        return rates
+    def turn() -> dict[str, Any]:
+        seed = next(seeds)
+        begin = time.perf_counter()
+        picture = shoot(seed)
+        seconds = time.perf_counter() - begin
+        return {"rate": paths / seconds / 1e6, "mean": np.asarray(picture, np.float64).mean((0, 1)).tolist()}
 
     return turn
+
+
+def wishes(scene: Any, arguments: argparse.Namespace) -> Any:
+    """Complete settings of a render."""
+    from torchpt.scene.description import settings
+
+    blocks = {
+        "film": {"width": arguments.size, "height": arguments.size, "filter": "box"},
+        "integrator": {"type": "path", "max_depth": DEPTH, "rr_depth": 5},
+        "sampler": arguments.sampler,
+        "render": {"spp": arguments.spp, "compile": arguments.compile, "threads": arguments.threads or "auto"},
+    }
+    return settings(scene.description, blocks)
+
+
+def replaced(name: str) -> dict[str, str]:
+    """What stands in place of something that Mitsuba lacks."""
+    from mitsuba_scene import replacements
+
+    return replacements(name)
+
+
+def mitsuba(name: str, variant: str, arguments: argparse.Namespace) -> Turn:
+    """Turns of Mitsuba's."""
+    import drjit
+    import numpy as np
+    from mitsuba_scene import convert, load_mitsuba, nearest
+
+    module = load_mitsuba(variant)
+    if arguments.threads is not None:
+        drjit.set_thread_count(arguments.threads)
+    scene = nearest(name)
+    given = wishes(scene, arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        theirs = module.load_dict(convert(module, scene, given, Path(folder)))
+    return timed(lambda seed: np.asarray(module.render(theirs, spp=arguments.spp, seed=seed)), arguments)
+
+
+def torchpt(name: str, arguments: argparse.Namespace) -> Turn:
+    """Turns of torchpt's."""
+    from mitsuba_scene import nearest
+
+    from torchpt.render import render_scene
+
+    scene = nearest(name)
+    given = wishes(scene, arguments)
+
+    def shoot(seed: int) -> Any:
+        drawn = given.render.model_copy(update={"seed": seed})
+        return render_scene(scene, given.model_copy(update={"render": drawn})).image.numpy()
+
+    return timed(shoot, arguments)
 
 
 if __name__ == "__main__":

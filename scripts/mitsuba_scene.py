@@ -2,14 +2,18 @@
 
 Rough models are built with GGX, opaque materials as ``twosided``, meshes with torchpt's own shading normals. In Mitsuba light
 that passes an opacity or ``null`` counts as a bounce and here it does not: scenes with such need a large ``max_depth``.
+
+What Mitsuba cannot express is left out by :func:`comparable`, and by :func:`nearest` replaced in the description, which both
+then render.
 """
 
 from __future__ import annotations
 
 import ctypes.util
 import importlib
+import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,19 +25,40 @@ import torchpt
 from torchpt.math.vectors import cross, dot
 from torchpt.scene import Scene
 from torchpt.scene.assembly import corners_of
+from torchpt.scene.description import Description, read_description
+from torchpt.scene.materials import (
+    Blend,
+    BlinnPhong,
+    Conductor,
+    Material,
+    Microfacet,
+    Nonmetal,
+    Phong,
+    RoughConductor,
+    RoughDielectric,
+    RoughPlastic,
+)
 from torchpt.scene.parts import MaterialSlot, Part, Source, VertexColors
-from torchpt.scene.schema import Camera, Orthographic, Perspective, ThinLens
+from torchpt.scene.schema import Camera, Cone, Cube, Instance, Mesh, Orthographic, Perspective, Shape, ThinLens
 from torchpt.scene.settings import Film, Filter, PathIntegrator, Settings
 from torchpt.scene.texels import images_of
+from torchpt.scene.textures import Slot
 from torchpt.textures import Node
 
-__all__ = ["NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "load_mitsuba", "sensor"]
+__all__ = [
+    "NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "lets_pass", "load_mitsuba", "nearest",
+    "replacements", "sensor",
+]  # fmt: skip
 
 #: Models with the same parameters on both sides; those with microfacets become the smooth one where alpha is next to nothing.
 SHARED = ("diffuse", "conductor", "dielectric", "thindielectric", "plastic", "principled", "null")
 SMOOTH = {"roughconductor": "conductor", "roughdielectric": "dielectric", "roughplastic": "plastic"}
 #: Below this alpha torchpt's rough models are mirrors.
 LEAST_ALPHA = 1e-4
+#: Sides of the mesh that stands for a cone.
+SIDES = 128
+#: Reflectance at normal incidence up to which an index or a metal is found for it.
+MOST_REFLECTANCE = 0.98
 
 
 class NoCounterpartError(ValueError):
@@ -84,6 +109,8 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
     """
     integrator = settings.integrator
     assert isinstance(integrator, PathIntegrator)
+    if scene.parts.copies:
+        raise NoCounterpartError(f"{scene.parts.copies[0].name}: instances are not converted")
     out: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": integrator.max_depth, "rr_depth": integrator.rr_depth},
@@ -170,6 +197,152 @@ def comparable(name: str) -> Scene:
     return Scene(replace(scene.description, shapes=shapes), scene.device)
 
 
+def nearest(scene: Scene | str) -> Scene:
+    """A scene, or one of ``configs/scene``, with the nearest that both can render for what Mitsuba cannot express.
+
+    Of :func:`replacements`; what is not among them still raises :class:`NoCounterpartError` in :func:`convert`.
+    """
+    loaded = torchpt.load(scene, device="cpu") if isinstance(scene, str) else scene
+    changed, said = _replaced(loaded.description)
+    return Scene(changed, loaded.device) if said else loaded
+
+
+def replacements(scene: Scene | str) -> dict[str, str]:
+    """What :func:`nearest` replaces, by dotted name: what stands there instead."""
+    return _replaced(read_description(scene) if isinstance(scene, str) else scene.description)[1]
+
+
+def _replaced(description: Description) -> tuple[Description, dict[str, str]]:
+    found, shapes = _Nearest(), description.shapes
+    changed = replace(
+        description,
+        camera=found.camera(description.camera),
+        materials={name: found.material(f"materials.{name}", value) for name, value in description.materials.items()},
+        shapes={name: found.shape(f"shapes.{name}", value, shapes) for name, value in shapes.items()},
+    )
+    return changed, found.said
+
+
+def lets_pass(scene: Scene) -> bool:
+    """Whether light passes some surface as if it were not there: in Mitsuba that is a bounce."""
+    slots = [slot for part in scene.parts.parts for slot in part.material.all()]
+    return any(slot.model.name == "null" or slot.opacity != 1.0 for slot in slots)
+
+
+class _Nearest:
+    """Replaces what Mitsuba lacks.
+
+    Attributes:
+        said: what was replaced, by dotted name.
+    """
+
+    def __init__(self) -> None:
+        self.said: dict[str, str] = {}
+
+    def camera(self, camera: Camera) -> Camera:
+        """A round aperture for one of blades."""
+        if not isinstance(camera, ThinLens) or not camera.blades:
+            return camera
+        self.said["camera"] = f"an aperture of {camera.blades} blades is round"
+        return camera.model_copy(update={"blades": 0})
+
+    def shape(self, name: str, shape: Shape, shapes: Mapping[str, Shape]) -> Shape:
+        """A mesh for a cone, and for an instance."""
+        if isinstance(shape, Cone):
+            self.said[name] = f"cone is a mesh of {SIDES} sides with smooth normals"
+            shape = _cone(shape)
+        elif isinstance(shape, Instance) and isinstance(mesh := shapes.get(shape.of), Mesh | Cube):
+            self.said[name] = f"instance is a copy of {shape.of}"
+            own = {"transform": shape.transform, "flip_normals": shape.flip_normals, "emission": None}
+            shape = mesh.model_copy(update={**own, "material": shape.material or mesh.material})
+        if isinstance(shape.material, Material):
+            shape = shape.model_copy(update={"material": self.material(f"{name}.material", shape.material)})
+        return shape
+
+    def material(self, name: str, material: Material) -> Material:
+        """A material whose model Mitsuba has, of the same highlight and base."""
+        if isinstance(material, Blend):
+            sides = {"a": material.a, "b": material.b}
+            inner = {k: self.material(f"{name}.{k}", v) if isinstance(v, Material) else v for k, v in sides.items()}
+            return material.model_copy(update=inner)
+        if isinstance(material.opacity, Slot) and material.alpha_cutoff is not None:
+            self.said[f"{name}.alpha_cutoff"] = "cutoff left out: opacity is coverage"
+            material = material.model_copy(update={"alpha_cutoff": None})
+        if isinstance(material, RoughConductor | RoughDielectric) and material.energy_compensation:
+            self.said[f"{name}.energy_compensation"] = "left out"
+            material = material.model_copy(update={"energy_compensation": False})
+        if isinstance(material, Conductor | RoughConductor) and material.schlick and material.reflectance is not None:
+            return self._metal(name, material, _numbers(name, material.reflectance))
+        coat = _coat(name, material)
+        if coat is None:
+            return material
+        base, reflectance, alpha, tint = coat
+        root = math.sqrt(min(reflectance, MOST_REFLECTANCE))
+        index = (1.0 + root) / (1.0 - root)
+        given = {key: getattr(material, key) for key in Material.model_fields}
+        given |= {"diffuse_reflectance": base, "int_ior": index, "ext_ior": 1.0, "alpha": alpha}
+        self.said[name] = f"{material.bsdf().name} is roughplastic of int_ior {index:.3g}, alpha {alpha:.3g}"
+        return RoughPlastic.model_construct(**given, specular_reflectance=tint)
+
+    def _metal(self, name: str, material: Conductor | RoughConductor, reflectance: tuple[float, ...]) -> Material:
+        """The index 1 with the absorption that reflects as much at normal incidence."""
+        if reflectance == (1.0, 1.0, 1.0):
+            return material
+        self.said[name] = "metal by its reflectance has eta 1 and k of the same reflectance"
+        k = tuple(2.0 * math.sqrt(r / (1.0 - r)) for r in (min(r, MOST_REFLECTANCE) for r in reflectance))
+        return material.model_copy(update={"material": None, "reflectance": None, "eta": (1.0, 1.0, 1.0), "k": k})
+
+
+def _coat(name: str, material: Material) -> tuple[Any, float, float, Any] | None:
+    """Base, reflectance at normal incidence, alpha and tint of a coated model that Mitsuba lacks; of others None.
+
+    ``(h . n)^n`` is as wide as GGX with ``alpha^2 = 2 / (n + 2)`` (Walter et al. 2007); the lobe about the mirror direction
+    is as wide as one of four times its exponent about the half vector.
+    """
+    if isinstance(material, Phong):
+        blinn = isinstance(material, BlinnPhong)
+        (exponent,) = _numbers(name, material.exponent)
+        specular = sum(_numbers(name, material.specular)) / 3.0
+        alpha = math.sqrt(2.0 / ((exponent if blinn else 4.0 * exponent) + 2.0))
+        return material.diffuse, (4.0 if blinn else 1.0) * specular, alpha, None
+    if isinstance(material, Nonmetal):
+        ((specular,), (roughness,)) = _numbers(name, material.specular), _numbers(name, material.roughness)
+        return material.base_color, specular, max(roughness**2, LEAST_ALPHA), None
+    if isinstance(material, Microfacet):
+        ((index,), (roughness,)) = _numbers(name, material.ior), _numbers(name, material.roughness)
+        return material.diffuse, ((index - 1.0) / (index + 1.0)) ** 2, max(roughness**2, LEAST_ALPHA), material.specular
+    return None
+
+
+def _numbers(name: str, value: Any) -> tuple[float, ...]:
+    if isinstance(value, Slot):
+        raise NoCounterpartError(f"{name}: a texture where its nearest takes a number")
+    return value if isinstance(value, tuple) else (value,)
+
+
+def _cone(cone: Cone) -> Mesh:
+    """A mesh in place of a cone: its side with the cone's own normals, and its base."""
+    angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
+    none, one = np.zeros(SIDES), np.ones(SIDES)
+    ring, tips = np.stack((np.cos(angles), np.sin(angles), none)), np.stack((none, none, one))
+    # Every side has a tip of its own, whose normal is that of its middle.
+    slanted = [np.stack((np.cos(a), np.sin(a), one)) for a in (angles, angles + np.pi / SIDES)]
+    here = np.arange(SIDES)
+    after = (here + 1) % SIDES
+    points, normals, faces = [ring, tips], slanted, [np.stack((here, after, here + SIDES))]
+    if cone.capped:  # by corners that face down, around a centre
+        points, normals = [*points, ring, np.zeros((3, 1))], [*normals, -tips, -tips[:, :1]]
+        faces.append(np.stack((after + 2 * SIDES, here + 2 * SIDES, np.full(SIDES, 3 * SIDES))))
+    own = cone.own()
+    across = np.linalg.inv(own[:3, :3]).T @ np.concatenate(normals, 1)
+    mesh = Mesh(
+        vertices=(own[:3, :3] @ np.concatenate(points, 1) + own[:3, 3:]).T,
+        normals=(across / np.linalg.norm(across, axis=0)).T,
+        faces=np.concatenate(faces, 1).T,
+    )
+    return mesh.model_copy(update={key: getattr(cone, key) for key in Shape.model_fields})
+
+
 def _film(film: Film) -> dict[str, Any]:
     return {
         "type": "hdrfilm",
@@ -232,6 +405,8 @@ def _kind(part: Part) -> str:
 
 def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
     """Mitsuba's dict of a texture."""
+    if node.filtered:
+        raise NoCounterpartError(f"{node.texels}: Mitsuba does not filter textures over a pixel")
     image = images_of([node], scene.params)[node.texels].detach()
     if node.channel is None:
         image = image[..., :3] if image.shape[2] >= 3 else image[..., :1].expand(-1, -1, 3)
@@ -275,6 +450,8 @@ def bsdf(slot: MaterialSlot, opened: Opened = _refuse) -> dict[str, Any]:
     else:
         found = _bare(slot, opened)
         if slot.normal_map is not None:
+            if slot.normal_strength != 1.0:
+                raise NoCounterpartError(f"{slot.name}: Mitsuba's normal maps have no strength")
             found = {"type": "normalmap", "normalmap": opened(slot.normal_map), "bsdf": found}
         if slot.bump_map is not None:
             found = {"type": "bumpmap", "bump_texture": opened(slot.bump_map), "bsdf": found}
