@@ -277,11 +277,13 @@ def looped(wave: Wave, settings: Settings, device: torch.device) -> bool:
 
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
     """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
-    kernels = Kernels(wave, is_fused(wave), before)
+    packets = wave.accel.name == "brute" and not wave.stages.world.counts[4]
+    fused = packets and wave.stages.world.opacity is None and wave.preview is None
+    kernels = Kernels(wave, packets, fused, before)
     own = [k for k, model in enumerate(wave.stages.world.models) if any(model is mine for mine in scene.own_models)]
     eager = kernels.probe(own) if wave.limits is not None else {}
     if eager and kernels.fused:  # what runs as tensor operations hands its rays to the search structure
-        kernels = Kernels(wave, False)
+        kernels = Kernels(wave, packets, False)
     kernels.eager = eager
     return kernels
 
@@ -291,12 +293,6 @@ def say_once(text: str) -> None:
     if text not in _said:
         _said.add(text)
         print(text, file=sys.stderr, flush=True)
-
-
-def is_fused(wave: Wave) -> bool:
-    """Whether rays are searched for inside the kernels: few primitives, none of them a quadric, all opaque."""
-    world = wave.stages.world
-    return wave.accel.name == "brute" and world.opacity is None and not world.counts[4] and wave.preview is None
 
 
 def _passes(spp: int, randomizations: int) -> Iterator[tuple[int, int]]:

@@ -82,6 +82,11 @@ class _Search(Block):
         self.lines.append(f"  %reach = fmul {_F} {far_d}, {self._larger(far_o, extent)}")
         bits = self.op(f"bitcast {_B} {good} to i16")
         self.lines.append(f"  %live = icmp ne i16 {bits}, 0")
+        if "sphere" in self.kinds:
+            d = [self.convert("fpext", "f", "d", f"%{name}") for name in _RAY[3:]]
+            self.lines.append(f"  %square = fadd {_D} {self._dot(d, d)}, {self.constant('d', 0.0)}")
+            self.lines.append(f"  %shrink = fdiv {_D} {self.constant('d', 1.0)}, %square")
+            self.lines.append(f"  %shrink32 = fptrunc {_D} %shrink to {_F}")
 
     def _larger(self, a: str, b: str) -> str:
         return self.select("f", self.compare("ogt", "f", a, b), a, b)
@@ -94,15 +99,18 @@ class _Search(Block):
         """All primitives of a kind; returns the names of distance and primitive after them, and the block that ends it."""
         number = KINDS.index(kind)
         first = "0" if number == 0 else f"%end_{KINDS[number - 1]}"
+        last = f"{kind}_last" if kind == "sphere" else kind
         self.lines += [
             f"  %{kind}_some = icmp slt i64 {first}, %end_{kind}",
             f"  %{kind}_go = and i1 %{kind}_some, %live",
             f"  br i1 %{kind}_go, label %{kind}, label %{kind}_done",
             f"{kind}:",
-            f"  %{kind}_id = phi i64 [ {first}, %{before} ], [ %{kind}_next, %{kind} ]",
-            f"  %{kind}_t = phi {_F} [ {t}, %{before} ], [ %{kind}_t1, %{kind} ]",
-            f"  %{kind}_p = phi {_I} [ {prim}, %{before} ], [ %{kind}_p1, %{kind} ]",
+            f"  %{kind}_id = phi i64 [ {first}, %{before} ], [ %{kind}_next, %{last} ]",
+            f"  %{kind}_t = phi {_F} [ {t}, %{before} ], [ %{kind}_t1, %{last} ]",
+            f"  %{kind}_p = phi {_I} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
         ]
+        if kind == "sphere":
+            self._near_ball(kind)
         found, hit = self._ball(kind) if kind == "sphere" else self._planar(kind)
         tests = [
             self.compare("ogt", "f", found, self.constant("f", 0.0)),
@@ -113,15 +121,25 @@ class _Search(Block):
         # A ray that meets anything at all is done: no distance is below the one it has then.
         better = self.constant("f", -1.0) if self.any_hit else found
         number_ = self.splat("i", self.op(f"trunc i64 %{kind}_id to i32"))
+        tail = "e" if kind == "sphere" else "1"
         self.lines += [
-            f"  %{kind}_t1 = select {_B} {hit}, {_F} {better}, {_F} %{kind}_t",
-            f"  %{kind}_p1 = select {_B} {hit}, {_I} {number_}, {_I} %{kind}_p",
+            f"  %{kind}_t{tail} = select {_B} {hit}, {_F} {better}, {_F} %{kind}_t",
+            f"  %{kind}_p{tail} = select {_B} {hit}, {_I} {number_}, {_I} %{kind}_p",
+        ]
+        if kind == "sphere":
+            self.lines += [
+                f"  br label %{kind}_last",
+                f"{kind}_last:",
+                f"  %{kind}_t1 = phi {_F} [ %{kind}_t, %{kind} ], [ %{kind}_te, %{kind}_exact ]",
+                f"  %{kind}_p1 = phi {_I} [ %{kind}_p, %{kind} ], [ %{kind}_pe, %{kind}_exact ]",
+            ]
+        self.lines += [
             f"  %{kind}_next = add i64 %{kind}_id, 1",
             f"  %{kind}_more = icmp slt i64 %{kind}_next, %end_{kind}",
             f"  br i1 %{kind}_more, label %{kind}, label %{kind}_done",
             f"{kind}_done:",
-            f"  %{kind}_t2 = phi {_F} [ {t}, %{before} ], [ %{kind}_t1, %{kind} ]",
-            f"  %{kind}_p2 = phi {_I} [ {prim}, %{before} ], [ %{kind}_p1, %{kind} ]",
+            f"  %{kind}_t2 = phi {_F} [ {t}, %{before} ], [ %{kind}_t1, %{last} ]",
+            f"  %{kind}_p2 = phi {_I} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
         ]
         return f"%{kind}_t2", f"%{kind}_p2", f"{kind}_done"
 
@@ -170,6 +188,37 @@ class _Search(Block):
             value = self.fma("d", x, y, value)
         return value
 
+    def _near_ball(self, kind: str) -> None:
+        """Goes on to the exact test where any ray comes near the sphere, by float32 and a bound of its rounding.
+
+        The perpendicular from the centre to the ray errs by less than ``2^-20 (|f| + |c|)``, with ``f`` from the centre ``c``
+        to the origin: a few roundings of terms that large, the centre's own included.
+        """
+        own = self.op(f"sub i64 %{kind}_id, %end_disk")
+        base = self.op(f"getelementptr [4 x double], ptr %balls, i64 {own}")
+        loaded = [self.load("double", self.at(base, "double", k)) for k in range(4)]
+        c = [self.splat("f", self.op(f"fptrunc double {x} to float")) for x in loaded]
+        d = [f"%{name}" for name in _RAY[3:]]
+        f = [self.sub("f", f"%{name}", x) for name, x in zip(_RAY[:3], c, strict=False)]
+        along = self.mul("f", f[0], d[0])
+        size = self.add("f", self.call("llvm.fabs", "f", f[0]), self.call("llvm.fabs", "f", c[0]))
+        for k in (1, 2):
+            along = self.fma("f", f[k], d[k], along)
+            size = self.add("f", size, self.call("llvm.fabs", "f", f[k]))
+            size = self.add("f", size, self.call("llvm.fabs", "f", c[k]))
+        s = self.negative("f", self.mul("f", along, "%shrink32"))
+        off = [self.fma("f", s, y, x) for x, y in zip(f, d, strict=True)]
+        square = self.mul("f", off[0], off[0])
+        for k in (1, 2):
+            square = self.fma("f", off[k], off[k], square)
+        reach = self.fma("f", size, self.constant("f", 2.0**-19), self.call("llvm.fabs", "f", c[3]))
+        # Not "farther away": what overflows or is no number takes the exact test.
+        near = self.compare("ule", "f", square, self.mul("f", reach, reach))
+        near = self.op(f"and {_B} {near}, {self.compare('ogt', 'f', f'%{kind}_t', self.constant('f', 0.0))}")
+        bits = self.op(f"bitcast {_B} {near} to i16")
+        some = self.op(f"icmp ne i16 {bits}, 0")
+        self.lines += [f"  br i1 {some}, label %{kind}_exact, label %{kind}_last", f"{kind}_exact:"]
+
     def _ball(self, kind: str) -> tuple[str, str | None]:
         """See :func:`torchpt.accel.kernels_sphere.sphere_distance`."""
         own = self.op(f"sub i64 %{kind}_id, %end_disk")
@@ -177,14 +226,14 @@ class _Search(Block):
         ball = [self.splat("d", self.load("double", self.at(base, "double", k))) for k in range(4)]
         o, d = ([self.convert("fpext", "f", "d", f"%{name}") for name in names] for names in (_RAY[:3], _RAY[3:]))
         f = [self.sub("d", x, c) for x, c in zip(o, ball, strict=False)]
-        a, b = self._dot(d, d), self.negative("d", self._dot(f, d))
-        s = self.div("d", b, a)
+        a, b = "%square", self.negative("d", self._dot(f, d))
+        s = self.mul("d", b, "%shrink")
         off = [self.fma("d", s, y, x) for x, y in zip(f, d, strict=True)]
         square = self.mul("d", ball[3], ball[3])
         rest = self.sub("d", square, self._dot(off, off))
         root = self.call("llvm.sqrt", "d", self.mul("d", a, rest))
         q = self.add("d", b, self.call("llvm.copysign", "d", root, b))
-        near, far = self.div("d", self.sub("d", self._dot(f, f), square), q), self.div("d", q, a)
+        near, far = self.div("d", self.sub("d", self._dot(f, f), square), q), self.mul("d", q, "%shrink")
         first = self.compare("olt", "d", near, far)
         low, high = self.select("d", first, near, far), self.select("d", first, far, near)
         t = self.select("d", self.compare("ogt", "d", low, self.constant("d", 0.0)), low, high)

@@ -292,6 +292,9 @@ class Worker:
         """How much of the light of shadow rays arrives."""
         rows = self.kernels.state
         if not self.kernels.veiled:
+            if self.kernels.packets:
+                self._run(self.kernels.block(), count, there, there)
+                return
             o, d, t_max = (_row(there.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
             self.wave.accel.blocked(o, d, t_max[0], count, _row(there.words, rows, "blocked", 1)[0])
             return
@@ -305,6 +308,9 @@ class Worker:
             source, target = target, source
 
     def _search(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: int) -> None:
+        if self.kernels.packets:
+            self._run(self.kernels.find(rows is self.kernels.passed), count, memory, memory)
+            return
         accel: Accel = self.wave.accel
         floats, words = memory.floats, memory.words
         accel.nearest(

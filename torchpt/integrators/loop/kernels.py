@@ -44,6 +44,7 @@ class Kernel:
     tables: Tables
 
 
+_PASSED = ("pass_o", "pass_d", "pass_t")
 #: Programs by what they were traced for, the latest last; more than this many are not kept.
 MOST_PROGRAMS = 512
 _programs: dict[Any, Program] = {}
@@ -70,7 +71,8 @@ class Kernels:
 
     Args:
         wave: the render.
-        fused: whether few primitives are searched inside the kernels; else rays are handed to the search structure.
+        packets: whether primitives are so few that rays are searched by kernels; else the search structure is called.
+        fused: whether that is done inside of the stages.
         before: kernels of another render, whose tables are taken over where they are made of the same tensors.
 
     Attributes:
@@ -84,8 +86,8 @@ class Kernels:
         seconds: spent on making kernels.
     """
 
-    def __init__(self, wave: Wave, fused: bool, before: Kernels | None = None) -> None:
-        self.wave, self.fused = wave, fused
+    def __init__(self, wave: Wave, packets: bool, fused: bool, before: Kernels | None = None) -> None:
+        self.wave, self.packets, self.fused = wave, packets, fused
         self.plan, self.world = wave.stages.plan, wave.stages.world
         self.numbers = wave.sampler.numbers(torch.device("cpu"))
         world, table = self.world, self.world.lights
@@ -112,10 +114,8 @@ class Kernels:
             for item in leaves_of(record, name)
         )
         self._ids = {id(tensor): (path, tensor) for path, tensor in self._leaves.items()}
-        self._structure = (
-            signature(world), wave.camera.kind(), wave.filter.kind_of(), wave.sampler.kind, signature(self.plan), fused,
-            signature(wave.preview), signature(self._leaves),
-        )  # fmt: skip
+        structure = (world, wave.camera.kind(), wave.filter.kind_of(), self.plan, wave.preview, self._leaves)
+        self._structure = (*map(signature, structure), wave.sampler.kind, packets, fused)
         self._before = before if before is not None and before._structure == self._structure else None
         self._laid_out: dict[Any, Tensor] = {}
         if self._before is not None:
@@ -125,7 +125,7 @@ class Kernels:
             self._same, old._before = same, None
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
-        self.search = _search_words(wave) if fused else None
+        self.search = _search_words(wave) if packets else None
         self.seconds = 0.0
         self.eager: dict[int, str] = {}
 
@@ -159,7 +159,7 @@ class Kernels:
 
     def settle(self, shadow: bool) -> Kernel:
         """What the lanes of the arena met: light that was not blocked, lists of lanes by model, ends of paths."""
-        return self._get(("settle", shadow), lambda tracer: self._settle(tracer, shadow), fused=False)
+        return self._get(("settle", shadow), lambda tracer: self._settle(tracer, shadow))
 
     def emit(self) -> Kernel:
         """Light of emitters that were met."""
@@ -179,17 +179,25 @@ class Kernels:
         """Ends of paths that are cut."""
         return self._get(("retire",), self._retire, listed=self.listed)
 
+    def find(self, passed: bool) -> Kernel:
+        """The nearest hits of all rays of the arena, by packets."""
+        return self._get(("find", passed), lambda tracer: self._find(tracer, passed))
+
+    def block(self) -> Kernel:
+        """Which shadow rays are blocked, by packets."""
+        return self._get(("block",), self._block)
+
     def meet(self, again: bool) -> Kernel:
         """Which rays a surface stops by chance, and where the others go on."""
-        return self._get(("meet", again), lambda tracer: self._meet(tracer, again), fused=False)
+        return self._get(("meet", again), lambda tracer: self._meet(tracer, again))
 
     def begin(self) -> Kernel:
         """Shadow rays as rays that pass surfaces."""
-        return self._get(("begin",), self._begin, fused=False)
+        return self._get(("begin",), self._begin)
 
     def through(self) -> Kernel:
         """How much light surfaces let through."""
-        return self._get(("through",), self._through, fused=False)
+        return self._get(("through",), self._through)
 
     def layers(self, model: int, names: tuple[str, ...]) -> Kernel:
         """What the first surfaces are, where they are of a model."""
@@ -199,13 +207,11 @@ class Kernels:
 
     def preview(self, model: int) -> Kernel:
         """The first surfaces of a model under the environment's prefiltered maps."""
-        return self._get(("preview", model), lambda tracer: self._preview(tracer, model), listed=True, fused=False)
+        return self._get(("preview", model), lambda tracer: self._preview(tracer, model), listed=True)
 
     def deposit(self, channels: int, clamp: bool) -> Kernel:
         """One sample of each pixel added to sums; those that are not finite are counted, and taken as black."""
-        return self._get(
-            ("deposit", channels, clamp), lambda tracer: self._deposit(tracer, channels, clamp), fused=False
-        )
+        return self._get(("deposit", channels, clamp), lambda tracer: self._deposit(tracer, channels, clamp))
 
     # -- how each is traced
 
@@ -214,7 +220,6 @@ class Kernels:
         key: tuple[Any, ...],
         build: Callable[[Tracer], Sinks],
         listed: bool = False,
-        fused: bool | None = None,
     ) -> Kernel:
         made = self._made.get(key)
         if made is not None:
@@ -223,11 +228,11 @@ class Kernels:
             made = self._made.get(key)
             if made is None:
                 begin = time.perf_counter()
-                made = self._made[key] = self._make(key, build, listed, self.fused if fused is None else fused)
+                made = self._made[key] = self._make(key, build, listed)
                 self.seconds += time.perf_counter() - begin
             return made
 
-    def _make(self, key: tuple[Any, ...], build: Callable[[Tracer], Sinks], listed: bool, fused: bool) -> Kernel:
+    def _make(self, key: tuple[Any, ...], build: Callable[[Tracer], Sinks], listed: bool) -> Kernel:
         whole = key, self._structure
         with _tracing:  # one at a time in a process: see torchpt.lanes.tracing.tracing
             program = _programs.get(whole)
@@ -235,7 +240,7 @@ class Kernels:
             if program is None and name is not None:
                 program = shelf.load(name)
             if program is None or not holds(program, self._leaves):
-                program = self._traced(build, listed, fused)
+                program = self._traced(build, listed)
                 if name is not None:
                     shelf.store(name, program)
                 _programs.pop(whole, None)
@@ -248,14 +253,14 @@ class Kernels:
         tables = bound(program.tables, program.steps, program.held, self._leaves, self._laid_out)
         return Kernel(program, tables)
 
-    def _traced(self, build: Callable[[Tracer], Sinks], listed: bool, fused: bool) -> Program:
+    def _traced(self, build: Callable[[Tracer], Sinks], listed: bool) -> Program:
         tracer = Tracer(lanes_for(self._leaves.values()), self._ids)
         self._uniforms: list[str] = []
         self._tensors = 0
         with torch.no_grad():
             sinks = build(tracer)
         search = None
-        if fused and any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes):
+        if any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes):
             search = packet_search(_kinds(self.world.counts), engine.estimates())
         ir, needed = text(tracer.graph, sinks, len(tracer.tables), len(self._uniforms), self._tensors, listed, search)
         made = engine.compiled(ir)
@@ -482,6 +487,17 @@ class Kernels:
             # No ray goes on: the lane ends where its shadow ray is known.
             after = replace(state, radiance=state.radiance + radiance, t_max=torch.zeros_like(state.t_max))
         return self._with_shadow(tracer, after, shadow, rest)
+
+    def _find(self, tracer: Tracer, passed: bool) -> Sinks:
+        rows, names = (self.passed, _PASSED) if passed else (self.state, ("o", "d", "t_max"))
+        t, prim, u, v = _nearest(tracer, *rows.read(tracer, *names).values())
+        return Sinks(write=rows.nodes(tracer, t=t, prim=prim, u=u, v=v))
+
+    def _block(self, tracer: Tracer) -> Sinks:
+        blocked = _occluded(tracer, *self.state.read(tracer, "shadow_o", "shadow_d", "shadow_t").values())
+        with tracer:
+            number = blocked.to(torch.int32)
+        return Sinks(write=self.state.nodes(tracer, blocked=number))
 
     def _meet(self, tracer: Tracer, again: bool) -> Sinks:
         salts = self._salts(tracer)
