@@ -96,8 +96,8 @@ def test_weights_have_the_sign_of_the_filter_and_a_mean_of_one(name):
     assert (np.sign(value[clear]) == np.sign(weight.numpy()[clear])).all()
     assert float(weight.double().mean()) == pytest.approx(1, abs=2e-2)
     # Over all numbers that a sampler can give, exactly: the lobe is a whole number of steps.
-    assert (1 - 4 * filter._lobe) * centre == pytest.approx(1, abs=1e-7)
-    assert filter._lobe * 2**24 == round(filter._lobe * 2**24)
+    assert (1 - 4 * float(filter._lobe)) * centre == pytest.approx(1, abs=1e-7)
+    assert float(filter._lobe) * 2**24 == round(float(filter._lobe) * 2**24)
 
 
 @pytest.mark.mitsuba
