@@ -51,7 +51,7 @@ def jit(**options: Any) -> Callable[[Callable], Any]:
 
     def wrap(function: Callable) -> Any:
         try:
-            kernel = numba.njit(cache=True, **settings)(function)
+            kernel: Any = numba.njit(cache=True, **settings)(function)
             if hasattr(kernel._cache, "_cache_file"):
                 kernel._cache._cache_file._source_stamp = _stamp()
             return kernel
