@@ -141,7 +141,7 @@ def ray_sets(g: Geometry, accel: Wide, first: Rays, light: np.ndarray, size: flo
 def embree(g: Geometry) -> Any:
     """Embree over the triangles, or None where it is not installed."""
     try:
-        from embreex import mesh_construction, rtcore_scene
+        from embreex import mesh_construction, rtcore_scene  # pyright: ignore[reportMissingImports]
     except ImportError:
         return None
     n = g.counts[0]

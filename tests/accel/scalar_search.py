@@ -89,7 +89,7 @@ def _trace(o, d, t_max, box, child, ids, p, rows, t, prim, u, v):
 
 def scalar_search(g, o, d, t_max):
     """``t, prim, u, v`` of rays in a geometry of triangles, arrays of numpy."""
-    tree, rows = mesh_tree(g)
+    tree, rows, _ = mesh_tree(g)
     p = torch.stack((g.p0, g.p1, g.p2)).permute(2, 0, 1).contiguous().numpy()
     t, u, v = np.empty((3, len(t_max)), np.float32)
     prim = np.empty(len(t_max), np.int32)

@@ -10,6 +10,7 @@ from torchpt.accel.bounds import primitive_bounds
 from torchpt.accel.kernels_blocks import LEAF, LINE, NODE
 from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
 from torchpt.accel.kernels_layout import lay_out
+from torchpt.accel.kernels_tables import leaf_ids, triangle_tables, work
 from torchpt.accel.tables import prepare
 from torchpt.records import Geometry
 
@@ -55,22 +56,13 @@ def wide_tree(boxes: Floats, ids: Ints) -> Tree:
     flat, child = np.empty(wide * 6 * WIDTH, np.float32), np.empty(wide * WIDTH, np.int32)
     first = np.empty((used, 2), np.int32)
     count, leaves, depth = collapse(nodes, spans, flat, child, first)
-    first = first[:leaves]
-    place = first[:, :1] + np.arange(WIDTH)
-    none = np.iinfo(np.int32).max
-    slots = np.where(place < first[:, 1:], ids[np.minimum(place, n - 1)], none)
-    slots.sort(axis=1)
-    slots[slots == none] = -1
-    cost = _binary_cost(nodes[:used], spans[:used])
-    return Tree(flat[: count * 6 * WIDTH], child[: count * WIDTH], slots.reshape(-1), depth, cost)
-
-
-def _binary_cost(nodes: Floats, spans: Ints) -> float:
-    """Expected cost of a random ray through the root's box: 1 a node, 1 a primitive (MacDonald & Booth 1990)."""
-    size = nodes[:, 3:].astype(np.float64) - nodes[:, :3]
-    area = size[:, 0] * size[:, 1] + size[:, 1] * size[:, 2] + size[:, 2] * size[:, 0]
-    work = np.where(spans[:, 2] > 0, 1, spans[:, 1] - spans[:, 0])
-    return float((area * work).sum() / area[0]) if area[0] > 0 else float(work[0])
+    slots = np.empty((leaves, WIDTH), np.int32)
+    leaf_ids(first[:leaves], ids, slots)
+    x, y, z = (nodes[0, 3:] - nodes[0, :3]).astype(np.float64)
+    area = x * y + y * z + z * x
+    # Expected cost of a random ray through the root's box (MacDonald & Booth 1990).
+    cost = work(nodes[:used], spans[:used]) / area if area > 0 else float(n)
+    return Tree(flat[: count * 6 * WIDTH], child[: count * WIDTH], slots.reshape(-1), depth, float(cost))
 
 
 def lines_of(tree: Tree) -> int:
@@ -90,15 +82,32 @@ def aligned(count: int) -> Floats:
     return raw[skip : skip + count * 4].view(np.float32)
 
 
-def mesh_tree(geometry: Geometry) -> tuple[Tree, Floats]:
-    """The tree over a geometry's primitives, and the affine rows ``(P, 12)`` of all."""
-    tables = prepare(geometry)
-    keep = torch.nonzero(tables.area)[:, 0]
-    boxes = torch.cat(primitive_bounds(geometry)).T[keep].contiguous().numpy()
-    return wide_tree(boxes, keep.int().numpy()), tables.rows.numpy()
+def mesh_tree(geometry: Geometry) -> tuple[Tree, Floats, Floats]:
+    """The tree over a geometry's primitives, the planes ``(T, 4)`` of its triangles, the affine rows ``(K, 12)`` of others."""
+    count = geometry.counts[0]
+    planes, boxes, ids = np.empty((count, 4), np.float32), np.empty((count, 6), np.float32), np.empty(count, np.int32)
+    kept = triangle_tables(*_corners(geometry), count, planes, boxes, ids)
+    boxes, ids = boxes[:kept], ids[:kept]
+    rest = _without_triangles(geometry)
+    tables = prepare(rest)
+    if rest.size:
+        keep = torch.nonzero(tables.area)[:, 0]
+        more = torch.cat(primitive_bounds(rest)).T[keep].numpy()
+        boxes, ids = np.concatenate([boxes, more]), np.concatenate([ids, keep.int().numpy() + np.int32(count)])
+    return wide_tree(boxes, ids), planes, tables.rows.numpy()
 
 
-def write(tree: Tree, geometry: Geometry, rows: Floats, line: int, memory: Floats) -> None:
+def write(tree: Tree, geometry: Geometry, planes: Floats, line: int, memory: Floats) -> None:
     """Lays a tree out in ``memory`` from a line on."""
-    corners = (p.contiguous().numpy() for p in (geometry.p0, geometry.p1, geometry.p2))
-    lay_out(tree.boxes, tree.child, tree.ids, *corners, rows, geometry.counts[0], line, memory, memory.view(np.int32))
+    codes, triangles = memory.view(np.int32), geometry.counts[0]
+    lay_out(tree.boxes, tree.child, tree.ids, *_corners(geometry), planes, triangles, line, memory, codes)
+
+
+def _without_triangles(geometry: Geometry) -> Geometry:
+    _, *counts = geometry.counts
+    p0, p1, p2 = (p[:, geometry.counts[0] :] for p in (geometry.p0, geometry.p1, geometry.p2))
+    return Geometry(p0, p1, p2, (0, counts[0], counts[1], counts[2], counts[3]), geometry.quadrics)
+
+
+def _corners(geometry: Geometry) -> tuple[Floats, Floats, Floats]:
+    return tuple(p.contiguous().numpy() for p in (geometry.p0, geometry.p1, geometry.p2))  # type: ignore[return-value]

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchpt.records import QUADRICS, Geometry
 
-__all__ = ["primitive_bounds", "surface"]
+__all__ = ["chosen", "primitive_bounds", "surface"]
 
 
 def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
@@ -37,6 +37,17 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     down = torch.where(down.double() > low, torch.nextafter(down, torch.full_like(down, -torch.inf)), down)
     up = torch.where(up.double() < high, torch.nextafter(up, torch.full_like(up, torch.inf)), up)
     return down.contiguous(), up.contiguous()
+
+
+def chosen(geometry: Geometry, prim: Tensor) -> Geometry:
+    """Some of the primitives, given by rising ids ``(K,)`` int64."""
+    starts = torch.tensor([sum(geometry.counts[:k]) for k in range(6)], device=prim.device)
+    a, b, c, d, e = torch.diff(torch.searchsorted(prim, starts)).tolist()
+    p0, p1, p2 = (p.index_select(1, prim) for p in (geometry.p0, geometry.p1, geometry.p2))
+    quadrics = (
+        None if geometry.quadrics is None else geometry.quadrics.index_select(1, prim[len(prim) - e :] - starts[4])
+    )
+    return Geometry(p0, p1, p2, (a, b, c, d, e), quadrics)
 
 
 def _quadric_bounds(table: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
 
 
 @part()
-def _leaf(base, tree, codes, ids, first, p0, p1, p2, rows, triangles):
+def _leaf(base, tree, codes, ids, first, p0, p1, p2, planes, triangles):
     """Writes a leaf's block; returns 1 where it holds more than triangles."""
     mixed = 0
     for k in range(8):
@@ -29,12 +29,12 @@ def _leaf(base, tree, codes, ids, first, p0, p1, p2, rows, triangles):
             tree[base + (3 + c) * 8 + k] = p1[c, q] if here else _NAN
             tree[base + (6 + c) * 8 + k] = p2[c, q] if here else _NAN
         for c in range(4):
-            tree[base + PLANES + c * 8 + k] = rows[q, c] if here else _NAN
+            tree[base + PLANES + c * 8 + k] = planes[q, c] if here else _NAN
     return mixed
 
 
 @jit()
-def lay_out(boxes, child, ids, p0, p1, p2, rows, triangles, line, tree, codes):
+def lay_out(boxes, child, ids, p0, p1, p2, planes, triangles, line, tree, codes):
     """Fills the blocks of a tree, parents before children, each node's leaves right behind it.
 
     Args:
@@ -44,7 +44,7 @@ def lay_out(boxes, child, ids, p0, p1, p2, rows, triangles, line, tree, codes):
         p0: ``(3, P)`` corners.
         p1: ``(3, P)``.
         p2: ``(3, P)``.
-        rows: ``(P, 4 or more)`` planes.
+        planes: ``(T, 4)`` of the triangles.
         triangles: how many of the P are triangles; these come first.
         line: the line of ``tree`` at which the root goes.
         tree: float32, filled: ``4 M + 7 L`` lines.
@@ -75,7 +75,7 @@ def lay_out(boxes, child, ids, p0, p1, p2, rows, triangles, line, tree, codes):
                 tree[base + c * 8 + k] = -_INF if code == 0 and c >= 3 else x
             codes[base + CHILDREN + k] = 2 * lines[code] if code > 0 else 0
             if code < 0:
-                mixed = _leaf(leaf * LINE, tree, codes, ids, (~code) * 8, p0, p1, p2, rows, triangles)
+                mixed = _leaf(leaf * LINE, tree, codes, ids, (~code) * 8, p0, p1, p2, planes, triangles)
                 codes[base + CHILDREN + k] = ~(2 * leaf + mixed)
                 leaf += LEAF
             codes[base + CHILDREN + 8 + k] = 0

@@ -36,11 +36,11 @@ class Wide(Accel):
     def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
         start = time.perf_counter()
         self.threads = thread_count(threads)
-        tree, rows = mesh_tree(geometry)
+        tree, planes, rows = mesh_tree(geometry)
         self.primitives, self.depth, self.sah_cost = geometry.size, tree.depth, tree.cost
         self.nodes, self.leaves = tree.nodes, tree.leaves
         memory = aligned(lines_of(tree) * LINE)
-        write(tree, geometry, rows, 0, memory)
+        write(tree, geometry, planes, 0, memory)
         self.tensors = [torch.from_numpy(memory), *_others(geometry, rows, tree.depth)]
         self.arrays = _arrays(self.tensors)
         self.build_seconds = time.perf_counter() - start
@@ -82,7 +82,7 @@ def _others(geometry: Geometry, rows: np.ndarray, depth: int) -> list[Tensor]:
     corner = torch.cat([p0, p1, p2, (p1 + p2) - p0]).float().T.contiguous()
     ends = [sum(geometry.counts[:k]) for k in range(1, 5)]
     kinds = torch.tensor([*ends, room_of(depth)], dtype=torch.int64)
-    return [corner, torch.from_numpy(rows[first:].copy()), inverses(geometry).T.contiguous(), kinds]
+    return [corner, torch.from_numpy(rows), inverses(geometry).T.contiguous(), kinds]
 
 
 def _arrays(tensors: list[Tensor]) -> tuple[np.ndarray, ...]:

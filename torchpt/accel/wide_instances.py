@@ -105,8 +105,8 @@ def _nothing() -> Geometry:
 def _meshes(meshes: list[Geometry]) -> tuple[list[Tree], np.ndarray, np.ndarray]:
     """The trees of all meshes, the codes of their roots, and their blocks one after the other."""
     built = [mesh_tree(mesh) for mesh in meshes]
-    lines = np.cumsum([0, *(lines_of(tree) for tree, _ in built)])
+    lines = np.cumsum([0, *(lines_of(tree) for tree, _, _ in built)])
     memory = aligned(int(lines[-1]) * LINE)
-    for (tree, rows), mesh, line in zip(built, meshes, lines[:-1], strict=True):
-        write(tree, mesh, rows, int(line), memory)
-    return [tree for tree, _ in built], 2 * lines[:-1].astype(np.int64), memory
+    for (tree, planes, _), mesh, line in zip(built, meshes, lines[:-1], strict=True):
+        write(tree, mesh, planes, int(line), memory)
+    return [tree for tree, _, _ in built], 2 * lines[:-1].astype(np.int64), memory

@@ -51,7 +51,7 @@ def jit(**options: Any) -> Callable[[Callable], Any]:
 
     def wrap(function: Callable) -> Any:
         try:
-            kernel = numba.njit(cache=True, **settings)(function)
+            kernel: Any = numba.njit(cache=True, **settings)(function)
             if hasattr(kernel._cache, "_cache_file"):
                 kernel._cache._cache_file._source_stamp = _stamp()
             return kernel
@@ -63,11 +63,12 @@ def jit(**options: Any) -> Callable[[Callable], Any]:
 
 @functools.cache
 def _stamp() -> tuple[float, int]:
-    """When the package last changed and how large it is.
+    """When the files of kernels last changed and how large they are.
 
     Numba keeps a kernel until the kernel's own file changes, and would not see that what is inlined into it has.
     """
-    found = [path.stat() for path in Path(__file__).parents[1].rglob("*.py")]
+    here = Path(__file__).parent
+    found = [path.stat() for path in (*here.rglob("*.py"), *here.parent.glob("*/kernels*.py"))]
     return max(file.st_mtime for file in found), sum(file.st_size for file in found)
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import types
-from numba.extending import intrinsic, lower_builtin, type_callable
+from numba.extending import lower_builtin, type_callable
 
-from torchpt.native.simd.types import I32, Vector, splatted
+from torchpt.native.simd.types import I32, Vector, intrinsic, splatted
 
 __all__ = ["absolute", "as_float", "as_int", "maximum", "minimum", "select"]
 
@@ -30,7 +30,7 @@ def _binary(symbol: Any, for_floats: str | None, for_others: str | None) -> None
 
     @lower_builtin(symbol, Vector, Vector)
     def _(context, builder, signature, args):
-        return getattr(builder, for_floats if _is_float(signature.args[0]) else for_others)(*args)
+        return getattr(builder, str(for_floats if _is_float(signature.args[0]) else for_others))(*args)
 
 
 def _compare(symbol: Any, code: str) -> None:

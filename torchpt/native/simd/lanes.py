@@ -6,9 +6,8 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import types
-from numba.extending import intrinsic
 
-from torchpt.native.simd.types import I32, Vector, lanes_of, numbers
+from torchpt.native.simd.types import I32, Vector, intrinsic, lanes_of, numbers
 
 __all__ = ["bits", "highest", "lane_numbers", "lowest", "mask", "population", "sort_descending", "trailing_zeros"]
 

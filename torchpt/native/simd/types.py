@@ -5,11 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 from llvmlite import ir
+from numba import extending
 from numba.core import types
 from numba.core.errors import RequireLiteralValue
-from numba.extending import intrinsic, models, register_model
+from numba.extending import models, register_model
 
-__all__ = ["ELEMENTS", "I32", "Vector", "lanes_of", "numbers", "splat", "splatted"]
+__all__ = ["ELEMENTS", "I32", "Vector", "intrinsic", "lanes_of", "numbers", "splat", "splatted"]
+
+#: Kernels call what this makes without its first parameter, which no checker of types can know.
+intrinsic: Any = extending.intrinsic
 
 I32 = ir.IntType(32)
 #: What a vector may hold, and how LLVM has it.

@@ -75,8 +75,8 @@ def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dty
     else:
         own = torch.from_numpy(part.normals).to(device)
         normals = normalize(torch.linalg.inv(linear).T @ own.T).to(dtype)
-    flat = normalize(cross(p1 - p0, p2 - p0))
     n0, n1, n2 = (normals.index_select(1, faces[:, k]) for k in range(3))
-    # A corner without a normal takes its face's.
-    n0, n1, n2 = (torch.where(dot(n, n) > 0, n, flat) for n in (n0, n1, n2))
+    if not bool((dot(normals, normals) > 0).all()):  # a corner without a normal takes its face's
+        flat = normalize(cross(p1 - p0, p2 - p0))
+        n0, n1, n2 = (torch.where(dot(n, n) > 0, n, flat) for n in (n0, n1, n2))
     return Corners(p0, p1, p2, (n0, n1, n2), faces)

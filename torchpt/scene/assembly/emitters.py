@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchpt.accel.bounds import primitive_bounds
+from torchpt.accel.bounds import chosen, primitive_bounds
 from torchpt.lights import choice_of, envmap
 from torchpt.lights.solid_angle import shapes_of, table_of
 from torchpt.math.vectors import dot, luminance, normalize
@@ -91,8 +91,7 @@ def lights_of(
     if glowing:
         surfaces, column = _surfaces(glowing, primitives, parameters, prim)
         groups.append(surfaces)
-    low, high = (box.double() for box in primitive_bounds(geometry))
-    reach = (high.amax(1) - low.amin(1)).norm() * 0.5 if low.shape[1] else torch.ones((), device=device)
+    reach = _reach(geometry) if sources else torch.ones((), device=device)
     around = [_surroundings(source, parameters, dtype) for source in sources if source.kind in ENVIRONMENTS]
     environment = around[0] if around else None
     groups += [_source(source, parameters, environment, centre, reach, dtype) for source in sources]
@@ -130,8 +129,14 @@ def lights_of(
         solid=solid,
         shapes=shapes_of(solid),
     )
-    boxes = low.index_select(1, prim), high.index_select(1, prim)
-    return replace(lights, choice=choice_of(lights, power, boxes, choice))
+    low, high = (box.double() for box in primitive_bounds(chosen(geometry, prim)))
+    return replace(lights, choice=choice_of(lights, power, (low, high), choice))
+
+
+def _reach(geometry: Geometry) -> Tensor:
+    """Radius of the scene: half the diagonal of its box, float64."""
+    low, high = (box.double() for box in primitive_bounds(geometry))
+    return (high.amax(1) - low.amin(1)).norm() * 0.5 if low.shape[1] else torch.ones((), device=low.device)
 
 
 #: Area over the length of the cross product of the edges.
