@@ -21,7 +21,7 @@ def loaded(code: str) -> tuple[str, float]:
 
 #: What a small render to a PNG file has no use for.
 NEEDLESS = (
-    *(name for name in HEAVY if name != "numba"),
+    *HEAVY,
     *("antlr4", "networkx", "pandas", "rich", "scipy", "sympy", "triton"),
     *("torch._dynamo", "torch._inductor", "torch.onnx", "torch.utils.tensorboard"),
     *("hydra_plugins", "hydra._internal.core_plugins", "PIL.TiffImagePlugin", "logging.config"),

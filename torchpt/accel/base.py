@@ -42,8 +42,8 @@ class Accel(ABC):
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """The nearest hits of the first ``count`` rays of arrays, for loops outside of torch.
 
-        Serial and without the GIL in the numba backends, so that several Python threads may search at once. Only lanes below ``count`` are read and
-        written. Misses are those of :meth:`intersect`.
+        Serial, and in the numba backends without the GIL, so that several Python threads may search at once. Only lanes
+        below ``count`` are read and written. Misses are those of :meth:`intersect`.
 
         Args:
             o: origins ``(3, C)`` float32, C-contiguous, ``C >= count``.

@@ -2,6 +2,7 @@
 
 One primitive's numbers are broadcast over a block of rays, so the inner loop has a constant trip count and no branches
 and becomes vector code. A last, shorter block is padded: a ray's result does not depend on its place in the batch.
+The kernels are imported when a ray is traced: scenes of few primitives are searched by the compiled loop itself.
 Edges are watertight because primitives accept their own rounding error (:func:`torchpt.accel.tables.tolerances`).
 """
 
@@ -14,12 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.accel import kernels_brute as kernels
 from torchpt.accel.base import Accel, Array, Hits
 from torchpt.accel.tables import extent, inverses, prepare, tolerances
 from torchpt.errors import SceneError
-from torchpt.native.jit import launch, thread_count
 from torchpt.native.operators import choose, operator
+from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
 __all__ = ["MAX_TOLERANCE", "Brute", "eligible"]
@@ -79,12 +79,16 @@ class Brute(Accel):
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
+        from torchpt.accel import kernels_brute as kernels
+
         blocks = -(-count // kernels.BLOCK)
         results = (t[:count], prim[:count], u[:count], v[:count])
         kernels.intersect(0, blocks, o, d, t_max[:count], *self.arrays, *results)
 
     def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
         """See :meth:`Accel.blocked`."""
+        from torchpt.accel import kernels_brute as kernels
+
         kernels.occluded(0, -(-count // kernels.BLOCK), o, d, t_max[:count], *self.arrays, out[:count])
 
     def describe(self) -> dict[str, Any]:
@@ -113,6 +117,9 @@ def _intersect(
     extent: float,
     threads: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    from torchpt.accel import kernels_brute as kernels
+    from torchpt.native.jit import launch
+
     t, prim, u, v = (torch.empty_like(t_max) for _ in range(4))
     prim = torch.empty_like(t_max, dtype=torch.int32)
     args = _arguments(o, d, t_max, table, spheres, quadrics, counts, extent)
@@ -148,6 +155,9 @@ def _occluded(
     extent: float,
     threads: int,
 ) -> Tensor:
+    from torchpt.accel import kernels_brute as kernels
+    from torchpt.native.jit import launch
+
     blocked = torch.empty_like(t_max, dtype=torch.bool)
     args = _arguments(o, d, t_max, table, spheres, quadrics, counts, extent)
     blocks = -(-t_max.shape[0] // kernels.BLOCK)

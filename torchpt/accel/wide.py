@@ -14,8 +14,9 @@ from torchpt.accel.base import Accel, Array, Hits
 from torchpt.accel.blocks import aligned, lines_of, mesh_tree, room_of, write
 from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.tables import inverses
-from torchpt.native.jit import compiled, launch, thread_count
+from torchpt.native.jit import compiled, launch
 from torchpt.native.operators import choose, operator
+from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
 __all__ = ["Wide"]

@@ -15,7 +15,8 @@ from torchpt.accel.blocks import Tree, aligned, lines_of, mesh_tree, room_of, wi
 from torchpt.accel.instances import CopyTables
 from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.wide import Wide
-from torchpt.native.jit import compiled, launch, thread_count
+from torchpt.native.jit import compiled, launch
+from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
 __all__ = ["WideInstanced"]

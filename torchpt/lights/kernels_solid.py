@@ -16,7 +16,8 @@ from torch import Tensor
 
 from torchpt.lights.solid_angle import LEAST, MOST, OTHER, RECTANGLE, TRIANGLE
 from torchpt.math.angles import SERIES
-from torchpt.native.jit import jit, launch, thread_count
+from torchpt.native.jit import jit, launch
+from torchpt.native.threads import thread_count
 
 __all__ = ["BLOCK", "angles", "sample"]
 

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.native.jit import jit, launch, thread_count
+from torchpt.native.jit import jit, launch
+from torchpt.native.threads import thread_count
 from torchpt.native.vector import at, larger
 
 __all__ = ["FIELDS", "NEAR", "SLACK", "WIDTH", "probability", "sample"]

@@ -19,7 +19,7 @@ import numba
 import torch
 from numba.core import config as numba_config
 
-__all__ = ["compiled", "jit", "launch", "parallel_allowed", "part", "thread_count"]
+__all__ = ["compiled", "jit", "launch", "parallel_allowed", "part"]
 
 _lock = threading.Lock()
 _state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "pools": {}, "said": False}
@@ -94,11 +94,6 @@ def _say() -> None:
     if not _state["said"]:
         _state["said"] = True
         print("torchpt: compiling the search kernels (once)...", file=sys.stderr, flush=True)
-
-
-def thread_count(threads: int | None) -> int:
-    """Threads to use: the caller's wish, else torch's own number."""
-    return max(1, int(threads)) if threads else max(1, torch.get_num_threads())
 
 
 def _most_threads() -> int:

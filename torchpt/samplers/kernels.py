@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.native.jit import jit, launch, thread_count
+from torchpt.native.jit import jit, launch
+from torchpt.native.threads import thread_count
 from torchpt.samplers.kernels_bits import SECOND, U, X, Y, mix, reverse, scramble, second_dimension, unit
 
 __all__ = ["draw"]
