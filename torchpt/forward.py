@@ -46,8 +46,11 @@ __all__ = [
     "Rendering",
     "Run",
     "chunks_of",
+    "kernels_of",
     "lanes_for",
     "limited_threads",
+    "loop_facts",
+    "looped",
     "make_wave",
     "pixel_of",
 ]
@@ -288,6 +291,24 @@ def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kerne
     return kernels
 
 
+def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
+    """How a render of the scene would run: as the compiled loop, and how that searches, or as tensor operations."""
+    with torch.no_grad():
+        wave = make_wave(scene, settings, None, torch.float32)
+        if not looped(wave, settings, scene.device):
+            return {"stages": "compiled by torch" if wave.stages.compiled else "eager, by tensor operations"}
+        kernels = kernels_of(scene, wave)
+    search = "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else wave.accel.name
+    names = [str(model) for model in wave.stages.world.models]
+    eager = {names[number]: reason for number, reason in kernels.eager.items()}
+    return {
+        "stages": "compiled to loops over lanes",
+        "search": search,
+        "rows_a_path": kernels.state.count,
+        **({"eager": eager} if eager else {}),
+    }
+
+
 def say_once(text: str) -> None:
     """A line on stderr, the first time only."""
     if text not in _said:
@@ -409,7 +430,9 @@ class Run:
     def _looped(self, loop: Loop) -> None:
         pixels = self.width * self.height
 
-        def each(share: Share) -> bool:
+        def each(share: Share | None) -> bool:
+            if share is None:
+                return self._advanced(0, False)
             self.tally.rays += share.tally.rays
             self.tally.truncated += share.tally.truncated
             self.bad += share.bad

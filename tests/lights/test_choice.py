@@ -14,7 +14,6 @@ import torchpt
 from torchpt import lights
 from torchpt.accel.bounds import primitive_bounds
 from torchpt.errors import EdgeWarning, SceneError
-from torchpt.integrators.compiled import can_compile
 from torchpt.lights.bounds import bounds_of
 from torchpt.lights.choice import MANY, ByTree, draw, probability
 from torchpt.math.distributions import Discrete
@@ -239,9 +238,6 @@ def test_a_floor_under_many_points_and_its_derivatives():
     assert float(intensity[0]) == pytest.approx(float(powers.grad[strongest]), rel=0.05)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not can_compile(torch.device("cpu")), reason="needs a C++ compiler")
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's own, while compiling
 def test_compiled_stages_choose_by_the_tree_too():
     description = every_kind()
     for shape in description["shapes"].values():

@@ -11,8 +11,8 @@ import torchpt
 from torchpt import forward
 from torchpt.errors import SceneError
 from torchpt.render import render_scene
-from torchpt.scene.build import _labels
 from torchpt.scene.description import settings
+from torchpt.scene.sources import labels_of
 
 LAMP = {
     "camera": {"type": "perspective", "origin": [0, 0, 3], "target": [0, 0, 0], "fov": 20},
@@ -109,7 +109,7 @@ def test_an_explicit_emission_of_zero_stays_a_parameter():
 
 
 def test_labels_of_mesh_parts_are_distinct():
-    labels = _labels(["a", "a_2", "a", "", "a.b", "a_b"])
+    labels = labels_of(["a", "a_2", "a", "", "a.b", "a_b"])
     assert len(set(labels)) == 6 and not any("." in label for label in labels)
 
 

@@ -22,12 +22,15 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
         TorchptError: bad input.
         Interrupted: a signal came.
     """
+    from torchpt.forward import loop_facts
     from torchpt.scene.scene import Scene, device_of
 
     collector.resume()
     with notices():
         description, wishes = described(job)
-        facts = Scene(description, device_of(wishes.render.device)).info(wishes)
+        scene = Scene(description, device_of(wishes.render.device))
+        facts = scene.info(wishes)
+        facts["built"]["loop"] = loop_facts(scene, wishes)
     interrupt.check()
     if as_json:
         print(json.dumps(plain(facts), allow_nan=False))

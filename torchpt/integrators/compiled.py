@@ -1,4 +1,6 @@
-"""The stages bound to one scene and plan, run eagerly or compiled.
+"""The stages bound to one scene and plan, run eagerly, or compiled by torch on CUDA.
+
+A CPU runs :mod:`torchpt.integrators.loop` instead.
 
 Compiled, a stage is one graph for any number of lanes: whole-state tensors, the gather inside, the index padded to a
 multiple of 16 by repeating its last lane. The extra lanes are exact duplicates of a path: they carry the same numbers and
@@ -8,7 +10,6 @@ write the same result twice, so nothing needs to know of them. (Under gradients 
 from __future__ import annotations
 
 import copy
-import shutil
 import types
 from collections.abc import Callable
 from typing import Any
@@ -17,13 +18,12 @@ import torch
 from torch import Tensor
 
 from torchpt.cameras import Camera
-from torchpt.errors import RenderError
 from torchpt.film import Filter
 from torchpt.integrators import stages
 from torchpt.integrators.stages import Plan
 from torchpt.records import Hit, PathState, Shadow, World, tensors_of
 
-__all__ = ["CompiledStages", "Stages", "can_compile"]
+__all__ = ["CompiledStages", "Stages"]
 
 #: Inductor writes what is used more than once out again for each use, unless it took more operations than this. Indices into
 #: textures and the frames of maps are long chains in which each step uses the one before twice: beyond its own 50 that is
@@ -31,11 +31,6 @@ __all__ = ["CompiledStages", "Stages", "can_compile"]
 REALIZE = 10
 
 Search = Callable[[PathState], Hit]
-
-
-def can_compile(device: torch.device) -> bool:
-    """Whether what ``torch.compile`` needs is on this machine."""
-    return device.type != "cpu" or any(shutil.which(name) for name in ("g++", "clang++", "c++"))
 
 
 class Stages:
@@ -90,8 +85,6 @@ class CompiledStages(Stages):
 
     def __init__(self, plan: Plan, world: World, pixel: Tensor | None = None) -> None:
         super().__init__(plan, world, pixel)
-        if not can_compile(world.p0.device):
-            raise RenderError("render.compile: on needs a C++ compiler (g++ or clang++) for the CPU; none was found")
         # Only lanes vary in number; a scene's tables do not.
         for table in tensors_of(world):
             torch._dynamo.mark_static(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import threading
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -20,7 +21,7 @@ from torchpt.lanes.kernel import CAPACITY, HEAD
 from torchpt.records import Hit, PathState
 from torchpt.samplers import salts
 
-__all__ = ["LANES", "Chunk", "Worker"]
+__all__ = ["LANES", "Chunk", "Halted", "Worker"]
 
 #: Lanes of a chunk.
 LANES = CAPACITY - WIDTH
@@ -42,15 +43,20 @@ def _none(state: PathState) -> Hit:
     raise AssertionError("hits are found between stages where there is no tape")
 
 
+class Halted(Exception):
+    """The render is to end."""
+
+
 class Worker:
     """What one thread needs: arenas, lists, slots, and the arguments of its calls.
 
     Args:
         kernels: of the render.
+        halt: set where the render is to end.
     """
 
-    def __init__(self, kernels: Kernels) -> None:
-        self.kernels, self.wave = kernels, kernels.wave
+    def __init__(self, kernels: Kernels, halt: threading.Event) -> None:
+        self.kernels, self.wave, self._halt = kernels, kernels.wave, halt
         self._arenas = [Memory(kernels.state.count) for _ in range(2)]
         self._passed = [Memory(kernels.passed.count) for _ in range(2)] if kernels.veiled else []
         count = kernels.models + 2
@@ -350,6 +356,8 @@ class Worker:
         lists: list[Memory] | None = None,
         slots: Memory | None = None,
     ) -> None:
+        if self._halt.is_set():
+            raise Halted
         program = kernel.program
         prepared = self._calls.get(id(kernel))
         if prepared is None:

@@ -13,7 +13,7 @@ import numpy as np
 from torchpt.errors import RenderError
 from torchpt.film import Film
 from torchpt.integrators.aov import CHANNELS
-from torchpt.integrators.loop.chunk import LANES, Chunk, Worker
+from torchpt.integrators.loop.chunk import LANES, Chunk, Halted, Worker
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.path import Tally
 from torchpt.lanes.block import WIDTH
@@ -74,35 +74,35 @@ class Loop:
         self.lanes = LANES if lanes is None else max(1, min(lanes, LANES))
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
-        self._stopped = False
+        self._halt = threading.Event()
 
-    def run(self, first: int, count: int, each: Callable[[Share], bool]) -> bool:
+    def run(self, first: int, count: int, each: Callable[[Share | None], bool]) -> bool:
         """Takes samples ``first .. first + count`` of every pixel.
 
         Args:
             first: sample.
             count: how many.
-            each: called after every task, in the calling thread; returning True stops early.
+            each: called in this thread after every task, and now and then with None while tasks run (or compile);
+                returning True ends the render: tasks stop at their next kernel.
 
         Returns:
             Whether all were taken.
         """
-        pixels = list(self._blocks(count))
-        if self.threads == 1 or len(pixels) == 1:
-            return not any(each(self._task(start, size, first, count)) for start, size in pixels)
-        pool = ThreadPoolExecutor(min(self.threads, len(pixels)), thread_name_prefix="torchpt")
+        blocks = list(self._blocks(count))
+        # Tasks never run in this thread: it looks after signals.
+        pool = ThreadPoolExecutor(min(self.threads, len(blocks)), thread_name_prefix="torchpt")
         try:
-            waiting: set[Future[Share]] = {pool.submit(self._task, start, size, first, count) for start, size in pixels}
+            waiting: set[Future[Share]] = {pool.submit(self._task, start, size, first, count) for start, size in blocks}
             while waiting:
                 done, waiting = wait(waiting, PATIENCE, FIRST_COMPLETED)
-                for future in done:
-                    if not future.cancelled() and each(future.result()):
-                        self._stopped = True
-                        for other in waiting:
-                            other.cancel()
-            return not self._stopped
+                shares = [future.result() for future in done if not future.cancelled()]
+                if any([each(share) for share in shares or [None]]):
+                    self._halt.set()
+                    for future in waiting:
+                        future.cancel()
+            return not self._halt.is_set()
         except BaseException:
-            self._stopped = True
+            self._halt.set()
             raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
@@ -118,7 +118,7 @@ class Loop:
 
     def _task(self, start: int, size: int, first: int, count: int) -> Share:
         with self._lock:
-            worker = self._workers.pop() if self._workers else Worker(self.kernels)
+            worker = self._workers.pop() if self._workers else Worker(self.kernels, self._halt)
         share = Share(Tally())
         try:
             step = max(self.lanes // size, 1)
@@ -129,6 +129,8 @@ class Loop:
                 if self.layers:
                     self._layers(worker, chunk, share)
                 share.samples += size * chunk.samples
+        except Halted:
+            pass  # what was added so far counts
         finally:
             with self._lock:
                 self._workers.append(worker)
