@@ -1,7 +1,8 @@
 """From IR to machine code: LLVM through llvmlite, and a cache on disk.
 
-The cache holds native code, so its folder is this user's alone (mode 0700, owner checked) and each entry carries a checksum.
-Where there can be no such folder, kernels are compiled in memory.
+The cache holds native code, so its folder is this user's alone (mode 0700, owner checked), an entry is read only where it is a
+file of this user's that nobody else can write, and carries a checksum of its code and its name. Where there can be no such
+folder, kernels are compiled in memory.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 __all__ = ["Function", "Target", "cache_folder", "compiled", "counts", "estimates", "host", "seconds"]
 
 #: Enters every key: entries of another form are never read.
-_FORM = "1"
+_FORM = "2"
 _lock = threading.Lock()
 _state: dict[str, Any] = {"ready": False, "seconds": 0.0, "compiled": 0, "loaded": 0}
 _functions: dict[str, Function] = {}
@@ -89,12 +90,12 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         found = _functions.get(key)
         if found is None:
             path = _path(key)
-            code = None if path is None else _read(path)
+            code = None if path is None else _read(path, key)
             if code is None:
                 code = _object(ir, target)
                 _state["compiled"] += 1
                 if path is not None:
-                    _write(path, code)
+                    _write(path, key, code)
             else:
                 _state["loaded"] += 1
             found = _functions[key] = _loaded(code, target)
@@ -111,14 +112,18 @@ def _key(ir: str, target: Target) -> str:
 
 def _machine(target: Target) -> Any:
     if target not in _machines:
-        llvm = _llvm()
-        if target.triple is not None:
-            llvm.initialize_all_targets()
-            llvm.initialize_all_asmprinters()
-        kind = llvm.Target.from_default_triple() if target.triple is None else llvm.Target.from_triple(target.triple)
-        options = {"jit": True} if target.triple is None else {}
-        _machines[target] = kind.create_target_machine(cpu=target.cpu, features=target.features, opt=2, **options)
+        _machines[target] = _new_machine(target)
     return _machines[target]
+
+
+def _new_machine(target: Target) -> Any:
+    llvm = _llvm()
+    if target.triple is not None:
+        llvm.initialize_all_targets()
+        llvm.initialize_all_asmprinters()
+    kind = llvm.Target.from_default_triple() if target.triple is None else llvm.Target.from_triple(target.triple)
+    options = {"jit": True} if target.triple is None else {}
+    return kind.create_target_machine(cpu=target.cpu, features=target.features, opt=2, **options)
 
 
 def _object(ir: str, target: Target) -> bytes:
@@ -139,7 +144,8 @@ def _loaded(code: bytes, target: Target) -> Function:
     if target.triple is not None:
         return Function(None, code, None)  # for another machine: not to be run here
     llvm = _llvm()
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(target))
+    machine = _new_machine(target)  # becomes the engine's own, and goes with it
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(engine.get_function_address("kernel"))
@@ -151,16 +157,20 @@ def cache_folder() -> Path | None:
     given = os.environ.get("TORCHPT_CACHE")
     if given == "":
         return None
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    folder = Path(given) if given else Path(base) / "torchpt" / "kernels"
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(base):  # as its specification says
+        base = os.path.join(os.path.expanduser("~"), ".cache")
+    folder = Path(given).absolute() if given else Path(base) / "torchpt" / "kernels"
+    if not folder.is_absolute():  # no home
+        return None
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        facts = folder.stat()
+        facts = [folder.stat(), folder.lstat()]  # a link must be this user's as well
     except OSError:
         return None
     if not hasattr(os, "getuid"):  # no owners and modes to check
         return folder
-    if facts.st_uid != os.getuid() or stat.S_IMODE(facts.st_mode) & 0o077:
+    if any(fact.st_uid != os.getuid() for fact in facts) or stat.S_IMODE(facts[0].st_mode) & 0o077:
         return None
     return folder
 
@@ -172,23 +182,35 @@ def _path(key: str) -> Path | None:
     return None if folder is None else folder / f"{key[:40]}.o"
 
 
-def _read(path: Path) -> bytes | None:
-    """An entry; None where there is none, or a damaged one, which is made again."""
+def _read(path: Path, key: str) -> bytes | None:
+    """An entry; None where there is none, or a damaged or a doubtful one, which is made again."""
     try:
-        content = path.read_bytes()
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0))
+        with os.fdopen(handle, "rb") as file:
+            facts = os.fstat(handle)
+            if not stat.S_ISREG(facts.st_mode):
+                return None
+            # Whoever may rename the folder could have put another in its place since it was looked at.
+            if hasattr(os, "getuid") and (facts.st_uid != os.getuid() or facts.st_mode & 0o022):
+                return None
+            content = file.read()
     except OSError:
         return None
     check, code = content[:32], content[32:]
-    return code if hashlib.sha256(code).digest() == check else None
+    return code if _check(key, code) == check else None
 
 
-def _write(path: Path, code: bytes) -> None:
+def _check(key: str, code: bytes) -> bytes:
+    return hashlib.sha256(key.encode() + code).digest()
+
+
+def _write(path: Path, key: str, code: bytes) -> None:
     """Put an entry in its place at once or not at all; a full disk is no reason to stop."""
     name = None
     try:
         handle, name = tempfile.mkstemp(dir=path.parent)
         with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(code).digest() + code)
+            file.write(_check(key, code) + code)
         os.replace(name, path)
     except OSError:
         if name is not None:

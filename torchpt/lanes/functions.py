@@ -95,6 +95,8 @@ def _trigonometric(shift: int) -> Callable[[Block, str, str], str]:
         if shift:
             q = b.add("i", q, b.constant("i", shift))
         found = _turned(b, ty, q, _sine(b, ty, rest), _cosine(b, ty, rest))
+        if not shift:  # its zeros keep their sign
+            found = b.select(ty, b.compare("oeq", ty, x, b.constant(ty, 0.0)), x, found)
         # Of infinity and of NaN there is none.
         none = b.compare("uge", ty, _absolute(b, ty, x), b.constant(ty, math.inf))
         return b.select(ty, none, b.constant(ty, math.nan), found)
