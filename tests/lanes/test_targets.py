@@ -58,9 +58,9 @@ def exact(x: Tensor, d: Tensor, i: Tensor, b: Tensor, u: Tensor) -> list[Tensor]
 def rounded(x: Tensor, d: Tensor, i: Tensor, b: Tensor, u: Tensor) -> list[Tensor]:
     """What may be rounded once more without fused multiply and add."""
     names = "sin cos tan atan exp exp2 expm1 tanh sinh cosh sigmoid".split()
-    found = [getattr(torch, name)(v) for name in names for v in (x, d)]
-    found += [getattr(torch, name)(v.abs()) for name in ("log", "log2", "log10", "log1p") for v in (x, d)]
-    found += [torch.asin(x * 0.2), torch.acos(d * 0.2), torch.atan2(x[0], x[1]), x.abs() ** x[0], d.abs() ** d[0]]
+    found = [getattr(torch, name)(v) for name in names for v in (x[0], d[0])]
+    found += [getattr(torch, name)(v.abs()) for name in ("log", "log10", "log1p") for v in (x[1], d[1])]
+    found += [torch.asin(x[0] * 0.2), torch.acos(d[0] * 0.2), torch.atan2(x[0], x[1]), x[1].abs() ** x[0], d[1].abs() ** d[0]]
     return [*found, x.prod(0), (x * x).sum(0), torch.lerp(x[0], x[1], x[2]), x[0] * x[1] + x[2]]
 
 
@@ -71,11 +71,12 @@ def test_older_machines(cpu):
     if cpu == "haswell" and "+avx2" not in engine.host().features.split(","):
         pytest.skip("this machine has no AVX2")
     target = Target(cpu, "")  # of features only the CPU's own
+    kernels = [lanewise(f, GIVEN, t) for f in (exact, rounded) for t in (target, None)]
     for n in (1, 16, N):
         given = [x[..., :n] for x in GIVEN]
-        for found, wanted in zip(lanewise(exact, GIVEN, target)(*given), exact(*given), strict=True):
-            torch.testing.assert_close(found, wanted, rtol=6e-8 if wanted.dtype == torch.float32 else 0, atol=0)
-        pairs = zip(lanewise(rounded, GIVEN, target)(*given), lanewise(rounded, GIVEN)(*given), strict=True)
+        for found, here in zip(kernels[0](*given), kernels[1](*given), strict=True):
+            assert torch.equal(found, here)  # which test_operators.py compares with torch
+        pairs = zip(kernels[2](*given), kernels[3](*given), strict=True)
         for k, (found, here) in enumerate(pairs):
             eps = torch.finfo(here.dtype).eps
             # A few units in the last place; sums of products by the size of what is summed.
@@ -99,7 +100,7 @@ def test_older_machines_have_no_newer_vectors():
 def test_aarch64():
     """The same functions as an object for another machine; nothing here runs it."""
     target = Target("generic", "+neon", "aarch64-linux-gnu")
-    run = lanewise(lambda *x: [*exact(*x), *rounded(*x)], GIVEN, target)
+    run = lanewise(lambda *x: [*exact(*x), x[0].sin(), x[1].log()], GIVEN, target)
     assert callable(run)
     made = [f for f in engine._functions.values() if f.call is None]
     assert made
@@ -109,7 +110,7 @@ def test_aarch64():
     assert (kind, machine) == (1, 183)  # relocatable, EM_AARCH64
 
 
-def test_tiny_host_features_are_sorted():
+def test_host_features_are_sorted():
     """The key of an entry is the same in every process."""
     names = [feature[1:] for feature in engine.host().features.split(",")]
     assert names == sorted(names)
