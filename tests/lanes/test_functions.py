@@ -161,7 +161,10 @@ def worst(name: str, dtype: type, count: int) -> tuple[float, tuple[float, ...]]
     return float(error[place]), tuple(float(a[place]) for a in given)
 
 
-TYPES = [np.float32, pytest.param(np.float64, marks=pytest.mark.skipif(not DENSE, reason="numpy has no wider floats here"))]
+TYPES = [
+    np.float32,
+    pytest.param(np.float64, marks=pytest.mark.skipif(not DENSE, reason="numpy has no wider floats here")),
+]
 
 
 @pytest.mark.parametrize("dtype", TYPES, ids=["float32", "float64"])
@@ -184,7 +187,15 @@ def test_error_dense(name, dtype):
 def test_references():
     """80-bit floats are what they should be: as good as 40 digits on a few arguments."""
     mpmath = pytest.importorskip("mpmath")
-    names = {"asin": "asin", "acos": "acos", "atan": "atan", "exp2": None, "log2": None, "sigmoid": None, "pow": "power"}
+    names = {
+        "asin": "asin",
+        "acos": "acos",
+        "atan": "atan",
+        "exp2": None,
+        "log2": None,
+        "sigmoid": None,
+        "pow": "power",
+    }
     with mpmath.workdps(40):
         for name in FUNCTIONS:
             given = [a[:: max(len(a) // 60, 1)][:60] for a in arguments(name, np.float64, 1000)]
@@ -230,7 +241,9 @@ def test_huge_angles(dtype):
     x = np.concatenate([x, -x, np.array([np.finfo(dtype).max], dtype)])
     s, c = run("sin", x), run("cos", x)
     assert np.abs(s).max() <= 1 and np.abs(c).max() <= 1
-    assert np.abs(s.astype(np.float64) ** 2 + c.astype(np.float64) ** 2 - 1).max() < 0.02  # the rest of the angle is cut off
+    assert (
+        np.abs(s.astype(np.float64) ** 2 + c.astype(np.float64) ** 2 - 1).max() < 0.02
+    )  # the rest of the angle is cut off
     assert np.isnan(run("sin", np.array([np.inf, -np.inf, np.nan], dtype))).all()
 
 

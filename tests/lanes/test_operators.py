@@ -21,7 +21,6 @@ import torch
 from torch import Tensor, nn
 
 from torchpt.lanes.function import lanewise
-from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.tracing import HANDLERS
 
 N = 1000
@@ -147,7 +146,10 @@ def function_of(name: str, ulps: float) -> Case:
 aten = torch.ops.aten
 
 CASES = [
-    Case("add", [*pairs(torch.add, *NUMBERS, "uv", "bc"), *each(lambda x: x + 1, "fdilub"), *each(lambda x: 0.1 + x, "fdi")]),
+    Case(
+        "add",
+        [*pairs(torch.add, *NUMBERS, "uv", "bc"), *each(lambda x: x + 1, "fdilub"), *each(lambda x: 0.1 + x, "fdi")],
+    ),
     Case(
         "add sub",
         [
@@ -161,9 +163,14 @@ CASES = [
     Case("add sub", [lambda x: torch.add(x.p, x.q, alpha=0.3), lambda x: torch.sub(x.w, x.p, alpha=0.3)], 2, 1e-7),
     Case("sub", [*pairs(torch.sub, *NUMBERS[:-6], "iu", "il", "uv"), *each(lambda x: x - 2.5, "fdi")]),
     Case("rsub", [*each(lambda x: 1 - x, "fdilu"), lambda x: 2.5 - x.i, lambda x: torch.rsub(x.f, x.g)]),
-    Case("mul", [*pairs(torch.mul, *NUMBERS, "uv", "bc"), *each(lambda x: x * 3, "fdilu"), *each(lambda x: 0.1 * x, "fdi")]),
+    Case(
+        "mul",
+        [*pairs(torch.mul, *NUMBERS, "uv", "bc"), *each(lambda x: x * 3, "fdilu"), *each(lambda x: 0.1 * x, "fdi")],
+    ),
     Case("mul", [lambda x: (x.u * x.v).int(), lambda x: x.i.long() * x.j, lambda x: x.i.long() * x.j.long() >> 32]),
-    Case("div", [*pairs(torch.div, *COMPARED), *each(lambda x: x / 3, "fdilu"), *each(lambda x: 1.0 / (x + 0.5), "fdi")]),
+    Case(
+        "div", [*pairs(torch.div, *COMPARED), *each(lambda x: x / 3, "fdilu"), *each(lambda x: 1.0 / (x + 0.5), "fdi")]
+    ),
     Case("div", [lambda x: x.f / 8.0, lambda x: x.d / -0.25, lambda x: x.f / 2.0**-130, lambda x: 0.1 / x.f]),
     Case("true_divide", [lambda x: aten.true_divide(x.f, x.g), lambda x: aten.true_divide(x.i, x.j)], inference=True),
     Case(
@@ -183,7 +190,12 @@ CASES = [
         "div floor_divide remainder fmod",
         [
             lambda x, op=op, a=a, b=b: op(a(x), _mended(b(x)))
-            for op in (torch.floor_divide, torch.remainder, torch.fmod, lambda p, q: torch.div(p, q, rounding_mode="trunc"))
+            for op in (
+                torch.floor_divide,
+                torch.remainder,
+                torch.fmod,
+                lambda p, q: torch.div(p, q, rounding_mode="trunc"),
+            )
             for a in (lambda x: x.i.long(), lambda x: x.i.long() * x.j + x.i)
             for b in (lambda x: x.j.long(), lambda x: x.j.long() * 65539, lambda x: x.j.long() * x.i)
         ],
@@ -303,22 +315,31 @@ CASES = [
             lambda x: aten.__rshift__(x.i, x.j & 15),
         ],
     ),
-    Case("copysign", [*floats(torch.copysign), lambda x: torch.copysign(x.f, -0.0), lambda x: torch.copysign(x.i, x.f)]),
-    Case("neg", each(torch.neg, "fdilu") + [lambda x: (-x.u).int()]),
+    Case(
+        "copysign", [*floats(torch.copysign), lambda x: torch.copysign(x.f, -0.0), lambda x: torch.copysign(x.i, x.f)]
+    ),
+    Case("neg", [*each(torch.neg, "fdilu"), lambda x: (-x.u).int()]),
     Case("abs", [*each(torch.abs, "fdilu"), lambda x: (x.i.long() * x.j).abs()]),
     Case("sign", each(torch.sign, "fdilub")),
     Case("sqrt", each(torch.sqrt, "fdiub"), 1),  # torch's is MKL's; see test_square_root
     Case("rsqrt", each(torch.rsqrt, "fdiub"), 1),
     Case("reciprocal", each(torch.reciprocal, "fdiub")),
     Case("square", each(aten.square, "fdil"), inference=True),
-    Case("floor ceil trunc round", [f for op in (torch.floor, torch.ceil, torch.trunc, torch.round) for f in each(op, "fdilu")]),
+    Case(
+        "floor ceil trunc round",
+        [f for op in (torch.floor, torch.ceil, torch.trunc, torch.round) for f in each(op, "fdilu")],
+    ),
     Case("isnan isinf", [f for op in (torch.isnan, torch.isinf, torch.isfinite) for f in each(op, "fdilu")]),
     Case("isfinite", each(aten.isfinite, "fd"), inference=True),
     *(
         function_of(name, 4)
         for name in "sin cos tan asin acos atan exp exp2 expm1 log log2 log10 log1p sinh cosh tanh sigmoid".split()
     ),
-    Case("atan2", [lambda x: torch.atan2(x.p, x.q), lambda x: torch.atan2(x.w, x.w.flip(0)), lambda x: torch.atan2(x.n, x.r)], 4),
+    Case(
+        "atan2",
+        [lambda x: torch.atan2(x.p, x.q), lambda x: torch.atan2(x.w, x.w.flip(0)), lambda x: torch.atan2(x.n, x.r)],
+        4,
+    ),
     Case(
         "softplus",
         [
@@ -359,8 +380,12 @@ CASES = [
         "pow",  # special values alone, whose powers are exact
         [lambda x: torch.where(torch.isfinite(x.f) & (x.f != 0) & (x.f.abs() != 1), 0.0, x.f) ** torch.round(x.g)],
     ),
-    Case("addcmul", [lambda x: torch.addcmul(x.p, x.q, x.r), lambda x: torch.addcmul(x.w, x.p, x.q, value=-1)], 0, 3e-7),
-    Case("addcmul", [lambda x: torch.addcmul(x.i, x.j, x.i), lambda x: torch.addcmul(x.p, x.q, x.r, value=0.5)], 0, 3e-7),
+    Case(
+        "addcmul", [lambda x: torch.addcmul(x.p, x.q, x.r), lambda x: torch.addcmul(x.w, x.p, x.q, value=-1)], 0, 3e-7
+    ),
+    Case(
+        "addcmul", [lambda x: torch.addcmul(x.i, x.j, x.i), lambda x: torch.addcmul(x.p, x.q, x.r, value=0.5)], 0, 3e-7
+    ),
     Case("addcmul", [lambda x: torch.addcmul(x.i.long(), x.j.long(), x.i.long(), value=3)]),
     Case("lerp", [lambda x: torch.lerp(x.p, x.q, x.r), lambda x: torch.lerp(x.w, x.w + 1, 0.7)], 0, 5e-7),
     Case("lerp", [lambda x: torch.lerp(x.f, x.g, (x.r > 0.5).float())], 0, 1e-300),  # but for signs of zeros
@@ -490,12 +515,16 @@ CASES = [
             lambda x: torch.stack([x.f, torch.tensor(0.25).expand_as(x.f)]),
         ],
     ),
-    Case("narrow chunk concat", [
-        lambda x: aten.narrow(x.p, 0, 1, 2),
-        lambda x: aten.narrow(x.w, -2, 2, 1),
-        lambda x: aten.chunk(x.p, 2)[0],
-        lambda x: aten.concat([x.p, x.q]),
-    ], inference=True),
+    Case(
+        "narrow chunk concat",
+        [
+            lambda x: aten.narrow(x.p, 0, 1, 2),
+            lambda x: aten.narrow(x.w, -2, 2, 1),
+            lambda x: aten.chunk(x.p, 2)[0],
+            lambda x: aten.concat([x.p, x.q]),
+        ],
+        inference=True,
+    ),
     Case(
         "permute t transpose flip roll expand view _unsafe_view",
         [
@@ -516,7 +545,11 @@ CASES = [
             lambda x: x.p.movedim(0, -1).movedim(-1, 0),
         ],
     ),
-    Case("reshape numpy_T", [lambda x: aten.reshape(x.w, [6, -1]), lambda x: aten.numpy_T(aten.numpy_T(x.p))], inference=True),
+    Case(
+        "reshape numpy_T",
+        [lambda x: aten.reshape(x.w, [6, -1]), lambda x: aten.numpy_T(aten.numpy_T(x.p))],
+        inference=True,
+    ),
     Case(
         "index_select",
         [

@@ -110,20 +110,20 @@ def test_against_brute(name, estimates):
         at, number, *uv = accel.intersect(*ray)
         t, prim, u, v, blocked = searches(accel, estimates)(*ray)
         same = prim == number
-        # Of 20,000 rays a handful lies within rounding (2^-20 of the scene) of an edge or of two surfaces at once.
-        assert (~same).sum() <= 4, int((~same).sum())
+        # Within rounding (2^-20 of the scene) of an edge, or of two surfaces at once, lies one ray in a million and primitive.
+        assert (~same).sum() <= 2, int((~same).sum())
         if n == COUNT:
             assert prim.unique().tolist() == list(range(-1, sum(SCENES[name])))  # all are seen, and the void
         hit = same & (prim >= 0)
         # By rows in float32: the rounding of a plane's distance is that of coordinates of size 2, over the slope.
         error = (t[hit] - at[hit]).abs() / at[hit].clamp_min(1.0)
-        assert error.numel() == 0 or (error.max() < 1e-3 and error.median() < 2e-7 and (error > 1e-5).float().mean() < 2e-3)
+        assert error.numel() == 0 or (error.max() < 2e-5 and (n < COUNT or error.median() < 1e-7))
         assert (t[same & (prim < 0)] == math.inf).all()
         assert (prim[t < math.inf] >= 0).all() and (t[prim >= 0] < t_max[:n][prim >= 0]).all() and (t > 0).all()
         near = same & ((u - uv[0]).abs() < 1e-3) & ((v - uv[1]).abs() < 1e-3)
-        assert (~near).sum() <= 4 + 1e-3 * n
+        assert (~near).sum() <= 2
         assert (blocked != (prim >= 0)).sum() == 0  # the same tests in the same order
-        assert (blocked != accel.occluded(*ray)).sum() <= 4
+        assert (blocked != accel.occluded(*ray)).sum() <= 2
 
 
 @pytest.mark.parametrize("estimates", ESTIMATES, ids=["divided", "estimated"])
@@ -237,5 +237,3 @@ def test_spheres_are_closed():
     assert (prim == 0).all() and blocked.all()
     radius = (o.double() + t.double() * d.double() - scene.p0.double()).norm(dim=0)
     assert (radius - 0.5).abs().max() < 3e-6  # coordinates of size 5 are float32
-
-

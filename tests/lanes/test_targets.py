@@ -60,7 +60,13 @@ def rounded(x: Tensor, d: Tensor, i: Tensor, b: Tensor, u: Tensor) -> list[Tenso
     names = "sin cos tan atan exp exp2 expm1 tanh sinh cosh sigmoid".split()
     found = [getattr(torch, name)(v) for name in names for v in (x[0], d[0])]
     found += [getattr(torch, name)(v.abs()) for name in ("log", "log10", "log1p") for v in (x[1], d[1])]
-    found += [torch.asin(x[0] * 0.2), torch.acos(d[0] * 0.2), torch.atan2(x[0], x[1]), x[1].abs() ** x[0], d[1].abs() ** d[0]]
+    found += [
+        torch.asin(x[0] * 0.2),
+        torch.acos(d[0] * 0.2),
+        torch.atan2(x[0], x[1]),
+        x[1].abs() ** x[0],
+        d[1].abs() ** d[0],
+    ]
     return [*found, x.prod(0), (x * x).sum(0), torch.lerp(x[0], x[1], x[2]), x[0] * x[1] + x[2]]
 
 

@@ -248,7 +248,11 @@ def test_networks():
 
 
 def many(x: Tensor, table: Tensor) -> list[Tensor]:
-    return [torch.sin(x[0]) * table[(x[1] * 3).long()] + torch.searchsorted(table, x[2]), x[0] % 0.3, x[1].exp() + x[2].clamp(0, 1)]
+    return [
+        torch.sin(x[0]) * table[(x[1] * 3).long()] + torch.searchsorted(table, x[2]),
+        x[0] % 0.3,
+        x[1].exp() + x[2].clamp(0, 1),
+    ]
 
 
 _HASHED = """
@@ -288,7 +292,9 @@ def test_equal_nodes_are_kept_once():
     assert graph.cast(graph.constant("l", 300), "u") == graph.constant("u", 44)
     assert graph.value(graph.cast(graph.constant("d", 1e300), "f")) == math.inf
     x = graph.node("tensor", "f", extra=(0, 0))
-    assert graph.binary("div", "f", x, graph.constant("f", 4.0)) == graph.binary("mul", "f", x, graph.constant("f", 0.25))
+    assert graph.binary("div", "f", x, graph.constant("f", 4.0)) == graph.binary(
+        "mul", "f", x, graph.constant("f", 0.25)
+    )
     tiny = graph.binary("div", "f", x, graph.constant("f", 2.0**-140))  # 2^140 is no float32
     assert graph.nodes[tiny][0] == "div"
 

@@ -314,7 +314,7 @@ def _log1p(b: Block, ty: str, x: str) -> str:
 
 
 def _pow(b: Block, ty: str, x: str, y: str) -> str:
-    """``e^(y ln |x|)`` in double, of float64 with the logarithm in two parts; whole powers of negative numbers have their sign."""
+    """``e^(y ln |x|)`` in double, of float64 with the logarithm in two parts; whole powers of negatives have their sign."""
     p, q = _wide(b, ty, x), _wide(b, ty, y)
     size, zero, one, inf = _absolute(b, "d", p), *(b.constant("d", v) for v in (0.0, 1.0, math.inf))
     if ty == "f":

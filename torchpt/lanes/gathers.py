@@ -59,7 +59,7 @@ def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
     if axes != list(range(len(axes))) or tracer.is_traced(table):
         raise Unsupported(f"a look-up by {len(axes)} indices")
     graph, ty = tracer.graph, DTYPES[table.dtype]
-    columns = np.broadcast_arrays(*(tracer.get(index).nodes for index in indices[: len(axes)]))
+    columns: Any = np.broadcast_arrays(*(tracer.get(index).nodes for index in indices[: len(axes)]))
     rest = tuple(table.shape[len(axes) :])
     width, number = math.prod(rest), tracer.table(table, None)
     found = np.empty((*columns[0].shape, *rest), object)
@@ -69,7 +69,9 @@ def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
             place = graph.binary("mul", "i", place, graph.constant("i", table.shape[axis])) if axis else place
             place = graph.binary("add", "i", place, graph.cast(column[at], "i"))
         place = graph.binary("mul", "i", place, graph.constant("i", width))
-        for k, inner in enumerate(np.ndindex(*rest)):  # entries of the table laid flat, where each is brought into range
+        for k, inner in enumerate(
+            np.ndindex(*rest)
+        ):  # entries of the table laid flat, where each is brought into range
             one = graph.binary("add", "i", place, graph.constant("i", k))
             found[(*at, *inner)] = graph.node("gather", ty, one, extra=(number, 1, 0))
     tracer.put(out, found)
@@ -160,7 +162,7 @@ def _product(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, start: Tensor | 
     x, y = _matrix(tracer, a), _matrix(tracer, b)
     lane = tracer.lane_axis(out.shape)
     found = np.empty(tracer.inner(out.shape, lane), object)
-    begin = None if start is None else np.broadcast_to(tracer.get(start).nodes, found.shape)
+    begin: Any = None if start is None else np.broadcast_to(tracer.get(start).nodes, found.shape)
     for i, j in np.ndindex(*found.shape):
         total = None if begin is None else graph.cast(begin[i, j], ty)
         for k in range(x.shape[1]):

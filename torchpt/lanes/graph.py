@@ -17,7 +17,6 @@ import torch
 __all__ = ["BYTES", "DTYPES", "FLOATS", "INTEGERS", "Graph", "Unsupported"]
 
 
-
 class Unsupported(Exception):
     """A stage does something that the lane compiler does not know; the message names it."""
 

@@ -354,13 +354,13 @@ def _reduce(op: str, boolean: bool = False) -> Any:
         for k in reversed(_axes(axis, nodes.ndim)):
             if k == value.lane:
                 raise Unsupported("a reduction over lanes")
-            parts = [np.take(nodes, j, k) for j in range(nodes.shape[k])]
+            parts: list[Any] = [np.take(nodes, j, k) for j in range(nodes.shape[k])]
             if not parts:
                 shape = (*nodes.shape[:k], *nodes.shape[k + 1 :])
                 parts = [np.full(shape, _nothing(graph, op, DTYPES[out.dtype]), object)]
             total = _cast_all(tracer, parts[0], "b" if boolean else _sums(op, out))
             for part in parts[1:]:
-                joined = np.empty(total.shape, object)
+                joined: Any = np.empty(total.shape, object)
                 for at in np.ndindex(*total.shape):
                     ty = "b" if boolean else _type(tracer, out.dtype, total[at], part[at])
                     joined[at] = graph.binary(op, ty, graph.cast(total[at], ty), graph.cast(part[at], ty))
@@ -383,7 +383,7 @@ def _nothing(graph: Any, op: str, ty: str) -> int:
     return graph.constant(ty, 1 if op in ("mul", "and") else 0)
 
 
-def _cast_all(tracer: Tracer, nodes: np.ndarray, ty: str) -> np.ndarray:
+def _cast_all(tracer: Tracer, nodes: Any, ty: str) -> Any:
     found = np.empty(nodes.shape, object)
     for at in np.ndindex(*nodes.shape):
         node = nodes[at]

@@ -100,7 +100,7 @@ class Guard:
 class Value:
     """A traced tensor: an array of nodes in which the lanes' axis has length 1."""
 
-    nodes: np.ndarray
+    nodes: Any  # an array of objects, whose elements numpy's types do not tell from arrays
     lane: int | None
 
 
@@ -178,7 +178,9 @@ class Tracer(TorchDispatchMode):
         """The nodes of a result ``(..., lanes)``, its leading axes flattened."""
         value = self.get(tensor)
         if value.lane is not None and value.nodes.shape[value.lane] != 1:
-            raise Unsupported(f"a result of shape {tuple(tensor.shape)} with several numbers of a lane along its lanes' axis")
+            raise Unsupported(
+                f"a result of shape {tuple(tensor.shape)} with several numbers of a lane along its lanes' axis"
+            )
         if value.lane is None and tensor.dim() and tensor.shape[-1] == 1:  # the same number for all lanes
             return [int(node) for node in value.nodes.reshape(-1)]
         if value.lane != tensor.dim() - 1:
@@ -282,7 +284,9 @@ class Tracer(TorchDispatchMode):
             try:
                 handler(self, out, *args, **kwargs)
             except TypeError as error:  # arguments that the handler does not take
-                raise Unsupported(f"the operator {func} with {', '.join(map(str, kwargs)) or 'these arguments'}") from error
+                raise Unsupported(
+                    f"the operator {func} with {', '.join(map(str, kwargs)) or 'these arguments'}"
+                ) from error
         elif not given and isinstance(out, Tensor) and self.lane_axis(out.shape) is not None:
             self._factory(name, out)
         else:
