@@ -124,7 +124,8 @@ class Block:
     def extreme(self, op: str, ty: str, a: str, b: str) -> str:
         """``max`` or ``min``; of floats NaN where either is, as torch has it."""
         if ty not in "fd":
-            return self.select(ty, self.compare("sgt" if op == "max" else "slt", ty, a, b), a, b)
+            sign = "u" if ty == "b" else "s"  # a bit that is set is -1 to signed comparisons
+            return self.select(ty, self.compare(sign + ("gt" if op == "max" else "lt"), ty, a, b), a, b)
         better = "ogt" if op == "max" else "olt"
         if b.startswith("splat"):  # no NaN: the other one is kept where it is
             return self.select(ty, self.compare(better, ty, b, a), b, a)

@@ -43,14 +43,21 @@ def emit(block: Block, graph: Graph, node: int, names: dict[int, str]) -> str:
     handler = _HANDLERS.get(op)
     if handler is None:
         raise Unsupported(f"the operation {op} on numbers of type {ty}")
-    return handler(block, ty, *a) if extra is None else handler(block, ty, *a, extra)
+    found = handler(block, ty, *a) if extra is None else handler(block, ty, *a, extra)
+    return _byte(block, found) if ty == "u" and op in _CARRIES else found
+
+
+#: Operations on bytes, which are held in 32 bits, that may leave more than eight.
+_CARRIES = ("add", "sub", "mul", "shl", "neg", "xor", "floordiv", "truncdiv", "remainder", "fmod")
+
+
+def _byte(block: Block, a: str) -> str:
+    return block.binary("and", "u", a, block.constant("u", 255))
 
 
 def _comparison(block: Block, op: str, ty: str, a: str, b: str) -> str:
     if ty == "b":
-        if op not in ("eq", "ne"):
-            raise Unsupported(f"an order of truth values ({op})")
-        return block.op(f"icmp {op} <{WIDTH} x i1> {a}, {b}")
+        return block.compare(_COMPARISONS[op][1].replace("s", "u"), ty, a, b)  # a bit that is set is -1 to signed ones
     return block.compare(_COMPARISONS[op][ty not in FLOATS], ty, a, b)
 
 
@@ -62,14 +69,16 @@ def _cast(block: Block, source: str, target: str, a: str) -> str:
     if source in FLOATS and target in FLOATS:
         return block.convert("fpext" if target == "d" else "fptrunc", source, target, a)
     if source in FLOATS:
-        return block.convert("fptosi", source, target, a)
+        # Frozen: of NaN and of numbers out of range it is some number, which look-ups bring into range.
+        found = block.op(f"freeze {block.vector(target)} {block.convert('fptosi', source, target, a)}")
+        return _byte(block, found) if target == "u" else found
     if target in FLOATS:
         return block.convert("sitofp", source, target, a)
     if target == "L":
         return block.convert("sext", source, target, a)
     if source == "L":
-        return block.convert("trunc", source, target, a)
-    return a
+        a = block.convert("trunc", source, target, a)
+    return _byte(block, a) if target == "u" else a
 
 
 def _arithmetic(op: str) -> Callable[..., str]:
@@ -84,6 +93,18 @@ def _arithmetic(op: str) -> Callable[..., str]:
 def _bits(op: str) -> Callable[..., str]:
     def handler(block: Block, ty: str, a: str, b: str) -> str:
         return block.op(f"{op} {block.vector(ty)} {a}, {b}")
+
+    return handler
+
+
+def _shift(op: str) -> Callable[..., str]:
+    """Bits moved further than there are leave nothing, or the sign; by negative numbers likewise, as in torch."""
+
+    def handler(block: Block, ty: str, a: str, b: str) -> str:
+        most = block.constant(ty, 63 if ty == "L" else 31)
+        far = block.compare("ugt", ty, b, most)
+        found = block.op(f"{op} {block.vector(ty)} {a}, {block.select(ty, far, most, b)}")
+        return found if op == "ashr" else block.select(ty, far, block.constant(ty, 0), found)
 
     return handler
 
@@ -104,6 +125,8 @@ def _abs(block: Block, ty: str, a: str) -> str:
 
 
 def _sign(block: Block, ty: str, a: str) -> str:
+    if ty == "b":
+        return a
     zero = block.constant(ty, 0)
     up, down = ("ogt", "olt") if ty in FLOATS else ("sgt", "slt")
     found = block.select(ty, block.compare(up, ty, a, zero), block.constant(ty, 1), zero)
@@ -114,31 +137,64 @@ def _quotient(block: Block, ty: str, a: str, b: str, rounding: str) -> str:
     """Rounded quotients of 32-bit integers by way of doubles, which hold them exactly; no machine divides such vectors."""
     x, y = (block.convert("sitofp", ty, "d", v) for v in (a, b))
     q = block.call(f"llvm.{rounding}", "d", block.div("d", x, y))
-    return block.convert("fptosi", "d", ty, q)
+    return block.op(f"freeze {block.vector(ty)} {block.convert('fptosi', 'd', ty, q)}")
 
 
 def _wide_quotient(block: Block, a: str, b: str) -> tuple[str, str]:
-    """Floored quotient and remainder of 64-bit integers below 2^53 by positive ones: by doubles, then mended."""
+    """Floored quotient and remainder of 64-bit integers, by doubles, which leave up to 2^10 of a quotient: once more for that.
+
+    Divisors of more than 62 bits are not meant.
+    """
     x, y = (block.convert("sitofp", "L", "d", v) for v in (a, b))
-    q = block.convert("fptosi", "d", "L", block.call("llvm.floor", "d", block.div("d", x, y)))
+
+    def floored(top: str) -> str:
+        whole = block.convert("fptosi", "d", "L", block.call("llvm.floor", "d", block.div("d", top, y)))
+        return block.op(f"freeze {block.vector('L')} {whole}")
+
+    q = floored(x)
+    r = block.sub("L", a, block.mul("L", q, b))
+    q = block.add("L", q, floored(block.convert("sitofp", "L", "d", r)))
     r = block.sub("L", a, block.mul("L", q, b))
     zero, one = block.constant("L", 0), block.constant("L", 1)
-    low = block.compare("slt", "L", r, zero)
+    # The remainder has the divisor's sign, and is smaller.
+    low = block.op(
+        f"and <{WIDTH} x i1> {block.compare('ne', 'L', r, zero)}, "
+        + block.compare("slt", "L", block.op(f"xor {block.vector('L')} {r}, {b}"), zero)
+    )
     q, r = block.select("L", low, block.sub("L", q, one), q), block.select("L", low, block.add("L", r, b), r)
-    high = block.compare("sge", "L", r, b)
+    high = block.compare("sge", "L", _abs(block, "L", r), _abs(block, "L", b))
     return block.select("L", high, block.add("L", q, one), q), block.select("L", high, block.sub("L", r, b), r)
 
 
 def _floordiv(block: Block, ty: str, a: str, b: str) -> str:
-    if ty in FLOATS:
-        return block.call("llvm.floor", ty, block.div(ty, a, b))
-    return _wide_quotient(block, a, b)[0] if ty == "L" else _quotient(block, ty, a, b, "floor")
+    if ty not in FLOATS:
+        return _wide_quotient(block, a, b)[0] if ty == "L" else _quotient(block, ty, a, b, "floor")
+    # As Python and torch have it: the exact quotient rounded down, not the rounded quotient; 1 // 0.1 is 9.
+    zero, one = block.constant(ty, 0.0), block.constant(ty, 1.0)
+    r = _fmod(block, ty, a, b)
+    q = block.div(ty, block.sub(ty, a, r), b)
+    q = block.select(ty, _against(block, ty, r, b), block.sub(ty, q, one), q)
+    whole = block.call("llvm.floor", ty, q)
+    up = block.compare("ogt", ty, block.sub(ty, q, whole), block.constant(ty, 0.5))
+    whole = block.select(ty, up, block.add(ty, whole, one), whole)
+    plain = block.div(ty, a, b)
+    nothing = block.call("llvm.copysign", ty, zero, plain)
+    whole = block.select(ty, block.compare("oeq", ty, q, zero), nothing, whole)
+    return block.select(ty, block.compare("oeq", ty, b, zero), plain, whole)
 
 
 def _truncdiv(block: Block, ty: str, a: str, b: str) -> str:
-    if ty == "L":
-        raise Unsupported("truncated division of 64-bit numbers")
-    return _quotient(block, ty, a, b, "trunc")
+    if ty in FLOATS:
+        return block.call("llvm.trunc", ty, block.div(ty, a, b))
+    if ty != "L":
+        return _quotient(block, ty, a, b, "trunc")
+    q, r = _wide_quotient(block, a, b)
+    zero, one = block.constant("L", 0), block.constant("L", 1)
+    up = block.op(
+        f"and <{WIDTH} x i1> {block.compare('ne', 'L', r, zero)}, "
+        + block.compare("slt", "L", block.op(f"xor {block.vector('L')} {a}, {b}"), zero)
+    )
+    return block.select("L", up, block.add("L", q, one), q)
 
 
 def _remainder(block: Block, ty: str, a: str, b: str) -> str:
@@ -147,11 +203,15 @@ def _remainder(block: Block, ty: str, a: str, b: str) -> str:
         return _wide_quotient(block, a, b)[1]
     if ty not in FLOATS:
         return block.sub(ty, a, block.mul(ty, _quotient(block, ty, a, b, "floor"), b))
-    r = block.op(f"frem {block.vector(ty)} {a}, {b}")
+    r = _fmod(block, ty, a, b)
+    return block.select(ty, _against(block, ty, r, b), block.add(ty, r, b), r)
+
+
+def _against(block: Block, ty: str, r: str, b: str) -> str:
+    """Whether a remainder of floats has another sign than the divisor."""
     zero = block.constant(ty, 0.0)
     other = block.op(f"xor <{WIDTH} x i1> {block.compare('olt', ty, r, zero)}, {block.compare('olt', ty, b, zero)}")
-    wrong = block.op(f"and <{WIDTH} x i1> {other}, {block.compare('une', ty, r, zero)}")
-    return block.select(ty, wrong, block.add(ty, r, b), r)
+    return block.op(f"and <{WIDTH} x i1> {other}, {block.compare('une', ty, r, zero)}")
 
 
 def _fmod(block: Block, ty: str, a: str, b: str) -> str:
@@ -255,8 +315,8 @@ _HANDLERS: dict[str, Callable[..., str]] = {
     "and": _bits("and"),
     "or": _bits("or"),
     "xor": _bits("xor"),
-    "ashr": _bits("ashr"),
-    "shl": _bits("shl"),
+    "ashr": _shift("ashr"),
+    "shl": _shift("shl"),
     "max": lambda block, ty, a, b: block.extreme("max", ty, a, b),
     "min": lambda block, ty, a, b: block.extreme("min", ty, a, b),
     "neg": lambda block, ty, a: block.negative(ty, a),

@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 #: Enters every key: entries of another form are never read.
-_FORM = "1"
+_FORM = "3"
 _lock = threading.Lock()
 _state: dict[str, Any] = {"ready": False, "seconds": 0.0, "compiled": 0, "loaded": 0}
 _functions: dict[str, Function] = {}
@@ -144,14 +144,18 @@ def _key(ir: str, target: Target) -> str:
 
 def _machine(target: Target) -> Any:
     if target not in _machines:
-        llvm = _llvm()
-        if target.triple is not None:
-            llvm.initialize_all_targets()
-            llvm.initialize_all_asmprinters()
-        kind = llvm.Target.from_default_triple() if target.triple is None else llvm.Target.from_triple(target.triple)
-        options = {"jit": True} if target.triple is None else {}
-        _machines[target] = kind.create_target_machine(cpu=target.cpu, features=target.features, opt=2, **options)
+        _machines[target] = _new_machine(target)
     return _machines[target]
+
+
+def _new_machine(target: Target) -> Any:
+    llvm = _llvm()
+    if target.triple is not None:
+        llvm.initialize_all_targets()
+        llvm.initialize_all_asmprinters()
+    kind = llvm.Target.from_default_triple() if target.triple is None else llvm.Target.from_triple(target.triple)
+    options = {"jit": True} if target.triple is None else {}
+    return kind.create_target_machine(cpu=target.cpu, features=target.features, opt=2, **options)
 
 
 def _object(ir: str, target: Target) -> bytes:
@@ -172,7 +176,8 @@ def _loaded(code: bytes, target: Target, key: str) -> Function:
     if target.triple is not None:
         return Function(None, code, None, key)  # for another machine: not to be run here
     llvm = _llvm()
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine(target))
+    machine = _new_machine(target)  # becomes the engine's own, and goes with it
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(engine.get_function_address("kernel"))
@@ -184,16 +189,20 @@ def cache_folder() -> Path | None:
     given = os.environ.get("TORCHPT_CACHE")
     if given == "":
         return None
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    folder = Path(given) if given else Path(base) / "torchpt" / "kernels"
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(base):  # as its specification says
+        base = os.path.join(os.path.expanduser("~"), ".cache")
+    folder = Path(given).absolute() if given else Path(base) / "torchpt" / "kernels"
+    if not folder.is_absolute():  # no home
+        return None
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        facts = folder.stat()
+        facts = [folder.stat(), folder.lstat()]  # a link must be this user's as well
     except OSError:
         return None
     if not hasattr(os, "getuid"):  # no owners and modes to check
         return folder
-    if facts.st_uid != os.getuid() or stat.S_IMODE(facts.st_mode) & 0o077:
+    if any(fact.st_uid != os.getuid() for fact in facts) or stat.S_IMODE(facts[0].st_mode) & 0o077:
         return None
     return folder
 
@@ -205,16 +214,28 @@ def _folder() -> Path | None:
 
 
 def read(name: str) -> bytes | None:
-    """An entry of the cache; None where there is none, or a damaged one, which is made again."""
+    """An entry of the cache; None where there is none, or a damaged or a doubtful one, which is made again."""
     folder = _folder()
     if folder is None:
         return None
     try:
-        content = (folder / name).read_bytes()
+        handle = os.open(folder / name, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0))
+        with os.fdopen(handle, "rb") as file:
+            facts = os.fstat(handle)
+            if not stat.S_ISREG(facts.st_mode):
+                return None
+            # Whoever may rename the folder could have put another in its place since it was looked at.
+            if hasattr(os, "getuid") and (facts.st_uid != os.getuid() or facts.st_mode & 0o022):
+                return None
+            content = file.read()
     except OSError:
         return None
     check, code = content[:32], content[32:]
-    return code if hashlib.sha256(code).digest() == check else None
+    return code if _check(name, code) == check else None
+
+
+def _check(name: str, code: bytes) -> bytes:
+    return hashlib.sha256(name.encode() + code).digest()
 
 
 def write(entry: str, code: bytes) -> None:
@@ -226,7 +247,7 @@ def write(entry: str, code: bytes) -> None:
     try:
         handle, name = tempfile.mkstemp(dir=path.parent)
         with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(code).digest() + code)
+            file.write(_check(entry, code) + code)
         os.replace(name, path)
     except OSError:
         if name is not None:

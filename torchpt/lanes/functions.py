@@ -41,8 +41,8 @@ def _quadrant(b: Block, ty: str, x: str) -> tuple[str, str]:
     q = b.fma("d", turns, b.constant("d", -4.0), q)
     finite = b.compare("olt", "d", _absolute(b, "d", q), b.constant("d", 5.0))
     q = b.select("d", finite, q, b.constant("d", 0.0))
-    # Of arguments so large that their digits say nothing of the angle, any angle will do.
-    y = _clamped(b, "d", y, -0.25 * math.pi, 0.25 * math.pi)
+    # Beyond 2^20 digits are lost, and far beyond any angle will do: one no larger than rounding leaves it.
+    y = _clamped(b, "d", y, -0.79, 0.79)
     return b.convert("fptosi", "d", "i", q), _narrow(b, ty, y)
 
 
@@ -95,6 +95,8 @@ def _trigonometric(shift: int) -> Callable[[Block, str, str], str]:
         if shift:
             q = b.add("i", q, b.constant("i", shift))
         found = _turned(b, ty, q, _sine(b, ty, rest), _cosine(b, ty, rest))
+        if not shift:  # its zeros keep their sign
+            found = b.select(ty, b.compare("oeq", ty, x, b.constant(ty, 0.0)), x, found)
         # Of infinity and of NaN there is none.
         none = b.compare("uge", ty, _absolute(b, ty, x), b.constant(ty, math.inf))
         return b.select(ty, none, b.constant(ty, math.nan), found)
@@ -144,16 +146,22 @@ def _finish_exponential(b: Block, ty: str, x: str, found: str) -> str:
     return b.select(ty, b.compare("uno", ty, x, x), x, found)
 
 
-def _exp(b: Block, ty: str, x: str) -> str:
-    low, high = (-104.0, 89.0) if ty == "f" else (-746.0, 710.0)
+def _exp(b: Block, ty: str, x: str, rest: str | None = None) -> str:
+    """``e^x``, or ``e^(x + rest)`` for a rest below the last place of ``x``."""
+    q, r = _reduced(b, ty, x, *((-104.0, 89.0) if ty == "f" else (-746.0, 710.0)))
+    if rest is not None:
+        r = b.add(ty, r, rest)
+    return _finish_exponential(b, ty, x, _power_of_two(b, ty, q, r))
+
+
+def _reduced(b: Block, ty: str, x: str, low: float, high: float) -> tuple[str, str]:
+    """Whole ``q`` and ``r`` for ``x = q ln 2 + r`` within limits; 0 for NaN."""
     y = _clamped(b, ty, x, low, high)
     y = b.select(ty, b.compare("uno", ty, x, x), b.constant(ty, 0.0), y)
     q = b.call("llvm.rint", ty, b.mul(ty, y, b.constant(ty, 1.0 / _LN2)))
-    parts = (0.693359375, -2.12194440e-4) if ty == "f" else (6.93145751953125e-1, 1.42860682030941723212e-6)
-    r = y
-    for part in parts:
-        r = b.fma(ty, q, b.constant(ty, -part), r)
-    return _finish_exponential(b, ty, x, _power_of_two(b, ty, q, r))
+    for part in (0.693359375, -2.12194440e-4) if ty == "f" else (6.93145751953125e-1, 1.42860682030941723212e-6):
+        y = b.fma(ty, q, b.constant(ty, -part), y)
+    return q, y
 
 
 def _exp2(b: Block, ty: str, x: str) -> str:
@@ -170,93 +178,168 @@ def _expm1(b: Block, ty: str, x: str) -> str:
         found = _narrow(b, ty, b.sub("d", _exp(b, "d", _wide(b, ty, x)), b.constant("d", 1.0)))
         small = b.compare("olt", ty, _absolute(b, ty, x), b.constant(ty, 1e-8))
         return b.select(ty, small, x, found)
-    # Kahan's: the error of e^x is undone by that of its logarithm.
-    u = _exp(b, ty, x)
+    # 2^q (e^r - 1 + (1 - 2^-q)), where the inner sum is exact.
+    q, r = _reduced(b, ty, x, -40.0, 710.0)
     one = b.constant(ty, 1.0)
-    less = b.sub(ty, u, one)
-    middle = b.div(ty, b.mul(ty, less, x), _log(b, ty, u))
-    middle = b.select(ty, b.compare("oeq", ty, u, one), x, middle)
-    plain = b.compare("ogt", ty, _absolute(b, ty, x), one)
-    return b.select(ty, plain, less, middle)
+    p = b.polynomial(ty, r, tuple(1.0 / math.factorial(k) for k in range(13, 1, -1)))
+    p = b.fma(ty, b.mul(ty, r, r), p, r)
+    less = b.sub(ty, one, _scaled(b, ty, one, b.negative(ty, q)))
+    found = _scaled(b, ty, b.add(ty, p, less), q)
+    small = b.compare("olt", ty, _absolute(b, ty, x), b.constant(ty, 1e-17))  # and its zeros keep their sign
+    return _finish_exponential(b, ty, x, b.select(ty, small, x, found))
 
 
 def _log(b: Block, ty: str, x: str) -> str:
-    found = _log_normal(b, ty, x)
+    if ty == "f":
+        return _log_ends(b, ty, x, _narrow(b, ty, _log_series(b, _wide(b, ty, x), 5)))
+    return _log_ends(b, ty, x, b.add(ty, *_log_parts(b, x)))
+
+
+def _log_wide(b: Block, x: str) -> str:
+    """The logarithm of a float64 that need be good to 50 bits only; denormals are not meant."""
+    return _log_ends(b, "d", x, _log_series(b, x, 11))
+
+
+def _log_ends(b: Block, ty: str, x: str, found: str) -> str:
+    """Put in the logarithms of what is not positive and finite."""
     zero, inf = b.constant(ty, 0.0), b.constant(ty, math.inf)
     found = b.select(ty, b.compare("oeq", ty, x, zero), b.constant(ty, -math.inf), found)
     found = b.select(ty, b.compare("ult", ty, x, zero), b.constant(ty, math.nan), found)
     return b.select(ty, b.compare("oeq", ty, x, inf), inf, found)
 
 
-def _log_normal(b: Block, ty: str, x: str) -> str:
-    """Of positive finite numbers: of float32 in double, of float64 with denormals scaled up."""
-    y = _wide(b, ty, x)
-    shift = None
-    if ty == "d":
-        tiny = b.compare("olt", "d", y, b.constant("d", 2.0**-1022))
-        y = b.select("d", tiny, b.mul("d", y, b.constant("d", 2.0**54)), y)
-        shift = b.select("d", tiny, b.constant("d", -54.0), b.constant("d", 0.0))
-    # Mantissa between the square roots of 1/2 and 2.
+def _mantissa(b: Block, y: str) -> tuple[str, str]:
+    """A positive float64 as ``m 2^e``: ``m`` between the square roots of 1/2 and 2, and ``e`` as a float64."""
     bits = b.convert("bitcast", "d", "L", y)
     e = b.binary("ashr", "L", b.sub("L", bits, b.constant("L", 0x3FE6A09E00000000)), b.constant("L", 52))
     m = b.convert("bitcast", "L", "d", b.sub("L", bits, b.binary("shl", "L", e, b.constant("L", 52))))
-    e = b.convert("sitofp", "i", "d", b.convert("trunc", "L", "i", e))
-    if shift is not None:
-        e = b.add("d", e, shift)
-    # ln m = 2 atanh(s), s = (m - 1) / (m + 1), |s| < 0.172: the series.
+    return m, b.convert("sitofp", "i", "d", b.convert("trunc", "L", "i", e))
+
+
+#: ln 2 in two parts, the first of 32 bits.
+_LN2_PARTS = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+
+
+def _log_series(b: Block, x: str, terms: int) -> str:
+    """``ln m = 2 atanh(s)``, ``s = (m - 1) / (m + 1)``, ``|s| < 0.172``: the series."""
+    m, e = _mantissa(b, x)
     f = b.sub("d", m, b.constant("d", 1.0))
     s = b.div("d", f, b.add("d", m, b.constant("d", 1.0)))
     z = b.mul("d", s, s)
-    p = b.polynomial("d", z, tuple(2.0 / k for k in range(11 if ty == "f" else 23, 2, -2)))
+    p = b.polynomial("d", z, tuple(2.0 / k for k in range(2 * terms + 1, 2, -2)))
     r = b.fma("d", b.mul("d", z, p), s, b.mul("d", s, b.constant("d", 2.0)))
-    # ln 2 in two parts, the first of 32 bits.
-    r = b.fma("d", e, b.constant("d", 1.90821492927058770002e-10), r)
-    r = b.fma("d", e, b.constant("d", 6.93147180369123816490e-01), r)
-    return _narrow(b, ty, r)
+    r = b.fma("d", e, b.constant("d", _LN2_PARTS[1]), r)
+    return b.fma("d", e, b.constant("d", _LN2_PARTS[0]), r)
 
 
-def _log_by(base: float) -> Callable[[Block, str, str], str]:
+# Sums and products of float64 with what rounding took from them (Dekker 1971). No flag allows to contract them.
+
+
+def _plain(b: Block, op: str, x: str, y: str) -> str:
+    return b.op(f"{op} {b.vector('d')} {x}, {y}")
+
+
+def _once(b: Block, x: str, y: str, z: str) -> str:
+    """``x y + z`` rounded once on every machine."""
+    return b.call("llvm.fma", "d", x, y, z)
+
+
+def _two_sum(b: Block, x: str, y: str) -> tuple[str, str]:
+    """Where ``x`` is the larger, or 0."""
+    s = _plain(b, "fadd", x, y)
+    return s, _plain(b, "fsub", y, _plain(b, "fsub", s, x))
+
+
+def _two_product(b: Block, x: str, y: str) -> tuple[str, str]:
+    p = _plain(b, "fmul", x, y)
+    return p, _once(b, x, y, b.negative("d", p))
+
+
+def _double_product(b: Block, x: tuple[str, str], y: tuple[str, str]) -> tuple[str, str]:
+    p, rest = _two_product(b, x[0], y[0])
+    rest = _once(b, x[0], y[1], _once(b, x[1], y[0], rest))
+    return _two_sum(b, p, rest)
+
+
+def _log_parts(b: Block, x: str) -> tuple[str, str]:
+    """The logarithm of positive finite float64 as a sum of two, good to about 63 bits: the series of :func:`_log_series`."""
+    tiny = b.compare("olt", "d", x, b.constant("d", 2.0**-1022))
+    m, e = _mantissa(b, b.select("d", tiny, b.mul("d", x, b.constant("d", 2.0**54)), x))
+    e = b.select("d", tiny, b.sub("d", e, b.constant("d", 54.0)), e)
+    one = b.constant("d", 1.0)
+    f = _plain(b, "fsub", m, one)
+    # s = f / (2 + f), with the rest of the division.
+    d = _two_sum(b, b.constant("d", 2.0), f)
+    sh = b.div("d", f, d[0])
+    off = _once(b, b.negative("d", sh), d[1], _once(b, b.negative("d", sh), d[0], f))
+    s = sh, b.div("d", off, d[0])
+    z = _double_product(b, s, s)
+    # 2 + z (2/3 + z (2/5 + ...)): the last bracket needs no more than float64 has.
+    p = b.polynomial("d", z[0], tuple(2.0 / k for k in range(23, 4, -2)))
+    w = _two_sum(b, b.constant("d", 2.0 / 3.0), _plain(b, "fmul", z[0], p))
+    w = w[0], b.add("d", w[1], b.constant("d", 3.700743415417188e-17))  # what 2/3 lacks
+    w = _double_product(b, z, w)
+    h = _two_sum(b, b.constant("d", 2.0), w[0])
+    r = _double_product(b, s, (h[0], b.add("d", h[1], w[1])))
+    t = _two_sum(b, _plain(b, "fmul", e, b.constant("d", _LN2_PARTS[0])), r[0])
+    rest = _once(b, e, b.constant("d", _LN2_PARTS[1]), b.add("d", t[1], r[1]))
+    return _two_sum(b, t[0], rest)
+
+
+def _log_by(factor: float, rest: float) -> Callable[[Block, str, str], str]:
+    """Logarithms times ``factor + rest``."""
+
     def function(b: Block, ty: str, x: str) -> str:
         if ty == "f":
-            wide = b.mul("d", _log(b, "d", _wide(b, ty, x)), b.constant("d", 1.0 / math.log(base)))
-            return _narrow(b, ty, wide)
-        return b.mul(ty, _log(b, ty, x), b.constant(ty, 1.0 / math.log(base)))
+            return _narrow(b, ty, b.mul("d", _log_wide(b, _wide(b, ty, x)), b.constant("d", factor)))
+        parts = _double_product(b, _log_parts(b, x), (b.constant("d", factor), b.constant("d", rest)))
+        return _log_ends(b, ty, x, b.add(ty, *parts))
 
     return function
 
 
 def _log1p(b: Block, ty: str, x: str) -> str:
+    small = b.compare("olt", ty, _absolute(b, ty, x), b.constant(ty, 1e-8 if ty == "f" else 1e-17))
+    one = b.constant("d", 1.0)
     if ty == "f":
-        found = _narrow(b, ty, _log(b, "d", b.add("d", _wide(b, ty, x), b.constant("d", 1.0))))
-        small = b.compare("olt", ty, _absolute(b, ty, x), b.constant(ty, 1e-8))
+        found = _narrow(b, ty, _log_wide(b, b.add("d", _wide(b, ty, x), one)))
         return b.select(ty, small, x, found)
-    one = b.constant(ty, 1.0)
-    u = b.add(ty, x, one)
-    logarithm = _log(b, ty, u)
-    found = b.div(ty, b.mul(ty, logarithm, x), b.sub(ty, u, one))
-    found = b.select(ty, b.compare("oeq", ty, u, one), x, found)
-    ends = b.compare("ueq", ty, _absolute(b, ty, logarithm), b.constant(ty, math.inf))
-    return b.select(ty, ends, logarithm, found)
+    # The logarithm of the rounded sum u, and what rounding took: ln(u + c) = ln u + c / u.
+    u = _plain(b, "fadd", x, one)
+    less = _plain(b, "fsub", u, x)
+    c = _plain(b, "fadd", _plain(b, "fsub", x, _plain(b, "fsub", u, less)), _plain(b, "fsub", one, less))
+    high, low = _log_parts(b, u)
+    found = b.add(ty, high, b.add(ty, low, b.div(ty, c, u)))
+    return b.select(ty, small, x, _log_ends(b, ty, u, found))
 
 
 def _pow(b: Block, ty: str, x: str, y: str) -> str:
-    """Of positive ``x`` ``e^(y ln x)`` in double; whole powers of negative numbers have their sign."""
+    """``e^(y ln |x|)`` in double, of float64 with the logarithm in two parts; whole powers of negatives have their sign."""
     p, q = _wide(b, ty, x), _wide(b, ty, y)
-    found = _exp(b, "d", b.mul("d", q, _log(b, "d", _absolute(b, "d", p))))
-    zero, one = b.constant("d", 0.0), b.constant("d", 1.0)
-    negative = b.compare("olt", "d", p, zero)
+    size, zero, one, inf = _absolute(b, "d", p), *(b.constant("d", v) for v in (0.0, 1.0, math.inf))
+    if ty == "f":
+        found = _exp(b, "d", b.mul("d", q, _log_wide(b, size)))
+    else:
+        high, low = _log_parts(b, size)
+        high = _log_ends(b, "d", size, high)
+        product = _plain(b, "fmul", q, high)
+        rest = _once(b, q, low, _once(b, q, high, b.negative("d", product)))
+        ends = b.compare("ult", "d", _absolute(b, "d", product), b.constant("d", 800.0))  # else 0 or infinite
+        found = _exp(b, "d", product, b.select("d", ends, rest, zero))
     whole = b.compare("oeq", "d", b.call("llvm.rint", "d", q), q)
     half = b.mul("d", q, b.constant("d", 0.5))
     odd = b.op(f"and <{WIDTH} x i1> {whole}, " + b.compare("one", "d", b.call("llvm.rint", "d", half), half))
     mirrored = b.select("d", odd, b.negative("d", found), found)
-    missing = b.op(
-        f"and <{WIDTH} x i1> {b.compare('one', 'd', b.call('llvm.rint', 'd', q), q)}, "
-        + b.compare("ogt", "d", p, b.constant("d", -math.inf))
-    )
+    # There is no broken power of a negative number; of -0 and of minus infinity it is that of the number without sign.
+    some = b.op(f"and <{WIDTH} x i1> {b.compare('olt', 'd', p, zero)}, {b.compare('olt', 'd', size, inf)}")
+    broken = b.compare("one", "d", b.call("llvm.rint", "d", q), q)
+    missing = b.op(f"and <{WIDTH} x i1> {broken}, {some}")
     mirrored = b.select("d", missing, b.constant("d", math.nan), mirrored)
-    found = b.select("d", negative, mirrored, found)
-    found = b.select("d", b.compare("oeq", "d", p, one), one, found)
-    found = b.select("d", b.compare("oeq", "d", q, zero), one, found)
+    found = b.select("d", _negative(b, "d", p), mirrored, found)
+    endless = b.compare("oeq", "d", _absolute(b, "d", q), inf)
+    always = b.op(f"and <{WIDTH} x i1> {endless}, {b.compare('oeq', 'd', size, one)}")  # (-1)^inf, as C has it
+    for condition in (always, b.compare("oeq", "d", p, one), b.compare("oeq", "d", q, zero)):
+        found = b.select("d", condition, one, found)
     return _narrow(b, ty, found)
 
 
@@ -336,8 +419,10 @@ def _other_leg(b: Block, ty: str, x: str) -> str:
 
 
 def _sigmoid(b: Block, ty: str, x: str) -> str:
+    e = _exp(b, ty, b.negative(ty, _absolute(b, ty, x)))  # does not overflow
     one = b.constant(ty, 1.0)
-    return b.div(ty, one, b.add(ty, one, _exp(b, ty, b.negative(ty, x))))
+    top = b.select(ty, b.compare("olt", ty, x, b.constant(ty, 0.0)), e, one)
+    return b.div(ty, top, b.add(ty, one, e))
 
 
 def _tanh(b: Block, ty: str, x: str) -> str:
@@ -379,8 +464,8 @@ FUNCTIONS: dict[str, Callable[..., str]] = {
     "exp2": _exp2,
     "expm1": _expm1,
     "log": _log,
-    "log2": _log_by(2.0),
-    "log10": _log_by(10.0),
+    "log2": _log_by(1.4426950408889634, 2.0355273740931033e-17),
+    "log10": _log_by(0.4342944819032518, 1.098319650216765e-17),
     "log1p": _log1p,
     "pow": _pow,
     "sinh": _sinh,

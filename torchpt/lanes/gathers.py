@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchpt.lanes.graph import DTYPES, Unsupported
@@ -58,7 +59,7 @@ def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
     if axes != list(range(len(axes))) or tracer.is_traced(table):
         raise Unsupported(f"a look-up by {len(axes)} indices")
     graph, ty = tracer.graph, DTYPES[table.dtype]
-    columns = np.broadcast_arrays(*(tracer.get(index).nodes for index in indices[: len(axes)]))
+    columns: Any = np.broadcast_arrays(*(tracer.get(index).nodes for index in indices[: len(axes)]))
     rest = tuple(table.shape[len(axes) :])
     width, number = math.prod(rest), tracer.table(table, None)
     found = np.empty((*columns[0].shape, *rest), object)
@@ -67,8 +68,12 @@ def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
         for axis, column in enumerate(columns):
             place = graph.binary("mul", "i", place, graph.constant("i", table.shape[axis])) if axis else place
             place = graph.binary("add", "i", place, graph.cast(column[at], "i"))
-        for k, inner in enumerate(np.ndindex(*rest)):
-            found[(*at, *inner)] = graph.node("gather", ty, place, extra=(number, width, k))
+        place = graph.binary("mul", "i", place, graph.constant("i", width))
+        for k, inner in enumerate(
+            np.ndindex(*rest)
+        ):  # entries of the table laid flat, where each is brought into range
+            one = graph.binary("add", "i", place, graph.constant("i", k))
+            found[(*at, *inner)] = graph.node("gather", ty, one, extra=(number, 1, 0))
     tracer.put(out, found)
 
 
@@ -112,7 +117,14 @@ def _gather(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor
     tracer.put(out, np.moveaxis(found, 0, axis))
 
 
-@handles("searchsorted", "bucketize")
+@handles("bucketize")
+def _bucketize(
+    tracer: Tracer, out: Tensor, values: Tensor, table: Tensor, out_int32: bool = False, right: bool = False
+) -> None:
+    _searchsorted(tracer, out, table, values, right=right)
+
+
+@handles("searchsorted")
 def _searchsorted(
     tracer: Tracer,
     out: Tensor,
@@ -144,19 +156,19 @@ def _matrix(tracer: Tracer, tensor: Tensor) -> np.ndarray:
 
 
 def _product(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, start: Tensor | None) -> None:
-    graph, ty = tracer.graph, DTYPES[out.dtype]
+    graph, ty = tracer.graph, "L" if out.dtype == torch.int64 else DTYPES[out.dtype]
     if (tracer.is_traced(a) and tracer.get(a).lane == 1) or (tracer.is_traced(b) and tracer.get(b).lane == 0):
         raise Unsupported("a sum over lanes")
     x, y = _matrix(tracer, a), _matrix(tracer, b)
     lane = tracer.lane_axis(out.shape)
     found = np.empty(tracer.inner(out.shape, lane), object)
-    begin = None if start is None else np.broadcast_to(tracer.get(start).nodes, found.shape)
+    begin: Any = None if start is None else np.broadcast_to(tracer.get(start).nodes, found.shape)
     for i, j in np.ndindex(*found.shape):
-        total = None if begin is None else begin[i, j]
+        total = None if begin is None else graph.cast(begin[i, j], ty)
         for k in range(x.shape[1]):
-            term = graph.binary("mul", ty, x[i, k], y[k, j])
+            term = graph.binary("mul", ty, graph.cast(x[i, k], ty), graph.cast(y[k, j], ty))
             total = term if total is None else graph.binary("add", ty, total, term)
-        found[i, j] = total
+        found[i, j] = graph.constant(ty, 0) if total is None else total
     tracer.put(out, found, lane)
 
 

@@ -1,8 +1,8 @@
 """A stage as a graph of scalar operations: each node stands for one number in every lane.
 
 Types are one letter: ``f`` float32, ``d`` float64, ``i`` int32, ``b`` bool, ``u`` uint8 held in 32 bits. An int64 tensor has
-nodes of two types: ``l`` where it is an index and 32 bits hold it, ``L`` where it was made of int32 lanes, so that products of
-64 bits may be meant.
+nodes of two types: ``l`` where it is an index and 32 bits hold it, ``L`` where it is a product, a power or shifted, or was made
+of int32 lanes, so that all 64 bits may be meant. (Of a product that is used as an index LLVM computes 32 bits alone.)
 """
 
 from __future__ import annotations
@@ -16,22 +16,30 @@ import torch
 
 __all__ = ["BYTES", "DTYPES", "FLOATS", "INTEGERS", "Graph", "Unsupported"]
 
-#: Node type of each dtype; int64 may also be ``L``.
-DTYPES = {
-    torch.float32: "f",
-    torch.float64: "d",
-    torch.int32: "i",
-    torch.int64: "l",
-    torch.bool: "b",
-    torch.uint8: "u",
-}
-FLOATS, INTEGERS = "fd", "ilLu"
-#: Bytes of an element in memory outside of the arena.
-BYTES = {"f": 4, "d": 8, "i": 4, "l": 8, "L": 8, "b": 1, "u": 1}
-
 
 class Unsupported(Exception):
     """A stage does something that the lane compiler does not know; the message names it."""
+
+
+class _Types(dict[torch.dtype, str]):
+    def __missing__(self, dtype: torch.dtype) -> str:
+        raise Unsupported(f"numbers of type {dtype}")
+
+
+#: Node type of each dtype; int64 may also be ``L``.
+DTYPES = _Types(
+    {
+        torch.float32: "f",
+        torch.float64: "d",
+        torch.int32: "i",
+        torch.int64: "l",
+        torch.bool: "b",
+        torch.uint8: "u",
+    }
+)
+FLOATS, INTEGERS = "fd", "ilLu"
+#: Bytes of an element in memory outside of the arena.
+BYTES = {"f": 4, "d": 8, "i": 4, "l": 8, "L": 8, "b": 1, "u": 1}
 
 
 class Graph:
@@ -65,11 +73,16 @@ class Graph:
 
     def constant(self, ty: str, value: float | int | bool) -> int:
         """A number that is the same in all lanes and scenes."""
-        if ty == "f":
-            value = float(np.float32(value)) if math.isfinite(value) else float(value)
         if ty in FLOATS:
-            return self.node("const", ty, extra=struct.pack("<d", float(value)))  # by its bits: -0.0, NaN
-        return self.node("const", ty, extra=bool(value) if ty == "b" else int(value))
+            with np.errstate(over="ignore"):
+                value = float(np.float32(value) if ty == "f" else value)
+            return self.node("const", ty, extra=struct.pack("<d", value))  # by its bits: -0.0, NaN
+        if ty == "b":
+            return self.node("const", ty, extra=bool(value))
+        value = int(value)
+        if ty == "i":
+            value = (value + (1 << 31)) % (1 << 32) - (1 << 31)
+        return self.node("const", ty, extra=value % 256 if ty == "u" else value)
 
     def value(self, node: int) -> Any:
         """The number of a constant; None for other nodes."""
@@ -86,7 +99,7 @@ class Graph:
         value = self.value(node)
         if value is not None and not (own in FLOATS and ty in INTEGERS and not math.isfinite(value)):
             return self.constant(ty, value != 0 if ty == "b" else value)
-        if own in "ilu" and ty in "ilu":
+        if own in "ilu" and ty in "il":
             return self.node("retype", ty, node)
         return self.node("cast", ty, node)
 
@@ -111,7 +124,12 @@ class Graph:
         if ty in INTEGERS and op == "add" and a == 0:
             return y
         if ty in FLOATS:
-            if op == "div" and b and abs(math.frexp(b)[0]) == 0.5 and math.isfinite(1.0 / b):
+            if op in ("max", "min"):
+                for constant in (a, b):
+                    if constant is not None and math.isnan(constant):
+                        return self.constant(ty, constant)
+            top = 2.0**127 if ty == "f" else 2.0**1023
+            if op == "div" and b and abs(math.frexp(b)[0]) == 0.5 and 1.0 / top <= abs(b) and abs(1.0 / b) <= top:
                 return self.node("mul", ty, x, self.constant(ty, 1.0 / b))  # a power of two: exact
             if a is not None and b is not None and op in ("add", "sub", "mul"):
                 real = np.float32 if ty == "f" else np.float64

@@ -390,7 +390,7 @@ def _sorted(graph: Graph, needed: list[int]) -> Block:
         at = block.call("llvm.umin", "i", block.add("i", "%base", block.splat("i", "%step")), last)
         entry = block.gather(element, "%table", at)
         below = block.compare(
-            ("ole" if right else "olt") if ty in "fd" else ("sle" if right else "slt"), ty, entry, "%value"
+            ("ule" if right else "ult") if ty in "fd" else ("sle" if right else "slt"), ty, entry, "%value"
         )
         further = block.add("i", "%base", block.splat("i", "%half"))
         block.lines += [

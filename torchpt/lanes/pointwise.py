@@ -39,13 +39,19 @@ def _number(graph: Any, x: float | int | bool) -> int:
 def _type(tracer: Tracer, dtype: torch.dtype, *nodes: int) -> str:
     """The type in which numbers of a dtype are computed from nodes."""
     ty = DTYPES[dtype]
-    return "L" if ty == "l" and any(tracer.graph.type(node) == "L" for node in nodes) else ty
+    return "L" if ty == "l" and any(tracer.graph.type(node) in "iL" for node in nodes) else ty
+
+
+#: Operations after which 32 bits may no longer hold what they held before.
+_GROWS = ("mul", "shl")
 
 
 def _binary(op: str) -> Any:
     def handler(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
         def function(x: int, y: int) -> int:
             ty = _type(tracer, out.dtype, x, y)
+            if ty == "l" and op in _GROWS:
+                ty = "L"
             return tracer.graph.binary(op, ty, tracer.graph.cast(x, ty), tracer.graph.cast(y, ty))
 
         _apply(tracer, out, function, a, b)
@@ -79,11 +85,7 @@ def _mul(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
 def _div(tracer: Tracer, out: Tensor, a: Any, b: Any, rounding_mode: str | None = None) -> None:
     if rounding_mode not in (None, "floor", "trunc"):
         raise Unsupported(f"division with rounding mode {rounding_mode}")
-    if rounding_mode == "trunc":
-        if not out.dtype.is_floating_point:
-            return _binary("truncdiv")(tracer, out, a, b)
-        raise Unsupported("division of floats with rounding mode trunc")
-    _binary("floordiv" if rounding_mode else "div")(tracer, out, a, b)
+    _binary({None: "div", "floor": "floordiv", "trunc": "truncdiv"}[rounding_mode])(tracer, out, a, b)
 
 
 def _sum(op: str) -> Any:
@@ -115,7 +117,7 @@ def _rsub(tracer: Tracer, out: Tensor, a: Any, b: Any, alpha: float = 1) -> None
 
 @handles("addcmul")
 def _addcmul(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, c: Tensor, value: float = 1) -> None:
-    graph, ty = tracer.graph, DTYPES[out.dtype]
+    graph, ty = tracer.graph, "L" if out.dtype == torch.int64 else DTYPES[out.dtype]
 
     def function(x: int, y: int, z: int) -> int:
         x, y, z = (graph.cast(w, ty) for w in (x, y, z))
@@ -204,7 +206,7 @@ def _softplus(tracer: Tracer, out: Tensor, a: Tensor, beta: float = 1, threshold
 
 @handles("pow")
 def _pow(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
-    graph, ty = tracer.graph, DTYPES[out.dtype]
+    graph, ty = tracer.graph, "L" if out.dtype == torch.int64 else DTYPES[out.dtype]
 
     def power(x: int, n: int) -> int:
         half = power(x, n // 2) if n > 1 else x
@@ -216,6 +218,8 @@ def _pow(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
     def function(x: int, y: int) -> int:
         x, y = graph.cast(x, ty), graph.cast(y, ty)
         n = graph.value(y)
+        if n == 0:
+            return graph.constant(ty, 1)
         if n == 0.5:
             return graph.node("sqrt", ty, x)
         if n is not None and float(n).is_integer() and 1 <= n <= 8:
@@ -245,6 +249,8 @@ def _not(tracer: Tracer, out: Tensor, a: Tensor) -> None:
 @handles("isinf")
 def _isinf(tracer: Tracer, out: Tensor, a: Tensor) -> None:
     graph, ty = tracer.graph, DTYPES[a.dtype]
+    if ty not in FLOATS:
+        return tracer.put(out, np.array(graph.constant("b", False), object))
     _apply(tracer, out, lambda x: graph.node("eq", "b", graph.node("abs", ty, x), graph.constant(ty, math.inf)), a)
 
 
@@ -307,7 +313,7 @@ def _clamp(tracer: Tracer, out: Tensor, a: Tensor, low: Any = None, high: Any = 
 
 
 @handles("_to_copy", "to")
-def _to_copy(tracer: Tracer, out: Tensor, a: Tensor, **_: Any) -> None:
+def _to_copy(tracer: Tracer, out: Tensor, a: Tensor, *_: Any, **__: Any) -> None:
     def function(x: int) -> int:
         own, ty = tracer.graph.type(x), DTYPES[out.dtype]
         if ty == "l" and own in "iL":
@@ -348,21 +354,36 @@ def _reduce(op: str, boolean: bool = False) -> Any:
         for k in reversed(_axes(axis, nodes.ndim)):
             if k == value.lane:
                 raise Unsupported("a reduction over lanes")
-            parts = [np.take(nodes, j, k) for j in range(nodes.shape[k])]
-            total = _cast_all(tracer, parts[0], "b" if boolean else DTYPES[out.dtype])
+            parts: list[Any] = [np.take(nodes, j, k) for j in range(nodes.shape[k])]
+            if not parts:
+                shape = (*nodes.shape[:k], *nodes.shape[k + 1 :])
+                parts = [np.full(shape, _nothing(graph, op, DTYPES[out.dtype]), object)]
+            total = _cast_all(tracer, parts[0], "b" if boolean else _sums(op, out))
             for part in parts[1:]:
-                joined = np.empty(total.shape, object)
+                joined: Any = np.empty(total.shape, object)
                 for at in np.ndindex(*total.shape):
                     ty = "b" if boolean else _type(tracer, out.dtype, total[at], part[at])
                     joined[at] = graph.binary(op, ty, graph.cast(total[at], ty), graph.cast(part[at], ty))
                 total = joined
             nodes = np.expand_dims(total, k) if keepdim else total
-        tracer.put(out, nodes)
+        tracer.put(out, _cast_all(tracer, nodes, DTYPES[out.dtype]))
 
     return handler
 
 
-def _cast_all(tracer: Tracer, nodes: np.ndarray, ty: str) -> np.ndarray:
+def _sums(op: str, out: Tensor) -> str:
+    """The type in which a reduction is computed."""
+    return "L" if out.dtype == torch.int64 and op in ("add", "mul") else DTYPES[out.dtype]
+
+
+def _nothing(graph: Any, op: str, ty: str) -> int:
+    """What a reduction of no numbers gives."""
+    if op not in ("add", "mul", "and", "or"):
+        raise Unsupported("the largest or smallest of no numbers")
+    return graph.constant(ty, 1 if op in ("mul", "and") else 0)
+
+
+def _cast_all(tracer: Tracer, nodes: Any, ty: str) -> Any:
     found = np.empty(nodes.shape, object)
     for at in np.ndindex(*nodes.shape):
         node = nodes[at]
@@ -387,7 +408,7 @@ def _mean(tracer: Tracer, out: Tensor, a: Tensor, axis: Any = None, keepdim: boo
 
 @handles("cumsum")
 def _cumsum(tracer: Tracer, out: Tensor, a: Tensor, axis: int, dtype: Any = None) -> None:
-    value, graph, ty = tracer.get(a), tracer.graph, DTYPES[out.dtype]
+    value, graph, ty = tracer.get(a), tracer.graph, _sums("add", out)
     axis %= a.dim()
     if axis == value.lane:
         raise Unsupported("a sum over lanes")

@@ -108,9 +108,11 @@ def laid_out(tensor: Tensor, axis: int | None) -> Tensor:
     """A table as kernels read it: entries first, contiguous, integers and truth values in 32 bits.
 
     Raises:
-        Unsupported: numbers beyond 32 bits.
+        Unsupported: numbers beyond 32 bits, or more of them than 32 bits count.
     """
     tensor = tensor.detach()
+    if tensor.numel() >= 1 << 31:
+        raise Unsupported(f"a table of {tensor.numel()} numbers")
     if axis is not None and tensor.dim() > 1:
         tensor = tensor.movedim(axis, 0)
     if tensor.dtype == torch.int64:
@@ -161,7 +163,11 @@ def holds(program: Program, leaves: Mapping[str, Tensor]) -> bool:
     if not program.guards:
         return True
     tensor = replayed(program.steps, program.held, leaves)
-    return all(tensor(guard.source).item() == guard.value for guard in program.guards)
+
+    def number(value: Any) -> Any:
+        return value.item() if isinstance(value, Tensor) else value
+
+    return all(number(tensor(guard.source)) == guard.value for guard in program.guards)
 
 
 def signature(record: Any) -> Any:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchpt.lanes.graph import DTYPES, Graph, Unsupported
@@ -124,7 +125,7 @@ class Guard:
 class Value:
     """A traced tensor: an array of nodes in which the lanes' axis has length 1."""
 
-    nodes: np.ndarray
+    nodes: Any  # an array of objects, whose elements numpy's types do not tell from arrays
     lane: int | None
 
 
@@ -161,15 +162,18 @@ class Tracer(TorchDispatchMode):
         self._sources = {key: Source("leaf", path) for key, (path, _) in leaves.items()}
         self._tensors: dict[Table, Tensor] = {}
         self._numbers: dict[Table, int] = {}
+        self._reads = _Reads(self)
         self._keep: list[Any] = [leaves]  # ids stay those of the same tensors as long as these live
 
     def __enter__(self) -> Tracer:
         _active.append(self)
+        self._reads.__enter__()
         return super().__enter__()
 
     def __exit__(self, *error: Any) -> None:
         _active.remove(self)
         super().__exit__(*error)
+        self._reads.__exit__(*error)
 
     # -- inputs and results
 
@@ -198,6 +202,10 @@ class Tracer(TorchDispatchMode):
     def nodes(self, tensor: Tensor) -> list[int]:
         """The nodes of a result ``(..., lanes)``, its leading axes flattened."""
         value = self.get(tensor)
+        if value.lane is not None and value.nodes.shape[value.lane] != 1:
+            raise Unsupported(
+                f"a result of shape {tuple(tensor.shape)} with several numbers of a lane along its lanes' axis"
+            )
         if value.lane is None and tensor.dim() and tensor.shape[-1] == 1:  # the same number for all lanes
             return [int(node) for node in value.nodes.reshape(-1)]
         if value.lane != tensor.dim() - 1:
@@ -244,8 +252,6 @@ class Tracer(TorchDispatchMode):
         lane = self.lane_axis(tensor.shape)
         if lane is not None:
             return self._spread(tensor, lane)
-        if tensor.dim() == 0 and id(tensor) not in self._sources:
-            return Value(np.array(self.graph.constant(DTYPES[tensor.dtype], tensor.item()), object), None)
         if tensor.numel() > 4096:
             raise Unsupported(f"a table of shape {tuple(tensor.shape)} read whole in every lane")
         table, ty = self.table(tensor, None), DTYPES[tensor.dtype]
@@ -257,7 +263,7 @@ class Tracer(TorchDispatchMode):
     def _spread(self, tensor: Tensor, lane: int) -> Value:
         """A table that was expanded to lanes: the same number in each."""
         first = torch.ops.aten.narrow.default(tensor, lane, 0, 1)
-        if not bool(((tensor == first) | (tensor != tensor)).all()):
+        if not bool(((tensor == first) | ((tensor != tensor) & (first != first))).all()):
             raise Unsupported("a table as long as the lanes that the stage is traced on")
         self._record(torch.ops.aten.narrow.default, (tensor, lane, 0, 1), {}, first)
         value = Value(self.get(first).nodes, lane)
@@ -297,10 +303,15 @@ class Tracer(TorchDispatchMode):
             return out
         out = func(*_safe(name, args) if traced else args, **kwargs)
         if traced:
-            handler = HANDLERS.get(name)
+            handler = HANDLERS.get(name) if func.namespace == "aten" else None
             if handler is None:
                 raise Unsupported(f"the operator {name}")
-            handler(self, out, *args, **kwargs)
+            try:
+                handler(self, out, *args, **kwargs)
+            except TypeError as error:  # arguments that the handler does not take
+                raise Unsupported(
+                    f"the operator {func} with {', '.join(map(str, kwargs)) or 'these arguments'}"
+                ) from error
         elif not given and isinstance(out, Tensor) and self.lane_axis(out.shape) is not None:
             self._factory(name, out)
         else:
@@ -310,6 +321,8 @@ class Tracer(TorchDispatchMode):
     def _factory(self, name: str, out: Tensor) -> None:
         ty = DTYPES[out.dtype]
         if name == "arange":
+            if out.shape[0] != self.lanes or out[0] != 0 or out[1] != 1:
+                raise Unsupported("numbers of lanes that do not count from 0 by 1")
             self.put(out, np.array([self.graph.node("iota", ty)], object))
         elif name in ("full", "ones", "zeros", "scalar_tensor"):
             self.put(out, np.array(self.graph.constant(ty, out.reshape(-1)[0].item()), object))
@@ -328,8 +341,24 @@ class Tracer(TorchDispatchMode):
         self.steps.append(Step(func, tuple(map(replaced, args)), {k: replaced(v) for k, v in kwargs.items()}))
         self._keep.append(out)
         for item, tensor in enumerate(out if isinstance(out, list | tuple) else [out]):
+            source = Source("step", number, item if isinstance(out, list | tuple) else -1)
             if isinstance(tensor, Tensor):
-                self._sources[id(tensor)] = Source("step", number, item if isinstance(out, list | tuple) else -1)
+                self._sources[id(tensor)] = source
+            else:  # a plain number: whether two tables are equal
+                self.guards.append(Guard(source, tensor))
+
+
+class _Reads(TorchFunctionMode):
+    """Notices lanes that leave torch for Python by ways that call no operator."""
+
+    def __init__(self, tracer: Tracer) -> None:
+        super().__init__()
+        self.tracer = tracer
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if getattr(func, "__name__", "") in ("tolist", "numpy", "__array__") and self.tracer.is_traced(args[0]):
+            raise Unsupported("numbers of lanes asked for by Python")
+        return func(*args, **(kwargs or {}))
 
 
 def _flat(values: Any) -> Iterable[Any]:
@@ -351,6 +380,8 @@ def _safe(name: str, args: Any) -> Any:
         return args[0], args[1], args[2].clamp(0, max(args[0].shape[args[1]] - 1, 0)), *args[3:]
     if name == "index":
         table, indices = args
+        if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in indices):
+            raise Unsupported("a look-up by truth values")
         sizes = table.shape
         return table, [None if i is None else i.clamp(0, max(sizes[k] - 1, 0)) for k, i in enumerate(indices)]
     return args

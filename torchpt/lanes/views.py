@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from torchpt.lanes.tracing import Tracer, handles
 __all__: list[str] = []
 
 
-@handles("detach", "alias", "clone", "contiguous", "lift_fresh", "view_as_real")
+@handles("detach", "alias", "clone", "contiguous", "lift_fresh")
 def _same(tracer: Tracer, out: Tensor, a: Tensor, *_: Any, **__: Any) -> None:
     tracer.alias(out, a)
 
@@ -26,7 +27,13 @@ def _select(tracer: Tracer, out: Tensor, a: Tensor, axis: int, index: int) -> No
     tracer.put(out, np.take(value.nodes, index, axis % a.dim()))
 
 
-@handles("slice", "narrow")
+@handles("narrow")
+def _narrow(tracer: Tracer, out: Tensor, a: Tensor, axis: int, start: int, length: int) -> None:
+    start %= max(a.shape[axis], 1)
+    _slice(tracer, out, a, axis, start, start + length)
+
+
+@handles("slice")
 def _slice(
     tracer: Tracer, out: Tensor, a: Tensor, axis: int = 0, start: Any = None, end: Any = None, step: int = 1
 ) -> None:
@@ -102,8 +109,12 @@ def _expand(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any, implicit: bool =
 
 @handles("view", "_unsafe_view", "reshape")
 def _view(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any) -> None:
-    lane = tracer.lane_axis(out.shape)
-    tracer.put(out, tracer.get(a).nodes.reshape(tracer.inner(out.shape, lane)))
+    value, lane = tracer.get(a), tracer.lane_axis(out.shape)
+    if value.lane is not None and lane is not None:
+        # Lanes are next to each other along their axis: what follows it must stay what follows.
+        if math.prod(a.shape[value.lane + 1 :]) != math.prod(out.shape[lane + 1 :]):
+            raise Unsupported(f"lanes of shape {tuple(a.shape)} mixed into shape {tuple(out.shape)}")
+    tracer.put(out, value.nodes.reshape(tracer.inner(out.shape, lane)))
 
 
 def _cast(tracer: Tracer, tensor: Tensor, out: Tensor) -> np.ndarray:

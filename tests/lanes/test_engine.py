@@ -1,0 +1,214 @@
+"""The cache of machine code: what is kept, what is trusted, and what is made again."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchpt.lanes import engine
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and modes of files here")
+
+#: Two kernels; the numbers that they give, how many were compiled and how many loaded.
+_SCRIPT = """
+import torch
+from torchpt.lanes import engine
+from torchpt.lanes.function import lanewise
+x = torch.arange(4.0)
+found = [lanewise(lambda x: [x * 2 + 1], [x])(x)[0].tolist(), lanewise(lambda x: [x.exp() > 3], [x])(x)[0].tolist()]
+assert found == [[1, 3, 5, 7], [False, False, True, True]], found
+print(*engine.counts())
+"""
+
+
+def start(folder: Path | str, **environment: str) -> subprocess.Popen[str]:
+    given = {**os.environ, "TORCHPT_CACHE": str(folder), **environment}
+    pipe = subprocess.PIPE
+    return subprocess.Popen([sys.executable, "-c", _SCRIPT], env=given, stdout=pipe, stderr=pipe, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, int]:
+    out, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    compiled, loaded = map(int, out.split())
+    return compiled, loaded
+
+
+def entries(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.o"))
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """The engine of this process as if nothing had been asked of it, with a cache of its own."""
+    folder = tmp_path / "kernels"
+    monkeypatch.setenv("TORCHPT_CACHE", str(folder))
+    monkeypatch.setattr(engine, "_functions", {})
+    monkeypatch.setattr(engine, "_state", {**engine._state, "compiled": 0, "loaded": 0})
+    engine._state.pop("folder", None)
+    return folder
+
+
+def ir(k: int = 0) -> str:
+    return f"define void @kernel(ptr %a, i64 %n) {{\n  store i64 {k}, ptr %a\n  ret void\n}}\n"
+
+
+def again() -> None:
+    """Forget what this process has loaded, as a new one would."""
+    engine._functions.clear()
+    engine._state.pop("folder", None)
+
+
+def test_second_process_compiles_nothing(tmp_path):
+    folder = tmp_path / "deep" / "kernels"
+    assert finish(start(folder)) == (2, 0)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert len(entries(folder)) == 2 and len(list(folder.iterdir())) == 2
+    assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in entries(folder))
+    before = [(path.name, path.stat().st_mtime_ns) for path in entries(folder)]
+    assert finish(start(folder)) == (0, 2)
+    assert [(path.name, path.stat().st_mtime_ns) for path in entries(folder)] == before
+
+
+def test_two_processes_at_once(tmp_path):
+    processes = [start(tmp_path / "kernels") for _ in range(2)]
+    assert all(sum(finish(process)) == 2 for process in processes)
+    assert len(list((tmp_path / "kernels").iterdir())) == 2  # nothing half written is left
+    assert finish(start(tmp_path / "kernels")) == (0, 2)
+
+
+def test_within_a_process_a_kernel_is_made_once(here):
+    first = engine.compiled(ir())
+    assert engine.compiled(ir()) is first and engine.counts() == (1, 0)
+    again()
+    assert engine.compiled(ir()).code == first.code and engine.counts() == (1, 1)
+    engine.compiled(ir(1))
+    assert engine.counts() == (2, 1)
+
+
+def test_targets_have_entries_of_their_own(here):
+    engine.compiled(ir(), engine.Target("generic", ""))
+    engine.compiled(ir())
+    assert engine.counts() == (2, 0) and len(entries(here)) == 2
+
+
+def test_switched_off(here, monkeypatch):
+    monkeypatch.setenv("TORCHPT_CACHE", "")
+    assert engine.cache_folder() is None
+    engine.compiled(ir())
+    again()
+    engine.compiled(ir())
+    assert engine.counts() == (2, 0) and not here.exists()
+
+
+@pytest.mark.parametrize("mode", [0o755, 0o770, 0o701, 0o720])
+def test_folder_that_others_may_enter(here, mode):
+    here.mkdir()
+    here.chmod(mode)
+    assert engine.cache_folder() is None
+    engine.compiled(ir())
+    assert engine.counts() == (1, 0) and not entries(here)
+
+
+def test_no_folder_can_be_made(here, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file" / "kernels"):
+        monkeypatch.setenv("TORCHPT_CACHE", str(place))
+        again()
+        assert engine.cache_folder() is None
+        engine.compiled(ir())
+    assert engine.counts() == (2, 0)
+
+
+def test_folder_that_cannot_be_written(here):
+    engine.compiled(ir())
+    again()
+    here.chmod(0o500)
+    try:
+        engine.compiled(ir())
+        assert engine.counts() == (1, 1)  # what is there is used
+        engine.compiled(ir(1))
+        assert engine.counts() == (2, 1)  # and what is not is compiled
+    finally:
+        here.chmod(0o700)
+
+
+def test_disk_full(here, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    engine.compiled(ir())
+    assert engine.counts() == (1, 0) and not list(here.iterdir())  # the temporary file is gone
+
+
+@pytest.mark.parametrize("what", ["flipped", "truncated", "empty", "another's", "folder", "writable", "link"])
+def test_damaged_entries_are_made_again(here, what):
+    code = engine.compiled(ir()).code
+    (path,) = entries(here)
+    content = path.read_bytes()
+    if what == "flipped":
+        path.write_bytes(content[:-5] + bytes([content[-5] ^ 1]) + content[-4:])
+    elif what == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    elif what == "empty":
+        path.write_bytes(b"")
+    elif what == "another's":  # a sound entry under another's name
+        engine.compiled(ir(1))
+        path.write_bytes(next(other for other in entries(here) if other != path).read_bytes())
+    elif what == "folder":
+        path.unlink()
+        path.mkdir()
+    elif what == "writable":
+        path.chmod(0o666)
+    else:
+        path.rename(here / "elsewhere")
+        path.symlink_to(here / "elsewhere")
+    again()
+    compiled, loaded = engine.counts()
+    assert engine.compiled(ir()).code == code
+    assert engine.counts() == (compiled + 1, loaded)
+    if what != "folder":
+        assert path.read_bytes() == content and not path.is_symlink() and stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can give files away")
+@pytest.mark.parametrize("what", ["folder", "entry", "link"])
+def test_owner(here, tmp_path, what):
+    engine.compiled(ir())
+    (path,) = entries(here)
+    again()
+    if what == "link":
+        here.rename(tmp_path / "elsewhere")
+        here.symlink_to(tmp_path / "elsewhere")
+        assert engine.cache_folder() == here  # this user's own link to this user's own folder
+        os.chown(here, 12345, 12345, follow_symlinks=False)
+    else:
+        os.chown(here if what == "folder" else path, 12345, 12345)
+    assert (engine.cache_folder() is None) == (what != "entry")
+    engine.compiled(ir())
+    assert engine.counts() == (2, 0)
+
+
+def test_places(tmp_path, monkeypatch):
+    monkeypatch.delenv("TORCHPT_CACHE", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert engine.cache_folder() == tmp_path / "cache" / "torchpt" / "kernels"
+    monkeypatch.chdir(tmp_path)
+    for relative in ("", "cache"):  # not a path to rely on
+        monkeypatch.setenv("XDG_CACHE_HOME", relative)
+        assert engine.cache_folder() == tmp_path / "home" / ".cache" / "torchpt" / "kernels"
+    monkeypatch.setenv("TORCHPT_CACHE", "own")
+    assert engine.cache_folder() == tmp_path / "own"
+
+
+def test_an_error_of_llvm_is_not_kept(here):
+    with pytest.raises(RuntimeError, match="parsing"):
+        engine.compiled("define void @kernel(")
+    assert engine.counts() == (0, 0) and not entries(here)
