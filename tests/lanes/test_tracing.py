@@ -105,7 +105,7 @@ def stage(x: Tensor, table: Tensor, gain: Tensor) -> list[Tensor]:
 def program(tracer: Tracer, ir: str) -> Program:
     made = engine.compiled(ir)
     parts = tuple(tracer.tables), tuple(tracer.steps), tuple(tracer.held), tuple(tracer.guards)
-    return Program(made.call, *parts, (), 0, 0, 1, 2, 0, {})
+    return Program(made.call, made.key, *parts, (), 0, 0, 1, 2, 0, {})
 
 
 def call(made: Program, x: Tensor, results: int, leaves: dict[str, Tensor]) -> list[Tensor]:
