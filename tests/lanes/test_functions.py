@@ -1,8 +1,8 @@
 """The elementary functions of the lane compiler: errors in units of the last place, special values, ends of their domains.
 
-float32 is measured against numpy's float64, float64 against 80-bit floats where numpy has them (skipped
-elsewhere), and these against mpmath. An error is the distance from the exact value in the spacing of floats there. Bounds are the measured maxima, rounded up to
-the next half with room for other samples; ``docs/lanes.md`` has the same table, which a test compares.
+float32 is measured against numpy's float64, float64 against 80-bit floats where numpy has them (skipped elsewhere), and these
+against mpmath. An error is the distance from the exact value in the spacing of floats there. Bounds are the measured maxima,
+rounded up to the next half with room for other samples; ``docs/lanes.md`` has the same table, which a test compares.
 """
 
 from __future__ import annotations
