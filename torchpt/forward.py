@@ -373,7 +373,7 @@ class Run:
         width, height, device = self.width, self.height, self.device
         self.film = Film(width, height, self.wave.sampler.randomizations, device)
         self.layers = {name: Film(width, height, 1, device, CHANNELS[name]) for name in self.names}
-        self.tally, self.done = Tally(), 0
+        self.tally, self.done, self.ended = Tally(), 0, False
         self.bad = torch.zeros((), dtype=torch.int64, device=device)
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
 
@@ -421,11 +421,12 @@ class Run:
         """Tell of progress; returns whether to stop."""
         self.done += samples
         total = self.width * self.height * self.settings.render.spp
-        if self.on_progress is None:
-            return False
+        if self.on_progress is None or self.ended:  # tasks of other threads still come in after the wish to stop
+            return self.ended
         seconds = time.perf_counter() - self.start
         state = Progress(self.done, total, self.tally.rays, seconds, ends, self.result)
-        return bool(self.on_progress(state)) and self.done < total
+        self.ended = bool(self.on_progress(state)) and self.done < total
+        return self.ended
 
     def _looped(self, loop: Loop) -> None:
         pixels = self.width * self.height

@@ -6,6 +6,8 @@ that a right renderer fails it with at most this probability; seeds are fixed, s
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 SIGNIFICANCE = 1e-3
@@ -21,3 +23,14 @@ def chi_square_p(statistic: float, freedom: int) -> float:
     """Probability that chi-square with ``freedom`` degrees exceeds ``statistic``."""
     half = torch.tensor([0.5 * freedom, 0.5 * statistic], dtype=torch.float64)
     return float(torch.special.gammaincc(half[0], half[1]))
+
+
+def t_limit(comparisons: int, freedom: int, significance: float = SIGNIFICANCE) -> float:
+    """As :func:`z_limit` for Student's t with ``freedom`` degrees: means over as many pictures plus one."""
+    share, steps = significance / comparisons, 1 << 19
+    # 1 + t^2 / freedom = 1 / cos^2(a): the tail is an integral of a power of a cosine.
+    a = torch.linspace(0.0, math.pi / 2, steps + 1, dtype=torch.float64)
+    density = a.cos().clamp_min(0.0) ** (freedom - 1)
+    tail = torch.cumulative_trapezoid(density.flip(0), dx=math.pi / 2 / steps).flip(0)
+    first = int((tail / tail[0] <= share).nonzero()[0])
+    return math.sqrt(freedom) * math.tan(float(a[first]))

@@ -1,39 +1,121 @@
-"""``render.compile``: few graphs, no recompiles after the first pass, no silent fall-back, the eager picture."""
+"""``render.compile``: what ``on``, ``auto`` and ``off`` mean. On a CPU kernels of the loop; on CUDA few graphs, and no recompiles."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from trials import film_of
 
 import torchpt
 from torchpt import forward
-from torchpt.errors import RenderError
 from torchpt.integrators import compiled
-from torchpt.render import render_scene
+from torchpt.integrators.loop import kernels
+from torchpt.integrators.loop.schedule import Loop
+from torchpt.render import Rendering, render_scene
 from torchpt.scene.description import settings
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
 
-pytestmark = [
-    pytest.mark.skipif(not compiled.can_compile(torch.device("cpu")), reason="needs a C++ compiler"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning"),  # torch's own, while compiling
-]
 
-
-def run(scene, spp: int, mode: str, seed: int = 1):
+def run(scene: torchpt.Scene, spp: int, mode: str | bool, seed: int = 1, **more: torch.dtype) -> Rendering:
     wish = {"film": FILM, "render": {"spp": spp, "compile": mode, "seed": seed}, "integrator": {"max_depth": 8}}
-    return render_scene(scene, settings(scene.description, wish))
+    return render_scene(scene, settings(scene.description, wish), **more)  # type: ignore[arg-type]
 
 
-def graphs(scene) -> dict[str, int]:
+@pytest.fixture
+def passes(monkeypatch) -> list[int]:
+    """Samples of each pass that the loop took."""
+    taken: list[int] = []
+    kept = Loop.run
+
+    def noted(self: Loop, first: int, count: int, each: object) -> bool:
+        taken.append(count)
+        return kept(self, first, count, each)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Loop, "run", noted)
+    return taken
+
+
+# -- on a CPU
+
+
+@pytest.mark.parametrize(("mode", "looped"), [("auto", True), ("on", True), (True, True), ("off", False), (False, False)])
+def test_auto_and_on_take_the_loop(passes, mode, looped):
+    scene = torchpt.load("cornell_box", device="cpu")
+    found = run(scene, 8, mode)
+    assert sum(passes) == (8 if looped else 0)
+    assert found.eager == ()
+    assert (scene in forward._kernels) == looped
+    assert scene not in forward._compiled or not forward._compiled[scene]  # graphs are for CUDA
+
+
+def test_the_summary_tells_the_time_that_compiling_took(monkeypatch):
+    scene = torchpt.load("cornell_box", device="cpu")
+    assert run(scene, 1, "off").summary()["compile_seconds"] == 0.0
+    first = run(scene, 1, "auto")
+    assert 0.0 < first.compile_seconds < first.seconds
+    assert first.summary()["compile_seconds"] == round(first.compile_seconds, 4)
+    assert run(scene, 1, "auto").compile_seconds < 0.1  # programs are known by now; binding tables is all
+    # The clock runs while kernels are made, and then alone: with one that ticks at each look, one tick a kernel.
+    clock = iter(range(1000))
+    monkeypatch.setattr(kernels.time, "perf_counter", lambda: float(next(clock)))
+    ticks = run(scene, 1, "auto").compile_seconds
+    assert ticks >= len(forward._kernels[scene]._made) > 0
+
+
+def test_float64_stays_eager(passes):
+    scene = torchpt.load("cornell_box", device="cpu")
+    found = run(scene, 2, "on", dtype=torch.float64)
+    assert found.image.dtype == torch.float64 and not passes and found.compile_seconds == 0.0
+    assert torch.equal(found.image, run(scene, 2, "off", dtype=torch.float64).image)
+
+
+def test_the_inductor_road_needs_no_compiler_here(monkeypatch):
+    monkeypatch.setattr(compiled.shutil, "which", lambda name: None)
+    assert run(torchpt.load("cornell_box", device="cpu"), 1, "on").complete
+
+
+def test_under_a_tape_the_picture_is_compiled_and_the_gradient_eager(passes):
+    scene = torchpt.load("cornell_box", device="cpu")
+    name = next(name for name in scene.params if name.endswith("reflectance"))
+    keys = {"spp": 4, "seed": 3, "seed_grad": 5, "film": {**film_of(16), "filter": "box"}}
+    plain = torchpt.render(scene, **keys)
+    assert sum(passes) == 4
+    gradients, pictures = [], []
+    for mode in ("auto", "off"):
+        value = scene.params[name].clone().requires_grad_()
+        passes.clear()
+        picture = torchpt.render(scene, params={name: value}, compile=mode, **keys)
+        assert picture.requires_grad and sum(passes) == (4 if mode == "auto" else 0)
+        passes.clear()
+        # A constant cotangent: the backward pass does not hear of the forward picture.
+        picture.backward(torch.ones_like(picture))
+        assert not passes  # the tape is of tensor operations
+        assert value.grad is not None
+        gradients.append(value.grad)
+        pictures.append(picture.detach())
+    assert torch.equal(*gradients) and float(gradients[0].abs().sum()) > 0
+    assert torch.equal(pictures[0], plain)
+    assert torch.isclose(*pictures, rtol=1e-3, atol=1e-5).float().mean() > 0.99
+
+
+# -- on CUDA
+
+
+def graphs(scene: torchpt.Scene) -> dict[str, int]:
     counts: dict[str, int] = {}
     for stages in forward._compiled[scene].values():
         counts |= stages.graphs
     return counts
 
 
+warns = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's own, while compiling
+
+
+@warns
+@pytest.mark.gpu
 def test_two_graphs_a_stage_and_none_later():
-    scene = torchpt.load("cornell_box")
+    scene = torchpt.load("cornell_box", device="cuda")
     first = run(scene, 4, "on")
     after_first_pass = graphs(scene)
     assert {name.split()[0] for name in after_first_pass} == {"generate", "emit", "bounce"}
@@ -48,8 +130,10 @@ def test_two_graphs_a_stage_and_none_later():
         assert float(compiled_picture.image.mean()) == pytest.approx(float(eager.image.mean()), rel=2e-3)
 
 
+@warns
+@pytest.mark.gpu
 def test_more_graphs_than_two_are_an_error_not_a_fall_back():
-    scene = torchpt.load("cornell_box")
+    scene = torchpt.load("cornell_box", device="cuda")
     world, _ = scene.world(torch.float32)
     plan = compiled.Plan("sobol", "mis", None, torch.float32, False, False)
     stages = compiled.CompiledStages(plan, world)
@@ -60,20 +144,12 @@ def test_more_graphs_than_two_are_an_error_not_a_fall_back():
     made = stages._get("stage", (), stage)
     with pytest.raises(Exception, match=r"(?i)recompile"):
         for rank in range(1, 6):  # a graph for each number of axes
-            made(torch.ones((2,) * rank))
+            made(torch.ones((2,) * rank, device="cuda"))
     assert stages.graphs["stage"] <= 2
 
 
-def test_without_a_compiler_on_is_an_error_and_auto_stays_eager(monkeypatch):
-    monkeypatch.setattr(compiled.shutil, "which", lambda name: None)
-    monkeypatch.setattr(forward, "COMPILE_REPAYS", 1)
-    scene = torchpt.load("cornell_box")
-    with pytest.raises(RenderError, match="C\\+\\+ compiler"):
-        run(scene, 1, "on")
-    assert run(scene, 1, "auto").complete
-    assert scene not in forward._compiled or not forward._compiled[scene]
-
-
+@warns
+@pytest.mark.gpu
 @pytest.mark.slow
 def test_textures_and_maps_compile():
     """Long chains of indices and frames: with inductor's own settings their compilation does not end."""
@@ -102,7 +178,8 @@ def test_textures_and_maps_compile():
                     ],
                 },
             },
-        }
+        },
+        "cuda",
     )
     wish = {"film": FILM, "render": {"spp": 4}, "integrator": {"max_depth": 3}}
     pictures = [

@@ -181,4 +181,25 @@ def signature(record: Any) -> Any:
     if is_dataclass(record) and not isinstance(record, torch.nn.Module | type):
         values = tuple((field.name, signature(getattr(record, field.name))) for field in fields(record))
         return type(record), values
-    return record
+    if record is None or isinstance(record, bool | int | float | str | bytes | type | torch.dtype):
+        return record
+    return record, _contents(record, set())
+
+
+def _contents(value: Any, seen: set[int]) -> Any:
+    """What a trace may have found in an object of the user's own: its plain numbers, and which tensors it holds.
+
+    Tensors enter by identity: what is in them is memory, and those that a program reads live as long as it does.
+    """
+    if value is None or isinstance(value, bool | int | float | str | bytes | type | torch.dtype):
+        return value
+    if id(value) in seen:
+        return None
+    if isinstance(value, Tensor):
+        return id(value), value.dtype, tuple(value.shape)
+    seen = seen | {id(value)}
+    if isinstance(value, dict):
+        return tuple((str(key), _contents(item, seen)) for key, item in value.items())
+    if isinstance(value, tuple | list):
+        return tuple(_contents(item, seen) for item in value)
+    return id(value), _contents(getattr(value, "__dict__", {}), seen)

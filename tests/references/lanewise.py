@@ -1,0 +1,368 @@
+"""Kernels of the compiled loop beside the eager stages that they were traced from, lane by lane on the same input.
+
+A wave is traced eagerly and the input of every stage kept. Each kernel then runs on that very input, so a path that goes
+elsewhere for its rounding does not spoil the vertices behind.
+
+Counting: a *value* is one number of one lane (a vector has three). It is off where it differs by more than ``TOLERANCE`` of
+the eager lane's own magnitude: that of the number, or of a vector's largest component, since a component near zero says
+nothing. Where a kernel decides otherwise (a path lives on or not, a ray is blocked or not, another surface is met) all values
+of the lane that follow from it are off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchpt
+from torchpt.forward import kernels_of, make_wave
+from torchpt.integrators.compiled import Stages
+from torchpt.integrators.loop.chunk import Chunk, Worker
+from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.loop.rows import HIT, Memory
+from torchpt.integrators.path import partition
+from torchpt.integrators.search import Search
+from torchpt.integrators.wave import Wave
+from torchpt.lanes.graph import Unsupported
+from torchpt.records import Hit, PathState, Shadow, rows
+from torchpt.samplers import salts
+from torchpt.scene.description import settings
+
+__all__ = ["ALLOWED", "TOLERANCE", "Differences", "compare", "loaded", "prepared", "run_bounce", "waves"]
+
+TOLERANCE = 1e-3
+#: Share of values that may be off. Kernels fuse products and sums and round otherwise: a comparison whose two sides are equal
+#: to a few 1e-7 may then fall the other way, and conditions as bad as 1e4 turn 1e-7 into 1e-3.
+ALLOWED = 1e-4
+
+_STATE = tuple(f.name for f in fields(PathState))
+_WHOLE = {"lane", "key", "prim"}  # equal or not
+
+
+@dataclass
+class Differences:
+    """How many values were compared, and how many of them are off, by kernel and field."""
+
+    values: dict[tuple[str, str], int] = field(default_factory=dict)
+    off: dict[tuple[str, str], int] = field(default_factory=dict)
+
+    def add(self, kernel: str, name: str, eager: Tensor, found: Tensor, floor: float = 0.0) -> None:
+        assert eager.shape == found.shape, (kernel, name, eager.shape, found.shape)
+        if name in _WHOLE:
+            wrong = eager != found
+        else:
+            a, b = eager.double(), found.double()
+            size = a.abs() if a.dim() == 1 else a.abs().amax(0)
+            near = (a - b).abs() <= TOLERANCE * torch.where(size.isfinite(), size, 0.0) + floor
+            wrong = ~(near | (a == b) | (a.isnan() & b.isnan()))
+        key = kernel, name
+        self.values[key] = self.values.get(key, 0) + wrong.numel()
+        self.off[key] = self.off.get(key, 0) + int(wrong.sum())
+
+    def share(self, kernel: str | None = None) -> float:
+        """The share of values that are off."""
+        chosen = [key for key in self.values if kernel in (None, key[0])]
+        return sum(self.off[key] for key in chosen) / max(sum(self.values[key] for key in chosen), 1)
+
+    def kernels(self) -> list[str]:
+        return sorted({kernel for kernel, _ in self.values})
+
+    def worst(self, count: int = 5) -> list[tuple[str, str, int, int]]:
+        found = sorted(self.off, key=lambda key: -self.off[key] / max(self.values[key], 1))[:count]
+        return [(*key, self.off[key], self.values[key]) for key in found if self.off[key]]
+
+
+class _Recorder(Stages):
+    """Eager stages that keep what they were given."""
+
+    def __init__(self, stages: Stages) -> None:
+        super().__init__(stages.plan, stages.world, stages.pixel)
+        self.bounces: list[tuple[int, PathState, Hit, Tensor, int]] = []
+        self.emits: list[tuple[PathState, Hit, Tensor]] = []
+        self.escapes: list[tuple[PathState, Hit, Tensor]] = []
+        self.states: list[PathState] = []
+        self._seen: list[Tensor] = []
+
+    def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
+        self.emits.append((_copied(state), hit, index))
+        return super().emit(state, hit, index, slide)
+
+    def escape(self, state: PathState, hit: Hit, index: Tensor) -> Tensor:
+        self.escapes.append((_copied(state), hit, index))
+        return super().escape(state, hit, index)
+
+    def bounce(self, model: int, *args: Any) -> Any:
+        _, _, _, state, hit, index, salt = args
+        if not self._seen or self._seen[-1] is not salt:
+            self._seen.append(salt)
+            self.states.append(_copied(state))
+        self.bounces.append((model, _copied(state), hit, index, len(self._seen)))
+        return super().bounce(model, *args)
+
+
+def _copied(state: PathState) -> PathState:
+    return replace(state, radiance=state.radiance.clone())
+
+
+def loaded(name: str | Mapping[str, Any]) -> torchpt.Scene:
+    return torchpt.load(name, device="cpu")
+
+
+def prepared(scene: torchpt.Scene, wishes: Mapping[str, Any]) -> tuple[Wave, Any]:
+    """The wave of a render, and its settings."""
+    wish = settings(scene.description, wishes)
+    with torch.no_grad():
+        return make_wave(scene, wish, None, torch.float32), wish
+
+
+def waves(wave: Wave, pixels: int, samples: int) -> _Recorder:
+    """What the stages of a wave were given."""
+    recorder = _Recorder(wave.stages)
+    with torch.no_grad():
+        replace(wave, stages=recorder).radiance(0, pixels, 0, samples)
+    return recorder
+
+
+def compare(scene: torchpt.Scene, wishes: Mapping[str, Any], pixels: int, samples: int) -> Differences:
+    """All kernels of a scene, as the loop takes them and, where it searches inside of stages, also without that."""
+    found = Differences()
+    wave, _ = prepared(scene, wishes)
+    with torch.no_grad():
+        chosen = kernels_of(scene, wave)
+        if wave.preview is not None:
+            _first_hits(found, wave, chosen, pixels, samples)
+            return found
+        recorder = waves(wave, pixels, samples)
+        _generate(found, wave, Kernels(wave, chosen.packets, False), pixels, samples)
+        for kernels in [chosen] + ([Kernels(wave, chosen.packets, False)] if chosen.fused else []):
+            _vertices(found, wave, kernels, recorder)
+        _search(found, wave, Kernels(wave, chosen.packets, False), recorder)
+    return found
+
+
+def arena(kernels: Kernels, **values: Tensor | None) -> Memory:
+    """Memory with the given fields in its first lanes."""
+    memory = Memory(kernels.state.count)
+    memory.words[:] = 0x7FC00000  # NaN: what is read though it was not written shows
+    kernels.state.put(memory, 0, values)
+    return memory
+
+
+def _fields(state: PathState, hit: Hit) -> dict[str, Tensor | None]:
+    found: dict[str, Tensor | None] = {name: getattr(state, name) for name in _STATE}
+    return {**found, **{name: getattr(hit, name) for name in HIT}, "weight": torch.ones_like(state.t_max)}
+
+
+def _listed(index: Tensor) -> Memory:
+    places = Memory(1)
+    places.words[0, : len(index)] = index.numpy()
+    return places
+
+
+def _generate(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:
+    eager = wave.rays(0, pixels, 0, samples)
+    worker, here = Worker(kernels), arena(kernels)
+    worker._start(Chunk(0, pixels, 0, samples))
+    worker._clear()
+    worker._name_salts(0)
+    worker._run(kernels.generate(), pixels * samples, here, here)
+    taken = kernels.state.take(here, np.arange(pixels * samples), _STATE)
+    for name, value in taken.items():
+        if name == "eta":
+            assert bool((value == 1).all())
+        elif name in ("p", "n"):
+            assert torch.equal(value, taken["o"] if name == "p" else torch.zeros_like(value))
+        else:
+            found.add("generate", name, getattr(eager, name), value, 1e-5 if name == "o" else 0.0)
+
+
+def run_bounce(
+    worker: Worker, model: int, roulette: bool, state: PathState, hit: Hit, index: Tensor, depth: int
+) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """One kernel on some lanes of a wave.
+
+    Returns:
+        The rows that it wrote, in the order of ``index``; which lanes go on; the radiance of those that do not.
+    """
+    kernels = worker.kernels
+    if not kernels.listed:
+        state, hit = rows(state, index), rows(hit, index)
+    here, there = arena(kernels, **_fields(state, hit)), arena(kernels)
+    worker._clear()
+    worker._name_salts(depth)
+    worker.slots.words[:] = 0
+    lists = [Memory(1) for _ in range(kernels.models + 2)]
+    places = _listed(index) if kernels.listed else None
+    worker._run(kernels.bounce(model, roulette), len(index), here, there, places, lists=lists)
+    names = tuple(kernels.state._fields)
+    lanes = (state.lane[index] if kernels.listed else state.lane).numpy()
+    if not kernels.fused:
+        return kernels.state.take(there, np.arange(len(index)), names), torch.ones(len(index), dtype=torch.bool), None  # type: ignore[return-value]
+    live, counts = worker._found()
+    taken = kernels.state.take(there, np.arange(live), names)
+    _routes(worker, taken, lists, counts)
+    place = np.full(int(lanes.max()) + 1, -1)
+    place[taken["lane"].numpy()] = np.arange(live)
+    place = torch.from_numpy(place[lanes])
+    values = {name: torch.where(place >= 0, value[..., place.clamp_min(0)], 0) if live else None for name, value in taken.items()}
+    ended = torch.from_numpy(worker.slots.floats[:, lanes].copy())
+    return values, place >= 0, ended  # type: ignore[return-value]
+
+
+def _routes(worker: Worker, taken: dict[str, Tensor], lists: list[Memory], counts: list[int]) -> None:
+    """Whether the lists name each lane where it belongs: exactly, for the hits that the kernel itself found."""
+    kernels = worker.kernels
+    hit = Hit(*(taken[name] for name in HIT))
+    ends, groups = partition(kernels.world, hit)
+    wanted: dict[int, Tensor] = {model: index for model, index in groups} if kernels.listed else {}
+    if kernels.emitters:
+        wanted[kernels.emissive] = ends.emissive
+    if kernels.around:
+        wanted[kernels.missed] = ends.missed[taken["t_max"][ends.missed] > 0]
+    for number in range(kernels.models + 2):
+        count = counts[number] if number < len(counts) else 0
+        expected = wanted.get(number)
+        if expected is None:
+            assert count == 0 or not kernels.listed
+            continue
+        named = torch.from_numpy(lists[number].words[0, :count].astype(np.int64))
+        assert torch.equal(named.sort()[0], expected.sort()[0])
+
+
+def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorder) -> None:
+    worker, plan, world = Worker(kernels), wave.stages.plan, wave.stages.world
+    search = Search(wave.accel, world, plan.sampler, plan.dtype)
+    kind = "fused" if kernels.fused else "apart"
+    done: set[tuple[int, bool]] = set()
+    for model, state, hit, index, depth in recorder.bounces:
+        # What the render itself asks for, and the other form once.
+        natural = wave.limits is not None and depth >= wave.limits.rr_depth
+        for roulette in (natural, not natural):
+            if roulette is not natural and (model, roulette) in done:
+                continue
+            done.add((model, roulette))
+            name = f"{kind} bounce {world.models[model]}{' with roulette' if roulette else ''}"
+            after, _, shadow = Stages.bounce(
+                recorder, model, roulette, False, _none, state, hit, index, salts(depth, torch.device("cpu"))
+            )
+            try:
+                values, on, ended = run_bounce(worker, model, roulette, state, hit, index, depth)
+            except Unsupported as error:
+                raise AssertionError(f"{name}: {error}") from None
+            if not kernels.fused:
+                _compare_apart(found, name, after, shadow, values)
+                continue
+            if shadow is not None:
+                clear = search.clear(shadow)
+                after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
+            _compare_fused(found, name, kernels, after, search.nearest(after, depth + 1), values, on, ended)
+    for state, hit, index in recorder.emits:
+        light = Stages.emit(recorder, state, hit, index, False)
+        here = arena(kernels, **_fields(state, hit))
+        worker._run(kernels.emit(), len(index), here, here, _listed(index))
+        taken = kernels.state.take(here, index.numpy(), ("radiance",))["radiance"]
+        found.add(f"{kind} emit", "radiance", state.radiance[:, index] + light, taken)
+    for state, hit, index in recorder.escapes:
+        index = index[state.t_max[index] > 0]
+        light = Stages.escape(recorder, state, hit, index)
+        here = arena(kernels, **_fields(state, hit))
+        worker._run(kernels.escape(), len(index), here, here, _listed(index))
+        lanes = state.lane[index].numpy()
+        taken = torch.from_numpy(worker.slots.floats[:, lanes].copy())
+        found.add(f"{kind} escape", "radiance", state.radiance[:, index] + light, taken)
+
+
+def _compare_apart(
+    found: Differences, name: str, after: PathState, shadow: Shadow | None, values: dict[str, Tensor]
+) -> None:
+    for key in _STATE:
+        if key in values:
+            found.add(name, key, getattr(after, key), values[key], _floor(key))
+    if "shadow_o" not in values:
+        assert shadow is None
+        return
+    if shadow is None:
+        assert not values["shadow_t"].any()
+        return
+    # Where no light is to be had the ray goes nowhere: its direction is of no consequence.
+    lit = shadow.t_max > 0
+    found.add(name, "shadow_t", shadow.t_max, values["shadow_t"])
+    found.add(name, "shadow_o", shadow.o[:, lit], values["shadow_o"][:, lit], _floor("o"))
+    found.add(name, "shadow_d", shadow.d[:, lit], values["shadow_d"][:, lit])
+    found.add(name, "shadow_radiance", shadow.radiance, values["shadow_radiance"])
+
+
+def _compare_fused(
+    found: Differences,
+    name: str,
+    kernels: Kernels,
+    after: PathState,
+    hit: Hit,
+    values: dict[str, Tensor],
+    on: Tensor,
+    ended: Tensor,
+) -> None:
+    alive = after.t_max > 0
+    goes = (hit.prim >= 0) | (alive & kernels.around)
+    both, neither, differ = goes & on, ~goes & ~on, goes != on
+    if values["lane"] is not None:
+        for key in (*_STATE, *HIT):
+            if key in values:
+                eager = getattr(after if key in _STATE else hit, key)
+                found.add(name, key, eager[..., both], values[key][..., both], _floor(key))
+    found.add(name, "ended", after.radiance[:, neither], ended[:, neither])
+    # Paths that live on in one of both only.
+    found.add(name, "lane", torch.ones(int(differ.sum()) * 20), torch.zeros(int(differ.sum()) * 20))
+
+
+def _floor(name: str) -> float:
+    # Places, and the parameters of a surface, are as exact as what they lie on is large.
+    return {"o": 1e-5, "p": 1e-5, "u": 1e-4, "v": 1e-4}.get(name, 0.0)
+
+
+def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorder) -> None:
+    """Rays from vertices on, and light: the search with the surfaces that let rays through."""
+    worker, plan, world = Worker(kernels), wave.stages.plan, wave.stages.world
+    search = Search(wave.accel, world, plan.sampler, plan.dtype)
+    for depth, state in enumerate(recorder.states, 1):
+        hit = search.nearest(state, depth)
+        here = arena(kernels, **_fields(state, Hit(*(torch.zeros_like(hit.t) for _ in range(4)))))
+        worker._nearest(here, len(state.lane), depth)
+        taken = kernels.state.take(here, np.arange(len(state.lane)), tuple(HIT))
+        for key in HIT:
+            found.add("nearest", key, getattr(hit, key), taken[key], _floor(key))
+    for model, state, hit, index, depth in recorder.bounces:
+        _, _, shadow = Stages.bounce(
+            recorder, model, False, False, _none, state, hit, index, salts(depth, torch.device("cpu"))
+        )
+        if shadow is None:
+            continue
+        n = len(index)
+        one = torch.ones(n)
+        here = arena(
+            kernels, shadow_o=shadow.o, shadow_d=shadow.d, shadow_t=shadow.t_max, clear=one, key=state.key[:, index]
+        )
+        worker._light(here, n)
+        taken = kernels.state.take(here, np.arange(n), ("clear", "blocked"))
+        arrived = taken["clear"] if "clear" in taken else (taken["blocked"] == 0).float()
+        lit = shadow.t_max > 0
+        found.add("light", "clear", search.clear(shadow)[lit], arrived[lit])
+
+
+def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:
+    """The preview has no vertices beyond the first: samples are compared whole."""
+    eager, tally = wave.radiance(0, pixels, 0, samples)
+    worker = Worker(kernels)
+    took = worker.trace(Chunk(0, pixels, 0, samples))
+    assert took.rays == tally.rays
+    slots = torch.from_numpy(worker.slots.floats[:, : pixels * samples].copy())
+    found.add("preview", "radiance", eager.reshape(3, -1), slots)
+
+
+def _none(state: PathState) -> Hit:
+    raise AssertionError("no tape here")
