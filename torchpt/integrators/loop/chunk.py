@@ -59,6 +59,7 @@ class Worker:
         self.kernels, self.wave, self._halt = kernels, kernels.wave, halt
         self._arenas = [Memory(kernels.state.count) for _ in range(2)]
         self._passed = [Memory(kernels.passed.count) for _ in range(2)] if kernels.veiled else []
+        self._sifted = Memory(1)
         count = kernels.models + 2
         self._lists = [[Memory(1) for _ in range(count)] for _ in range(2)]
         self.slots = Memory(3)
@@ -282,9 +283,14 @@ class Worker:
         if not self.kernels.veiled:
             return
         self._name_salts(depth)
+        self._clear()
+        self._run(self.kernels.sift(), count, here, here, lists=[self._sifted])
+        some = int(self._counters[0])
+        if not some:
+            return
         source, target = self._passed
         self._clear()
-        self._run(self.kernels.meet(False), count, here, source)
+        self._run(self.kernels.meet(False), some, here, source, self._sifted)
         step = 0
         while left := int(self._counters[0]):
             step += 1

@@ -187,9 +187,13 @@ class Kernels:
         """Which shadow rays are blocked, by packets."""
         return self._get(("block",), self._block)
 
+    def sift(self) -> Kernel:
+        """A list of the rays that met a surface which may let them pass."""
+        return self._get(("sift",), self._sift)
+
     def meet(self, again: bool) -> Kernel:
         """Which rays a surface stops by chance, and where the others go on."""
-        return self._get(("meet", again), lambda tracer: self._meet(tracer, again))
+        return self._get(("meet", again), lambda tracer: self._meet(tracer, again), listed=not again)
 
     def begin(self) -> Kernel:
         """Shadow rays as rays that pass surfaces."""
@@ -498,6 +502,18 @@ class Kernels:
         with tracer:
             number = blocked.to(torch.int32)
         return Sinks(write=self.state.nodes(tracer, blocked=number))
+
+    def _sift(self, tracer: Tracer) -> Sinks:
+        world = self.world
+        prim = self.state.read(tracer, "prim")["prim"]
+        assert world.opacity is not None
+        with tracer:
+            slot = world.slot(prim)
+            some = torch.index_select(world.opacity, 0, slot) < 1
+            if world.veils is not None:
+                some = some | (torch.index_select(world.veils.nodes, 0, slot) >= 0)
+            some = some & (prim >= 0)
+        return Sinks(notes=[Note(tracer.nodes(some)[0], 0, 0)])
 
     def _meet(self, tracer: Tracer, again: bool) -> Sinks:
         salts = self._salts(tracer)
