@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -19,9 +19,7 @@ from torchpt.cameras import Camera
 from torchpt.errors import RenderError
 from torchpt.film import Film, Filter
 from torchpt.integrators import Wave
-from torchpt.integrators.aov import CHANNELS, NAMES
 from torchpt.integrators.compiled import CompiledStages, Stages
-from torchpt.integrators.ibl import Preview
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.loop.schedule import Loop, Share
 from torchpt.integrators.path import Limits, Tally
@@ -39,6 +37,9 @@ from torchpt.scene.settings import (
     PathIntegrator,
     Settings,
 )
+
+if TYPE_CHECKING:
+    from torchpt.integrators.ibl import Preview
 
 __all__ = [
     "BYTES_PER_LANE",
@@ -235,6 +236,8 @@ def make_wave(
 
 def _preview(scene: Scene, world: World, own: bool) -> Preview:
     """The environment's maps; kept with the scene, unless the world is not the scene's ``own``."""
+    from torchpt.integrators.ibl import Preview
+
     if not own or torch.is_grad_enabled():
         return Preview.of(world)
     kept = _previews.get(scene)
@@ -309,6 +312,18 @@ def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
     }
 
 
+def _channels(settings: Settings) -> dict[str, int]:
+    """How many channels each layer of the first surfaces has that is wanted."""
+    wanted = settings.film.aovs
+    if isinstance(settings.integrator, AovIntegrator) and not wanted:
+        wanted = ("albedo",)
+    if not wanted:
+        return {}
+    from torchpt.integrators.aov import CHANNELS
+
+    return {name: CHANNELS[name] for name in wanted if name in CHANNELS}
+
+
 def say_once(text: str) -> None:
     """A line on stderr, the first time only."""
     if text not in _said:
@@ -360,9 +375,8 @@ class Run:
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
         self.dtype = dtype
-        self.names = tuple(name for name in settings.film.aovs if name in CHANNELS)
-        if isinstance(settings.integrator, AovIntegrator) and not settings.film.aovs:
-            self.names = ("albedo",)
+        self.channels = _channels(settings)
+        self.names = tuple(self.channels)
         self.on_progress: Callable[[Progress], bool | None] | None = None
         self.eager: list[str] = []
         self._begin()
@@ -372,7 +386,7 @@ class Run:
         """Nothing is sampled yet."""
         width, height, device = self.width, self.height, self.device
         self.film = Film(width, height, self.wave.sampler.randomizations, device)
-        self.layers = {name: Film(width, height, 1, device, CHANNELS[name]) for name in self.names}
+        self.layers = {name: Film(width, height, 1, device, channels) for name, channels in self.channels.items()}
         self.tally, self.done, self.ended = Tally(), 0, False
         self.bad = torch.zeros((), dtype=torch.int64, device=device)
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
@@ -478,8 +492,11 @@ class Run:
         """The picture so far."""
         layers = {name: film.mean().to(self.dtype) for name, film in self.layers.items()}
         aov = isinstance(self.settings.integrator, AovIntegrator)
-        for name in set(NAMES) & set(layers):
-            layers[name] = self.layers[name].first().to(self.dtype)
+        if layers:
+            from torchpt.integrators.aov import NAMES
+
+            for name in set(NAMES) & set(layers):
+                layers[name] = self.layers[name].first().to(self.dtype)
         image = self.film.mean().to(self.dtype)
         variance = None if aov else self.film.variance()
         if aov and self.names:

@@ -25,7 +25,6 @@ from torchpt.forward import (
     pixel_of,
 )
 from torchpt.integrators.compiled import Stages
-from torchpt.integrators.ibl import Preview
 from torchpt.records import tensors_of
 from torchpt.scene import Scene
 from torchpt.scene.description import settings as complete
@@ -212,6 +211,8 @@ def _differentiable_chunks(
         preview = still.preview
         if preview is not None and world.lights is not None:
             if any(t.requires_grad for t in tensors_of(world.lights.environment)):
+                from torchpt.integrators.ibl import Preview
+
                 preview = Preview.of(world)
         values, _ = replace(still, stages=stages, camera=camera, preview=preview).radiance(*span)
         values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)

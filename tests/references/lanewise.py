@@ -209,7 +209,10 @@ def run_bounce(
     place = np.full(int(lanes.max()) + 1, -1)
     place[taken["lane"].numpy()] = np.arange(live)
     place = torch.from_numpy(place[lanes])
-    values = {name: torch.where(place >= 0, value[..., place.clamp_min(0)], 0) if live else None for name, value in taken.items()}
+    values = {
+        name: torch.where(place >= 0, value[..., place.clamp_min(0)], 0) if live else None
+        for name, value in taken.items()
+    }
     ended = torch.from_numpy(worker.slots.floats[:, lanes].copy())
     return values, place >= 0, ended  # type: ignore[return-value]
 

@@ -1,4 +1,4 @@
-"""``render.compile``: what ``on``, ``auto`` and ``off`` mean. On a CPU kernels of the loop; on CUDA few graphs, and no recompiles."""
+"""``render.compile``: what ``on``, ``auto``, ``off`` mean: on a CPU kernels of the loop, on CUDA few graphs and no recompiles."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ def passes(monkeypatch) -> list[int]:
 # -- on a CPU
 
 
-@pytest.mark.parametrize(("mode", "looped"), [("auto", True), ("on", True), (True, True), ("off", False), (False, False)])
+@pytest.mark.parametrize(
+    ("mode", "looped"), [("auto", True), ("on", True), (True, True), ("off", False), (False, False)]
+)
 def test_auto_and_on_take_the_loop(passes, mode, looped):
     scene = torchpt.load("cornell_box", device="cpu")
     found = run(scene, 8, mode)
@@ -109,7 +111,9 @@ def graphs(scene: torchpt.Scene) -> dict[str, int]:
     return counts
 
 
-warns = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's own, while compiling
+warns = pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning", "ignore::FutureWarning"
+)  # torch's own, while compiling
 
 
 @warns

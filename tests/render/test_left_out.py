@@ -1,17 +1,22 @@
-"""What a scene does not use costs nothing: no tensor, no operator call, and `info` says so."""
+"""What a scene does not use costs nothing: no tensor, no operator call, no node of a kernel; and `info` says so."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import Counter
 from typing import Any
 
 import pytest
 import torch
+from features import FEATURES, Feature, kernels, with_feature
 from showcase import MATERIALS, showcase
 from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
+from torchpt.integrators.loop import kernels as loop_kernels
+from torchpt.lanes.program import Program
 from torchpt.records import tensors_of
 from torchpt.scene.description import settings
 
@@ -79,3 +84,89 @@ def test_info_says_what_was_left_out():
     info = torchpt.load(showcase("brushed", "glass"), "cpu")
     made = info.info(settings(info.description))["built"]["bsdfs"]
     assert made == {"diffuse": 2, "roughconductor (anisotropic)": 1, "dielectric": 1}  # floor and lamp have their own
+
+
+# -- kernels of the compiled loop
+
+
+def _programs(described: dict[str, Any]) -> dict[Any, Program]:
+    return {key: kernel.program for key, kernel in kernels(described)[0]._made.items()}
+
+
+def _of(feature: Feature, programs: dict[Any, Program]) -> tuple[int, int]:
+    """Nodes that a feature's files asked for, and tables that it brings."""
+    nodes = sum(program.nodes.get(file, 0) for program in programs.values() for file in feature.files)
+    leaves = {leaf for program in programs.values() for leaf in program.leaves()}
+    return nodes, sum(leaf.startswith(feature.leaves) for leaf in leaves) if feature.leaves else 0
+
+
+@pytest.fixture(scope="module")
+def plain() -> dict[Any, Program]:
+    return _programs(with_feature(None))
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_kernels_hold_nothing_of_what_is_not_there(name, plain):
+    feature = FEATURES[name]
+    assert _of(feature, plain) == (0, 0)
+    made, _ = kernels(with_feature(name))
+    nodes, tables = _of(feature, {key: kernel.program for key, kernel in made._made.items()})
+    assert nodes > 0  # these are its files
+    assert tables > 0 or not feature.leaves
+    without, _ = kernels(with_feature(None))
+    for row in feature.rows:
+        assert row in made.state and row not in without.state
+    if feature.rows:
+        assert made.state.count > without.state.count
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_kernels_are_the_same_after_it_was_there_and_is_gone(name, plain):
+    """Traced anew, not from the cache: the machine code's name is made of the IR."""
+    kernels(with_feature(name))
+    loop_kernels._programs.clear()
+    again = _programs(with_feature(None))
+    assert {key: program.code for key, program in again.items()} == {
+        key: program.code for key, program in plain.items()
+    }
+    assert len(plain) >= 3
+
+
+_BLOCKED = """
+import sys
+sys.path[:0] = {paths!r}
+name = sys.argv[1]
+if name != "none":
+    sys.modules[name] = None
+import torchpt
+from features import with_feature
+image = torchpt.render(torchpt.load(with_feature(None), "cpu"), spp=2, threads=1, compile="on")
+print(float(image.double().sum()).hex())
+if name != "none":
+    from features import FEATURES
+    wanted = next(key for key, feature in FEATURES.items() if feature.module == name)
+    try:
+        torchpt.render(torchpt.load(with_feature(wanted), "cpu"), spp=1, threads=1)
+    except ImportError:
+        print("missed")
+"""
+
+
+@pytest.fixture(scope="module")
+def unblocked() -> list[str]:
+    return _blocked("none")
+
+
+def _blocked(module: str) -> list[str]:
+    code = _BLOCKED.format(paths=[path for path in sys.path if path.endswith("references")])
+    command = [sys.executable, "-W", "ignore", "-c", code, module]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", sorted({f.module for f in FEATURES.values() if f.module is not None}))
+def test_the_same_picture_where_its_module_cannot_be_imported(module, unblocked):
+    """BSDF models, textures and lights other than maps are imported together, and are not asked here."""
+    assert _blocked(module) == [*unblocked, "missed"]

@@ -188,7 +188,9 @@ def test_the_limit_of_a_t_test():
 ROUNDING = 1e-5
 
 
-def paired(scene: torchpt.Scene, wishes: Mapping[str, Any], side: int, spp: int, seeds: int = 8, block: int = 8) -> float:
+def paired(
+    scene: torchpt.Scene, wishes: Mapping[str, Any], side: int, spp: int, seeds: int = 8, block: int = 8
+) -> float:
     """Largest t of the blocks' differences, as a share of the limit for all of them together.
 
     The same seeds, so a block differs by those paths alone that rounding sends elsewhere. Where that is no bias its mean over
@@ -204,7 +206,10 @@ def paired(scene: torchpt.Scene, wishes: Mapping[str, Any], side: int, spp: int,
         assert on.spp == off.spp and on.paths == off.paths
         assert abs(on.rays - off.rays) <= max(0.01 * off.rays, 3)  # a path that goes elsewhere may be longer
         for name, value in layers_of(off).items():
-            a, b = coarse(layers_of(on)[name].nan_to_num(posinf=0.0), block), coarse(value.nan_to_num(posinf=0.0), block)
+            a, b = (
+                coarse(layers_of(on)[name].nan_to_num(posinf=0.0), block),
+                coarse(value.nan_to_num(posinf=0.0), block),
+            )
             differences.setdefault(name, []).append(a - b)
             sizes[name] = sizes.get(name, torch.zeros(())) + b.abs() / seeds
     worst, comparisons = 0.0, sum(found[0].numel() for found in differences.values())
@@ -224,7 +229,9 @@ def test_pictures(name):
 def test_the_means_of_diffuse_scenes():
     for name in DIFFUSE[:1] + DIFFUSE[3:]:
         scene = scene_of(name)
-        a, b = (float(rendered(scene, mode, 3, 32, {"film": film_of(32)}).image.double().mean()) for mode in ("on", "off"))
+        a, b = (
+            float(rendered(scene, mode, 3, 32, {"film": film_of(32)}).image.double().mean()) for mode in ("on", "off")
+        )
         assert a == pytest.approx(b, rel=1e-4)
 
 
@@ -277,7 +284,9 @@ def test_strategies(kind, strategy):
     assert paired(loaded("cornell_box"), wish, 16, 4) <= 1.0
 
 
-@pytest.mark.parametrize("limits", [{"max_depth": 1}, {"max_depth": -1, "rr_depth": 2}, {"rr_prob": 0.5, "rr_depth": 1}], ids=str)
+@pytest.mark.parametrize(
+    "limits", [{"max_depth": 1}, {"max_depth": -1, "rr_depth": 2}, {"rr_prob": 0.5, "rr_depth": 1}], ids=str
+)
 def test_depths_and_roulette(limits):
     assert paired(loaded("cornell_box"), {"integrator": {"type": "path", **limits}}, 16, 4) <= 1.0
 
@@ -296,7 +305,9 @@ def test_first_surfaces_agree_pixel_by_pixel():
     wish = {"integrator": {"type": "aov"}, "film": {**film_of(40, 30), "aovs": list(CHANNELS)}}
     on, off = (layers_of(rendered(scene, mode, 1, 2, wish)) for mode in ("on", "off"))
     for name in on:
-        near = torch.isclose(on[name], off[name], rtol=1e-3, atol=1e-4 * float(off[name].nan_to_num(posinf=0).abs().max()))
+        near = torch.isclose(
+            on[name], off[name], rtol=1e-3, atol=1e-4 * float(off[name].nan_to_num(posinf=0).abs().max())
+        )
         assert near.all(-1).float().mean() > 0.995, name
 
 

@@ -27,7 +27,9 @@ from torchpt.scene.description import settings
 FILM = {**film_of(37, 23), "filter": "mitchell", "aovs": ["albedo", "normal", "variance"]}
 
 
-def rendered(scene: torchpt.Scene, spp: int, film: Any = None, integrator: Any = None, on_progress: Any = None, **render: Any) -> Rendering:
+def rendered(
+    scene: torchpt.Scene, spp: int, film: Any = None, integrator: Any = None, on_progress: Any = None, **render: Any
+) -> Rendering:
     wish = {
         "film": film or FILM,
         "integrator": {"type": "path", "max_depth": 4, "rr_depth": 2, **(integrator or {})},

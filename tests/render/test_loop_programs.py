@@ -96,15 +96,13 @@ def test_the_same_scene_otherwise(work, which):
         rendered(scene, **copy.deepcopy(change))
         found = work()
         assert found[0] <= ("clamp" in change.get("integrator", {}) and change["integrator"]["clamp"] == 2.0), change
-    params = {name: value * 0.9 + 0.01 for name, value in scene.params.items() if "reflectance" in name or "fov" in name}
+    params = {
+        name: value * 0.9 + 0.01 for name, value in scene.params.items() if "reflectance" in name or "fov" in name
+    }
     assert params
     picture = rendered(scene, params).image
     assert work() == (0, 0)
-    eager = render_scene(
-        scene,
-        settings(scene.description, {"film": film_of(20, 14), "integrator": {"type": "path", "max_depth": 4, "rr_depth": 2}, "render": {"spp": 2, "compile": "off"}}),
-        params=params,
-    ).image  # fmt: skip
+    eager = rendered(scene, params, render={"compile": "off"}).image
     assert float((picture - eager).abs().mean()) < 1e-3 * float(eager.mean())
     assert not torch.equal(picture, rendered(scene).image)
     assert work() == (0, 0)
@@ -142,7 +140,11 @@ def test_larger_pictures_and_maps(work, tmp_path):
         generator = torch.Generator().manual_seed(texture[0])
         for name, size in (("wood", texture), ("sky", sky)):
             write_image(tmp_path / f"{name}{size[0]}.exr", torch.rand(*size, 3, generator=generator))
-        described["textures"]["wood"] = {"type": "image", "path": str(tmp_path / f"wood{texture[0]}.exr"), "colorspace": "linear"}
+        described["textures"]["wood"] = {
+            "type": "image",
+            "path": str(tmp_path / f"wood{texture[0]}.exr"),
+            "colorspace": "linear",
+        }
         described["lights"]["sky"] = {"type": "envmap", "path": str(tmp_path / f"sky{sky[0]}.exr")}
         return torchpt.load(described, "cpu")
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchpt import lights
 from torchpt.cameras import Camera
 from torchpt.film import Filter
+from torchpt.integrators.roulette import survived
 from torchpt.integrators.surfaces import Surface, glow, surface_at, veil
 from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import dot, largest, take
@@ -41,8 +42,6 @@ STRATEGIES = ("mis", "bsdf", "light", "uniform")
 
 #: Shadow rays end this fraction of their length short of the light, beside the offset off its surface.
 SHORTEN = 1e-4
-#: Roulette never lets a path live on for sure: throughput above one would make it immortal.
-SURVIVAL_CAP = 0.95
 
 
 @dataclass(frozen=True)
@@ -281,14 +280,7 @@ def scatter(
     if eta is not None and drawn.eta is not None:
         eta = eta * drawn.eta.detach()
     if roulette:
-        if plan.rr_prob is None:
-            # Radiance is scaled at refraction; what a path can still bring is not.
-            expected = brightest if eta is None else brightest * eta * eta
-            survival = expected.clamp_max(SURVIVAL_CAP)
-        else:
-            survival = torch.full_like(brightest, plan.rr_prob)
-        alive = alive & (draws.one(Dimension.ROULETTE) < survival)
-        throughput = throughput / torch.where(alive, survival, 1.0)
+        alive, throughput = survived(plan.rr_prob, draws, alive, throughput, brightest, eta)
     if hit is not None:
         hit = replace(hit, prim=torch.where(alive, hit.prim, -1))
     on = alive.to(plan.dtype)

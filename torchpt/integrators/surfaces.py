@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from torchpt import bsdfs
+from torchpt.integrators.relief import Relief, mapped
 from torchpt.math.frames import Frame
-from torchpt.math.vectors import affine, cross, dot, luminance, normalize, take
+from torchpt.math.vectors import cross, dot, luminance, normalize, take
 from torchpt.records import Interaction, World
 from torchpt.shapes import surface_uv, vertex_colors
-from torchpt.textures import Look, Pick, look_up, slope
+from torchpt.textures import Look, Pick, look_up
 
 __all__ = ["Spot", "Surface", "glow", "parameters_at", "shading_normal", "spot_at", "surface_at", "veil"]
 
@@ -60,24 +61,6 @@ def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
     some = stretch > 0
     stretch = torch.where(some, torch.where(some, stretch, 1.0).sqrt(), torch.inf)
     return square * (pixel[4] * pixel[4]) / (cosine * stretch)
-
-
-@dataclass(frozen=True)
-class Relief:
-    """What a normal or bump map did to the shading normal."""
-
-    normal: Tensor  # (3, N) without the map, turned as the frame is
-    alpha2: Tensor  # (N,) squared roughness of a surface whose facets lean as the map does
-
-    def shadowing(self, w: Tensor) -> Tensor:
-        """How much of the light from unit directions ``w (3, N)`` the relief lets through ``(N,)``.
-
-        Smith's masking by the facets that the tilt stands for, which takes the place of the hard edge where mapped and true
-        horizon differ (Conty Estevez, Lecocq, Stein, *A Microfacet-Based Shadowing Function to Solve the Bump Terminator
-        Problem*, Ray Tracing Gems, 2019).
-        """
-        square = dot(w, self.normal).square().clamp_min(1e-12)
-        return 2.0 / (1.0 + (1.0 + self.alpha2 * (1.0 - square).clamp_min(0.0) / square).sqrt())
 
 
 @dataclass(frozen=True)
@@ -187,36 +170,7 @@ def shading_normal(world: World, number: int, d: Tensor, at: Interaction, spot: 
 def _mapped(
     world: World, look: Look, row: Tensor, spot: Spot, d: Tensor, at: Interaction, side: Tensor | None
 ) -> tuple[Frame, Relief]:
-    """The frame about the normal of a normal or bump map, and what the map did.
-
-    A normal map's vectors are relative to the shading normal, the tangent along u, and their cross product. A bump map's
-    heights move the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). What is seen from behind is
-    the mirror image. A normal that turns from the eye is mirrored about the surface's own (after Schuessler, Heitz,
-    Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017): all as Mitsuba's ``normalmap`` and ``bumpmap``.
-    """
-    assert world.textures is not None and at.tangent is not None
-    base = Frame.along(at.ns, at.tangent)
-    if look.normal is not None:
-        local = _read(world, look.normal, row, at, spot) * 2.0 - 1.0
-        x, y, z = local[0], local[1], local[2].clamp_min(1e-3)
-        if look.strength is not None:
-            strength = take(look.strength, row)
-            x, y = x * strength, y * strength
-    else:
-        assert look.bump is not None and look.bump.nodes is not None and at.bitangent is not None
-        footprint = spot.footprint if look.bump.filtered else None
-        du, dv = slope(world.textures, take(look.bump.nodes, row), spot.uv, footprint)
-        along = torch.addcmul(at.tangent, at.ns, du - dot(at.ns, at.tangent))
-        across = torch.addcmul(at.bitangent, at.ns, dv - dot(at.ns, at.bitangent))
-        x, y, z = base.to_local(cross(along, across))
-        sign = torch.copysign(torch.ones_like(z), z.detach())
-        x, y, z = x * sign, y * sign, z * sign
-    n = at.ns if side is None else at.ns * side
-    normal = normalize(affine(base.s * x, base.t, y, n, z))
-    away = (dot(d, n) * dot(d, normal) <= 0).detach()
-    normal = torch.where(away, normalize(affine(base.s * -x, base.t, -y, n, z)), normal)
-    flat = dot(normal, normal) == 0  # no texture coordinates, so no slope
-    normal = torch.where(flat, n, normal)
-    square = dot(normal, n).square().clamp_min(1e-12)
-    alpha2 = (0.125 * (1.0 - square).clamp_min(0.0) / square).clamp_max(1.0)
-    return Frame.along(normal, at.tangent), Relief(n, alpha2)
+    """The frame about the normal of a normal or bump map, and what the map did."""
+    assert world.textures is not None
+    local = None if look.normal is None else _read(world, look.normal, row, at, spot)
+    return mapped(world.textures, look, row, local, spot.uv, spot.footprint, d, at, side)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -10,12 +11,14 @@ from torch import Tensor
 from torchpt.accel import Accel
 from torchpt.cameras import Camera
 from torchpt.film import Filter
-from torchpt.integrators import aov, ibl
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import Limits, Tally, trace
 from torchpt.integrators.search import Search
 from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, salts
+
+if TYPE_CHECKING:
+    from torchpt.integrators.ibl import Preview
 
 __all__ = ["Wave"]
 
@@ -44,7 +47,7 @@ class Wave:
     sampler: Sampler
     crop: tuple[int, int, int, int]
     centre: Tensor
-    preview: ibl.Preview | None = None
+    preview: Preview | None = None
 
     def rays(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> PathState:
         """Camera rays of consecutive pixels of the picture, row by row; lanes run over pixels, then over samples."""
@@ -66,6 +69,8 @@ class Wave:
         if self.preview is None:
             radiance, tally = trace(self.stages, self.limits, self.accel, state)
         else:
+            from torchpt.integrators import ibl
+
             radiance, tally = ibl.first_hit(self.stages, self.preview, self.accel, state)
         if self.filter.signed:
             radiance = radiance * self._weight(state)
@@ -80,6 +85,8 @@ class Wave:
         self, names: tuple[str, ...], first_pixel: int, pixels: int, first_sample: int, samples: int
     ) -> dict[str, Tensor]:
         """The layers ``names``, each ``(C, samples, pixels)``."""
+        from torchpt.integrators import aov
+
         state = self.rays(first_pixel, pixels, first_sample, samples)
         plan, world = self.stages.plan, self.stages.world
         search = Search(self.accel, world, plan.sampler, plan.dtype)

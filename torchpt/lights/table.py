@@ -12,8 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lights import area, choice, constant, envmap, point, quadric, solid_angle, sphere, spot
-from torchpt.lights.envmap import EnvironmentMap
+from torchpt.lights import area, choice, constant, point, quadric, solid_angle, sphere, spot
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.math.warps import concentric_disk
 from torchpt.records import DISTANT, KINDS, Interaction, Lights, LightSample, Quadrics, rows
@@ -194,7 +193,9 @@ def _from_afar(
         wi = constant.sample(u).to(at.radiance.dtype)
         pdf, weight = (torch.full_like(wi[0], value) for value in (1.0 / constant.INVERSE_PDF, constant.INVERSE_PDF))
     radiance = at.radiance.expand(3, u.shape[1])
-    if isinstance(lights.environment, EnvironmentMap):
+    if lights.environment is not None and not isinstance(lights.environment, Tensor):
+        from torchpt.lights import envmap
+
         wi, pdf, light = envmap.sample(lights.environment, u, mis)
         weight = torch.where(pdf > 0, safe_reciprocal(pdf), 0.0)
         radiance = _pick(_is(lights, "envmap", row), light, radiance)
@@ -247,7 +248,9 @@ def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
     """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS."""
     assert lights.environment is not None
     probability = choice.environment(lights.choice)
-    if isinstance(lights.environment, EnvironmentMap):
+    if not isinstance(lights.environment, Tensor):
+        from torchpt.lights import envmap
+
         radiance, pdf = envmap.environment(lights.environment, d, mis=True)
         return radiance, pdf * probability
     pdf = torch.full_like(d[0], 1.0 / constant.INVERSE_PDF) * probability

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from torch import Tensor
+
 from torchpt import bsdfs
 from torchpt.accel import Accel
 from torchpt.lights.choice import ByTree
-from torchpt.lights.envmap import EnvironmentMap
 from torchpt.records import KINDS, Lights, World, tensors_of
 from torchpt.scene.schema import ThinLens
 from torchpt.scene.settings import Settings
@@ -60,7 +61,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "scene_bytes": memory,
     }
     around = None if lights is None else lights.environment
-    if isinstance(around, EnvironmentMap):
+    if around is not None and not isinstance(around, Tensor):
         compensated = around.compensated is not None
         made["lights"]["envmap"] = {"texels": [around.width, around.height], "mis_compensation": compensated}
     if world.textures is not None:

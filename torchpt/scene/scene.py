@@ -14,7 +14,7 @@ from torch import Tensor
 from torchpt import accel as search
 from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
-from torchpt.cameras import Camera, Orthographic, Perspective, ThinLens
+from torchpt.cameras import Camera, Orthographic, Perspective
 from torchpt.errors import RenderError, SceneError
 from torchpt.math.transforms import is_singular, similarity_scale
 from torchpt.records import Geometry, World
@@ -221,6 +221,8 @@ class Scene:
         if isinstance(kind, schema.Orthographic):
             return Orthographic(**placed, extent=number["width"])
         if isinstance(kind, schema.ThinLens):
+            from torchpt.cameras import ThinLens
+
             return ThinLens(**placed, **number, fov_axis=kind.fov_axis, blades=kind.blades)
         assert isinstance(kind, schema.Perspective)
         return Perspective(**placed, **number, fov_axis=kind.fov_axis)

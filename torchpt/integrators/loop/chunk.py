@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from torchpt.accel import Accel
-from torchpt.integrators.aov import CHANNELS
 from torchpt.integrators.loop.kernels import PLACE, Kernel, Kernels
 from torchpt.integrators.loop.rows import HIT, Memory, Rows
 from torchpt.integrators.path import ENDLESS, Tally
@@ -85,6 +84,8 @@ class Worker:
 
     def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
         """Fills ``shown`` with layers of the first surfaces, channel after channel; returns how many rays it took."""
+        from torchpt.integrators.aov import CHANNELS
+
         self._start(chunk)
         kernels, count = self.kernels, chunk.pixels * chunk.samples
         channels = sum(CHANNELS[name] for name in names)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
-from torchpt.integrators import aov, ibl, stages
+from torchpt.integrators import stages
 from torchpt.integrators.loop.rows import HIT, PASS, SHADOW, Rows
 from torchpt.integrators.search import beyond, passing
 from torchpt.lanes import engine, gathers, pointwise, shelf, views  # noqa: F401  (they register what they lower)
@@ -467,6 +467,8 @@ class Kernels:
         return sinks
 
     def _layers(self, tracer: Tracer, model: int, names: tuple[str, ...]) -> Sinks:
+        from torchpt.integrators import aov
+
         state, rest = self._state(tracer)
         hit = self._hit(tracer)
         wave = self.wave
@@ -480,6 +482,8 @@ class Kernels:
         return Sinks(scatter=[Scatter(-1, tracer.nodes(state.lane)[0], tuple(enumerate(nodes)), slots=True)])
 
     def _preview(self, tracer: Tracer, model: int) -> Sinks:
+        from torchpt.integrators import ibl
+
         salts = self._salts(tracer)
         state, rest = self._state(tracer)
         hit = self._hit(tracer)

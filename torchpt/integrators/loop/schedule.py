@@ -12,7 +12,6 @@ import numpy as np
 
 from torchpt.errors import RenderError
 from torchpt.film import Film
-from torchpt.integrators.aov import CHANNELS
 from torchpt.integrators.loop.chunk import LANES, Chunk, Halted, Worker
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.path import Tally
@@ -151,6 +150,8 @@ class Loop:
             raise self._not_finite(used, chunk)
 
     def _layers(self, worker: Worker, chunk: Chunk, share: Share) -> None:
+        from torchpt.integrators.aov import CHANNELS
+
         names = tuple(self.layers)
         share.tally.rays += worker.layers(chunk, names)
         assert worker.shown is not None

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchpt.accel.bounds import chosen, primitive_bounds
-from torchpt.lights import choice_of, envmap
+from torchpt.lights import choice_of
 from torchpt.lights.solid_angle import shapes_of, table_of
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Geometry, Lights
@@ -19,6 +20,9 @@ from torchpt.scene.assembly.primitives import Primitives
 from torchpt.scene.lights import ENVIRONMENTS
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.texels import images_of
+
+if TYPE_CHECKING:
+    from torchpt.lights.envmap import EnvironmentMap
 
 __all__ = ["lights_of"]
 
@@ -175,22 +179,22 @@ def _surfaces(
     return _Rows(names, p0, e1, e2, normal, flip, area, bound, radiance, power), column
 
 
-def _surroundings(
-    source: Source, parameters: Mapping[str, Tensor], dtype: torch.dtype
-) -> Tensor | envmap.EnvironmentMap:
+def _surroundings(source: Source, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> Tensor | EnvironmentMap:
     """What an environment sends: one radiance, or a map."""
     if source.kind == "constant":
         return parameters[f"{source.name}.radiance"].to(dtype)
     texels, scale, pose = (parameters[f"{source.name}.{key}"] for key in ("texels", "scale", "to_world"))
     linear = pose[:3, :3].double()
     turn = torch.linalg.inv(linear) * torch.linalg.det(linear).abs() ** (1.0 / 3.0)
+    from torchpt.lights import envmap
+
     return envmap.build(texels.to(dtype), turn.to(dtype), scale.to(dtype))
 
 
 def _source(
     source: Source,
     parameters: Mapping[str, Tensor],
-    environment: Tensor | envmap.EnvironmentMap | None,
+    environment: Tensor | EnvironmentMap | None,
     centre: Tensor,
     reach: Tensor,
     dtype: torch.dtype,
@@ -225,8 +229,10 @@ def _source(
         normal, color = normalize(given("direction")[:, None])[:, 0], given("irradiance")
         share = math.pi * reach**2
     else:
-        map = isinstance(environment, envmap.EnvironmentMap)
-        color = (environment.mean * environment.scale.detach()).expand(3) if map else given("radiance")
+        if environment is None or isinstance(environment, Tensor):
+            color = given("radiance")
+        else:
+            color = (environment.mean * environment.scale.detach()).expand(3)
         share = 4.0 * math.pi**2 * reach**2
     one = torch.ones(1, dtype=dtype, device=centre.device)
     p0, e1, e2, normal, light = (x[:, None].to(dtype) for x in (p0, e1, blank, normal, color))

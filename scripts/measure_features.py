@@ -1,0 +1,60 @@
+"""What a feature costs where a scene has it, and where it does not: nodes of its files in kernels, rows, tables, time.
+
+Prints a table in Markdown for ``docs/lanes.md``: ``python scripts/measure_features.py``. A plain scene of three rectangles
+(``tests/references/features.py``) gets one feature at a time. Times are of one thread, the least of several renders.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "references"))
+
+from features import FEATURES, Feature, kernels, with_feature
+
+import torchpt
+from torchpt.integrators.loop.kernels import Kernels
+from torchpt.render import render_scene
+from torchpt.scene.description import settings
+
+REPEATS = 7
+
+
+def _counts(made: Kernels, feature: Feature | None) -> tuple[int, int, int, int]:
+    """All nodes, those of the feature's files, rows of a path, tables."""
+    programs = [kernel.program for kernel in made._made.values()]
+    mine = () if feature is None else feature.files
+    nodes = sum(program.nodes.get(file, 0) for program in programs for file in mine)
+    whole = sum(max(program.nodes.values(), default=0) for program in programs)
+    leaves = {leaf for program in programs for leaf in program.leaves()}
+    return whole, nodes, made.state.count, len(leaves)
+
+
+def _time(scene: torchpt.Scene) -> float:
+    """Nanoseconds a camera sample."""
+    wish = settings(scene.description, {"render": {"spp": 64, "threads": 1, "compile": "on"}})
+    best = float("inf")
+    for _ in range(REPEATS):
+        done = render_scene(scene, wish)
+        best = min(best, (done.seconds - done.build_seconds - done.compile_seconds) / done.paths)
+    return 1e9 * best
+
+
+def main() -> None:
+    """Print the table."""
+    made, scene = kernels(with_feature(None))
+    plain, rows = _counts(made, None)[0], _counts(made, None)
+    print("| feature | nodes of its files without it | with it | all nodes | rows of a path | tables | ns a sample |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    print(f"| (plain) | | | {plain} | {rows[2]} | {rows[3]} | {_time(scene):.0f} |")
+    for name, feature in FEATURES.items():
+        without = _counts(made, feature)[1]
+        more, with_it = kernels(with_feature(name))
+        whole, nodes, state, tables = _counts(more, feature)
+        print(f"| {name} | {without} | {nodes} | {whole} | {state} | {tables} | {_time(with_it):.0f} |", flush=True)
+    print(f"\nthe plain scene again: {_time(kernels(with_feature(None))[1]):.0f} ns a sample")
+
+
+if __name__ == "__main__":
+    main()

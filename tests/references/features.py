@@ -1,0 +1,138 @@
+"""A plain scene, and the same with one feature more: what a feature costs where it is, and where it is not."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torchpt
+from torchpt import forward
+from torchpt.integrators.loop.kernels import Kernels
+
+__all__ = ["FEATURES", "PLAIN", "Feature", "kernels", "with_feature"]
+
+_SCENES = Path(__file__).parents[2] / "scenes"
+_TURN = {"rotate": {"axis": [1, 0, 0], "angle": -90}}
+
+PLAIN: dict[str, Any] = {
+    "camera": {"origin": [0, 1.5, 4], "target": [0, 0.5, 0], "fov": 45},
+    "materials": {"clay": {"type": "diffuse", "reflectance": [0.6, 0.4, 0.3]}},
+    "shapes": {
+        "floor": {"type": "rectangle", "material": "clay", "transform": [{"scale": 3}, _TURN]},
+        "wall": {
+            "type": "rectangle",
+            "material": "clay",
+            "transform": [{"scale": 3}, {"translate": [0, 0, -2]}],
+        },
+        "lamp": {
+            "type": "rectangle",
+            "emission": 8,
+            "material": "clay",
+            "transform": [{"rotate": {"axis": [1, 0, 0], "angle": 90}}, {"translate": [0, 3, 0]}],
+        },
+    },
+    "integrator": {"type": "path", "max_depth": 4, "rr_depth": 9},
+    "film": {"width": 64, "height": 64, "filter": "box"},
+}
+
+
+@dataclass(frozen=True)
+class Feature:
+    """What a scene may have.
+
+    Attributes:
+        files: of the package that nothing else needs, relative to it.
+        add: puts it into a scene.
+        leaves: how the names of its tables begin.
+        rows: fields of a path's state that it brings.
+        module: what a scene without it does not import; None where modules of its kind are imported together.
+    """
+
+    files: tuple[str, ...]
+    add: Callable[[dict[str, Any]], None]
+    leaves: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ()
+    module: str | None = None
+
+
+def _material(scene: dict[str, Any], **keys: Any) -> None:
+    scene["materials"]["more"] = {"type": "diffuse", **keys}
+    scene["shapes"]["wall"]["material"] = "more"
+
+
+def _squares(**keys: Any) -> dict[str, Any]:
+    return {"type": "checkerboard", "scale": 6, **keys}
+
+
+def _light(scene: dict[str, Any], **keys: Any) -> None:
+    scene["lights"] = {"more": keys}
+
+
+#: By name.
+FEATURES: dict[str, Feature] = {
+    "second material": Feature(
+        ("bsdfs/roughconductor.py",),
+        lambda scene: _material(scene, **{"type": "roughconductor", "material": "Au", "alpha": 0.2}),
+        ("world.bsdfs.1",),
+    ),
+    "refraction": Feature(
+        ("bsdfs/dielectric.py",), lambda scene: _material(scene, type="dielectric"), ("world.bsdfs.1",), ("eta",)
+    ),
+    "texture": Feature(
+        ("textures.py",), lambda scene: _material(scene, reflectance=_squares()), ("world.textures", "world.uvs")
+    ),
+    "normal map": Feature(
+        ("integrators/relief.py",),
+        lambda scene: _material(scene, normal_map=_squares(color0=[0.6, 0.45, 0.95], color1=[0.4, 0.5, 0.95])),
+        ("world.textures", "world.tangents"),
+    ),
+    "opacity": Feature(
+        ("integrators/search.py",), lambda scene: _material(scene, opacity=0.5), ("world.opacity",), ("clear",)
+    ),
+    "constant sky": Feature(
+        ("lights/constant.py",),
+        lambda scene: _light(scene, type="constant", radiance=0.3),
+        ("world.lights.environment",),
+    ),
+    "environment map": Feature(
+        ("lights/envmap.py",),
+        lambda scene: _light(scene, type="envmap", path=str(_SCENES / "sky.exr")),
+        ("world.lights.environment",),
+        module="torchpt.lights.envmap",
+    ),
+    "point light": Feature(("lights/point.py",), lambda scene: _light(scene, type="point", position=[1, 2, 1], intensity=5)),
+    "layer": Feature(
+        ("integrators/aov.py",), lambda scene: scene["film"].update(aovs=["normal"]), module="torchpt.integrators.aov"
+    ),
+    "lens": Feature(
+        ("cameras/thinlens.py",),
+        lambda scene: scene["camera"].update(type="thinlens", aperture_radius=0.05, focus_distance=4),
+        ("camera.aperture", "camera.lens"),
+        module="torchpt.cameras.thinlens",
+    ),
+    "preview": Feature(
+        ("integrators/ibl.py", "integrators/split_sum.py"),
+        lambda scene: scene.update(integrator={"type": "ibl"}, lights={"more": {"type": "constant", "radiance": 0.3}}),
+        ("preview",),
+        module="torchpt.integrators.ibl",
+    ),
+    "roulette": Feature(("integrators/roulette.py",), lambda scene: scene["integrator"].update(rr_depth=2)),
+}  # fmt: skip
+
+
+def with_feature(name: str | None) -> dict[str, Any]:
+    """The plain scene, with a feature where there is a name."""
+    scene = copy.deepcopy(PLAIN)
+    if name is not None:
+        FEATURES[name].add(scene)
+    return scene
+
+
+def kernels(described: Mapping[str, Any]) -> tuple[Kernels, torchpt.Scene]:
+    """A scene's kernels, all that a render of it asks for made."""
+    scene = torchpt.load(described, "cpu")
+    torchpt.render(scene, spp=8, compile="on")
+    return forward._kernels[scene], scene
