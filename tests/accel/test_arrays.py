@@ -86,13 +86,20 @@ def test_python_threads_search_at_once(name):
     assert len(results) == 3 and all(np.array_equal(expected, prim) for prim in results)
 
 
-def test_the_tensor_search_says_that_it_takes_no_arrays():
-    accel = build(soup(0), "torch")
-    none = np.zeros((3, 0), np.float32)
-    with pytest.raises(NotImplementedError, match="numba and brute"):
-        accel.nearest(none, none, none[0], 0, none[0], none[0], none[0], none[0])
-    with pytest.raises(NotImplementedError, match="numba and brute"):
-        accel.blocked(none, none, none[0], 0, none[0])
+def test_the_tensor_search_takes_arrays_too():
+    """By way of tensors: any structure serves the compiled loop."""
+    accel = build(soup(40), "torch")
+    rays = np.random.default_rng(5).normal(size=(7, 50)).astype(np.float32)
+    o, d, t_max = rays[:3], rays[3:6], np.abs(rays[6]) + 1
+    t, u, v = (np.full(50, 7, np.float32) for _ in range(3))
+    prim, out = np.full(50, 7, np.int32), np.full(50, 7, np.int32)
+    accel.nearest(o, d, t_max, 45, t, prim, u, v)
+    accel.blocked(o, d, t_max, 45, out)
+    hits = accel.intersect(*(torch.from_numpy(x[..., :45].copy()) for x in (o, d, t_max)))
+    for found, expected in zip((t, prim, u, v), hits, strict=True):
+        assert (found[:45] == expected.numpy()).all() and (found[45:] == 7).all()
+    assert (out[:45] == (prim[:45] >= 0)).all() and (out[45:] == 7).all()
+    assert 0 < out[:45].sum() < 45
 
 
 def test_a_triangle_is_met_alike_beside_other_kinds():

@@ -51,11 +51,11 @@ class Worker:
 
     Args:
         kernels: of the render.
-        halt: set where the render is to end.
+        halt: set where the render is to end; None: it never is.
     """
 
-    def __init__(self, kernels: Kernels, halt: threading.Event) -> None:
-        self.kernels, self.wave, self._halt = kernels, kernels.wave, halt
+    def __init__(self, kernels: Kernels, halt: threading.Event | None = None) -> None:
+        self.kernels, self.wave, self._halt = kernels, kernels.wave, halt or threading.Event()
         self._arenas = [Memory(kernels.state.count) for _ in range(2)]
         self._passed = [Memory(kernels.passed.count) for _ in range(2)] if kernels.veiled else []
         self._sifted = Memory(1)
