@@ -1,4 +1,4 @@
-"""``render.compile``: what ``on``, ``auto``, ``off`` mean: on a CPU kernels of the loop, on CUDA few graphs and no recompiles."""
+"""``render.compile``: what ``on``, ``auto``, ``off`` mean: kernels of the loop on a CPU, few graphs on CUDA."""
 
 from __future__ import annotations
 
