@@ -18,7 +18,7 @@ from torchpt.integrators.loop.kernels import Kernels
 from torchpt.render import render_scene
 from torchpt.scene.description import settings
 
-REPEATS = 7
+REPEATS = 15
 
 
 def _counts(made: Kernels, feature: Feature | None) -> tuple[int, int, int, int]:

@@ -105,7 +105,9 @@ def plain() -> dict[Any, Program]:
     return _programs(with_feature(None))
 
 
-@pytest.mark.parametrize("name", FEATURES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "preview" else name for name in FEATURES]
+)
 def test_kernels_hold_nothing_of_what_is_not_there(name, plain):
     feature = FEATURES[name]
     assert _of(feature, plain) == (0, 0)
