@@ -145,9 +145,13 @@ class Film:
         """``(randomizations, C, pixels)`` float64."""
         return self._sums
 
-    def counted(self, first_pixel: int, pixels: int, group: int) -> None:
-        """Say that a sample of a randomization was added to the sums of consecutive pixels."""
-        self._counts[group, first_pixel : first_pixel + pixels] += 1
+    def counted(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> None:
+        """Say that consecutive samples were added to the sums of consecutive pixels."""
+        counts = self._counts.numpy()
+        for group in range(self.randomizations):
+            # Of the numbers from `first_sample` on those that are `group` modulo the randomizations.
+            number = len(range((group - first_sample) % self.randomizations, samples, self.randomizations))
+            counts[group, first_pixel : first_pixel + pixels] += number
 
     def keep_first(self, values: np.ndarray, first_pixel: int) -> None:
         """Keep the first samples ``(C, n)`` of consecutive pixels."""

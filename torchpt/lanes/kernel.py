@@ -16,7 +16,7 @@ from torchpt.lanes.graph import Graph, Unsupported
 __all__ = ["CAPACITY", "HEAD", "Note", "Pack", "Scatter", "Sinks", "Store", "text"]
 
 #: Lanes of an arena: a multiple of WIDTH, with WIDTH to spare at the end of each row.
-CAPACITY = 8192 + WIDTH
+CAPACITY = 16384 + WIDTH
 _UMIN = f"declare <{WIDTH} x i32> @llvm.umin.v{WIDTH}i32(<{WIDTH} x i32>, <{WIDTH} x i32>)"
 #: What every call is given, in this order; then uniforms, lists, and input and output tensors with their row lengths.
 HEAD = ("src", "dst", "list", "slots", "stride", "counters", "tables", "search")

@@ -65,7 +65,8 @@ class Worker:
         self.shown: Memory | None = None
         self._counters = np.zeros(count + 4, np.int64)
         self._place = np.zeros(len(PLACE), np.int32)
-        self._calls: dict[int, tuple[Any, Any, int]] = {}
+        self._calls: dict[int, tuple[Any, Any, int, tuple[tuple[int, str], ...], range]] = {}
+        self._keep: list[Kernel] = []
         self._salts: dict[int, Any] = {}
         self._uniforms = {"place": self._place.ctypes.data}
 
@@ -365,27 +366,34 @@ class Worker:
     ) -> None:
         if self._halt.is_set():
             raise Halted
-        program = kernel.program
         prepared = self._calls.get(id(kernel))
         if prepared is None:
-            words = (ctypes.c_int64 * (len(HEAD) + len(program.uniforms) + program.lists))()
-            words[_WORD["counters"]] = self._counters.ctypes.data
-            words[_WORD["tables"]] = kernel.tables.address
-            if self.kernels.search is not None:
-                words[_WORD["search"]] = ctypes.addressof(self.kernels.search)
-            prepared = self._calls[id(kernel)] = words, kernel, ctypes.addressof(words)
-        words, _, address = prepared
+            prepared = self._calls[id(kernel)] = self._prepared(kernel)
+        words, call, address, uniforms, first = prepared
         words[0], words[1] = source.address, target.address
         if places is not None:
             words[2] = places.address
-        out = self.slots if slots is None else slots
-        words[3], words[4] = out.address, out.words.shape[1]
-        for k, name in enumerate(program.uniforms):
-            words[len(HEAD) + k] = self._uniforms[name]
+        words[3] = self.slots.address if slots is None else slots.address
+        for place, name in uniforms:
+            words[place] = self._uniforms[name]
         if lists is not None:
-            for k in range(program.lists):
-                words[len(HEAD) + len(program.uniforms) + k] = lists[k].address
-        program.call(address, count)
+            for place, memory in zip(first, lists, strict=False):
+                words[place] = memory.address
+        call(address, count)
+
+    def _prepared(self, kernel: Kernel) -> tuple[Any, Any, int, tuple[tuple[int, str], ...], range]:
+        """A kernel's arguments: what is always the same is filled in, and it is said where the rest goes."""
+        program = kernel.program
+        start = len(HEAD) + len(program.uniforms)
+        words = (ctypes.c_int64 * (start + program.lists))()
+        words[_WORD["stride"]] = CAPACITY
+        words[_WORD["counters"]] = self._counters.ctypes.data
+        words[_WORD["tables"]] = kernel.tables.address
+        if self.kernels.search is not None:
+            words[_WORD["search"]] = ctypes.addressof(self.kernels.search)
+        uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(program.uniforms))
+        self._keep.append(kernel)  # so that its id stays its own
+        return words, program.call, ctypes.addressof(words), uniforms, range(start, start + program.lists)
 
 
 def _row(memory: np.ndarray, rows: Rows, name: str, count: int) -> np.ndarray:

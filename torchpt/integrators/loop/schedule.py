@@ -186,9 +186,9 @@ class Loop:
             if clamp is not None:
                 words[at + 6], words[at + 7] = source, CAPACITY
             kernel.call(ctypes.addressof(words), n)
-            film.counted(chunk.first_pixel, n, group)
-            if chunk.first_sample + k == 0:
-                film.keep_first(values[:, :n], chunk.first_pixel)
+        film.counted(chunk.first_pixel, n, chunk.first_sample, chunk.samples)
+        if chunk.first_sample == 0:
+            film.keep_first(values[:, :n], chunk.first_pixel)
         return int(counters[0])
 
     def _not_finite(self, used: np.ndarray, chunk: Chunk) -> RenderError:
