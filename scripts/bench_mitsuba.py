@@ -353,7 +353,7 @@ def replaced(name: str) -> dict[str, str]:
 
 def mitsuba(name: str, variant: str, arguments: argparse.Namespace) -> Turn:
     """Turns of Mitsuba's."""
-    import drjit
+    drjit: Any = importlib.import_module("drjit")
     import numpy as np
     from mitsuba_scene import convert, load_mitsuba, nearest
 

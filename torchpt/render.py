@@ -220,5 +220,6 @@ def _differentiable_chunks(
             values = values * (clamp / values.detach().abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
         return values.sum(1) / settings.render.spp
 
-    for first, count, sample, samples, _ in chunks_of(settings, lanes, still.sampler.randomizations, pixels):
-        yield adjoints.Chunk(first, count, partial(radiance, (first, count, sample, samples)))
+    with limited_threads(settings.render.threads):  # while whoever asked for the chunks differentiates them
+        for first, count, sample, samples, _ in chunks_of(settings, lanes, still.sampler.randomizations, pixels):
+            yield adjoints.Chunk(first, count, partial(radiance, (first, count, sample, samples)))

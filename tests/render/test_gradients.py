@@ -198,3 +198,22 @@ def test_wrong_parameters_are_named(params, words):
     with pytest.raises(SceneError, match=words) as caught:
         torchpt.render(torchpt.load(only("floor"), "cpu"), params=params, spp=1)
     assert "\n" not in str(caught.value)
+
+
+def test_the_backward_pass_keeps_to_its_threads(monkeypatch):
+    scene, seen = torchpt.load("cornell_box", "cpu"), []
+    before, plain = torch.get_num_threads(), torch.autograd.grad
+    monkeypatch.setattr(
+        torch.autograd, "grad", lambda *a, **k: (seen.append(torch.get_num_threads()), plain(*a, **k))[1]
+    )
+    red = scene.params["materials.red.reflectance"].clone().requires_grad_()
+    torch.set_num_threads(2)
+    try:
+        picture = torchpt.render(
+            scene, params={"materials.red.reflectance": red}, spp=1, threads=1, film={"width": 8, "height": 8}
+        )
+        picture.sum().backward()
+        assert seen and set(seen) == {1}
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
