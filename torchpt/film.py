@@ -173,13 +173,19 @@ class Film:
 
         Randomizations with a sample more than the others weigh as much: the estimate is exact for equal counts.
         """
-        filled = self._counts.amin(1) > 0
-        if int(filled.sum()) < 2:
+        filled = [k for k in range(self.randomizations) if int(self._counts[k].min()) > 0]
+        if len(filled) < 2:
             return None
-        sums, counts = self._sums[filled], self._counts[filled]
-        means = sums / counts[:, None]
-        spread = (means - means.mean(0)).square().sum(0) / (len(means) - 1)
-        return self._picture(spread / len(means))
+        # One randomization at a time: a large film has room for no more.
+        mean = torch.zeros_like(self._first)
+        for k in filled:
+            mean += self._sums[k] / self._counts[k]
+        mean /= len(filled)
+        spread = torch.zeros_like(mean)
+        for k in filled:
+            spread += (self._sums[k] / self._counts[k] - mean).square_()
+        spread /= len(filled) - 1
+        return self._picture(spread / len(filled))
 
     def relmse(self) -> float | None:
         """The picture's estimate of its own relMSE."""
