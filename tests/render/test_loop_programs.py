@@ -342,3 +342,13 @@ def test_a_stage_that_turns_out_not_to_compile_renders_all_eagerly(monkeypatch, 
         assert torch.equal(found.image, eager.image) and found.rays == eager.rays
         assert found.eager == ("all stages: the operator nothing_of_the_kind",)
     assert capsys.readouterr().err.count("nothing_of_the_kind") == 1
+
+
+def test_a_parameter_changed_in_place_reaches_the_tables():
+    scene = torchpt.load("env_teapot", device="cpu")
+    keys = {"spp": 1, "film": {**film_of(8), "filter": "box"}}
+    torchpt.render(scene, **keys)
+    for name in ("lights.sky.scale", "lights.sky.texels", "materials.gold.alpha", "materials.table.reflectance"):
+        scene.params[name].mul_(0.5)
+        found, expected = (float(torchpt.render(scene, compile=mode, **keys).mean()) for mode in ("on", "off"))
+        assert found == pytest.approx(expected, rel=1e-4)

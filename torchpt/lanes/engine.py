@@ -13,7 +13,6 @@ import stat
 import sys
 import tempfile
 import threading
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,14 +28,13 @@ __all__ = [
     "identity",
     "kept",
     "read",
-    "seconds",
     "write",
 ]
 
 #: Enters every key: entries of another form are never read.
 _FORM = "4"
 _lock = threading.Lock()
-_state: dict[str, Any] = {"ready": False, "seconds": 0.0, "compiled": 0, "loaded": 0}
+_state: dict[str, Any] = {"ready": False, "compiled": 0, "loaded": 0}
 _functions: dict[str, Function] = {}
 _machines: dict[Target, Any] = {}
 
@@ -84,11 +82,6 @@ def estimates() -> bool:
     return "+avx512f" in host().features.split(",")
 
 
-def seconds() -> float:
-    """Time spent on compiling and loading in this process so far."""
-    return _state["seconds"]
-
-
 def counts() -> tuple[int, int]:
     """How many kernels this process compiled, and how many it loaded from disk."""
     return _state["compiled"], _state["loaded"]
@@ -97,7 +90,6 @@ def counts() -> tuple[int, int]:
 def compiled(ir: str, target: Target | None = None) -> Function:
     """The function ``kernel`` of a module, from this process, from disk, or made now."""
     with _lock:
-        begin = time.perf_counter()
         target = target or host()
         key = _key(ir, target)
         found = _functions.get(key)
@@ -110,20 +102,17 @@ def compiled(ir: str, target: Target | None = None) -> Function:
             else:
                 _state["loaded"] += 1
             found = _functions[key] = _loaded(code, target, key)
-        _state["seconds"] += time.perf_counter() - begin
         return found
 
 
 def kept(key: str) -> Function | None:
     """A function of this machine by its key, from this process or from disk; None where there is none."""
     with _lock:
-        begin = time.perf_counter()
         found = _functions.get(key)
         code = read(f"{key[:40]}.o") if found is None else None
         if code is not None:
             _state["loaded"] += 1
             found = _functions[key] = _loaded(code, host(), key)
-        _state["seconds"] += time.perf_counter() - begin
         return found
 
 

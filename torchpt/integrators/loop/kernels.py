@@ -113,6 +113,11 @@ class Kernels:
             )
             for item in leaves_of(record, name)
         )
+        # A tensor is the same one only as long as nobody wrote into it; of inference tensors that cannot be known.
+        self._states = {
+            path: (id(tensor), object() if tensor.is_inference() else tensor._version)
+            for path, tensor in self._leaves.items()
+        }
         self._ids = {id(tensor): (path, tensor) for path, tensor in self._leaves.items()}
         structure = (world, wave.camera.kind(), wave.filter.kind_of(), self.plan, wave.preview, self._leaves)
         self._structure = (*map(signature, structure), wave.sampler.kind, packets, fused)
@@ -120,7 +125,7 @@ class Kernels:
         self._laid_out: dict[Any, Tensor] = {}
         if self._before is not None:
             old = self._before
-            same = {path for path, tensor in self._leaves.items() if old._leaves[path] is tensor}
+            same = {path for path, state in self._states.items() if old._states[path] == state}
             self._laid_out |= {key: table for key, table in old._laid_out.items() if key[0] in same}
             self._same, old._before = same, None
         self._made: dict[tuple[Any, ...], Kernel] = {}
