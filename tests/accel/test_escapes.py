@@ -1,10 +1,14 @@
 """No ray escapes a closed mesh, however large the mesh, however far from the origin, however well aimed at its edges."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 from accel_reference import sphere_mesh, triangles
 
 from torchpt.accel.wide import Wide
+from torchpt.scene.loaders import load_mesh
 
 FAR = (148376.0, 1234.0, -223423.0)
 BLOCK = 250_000
@@ -26,7 +30,29 @@ def cube(cells):
     return np.concatenate(sides).astype(np.float32), np.concatenate([f[:, [0, 1, 2]], f[:, [0, 2, 3]]])
 
 
-MESHES = {"sphere": lambda: sphere_mesh(144), "cube": lambda: cube(40)}
+def bunny():
+    """The scanned bunny at size 4 about the origin, its holes closed by fans: vertices, faces."""
+    folder = os.environ.get("TORCHPT_ASSETS")
+    if not folder:
+        pytest.skip("the bunny lies in $TORCHPT_ASSETS")
+    (mesh,) = load_mesh(Path(folder) / "bunny.ply")
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+    pairs, counts = np.unique(edges, axis=0, return_counts=True)
+    rim = pairs[counts == 1]
+    hole = np.arange(len(vertices))  # of each vertex on a rim: the least vertex of its hole
+    while (hole[rim[:, 0]] != hole[rim[:, 1]]).any():
+        np.minimum.at(hole, rim[:, 0], hole[rim[:, 1]])
+        np.minimum.at(hole, rim[:, 1], hole[rim[:, 0]])
+    for k in np.unique(hole[rim[:, 0]]):
+        own = rim[hole[rim[:, 0]] == k]
+        faces = np.concatenate([faces, np.column_stack([own, np.full(len(own), len(vertices))])])
+        vertices = np.concatenate([vertices, vertices[np.unique(own)].mean(0, keepdims=True)])
+    low, high = vertices.min(0), vertices.max(0)
+    return ((vertices - (low + high) / 2) * (4 / (high - low).max())).astype(np.float32), faces
+
+
+MESHES = {"sphere": lambda: sphere_mesh(144), "cube": lambda: cube(40), "bunny": bunny}
 
 
 def directions(rng, vertices, faces, o, n):
@@ -70,7 +96,7 @@ def test_no_ray_escapes(name, place):
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), FAR])
 @pytest.mark.parametrize("name", MESHES)
 def test_none_of_a_hundred_million_rays_escapes(name, place):
-    assert escapes(name, place, 25_000_000) == (0, 0)
+    assert escapes(name, place, 17_000_000) == (0, 0)
 
 
 def test_a_hole_is_seen():

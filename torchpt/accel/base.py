@@ -59,10 +59,21 @@ class Accel(ABC):
         for out, found in zip((t, prim, u, v), self.intersect(*rays), strict=True):
             out[:count] = found.numpy()
 
-    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
-        """Whether anything lies in ``(0, t_max)``: 1 or 0 in ``out (C,)`` int32; else as :meth:`nearest`."""
+    def blocked(
+        self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None
+    ) -> None:
+        """Whether anything lies in ``(0, t_max)``: 1 or 0 in ``out (C,)`` int32; else as :meth:`nearest`.
+
+        Args:
+            o, d, t_max, count: rays, as in :meth:`nearest`.
+            out: ``(C,)`` int32, filled.
+            veils: a uint8 for each primitive, not 0 where light may pass it. A ray gets 2 where it may be that all it meets
+                lets light pass, so that it has to be looked at closer.
+        """
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         out[:count] = self.occluded(*rays).numpy()
+        if veils is not None:
+            np.left_shift(out[:count], 1, out=out[:count])
 
     @abstractmethod
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits: ...

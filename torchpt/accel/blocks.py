@@ -7,14 +7,14 @@ import torch
 from numpy.typing import NDArray
 
 from torchpt.accel.bounds import primitive_bounds
-from torchpt.accel.kernels_blocks import LEAF, LINE, NODE
+from torchpt.accel.kernels_blocks import LEAF, LINE, MORE, NODE
 from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
 from torchpt.accel.kernels_layout import lay_out
 from torchpt.accel.kernels_tables import leaf_ids, triangle_tables, work
 from torchpt.accel.tables import prepare
 from torchpt.records import Geometry
 
-__all__ = ["Tree", "aligned", "lines_of", "mesh_tree", "room_of", "wide_tree", "write"]
+__all__ = ["Tree", "aligned", "corners_of", "lines_of", "mesh_tree", "room_of", "wide_tree", "write"]
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -65,9 +65,11 @@ def wide_tree(boxes: Floats, ids: Ints) -> Tree:
     return Tree(flat[: count * 6 * WIDTH], child[: count * WIDTH], slots.reshape(-1), depth, float(cost))
 
 
-def lines_of(tree: Tree) -> int:
-    """Cache lines that a tree takes."""
-    return NODE * tree.nodes + LEAF * tree.leaves
+def lines_of(tree: Tree, counts: tuple[int, ...]) -> int:
+    """Cache lines that a tree takes over primitives of which there are ``counts`` of each kind."""
+    ids = tree.ids.reshape(-1, WIDTH)
+    ruled = ((ids >= counts[0]) & (ids < counts[0] + counts[1])).any(1).sum() if counts[1] else 0
+    return NODE * tree.nodes + LEAF * tree.leaves + MORE * int(ruled)
 
 
 def room_of(depth: int) -> int:
@@ -97,10 +99,18 @@ def mesh_tree(geometry: Geometry) -> tuple[Tree, Floats, Floats]:
     return wide_tree(boxes, ids), planes, tables.rows.numpy()
 
 
-def write(tree: Tree, geometry: Geometry, planes: Floats, line: int, memory: Floats) -> None:
+def write(tree: Tree, geometry: Geometry, planes: Floats, rows: Floats, line: int, memory: Floats) -> None:
     """Lays a tree out in ``memory`` from a line on."""
     codes, triangles = memory.view(np.int32), geometry.counts[0]
-    lay_out(tree.boxes, tree.child, tree.ids, *_corners(geometry), planes, triangles, line, memory, codes)
+    disk = triangles + geometry.counts[1]
+    tables = (planes, corners_of(geometry), rows)
+    lay_out(tree.boxes, tree.child, tree.ids, *_corners(geometry), *tables, triangles, disk, line, memory, codes)
+
+
+def corners_of(geometry: Geometry) -> Floats:
+    """Corners of the primitives that are no triangles, and fourth corners ``(K, 12)``."""
+    p0, p1, p2 = (p[:, geometry.counts[0] :] for p in (geometry.p0, geometry.p1, geometry.p2))
+    return torch.cat([p0, p1, p2, (p1 + p2) - p0]).float().T.contiguous().numpy()
 
 
 def _without_triangles(geometry: Geometry) -> Geometry:

@@ -2,10 +2,12 @@
 
 Everything lies in one buffer of 64-byte lines of 16 float32. A *node* is 4 lines: the lower x, y, z and the upper x, y, z
 of eight children, their eight codes, eight numbers not used. A *leaf* is 7 lines: the nine components of eight
-triangles' corners, their planes' four numbers, eight ids. The leaves of a node follow it.
+triangles' corners, their planes' four numbers, eight ids. A leaf that holds rectangles has 8 lines more: the twelve
+components of eight corners and fourth corners, their planes. The leaves of a node follow it.
 
-A *code* is ``2 line`` for a node and ``~(2 line + mixed)`` for a leaf, where ``mixed`` says that it holds primitives other
-than triangles. Such a primitive has NaN for corners and ``-2 - id`` for an id; empty places have NaN and -1.
+A *code* is ``4 line`` for a node and ``~(4 line + kinds)`` for a leaf, where ``kinds`` is 2 for rectangles plus 1 for
+primitives of other kinds. A primitive that is no triangle has NaN for corners and ``-2 - id`` for an id; empty places have
+NaN and -1.
 
 An *entry* is the distance at which a ray enters a box. Every hit in a leaf is taken to lie at ``FLOOR`` times its leaf's
 entry or beyond, and boxes are passed over only from ``SLACK`` times the best hit on. Boxes within boxes are entered no
@@ -17,7 +19,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchpt.accel.kernels_leaf import distance
 from torchpt.native.jit import part
 from torchpt.native.simd import (
     as_int,
@@ -41,25 +42,30 @@ __all__ = [
     "IDS",
     "LEAF",
     "LINE",
+    "MORE",
     "NODE",
     "PLANES",
     "SLACK",
+    "VEILED",
+    "blocking",
     "boxes",
     "crossed",
     "fetch",
     "fits",
-    "others",
     "place",
     "planes",
     "push",
+    "triangles_alone",
 ]
 
 LINE = 16  # float32 numbers a cache line
-NODE, LEAF = 4, 7  # lines
+NODE, LEAF, MORE = 4, 7, 8  # lines of a node, of a leaf, and of the rectangles that it holds
 CHILDREN = 48  # where a node's codes begin
 PLANES, IDS = 72, 104  # where a leaf's planes and ids begin
 SLACK = np.float32(1.0 + 2.0**-16)
 FLOOR = np.float32(1.0 - 2.0**-17)
+#: In place of an id: an any-hit ray has met surfaces that may let light pass, and no others yet.
+VEILED = np.int32(-2)
 _ZERO = np.float32(0.0)
 _INF = np.float32(np.inf)
 
@@ -67,7 +73,22 @@ _INF = np.float32(np.inf)
 @part(forceinline=True)
 def place(code):
     """Where a code's block begins in the buffer."""
-    return ((code ^ (code >> 63)) & ~1) * (LINE // 2)
+    return ((code ^ (code >> 63)) & ~3) * (LINE // 4)
+
+
+@part(forceinline=True)
+def triangles_alone(code):
+    """Whether a leaf's code says that it holds nothing else."""
+    return code & 3 == 3
+
+
+@part(forceinline=True)
+def blocking(scene, prim):
+    """The id of a primitive that any-hit rays end at, or :data:`VEILED`.
+
+    ``scene`` ends with a uint8 for each primitive that is not 0 where light may pass, and how many there are: 0 where all block.
+    """
+    return VEILED if scene[5] > 0 and item(scene[4], prim) != 0 else prim
 
 
 @part(forceinline=True)
@@ -136,48 +157,6 @@ def planes(tree, base, o, d, za, zb, zc, sz, floor):
     return maximum(t, splat(floor, 8)), ahead & (t > zero)
 
 
-@part()
-def others(codes, base, tables, kinds, o, d, axes, shear, floor, best, prim, any_hit):
-    """One ray against the primitives of a leaf that are no triangles: the best hit so far, with ``u`` and ``v``.
-
-    Args:
-        codes: the tree's buffer as int32.
-        base: where the leaf begins.
-        tables: corners, affine rows and quadrics of all primitives but triangles.
-        kinds: ids of the first rectangle, disk, sphere and quadric.
-        o: origin.
-        d: direction.
-        axes: order of the axes.
-        shear: see :func:`torchpt.accel.kernels_leaf.setup`.
-        floor: least distance of a hit here.
-        best: the best distance so far.
-        prim: its primitive, or -1.
-        any_hit: stop at the first hit.
-
-    Returns:
-        ``best, prim, u, v``; the last two mean nothing where ``prim`` is the one that came in.
-    """
-    first, disk, sphere, quadric = item(kinds, 0), item(kinds, 1), item(kinds, 2), item(kinds, 3)
-    u, v = _ZERO, _ZERO
-    for k in range(8):
-        code = item(codes, base + IDS + k)
-        if code >= -1:
-            continue
-        q = np.int32(-2 - code)
-        t, a, b = distance(
-            q - first, tables[0], tables[1], tables[2], disk - first, sphere - first, quadric - first,
-            o, d, axes[0], axes[1], axes[2], shear[0], shear[1], shear[2],
-        )  # fmt: skip
-        if not t > _ZERO:
-            continue
-        t = max(t, floor)
-        if t < best or (t == best and q < prim):
-            best, prim, u, v = t, q, a, b
-            if any_hit:
-                break
-    return best, prim, u, v
-
-
 @part(forceinline=True)
 def fetch(tree, code):
     """Asks for the lines of a block.
@@ -186,7 +165,7 @@ def fetch(tree, code):
     follows. The ids of a leaf are left out, which few rays look at.
     """
     leaf = code >> 63
-    base = ((code ^ leaf) & ~1) * (LINE // 2)
+    base = ((code ^ leaf) & ~3) * (LINE // 4)
     rest = base + (leaf & (NODE * LINE))
     prefetch(tree, base)
     prefetch(tree, base + LINE)

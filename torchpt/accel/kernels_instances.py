@@ -67,7 +67,7 @@ def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
                 at, along = _moved(table, copy, o, d)
                 had = prim
                 best, prim, a, b = nearest_of(
-                    lower[0], lower[1], item(roots, copy), at, along, best, prim, item(shift, copy),
+                    lower, item(roots, copy), at, along, best, prim, item(shift, copy),
                     keys, parents, top, scratch, any_hit,
                 )  # fmt: skip
                 if prim != had:
@@ -83,8 +83,9 @@ def _search(
     first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v, any_hit
 ):
     keys, parents, scratch = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(SCRATCH, np.float32)
+    none = np.empty(1, np.uint8)
     work = (pointer(keys), pointer(parents), pointer(scratch))
-    above, below = (pointer(upper), pointer(upper_codes)), (pointer(lower), pointer(lower_codes))
+    above, below = (pointer(upper), pointer(upper_codes)), (pointer(lower), pointer(lower_codes), 0, 0, pointer(none), 0)
     copies = (pointer(table), pointer(shift), pointer(roots))
     for i in range(first, last):
         p, r = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i])
@@ -99,7 +100,7 @@ def _search(
             if found != prim[i]:
                 put(prim, i, found)
                 t[i], u[i], v[i] = best, a, b
-    keys[0], parents[0], scratch[0] = 0, 0, 0  # what pointers point to lives until here
+    keys[0], parents[0], scratch[0], none[0] = 0, 0, 0, 0  # what pointers point to lives until here
 
 
 @jit()

@@ -36,22 +36,12 @@ def setup(dx, dy, dz):
     return kx, ky, kz, px / pz, py / pz, _ONE / pz, ix, iy, iz
 
 
-@part(forceinline=True)
-def _sheared(corner, prim, k, kx, ky, kz, px, py, pz, sx, sy, sz):
-    x, y, z = (
-        item(corner, 12 * prim + k + kx) - px,
-        item(corner, 12 * prim + k + ky) - py,
-        item(corner, 12 * prim + k + kz) - pz,
-    )
-    return x - sx * z, y - sy * z, z * sz
-
-
 @part()
-def distance(prim, corner, rows, quadrics, n2, n3, n4, o, d, kx, ky, kz, sx, sy, sz):
-    """``t, u, v`` of ray ``o, d`` (tuples) at a primitive; ``t`` is NaN where it misses.
+def distance(prim, corner, rows, quadrics, n2, n3, n4, o, d):
+    """``t, u, v`` of ray ``o, d`` (tuples) at a disk, sphere or quadric; ``t`` is NaN where it misses.
 
     Primitives are rectangles first; ``n2`` to ``n4`` are the numbers of the first disk, sphere and quadric. ``corner`` is
-    ``(K, 12)``: p0, p1, p2 and the fourth corner; the axes and the shear come from :func:`setup`.
+    ``(K, 12)``: centre and radius of spheres.
     """
     if prim >= n3:
         if prim >= n4:
@@ -70,32 +60,17 @@ def distance(prim, corner, rows, quadrics, n2, n3, n4, o, d, kx, ky, kz, sx, sy,
     plane = -away / along
     if not (plane > _ZERO and plane < _INF):
         return _NAN, _ZERO, _ZERO
-    if prim >= n2:
-        x, y, z = o[0] + plane * d[0], o[1] + plane * d[1], o[2] + plane * d[2]
-        u = (
-            item(rows, 12 * prim + 4) * x
-            + item(rows, 12 * prim + 5) * y
-            + item(rows, 12 * prim + 6) * z
-            + item(rows, 12 * prim + 7)
-        )
-        v = (
-            item(rows, 12 * prim + 8) * x
-            + item(rows, 12 * prim + 9) * y
-            + item(rows, 12 * prim + 10) * z
-            + item(rows, 12 * prim + 11)
-        )
-        return (plane if u * u + v * v <= _ONE else _NAN), u, v
-    px, py, pz = o[kx], o[ky], o[kz]
-    first = np.int64(0)
-    ax, ay, az = _sheared(corner, prim, first, kx, ky, kz, px, py, pz, sx, sy, sz)
-    bx, by, bz = _sheared(corner, prim, first + 3, kx, ky, kz, px, py, pz, sx, sy, sz)
-    cx, cy, cz = _sheared(corner, prim, first + 6, kx, ky, kz, px, py, pz, sx, sy, sz)
-    qx, qy, qz = _sheared(corner, prim, first + 9, kx, ky, kz, px, py, pz, sx, sy, sz)
-    f, g = ax * cy - ay * cx, bx * ay - by * ax
-    h, k = qx * by - qy * bx, cx * qy - cy * qx
-    low, high = min(min(f, g), min(h, k)), max(max(f, g), max(h, k))
-    det = (f + h) * (g + k)
-    if not ((low >= _ZERO or high <= _ZERO) and det != _ZERO):
-        return _NAN, _ZERO, _ZERO
-    near, far = min(min(min(az, bz), cz), qz), max(max(max(az, bz), cz), qz)
-    return min(max(plane, near), far), f / (f + h), g / (g + k)
+    x, y, z = o[0] + plane * d[0], o[1] + plane * d[1], o[2] + plane * d[2]
+    u = (
+        item(rows, 12 * prim + 4) * x
+        + item(rows, 12 * prim + 5) * y
+        + item(rows, 12 * prim + 6) * z
+        + item(rows, 12 * prim + 7)
+    )
+    v = (
+        item(rows, 12 * prim + 8) * x
+        + item(rows, 12 * prim + 9) * y
+        + item(rows, 12 * prim + 10) * z
+        + item(rows, 12 * prim + 11)
+    )
+    return (plane if u * u + v * v <= _ONE else _NAN), u, v

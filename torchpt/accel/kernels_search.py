@@ -5,54 +5,80 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from torchpt.accel.kernels_packet import RAYS, SPARE, coherent, packet
+from torchpt.accel.kernels_packet import RAYS, SPARE, coherent, deliver, packet
+from torchpt.accel.kernels_rays import BEST, COLUMNS, FLOATS, IDS, NUMBERS, U, V, prepare
 from torchpt.accel.kernels_turn import SCRATCH, STATE, TURNS, turn
 from torchpt.native.jit import jit, part
-from torchpt.native.simd import pointer, put
+from torchpt.native.simd import item, load, pointer, put
 
 __all__ = ["blocked", "blocked_parallel", "nearest", "nearest_parallel"]
 
-WAITING = 2048  # rays that are collected before they go in turn
-
-
 @part(inline="always")
-def _trace(first, last, rays, scene, room, chosen, work, spare, out, any_hit):
-    """Both kernels, on pointers."""
-    i = first
+def _trace(first, last, rays, scene, room, groups, columns, work, spare, out, any_hit):
+    """Rays ``first`` to ``last``, a multiple of 16."""
+    rows, ids = columns
+    i, count = first, np.int64(0)
     while i < last:
-        count = np.int64(0)
-        while i < last and count <= WAITING - RAYS:
-            stop = min(i + RAYS, last)
-            together, axis, ux, uy, uz = False, 0, False, False, False
-            if stop - i == RAYS:
-                together, axis, ux, uy, uz = coherent(rays, i)
-            if together:
-                packet(i, axis, ux, uy, uz, rays, scene, (work[0], work[1]), spare, out, any_hit)
-            else:
-                for j in range(i, stop):
-                    put(chosen, count, np.int32(j))
-                    count += 1
-            i = stop
-        if count > 0:
-            turn(chosen, count, rays, scene, room, work, out, any_hit)
+        together, good, axis, ux, uy, uz = coherent(rays, i)
+        if together:
+            packet(i, good, axis, ux, uy, uz, rays, scene, (work[0], work[1]), spare, out, any_hit)
+        else:
+            prepare(i, rays, count, rows, ids)
+            put(groups, count >> 4, i)
+            count += 16
+        i += 16
+        if count == COLUMNS or (i >= last and count > 0):
+            turn(count, scene, room, rows, ids, work, any_hit)
+            for k in range(count >> 4):
+                best, u, v = load(rows, BEST + 16 * k, 16), load(rows, U + 16 * k, 16), load(rows, V + 16 * k, 16)
+                deliver(item(groups, k), out, best, load(ids, IDS + 16 * k, 16), u, v, any_hit)
+            count = np.int64(0)
+
+
+@part()
+def _none():
+    return np.empty(0, np.uint8)
 
 
 @part(inline="always")
-def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v, any_hit):
-    """:func:`_trace` with its memory."""
+def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, t, prim, u, v, any_hit):
+    """:func:`_trace` with its memory; the rays beyond the last sixteen in memory of their own."""
     room = kinds[4]
     keys, parents = np.empty(TURNS * room, np.int32), np.empty(TURNS * room, np.int32)
-    state, slots, scratch = np.empty(STATE, np.float32), np.empty(STATE, np.int64), np.empty(SCRATCH, np.float32)
-    chosen, lanes, ids = np.empty(WAITING, np.int32), np.empty(SPARE, np.float32), np.empty(RAYS, np.int32)
-    rays = (pointer(o), pointer(d), pointer(t_max), d.shape[1])
+    slots, scratch, groups = np.empty(STATE, np.int64), np.empty(SCRATCH, np.float32), np.empty(COLUMNS >> 4, np.int64)
+    columns, numbers = np.empty(FLOATS, np.float32), np.empty(NUMBERS, np.int32)
+    lanes, kept = np.empty(SPARE, np.float32), np.empty(RAYS, np.int32)
     tables = (pointer(corner), pointer(rows), pointer(quadrics))
-    scene = (pointer(tree), pointer(codes), tables, pointer(kinds))
-    work = (pointer(keys), pointer(parents), pointer(state), pointer(slots), pointer(scratch))
-    spare, out = (pointer(lanes), pointer(ids)), (pointer(t), pointer(prim), pointer(u), pointer(v))
-    _trace(first, last, rays, scene, room, pointer(chosen), work, spare, out, any_hit)
+    scene = (pointer(tree), pointer(codes), tables, pointer(kinds), pointer(veils), len(veils))
+    work = (pointer(keys), pointer(parents), pointer(slots), pointer(scratch))
+    held = (pointer(columns), pointer(numbers))
+    spare = (pointer(lanes), pointer(kept), pointer(scratch))
+    ray = (pointer(o), pointer(d), pointer(t_max), d.shape[1])
+    end = last - (last - first) % RAYS
+    edge, number = np.zeros(10 * RAYS, np.float32), np.zeros(RAYS, np.int32)
+    for again in range(2):
+        out = (pointer(t), pointer(prim), pointer(u), pointer(v))
+        if again:
+            if end == last:
+                break
+            for j in range(last - end):
+                edge[6 * RAYS + j] = t_max[end + j]
+                for k in range(3):
+                    edge[k * RAYS + j], edge[(3 + k) * RAYS + j] = o[k, end + j], d[k, end + j]
+            e = pointer(edge)
+            ray = (e, pointer(edge[3 * RAYS :]), pointer(edge[6 * RAYS :]), RAYS)
+            out = (pointer(edge[7 * RAYS :]), pointer(number), pointer(edge[8 * RAYS :]), pointer(edge[9 * RAYS :]))
+            first, end_ = 0, RAYS
+        else:
+            end_ = end
+        _trace(first, end_, ray, scene, room, pointer(groups), held, work, spare, out, any_hit)
+    for j in range(last - end):
+        prim[end + j] = number[j]
+        if not any_hit:
+            t[end + j], u[end + j], v[end + j] = edge[7 * RAYS + j], edge[8 * RAYS + j], edge[9 * RAYS + j]
     # what pointers point to lives until here
-    keys[0], parents[0], state[0], slots[0], scratch[0] = 0, 0, 0, 0, 0
-    chosen[0], lanes[0], ids[0] = 0, 0, 0
+    keys[0], parents[0], slots[0], scratch[0], groups[0] = 0, 0, 0, 0, 0
+    columns[0], numbers[0], lanes[0], kept[0], edge[0], number[0] = 0, 0, 0, 0, 0, 0
 
 
 @jit()
@@ -76,7 +102,7 @@ def nearest(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
         u: ``(N,)`` float32, filled.
         v: ``(N,)`` float32, filled.
     """
-    _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v, False)
+    _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, _none(), t, prim, u, v, False)
 
 
 @jit(parallel=True)
@@ -88,14 +114,18 @@ def nearest_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quad
 
 
 @jit()
-def blocked(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, out):
-    """1 in ``out`` ``(N,)`` int32 for each of the rays ``first <= i < last`` that hits anything, else 0."""
-    _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t_max, out, t_max, t_max, True)
+def blocked(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out):
+    """What stands in the way of rays ``first <= i < last``: 1 in ``out`` ``(N,)`` int32 for what blocks, 0 for nothing.
+
+    Where ``veils`` is not empty it holds a uint8 for each primitive, not 0 where light may pass: 2 in ``out`` is for rays that meet
+    such primitives alone.
+    """
+    _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, t_max, out, t_max, t_max, True)
 
 
 @jit(parallel=True)
-def blocked_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, out):
+def blocked_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out):
     """:func:`blocked` over equal chunks of the rays, one a thread."""
     for c in prange(chunks):
         a, b = c * items // chunks, (c + 1) * items // chunks
-        blocked(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, out)
+        blocked(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out)

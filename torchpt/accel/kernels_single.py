@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchpt.accel.kernels_blocks import CHILDREN, FLOOR, IDS, SLACK, boxes, crossed, place, planes, push
+from torchpt.accel.kernels_blocks import CHILDREN, FLOOR, IDS, SLACK, blocking, boxes, crossed, place, planes, push
 from torchpt.accel.kernels_leaf import setup
 from torchpt.native.jit import part
 from torchpt.native.simd import as_float, bits, item, splat, store, trailing_zeros
 
-__all__ = ["SCRATCH", "nearer", "nearest_of", "pop"]
+__all__ = ["SCRATCH", "blocker", "nearer", "nearest_of", "pop"]
 
 _ZERO = np.float32(0.0)
 #: Numbers of a kernel's scratch row: ``t``, ``u``, ``v`` of eight triangles.
@@ -32,8 +32,8 @@ def pop(codes, keys, parents, top, bottom, limit):
 
 
 @part(forceinline=True)
-def nearer(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch, any_hit):
-    """The nearest of a leaf's triangles that :func:`crossed` has found, or any of them.
+def nearer(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch):
+    """The nearest of a leaf's triangles that :func:`crossed` has found.
 
     Returns ``best``, ``prim`` (ids count from ``shift``) and the lane of ``scratch`` where u and v are, -1 where no triangle is
     nearer than what came in.
@@ -41,33 +41,38 @@ def nearer(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch, 
     m, za, zb, zc, f, g, det = met
     lane = np.int64(-1)
     t, ahead = planes(tree, base, o, d, za, zb, zc, splat(sz, 8), floor)
-    if any_hit:
-        w = bits(m & ahead & (t < splat(best, 8)))
-        if w != 0:
-            lane = trailing_zeros(w)
-            prim = np.int32(item(codes, base + IDS + lane) + shift)
-    else:
-        w = bits(m & ahead & (t <= splat(best, 8)))
-        if w != 0:
-            store(scratch, 0, t)
-            store(scratch, 8, f / det)
-            store(scratch, 16, g / det)
-            while w != 0:
-                k = trailing_zeros(w)
-                w &= w - 1
-                near, q = item(scratch, k), np.int32(item(codes, base + IDS + k) + shift)
-                if near < best or (near == best and q < prim):
-                    best, prim, lane = near, q, k
+    w = bits(m & ahead & (t <= splat(best, 8)))
+    if w != 0:
+        store(scratch, 0, t)
+        store(scratch, 8, f / det)
+        store(scratch, 16, g / det)
+        while w != 0:
+            k = trailing_zeros(w)
+            w &= w - 1
+            near, q = item(scratch, k), np.int32(item(codes, base + IDS + k) + shift)
+            if near < best or (near == best and q < prim):
+                best, prim, lane = near, q, k
     return best, prim, lane
 
 
+@part(forceinline=True)
+def blocker(scene, base, met, sz, o, d, floor, best, prim, shift):
+    """The id of a leaf's triangle that :func:`crossed` has found and that lets no light pass; else :data:`VEILED` or ``prim``."""
+    tree, codes = scene[0], scene[1]
+    t, ahead = planes(tree, base, o, d, met[1], met[2], met[3], splat(sz, 8), floor)
+    w = bits(met[0] & ahead & (t < splat(best, 8)))
+    while w != 0:
+        prim = blocking(scene, np.int32(item(codes, base + IDS + trailing_zeros(w)) + shift))
+        w = 0 if prim >= 0 else w & (w - 1)
+    return prim
+
+
 @part()
-def nearest_of(tree, codes, root, o, d, best, prim, shift, keys, parents, bottom, scratch, any_hit):
+def nearest_of(scene, root, o, d, best, prim, shift, keys, parents, bottom, scratch, any_hit):
     """The nearest hit of a ray below a node of triangles alone where it is nearer than ``best``, or any such hit.
 
     Args:
-        tree: the buffer.
-        codes: the same as int32.
+        scene: the buffer, the same as int32; and as :func:`torchpt.accel.kernels_blocks.blocking` takes it.
         root: the node's code.
         o: origin, a tuple.
         d: direction.
@@ -83,6 +88,7 @@ def nearest_of(tree, codes, root, o, d, best, prim, shift, keys, parents, bottom
     Returns:
         ``t, prim, u, v``; ``u`` and ``v`` mean nothing where ``prim`` is the one that came in.
     """
+    tree, codes = scene[0], scene[1]
     kx, ky, kz, sx, sy, sz, ix, iy, iz = setup(d[0], d[1], d[2])
     px, py, pz = splat(o[kx], 8), splat(o[ky], 8), splat(o[kz], 8)
     nx, ny, nz = 0 if ix > _ZERO else 24, 8 if iy > _ZERO else 32, 16 if iz > _ZERO else 40
@@ -100,10 +106,13 @@ def nearest_of(tree, codes, root, o, d, best, prim, shift, keys, parents, bottom
             met = crossed(tree, base, kx, ky, kz, px, py, pz, splat(sx, 8), splat(sy, 8))
             if bits(met[0]) != 0:
                 floor = as_float(key & np.int32(-8)) * FLOOR
-                best, prim, lane = nearer(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch, any_hit)
-                if lane >= 0:
-                    if any_hit:
+                if any_hit:
+                    prim = blocker(scene, base, met, sz, o, d, floor, best, prim, shift)
+                    if prim >= 0:
                         break
-                    u, v = item(scratch, 8 + lane), item(scratch, 16 + lane)
+                else:
+                    best, prim, lane = nearer(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch)
+                    if lane >= 0:
+                        u, v = item(scratch, 8 + lane), item(scratch, 16 + lane)
         top, code, key = pop(codes, keys, parents, top, bottom, best * SLACK)
     return best, prim, u, v

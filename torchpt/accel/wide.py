@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.accel import kernels_search as kernels
 from torchpt.accel.base import Accel, Array, Hits
-from torchpt.accel.blocks import aligned, lines_of, mesh_tree, room_of, write
+from torchpt.accel.blocks import aligned, corners_of, lines_of, mesh_tree, room_of, write
 from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.tables import inverses
 from torchpt.native.jit import compiled, launch
@@ -22,6 +22,7 @@ from torchpt.records import Geometry
 __all__ = ["Wide"]
 
 _GRAIN = 512  # rays that repay another thread
+_NO_VEILS = np.empty(0, np.uint8)
 
 
 class Wide(Accel):
@@ -40,8 +41,8 @@ class Wide(Accel):
         tree, planes, rows = mesh_tree(geometry)
         self.primitives, self.depth, self.sah_cost = geometry.size, tree.depth, tree.cost
         self.nodes, self.leaves = tree.nodes, tree.leaves
-        memory = aligned(lines_of(tree) * LINE)
-        write(tree, geometry, planes, 0, memory)
+        memory = aligned(lines_of(tree, geometry.counts) * LINE)
+        write(tree, geometry, planes, rows, 0, memory)
         self.tensors = [torch.from_numpy(memory), *_others(geometry, rows, tree.depth)]
         self.arrays = _arrays(self.tensors)
         self.build_seconds = time.perf_counter() - start
@@ -57,9 +58,11 @@ class Wide(Accel):
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
         compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
-    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
+    def blocked(
+        self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None
+    ) -> None:
         """See :meth:`Accel.blocked`."""
-        args = (o, d, t_max, *self.arrays, out)
+        args = (o, d, t_max, *self.arrays, _NO_VEILS if veils is None else veils, out)
         compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
 
     def describe(self) -> dict[str, Any]:
@@ -78,12 +81,9 @@ class Wide(Accel):
 
 def _others(geometry: Geometry, rows: np.ndarray, depth: int) -> list[Tensor]:
     """What the kernels take of primitives that are no triangles: corners, rows, quadrics, first ids and room of a stack."""
-    first = geometry.counts[0]
-    p0, p1, p2 = (p[:, first:] for p in (geometry.p0, geometry.p1, geometry.p2))
-    corner = torch.cat([p0, p1, p2, (p1 + p2) - p0]).float().T.contiguous()
     ends = [sum(geometry.counts[:k]) for k in range(1, 5)]
     kinds = torch.tensor([*ends, room_of(depth)], dtype=torch.int64)
-    return [corner, torch.from_numpy(rows), inverses(geometry).T.contiguous(), kinds]
+    return [torch.from_numpy(corners_of(geometry)), torch.from_numpy(rows), inverses(geometry).T.contiguous(), kinds]
 
 
 def _arrays(tensors: list[Tensor]) -> tuple[np.ndarray, ...]:
@@ -115,7 +115,7 @@ def _(o, d, t_max, tensors, threads):
 def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], threads: int) -> Tensor:
     out = torch.empty_like(t_max, dtype=torch.int32)
     rays = (x.contiguous().numpy() for x in (o, d, t_max))
-    args = (*rays, *_arrays(tensors), out.numpy())
+    args = (*rays, *_arrays(tensors), _NO_VEILS, out.numpy())
     launch(kernels.blocked, kernels.blocked_parallel, t_max.shape[0], threads, _GRAIN, args)
     return out != 0
 

@@ -44,8 +44,9 @@ class WideInstanced(Accel):
         some = np.flatnonzero([tables.meshes[k].size > 0 for k in tables.mesh.tolist()]).astype(np.int32)
         boxes = torch.cat((tables.low, tables.high)).T.contiguous().numpy()[some]
         top = wide_tree(boxes, some.copy())
-        upper = aligned(lines_of(top) * LINE)
-        write(top, _nothing(), np.zeros((0, 4), np.float32), 0, upper)
+        none = _nothing()
+        upper = aligned(lines_of(top, none.counts) * LINE)
+        write(top, none, np.zeros((0, 4), np.float32), np.zeros((0, 12), np.float32), 0, upper)
         depth = top.depth + max(tree.depth for tree in trees)
         self.arrays = (
             upper, upper.view(np.int32), lower, lower.view(np.int32), tables.inverse.numpy(),
@@ -76,11 +77,15 @@ class WideInstanced(Accel):
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
         compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
-    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
-        """See :meth:`Accel.blocked`."""
+    def blocked(
+        self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None
+    ) -> None:
+        """See :meth:`Accel.blocked`; where there are veils, every ray that meets anything is to be looked at closer."""
         self.base.blocked(o, d, t_max, count, out)
         args = (o, d, t_max, *self.arrays, out)
         compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
+        if veils is not None:
+            np.left_shift(out[:count], 1, out=out[:count])
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost is that of what is no copy."""
@@ -106,8 +111,8 @@ def _nothing() -> Geometry:
 def _meshes(meshes: list[Geometry]) -> tuple[list[Tree], np.ndarray, np.ndarray]:
     """The trees of all meshes, the codes of their roots, and their blocks one after the other."""
     built = [mesh_tree(mesh) for mesh in meshes]
-    lines = np.cumsum([0, *(lines_of(tree) for tree, _, _ in built)])
+    lines = np.cumsum([0, *(lines_of(tree, mesh.counts) for (tree, _, _), mesh in zip(built, meshes, strict=True))])
     memory = aligned(int(lines[-1]) * LINE)
-    for (tree, planes, _), mesh, line in zip(built, meshes, lines[:-1], strict=True):
-        write(tree, mesh, planes, int(line), memory)
-    return [tree for tree, _, _ in built], 2 * lines[:-1].astype(np.int64), memory
+    for (tree, planes, rows), mesh, line in zip(built, meshes, lines[:-1], strict=True):
+        write(tree, mesh, planes, rows, int(line), memory)
+    return [tree for tree, _, _ in built], 4 * lines[:-1].astype(np.int64), memory

@@ -272,7 +272,6 @@ class Worker:
                 "shadow_d": after.d if shadow is None else shadow.d,
                 "shadow_t": torch.zeros_like(after.t_max) if shadow is None else shadow.t_max,
                 "shadow_radiance": light,
-                "clear": torch.ones_like(after.t_max),
             }
         rows.put(there, done, values)
         return 0 if shadow is None else count
@@ -304,17 +303,18 @@ class Worker:
 
     def _light(self, there: Memory, count: int) -> None:
         """How much of the light of shadow rays arrives."""
-        rows = self.kernels.state
-        if not self.kernels.veiled:
-            if self.kernels.packets:
-                self._run(self.kernels.block(), count, there, there)
-                return
+        kernels, rows = self.kernels, self.kernels.state
+        if not kernels.packets:
             o, d, t_max = (_row(there.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
-            self.wave.accel.blocked(o, d, t_max[0], count, _row(there.words, rows, "blocked", 1)[0])
+            blocked = _row(there.words, rows, "blocked", 1)[0]
+            self.wave.accel.blocked(o, d, t_max[0], count, blocked, kernels.veils)
+        elif not kernels.veiled:
+            self._run(kernels.block(), count, there, there)
+        if not kernels.veiled:
             return
         source, target = self._passed
         self._clear()
-        self._run(self.kernels.begin(), count, there, source)
+        self._run(kernels.begin(), count, there, source, slots=there)
         while left := int(self._counters[0]):
             self._search(source, self.kernels.passed, "pass_o", "pass_d", "pass_t", left)
             self._clear()

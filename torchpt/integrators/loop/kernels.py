@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -97,7 +98,7 @@ class Kernels:
         self.listed = not fused or self.models > 1 or self.around
         self.veiled = world.opacity is not None
         self.state, self.passed = (
-            _state_rows(wave, fused, self.veiled),
+            _state_rows(wave, packets, fused, self.veiled),
             Rows({**PASS, "clear": ((), "f"), **_key(wave), **HIT}),
         )
         self._leaves = dict(
@@ -131,6 +132,10 @@ class Kernels:
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
         self.search = _search_words(wave) if packets else None
+        #: For each primitive whether a ray may pass it, as uint8.
+        self.veils: np.ndarray | None = None
+        if self.veiled and not packets:
+            self.veils = self._passing(torch.arange(sum(world.counts))).to(torch.uint8).numpy()
         self.seconds = 0.0
         self.eager: dict[int, str] = {}
 
@@ -201,7 +206,7 @@ class Kernels:
         return self._get(("meet", again), lambda tracer: self._meet(tracer, again), listed=not again)
 
     def begin(self) -> Kernel:
-        """Shadow rays as rays that pass surfaces."""
+        """Shadow rays that meet what may let light pass as rays that pass surfaces; what is known of the others."""
         return self._get(("begin",), self._begin)
 
     def through(self) -> Kernel:
@@ -460,14 +465,12 @@ class Kernels:
             if shadow is None:
                 nothing = torch.zeros_like(state.o)
                 shadow = Shadow(nothing, nothing, torch.zeros_like(state.t_max), nothing)
-            one = torch.ones_like(state.t_max)
         sinks.write += self.state.nodes(
             tracer,
             shadow_o=shadow.o,
             shadow_d=shadow.d,
             shadow_t=shadow.t_max,
             shadow_radiance=shadow.radiance,
-            **({"clear": one} if "clear" in self.state else {}),
         )
         return sinks
 
@@ -513,16 +516,20 @@ class Kernels:
         return Sinks(write=self.state.nodes(tracer, blocked=number))
 
     def _sift(self, tracer: Tracer) -> Sinks:
-        world = self.world
         prim = self.state.read(tracer, "prim")["prim"]
-        assert world.opacity is not None
         with tracer:
-            slot = world.slot(prim)
-            some = torch.index_select(world.opacity, 0, slot) < 1
-            if world.veils is not None:
-                some = some | (torch.index_select(world.veils.nodes, 0, slot) >= 0)
-            some = some & (prim >= 0)
+            some = self._passing(prim) & (prim >= 0)
         return Sinks(notes=[Note(tracer.nodes(some)[0], 0, 0)])
+
+    def _passing(self, prim: Tensor) -> Tensor:
+        """Which primitives may let a ray pass."""
+        world = self.world
+        assert world.opacity is not None
+        slot = world.slot(prim)
+        some = torch.index_select(world.opacity, 0, slot) < 1
+        if world.veils is not None:
+            some = some | (torch.index_select(world.veils.nodes, 0, slot) >= 0)
+        return some
 
     def _meet(self, tracer: Tracer, again: bool) -> Sinks:
         salts = self._salts(tracer)
@@ -552,13 +559,20 @@ class Kernels:
         return sinks
 
     def _begin(self, tracer: Tracer) -> Sinks:
-        ray = self.state.read(tracer, "shadow_o", "shadow_d", "shadow_t")
-        o, d, t_max = ray.values()
+        ray = self.state.read(tracer, "shadow_o", "shadow_d", "shadow_t", "blocked")
+        o, d, t_max = list(ray.values())[:3]
         home = tracer.lane(torch.zeros(tracer.lanes, dtype=torch.int64), lambda _: tracer.graph.node("place", "l"))
         with tracer:
-            on, one = t_max > 0, torch.ones_like(t_max)
+            one = torch.ones_like(t_max)
+            if "blocked" in ray:
+                on, off = ray["blocked"] == 2, ray["blocked"] != 2
+                clear = torch.where(ray["blocked"] == 0, one, 0.0)
+            else:
+                on, off, clear = t_max > 0, t_max <= 0, one
         rows = self.passed.nodes(tracer, pass_o=o, pass_d=d, pass_t=t_max, home=home, clear=one)
-        return Sinks(pack=[Pack(tracer.nodes(on)[0], tuple(rows), 0)])
+        known = tuple(self.state.nodes(tracer, clear=clear))
+        done = Scatter(tracer.nodes(off)[0], tracer.nodes(home)[0], known, slots=True)
+        return Sinks(pack=[Pack(tracer.nodes(on)[0], tuple(rows), 0)], scatter=[done])
 
     def _through(self, tracer: Tracer) -> Sinks:
         hit = Hit(**self.passed.read(tracer, *HIT))
@@ -607,7 +621,7 @@ def _key(wave: Wave) -> dict[str, tuple[tuple[int, ...], str]]:
     return {"key": ((rows,), "i")}
 
 
-def _state_rows(wave: Wave, fused: bool, veiled: bool) -> Rows:
+def _state_rows(wave: Wave, packets: bool, fused: bool, veiled: bool) -> Rows:
     """Only what the scene needs."""
     world = wave.stages.world
     found: dict[str, tuple[tuple[int, ...], str]] = {
@@ -629,7 +643,8 @@ def _state_rows(wave: Wave, fused: bool, veiled: bool) -> Rows:
     found |= HIT
     if not fused and world.lights is not None:
         found |= SHADOW
-        found |= {"clear": ((), "f")} if veiled else {"blocked": ((), "i")}
+        found |= {"clear": ((), "f")} if veiled else {}
+        found |= {} if veiled and packets else {"blocked": ((), "i")}
     return Rows(found)
 
 
