@@ -124,6 +124,27 @@ def test_bits_of_floats(lanes):
     assert np.array_equal(run(lanes, lambda x, y: ~x, k, j), ~k)
 
 
+@pytest.mark.parametrize("lanes", LANES)
+def test_float64_between_float32(lanes):
+    """What comes and goes as float32 is computed in float64, and rounded once."""
+    a, b = floats()
+    with np.errstate(all="ignore"):
+        x, y = a.astype(np.float64), b.astype(np.float64)
+    widen, narrow, root, absolute, splat = simd.widen, simd.narrow, simd.square_root, simd.absolute, simd.splat
+    low, high, select = simd.minimum, simd.maximum, simd.select
+    with np.errstate(all="ignore"):
+        same(run(lanes, lambda p, q: narrow(widen(p)), a, b), a)
+        same(run(lanes, lambda p, q: narrow(root(widen(p) * widen(p) + widen(q) * widen(q))), a, b),
+             np.sqrt(x * x + y * y).astype(np.float32))  # fmt: skip
+        same(run(lanes, lambda p, q: root(p), a, b), np.sqrt(a))
+        same(run(lanes, lambda p, q: narrow(-absolute(widen(p) - widen(q)) / splat(3.0, lanes)), a, b),
+             (-np.abs(x - y) / 3.0).astype(np.float32))  # fmt: skip
+        same(run(lanes, lambda p, q: narrow(low(widen(p), widen(q))), a, b), np.where(x < y, x, y).astype(np.float32))
+        same(run(lanes, lambda p, q: narrow(high(widen(p), widen(q))), a, b), np.where(x > y, x, y).astype(np.float32))
+        body = lambda p, q: select((widen(p) + widen(q)) * splat(0.5, lanes) > widen(p), p, q)  # noqa: E731
+        same(run(lanes, body, a, b), np.where((x + y) * 0.5 > x, a, b))
+
+
 def test_bits_of_scalars():
     @jit()
     def kernel(x, k):

@@ -25,13 +25,14 @@ KINDS = ("auto", "torch", "numba", "brute")
 BRUTE_LIMIT = 128
 
 
-def build(geometry: Geometry, kind: str = "auto", threads: int | None = None) -> Accel:
-    """Builds a search structure.
+def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, before: Accel | None = None) -> Accel:
+    """Builds a search structure, or makes it from one of the same primitives in other places.
 
     Args:
         geometry: the primitives, on the device where rays will live.
         kind: ``auto``, ``torch``, ``numba`` or ``brute``.
         threads: CPU threads of the numba backends; ``None`` is torch's own number. Results do not depend on it.
+        before: a structure that may be refitted where it is of the kind that is wanted; it stays as it is.
 
     Returns:
         The structure. ``auto`` gives ``torch`` on an accelerator; on a CPU ``brute`` for few primitives of like scale,
@@ -47,6 +48,10 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None) ->
         raise SceneError("render.accel", kind, "numba or torch (this scene has instances)")
     if kind == "auto":
         kind = _choose(geometry) if on_cpu else "torch"
+    if before is not None and before.name == kind:
+        refitted = before.refit(geometry, threads)
+        if refitted is not None:
+            return refitted
     if kind == "torch":
         from torchpt.accel.instances import Instanced
         from torchpt.accel.lbvh import Lbvh

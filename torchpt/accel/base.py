@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.records import Geometry
+
 __all__ = ["Accel", "Array", "Hits"]
 
 #: A numpy array, float32 or int32.
@@ -28,6 +30,8 @@ class Accel(ABC):
     """
 
     name: str = ""
+    #: Whether :meth:`refit` ever gives a structure.
+    refits: bool = False
 
     @torch.no_grad()
     def intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
@@ -58,6 +62,19 @@ class Accel(ABC):
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         for out, found in zip((t, prim, u, v), self.intersect(*rays), strict=True):
             out[:count] = found.numpy()
+
+    def refit(self, geometry: Geometry, threads: int | None = None) -> Accel | None:
+        """A structure for primitives that have moved, made from this one, which stays as it is and may be in use.
+
+        Args:
+            geometry: the primitives where they are now, on the same device.
+            threads: as where a structure is built.
+
+        Returns:
+            The structure, or None where one has to be built: this kind has no refit, the primitives are others, or they have
+            moved too far for a search to be quick.
+        """
+        return None
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None

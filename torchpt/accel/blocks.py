@@ -11,10 +11,21 @@ from torchpt.accel.kernels_blocks import LEAF, LINE, MORE, NODE
 from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
 from torchpt.accel.kernels_layout import lay_out
 from torchpt.accel.kernels_tables import leaf_ids, triangle_tables, work
-from torchpt.accel.tables import prepare
+from torchpt.accel.tables import inverses, prepare
 from torchpt.records import Geometry
 
-__all__ = ["Tree", "aligned", "corners_of", "lines_of", "mesh_tree", "room_of", "wide_tree", "write"]
+__all__ = [
+    "Others",
+    "Tree",
+    "aligned",
+    "corners",
+    "lines_of",
+    "mesh_tree",
+    "room_of",
+    "tables_of",
+    "wide_tree",
+    "write",
+]
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -43,6 +54,33 @@ class Tree:
     def leaves(self) -> int:
         """How many leaves there are."""
         return len(self.ids) // WIDTH
+
+
+class Others:
+    """The K primitives of a geometry that are no triangles.
+
+    Attributes:
+        area: ``(K,)`` bool: the primitive can be hit.
+        boxes: ``(K, 6)`` float32: low x, y, z, high x, y, z; a box that ends before it begins where it cannot be hit.
+        tensors: what the search's kernels take of them: corners ``(K, 12)`` float32, affine rows ``(K, 12)`` float32 and
+            quadrics ``(Q, 13)`` float64; NaN, which no ray meets, where a primitive cannot be hit.
+    """
+
+    def __init__(self, geometry: Geometry) -> None:
+        rest = _without_triangles(geometry)
+        if not rest.size:  # the operations below would take longer than the tree of a small mesh
+            self.area, self.boxes = np.zeros(0, bool), np.zeros((0, 6), np.float32)
+            self.tensors = [torch.zeros(0, 12), torch.zeros(0, 12), torch.zeros(0, 13, dtype=torch.float64)]
+            return
+        tables = prepare(rest)
+        good = tables.area
+        low, high = primitive_bounds(rest)
+        boxes = torch.cat((torch.where(good, low, torch.inf), torch.where(good, high, -torch.inf)))
+        self.area, self.boxes = good.numpy(), boxes.T.contiguous().numpy()
+        corner = torch.cat([rest.p0, rest.p1, rest.p2, (rest.p1 + rest.p2) - rest.p0]).float()
+        corner, quadrics = torch.where(good, corner, torch.nan), inverses(rest)
+        quadrics = torch.where(good[rest.size - rest.counts[4] :], quadrics, torch.nan)
+        self.tensors = [corner.T.contiguous(), tables.rows, quadrics.T.contiguous()]
 
 
 def wide_tree(boxes: Floats, ids: Ints) -> Tree:
@@ -84,40 +122,38 @@ def aligned(count: int) -> Floats:
     return raw[skip : skip + count * 4].view(np.float32)
 
 
-def mesh_tree(geometry: Geometry) -> tuple[Tree, Floats, Floats]:
-    """The tree over a geometry's primitives, the planes ``(T, 4)`` of its triangles, the affine rows ``(K, 12)`` of others."""
+def tables_of(geometry: Geometry) -> tuple[Floats, Floats, Ints, Others]:
+    """Planes ``(T, 4)`` of the triangles, boxes ``(K, 6)`` and rising ids ``(K,)`` of those with an area, and the others."""
     count = geometry.counts[0]
     planes, boxes, ids = np.empty((count, 4), np.float32), np.empty((count, 6), np.float32), np.empty(count, np.int32)
-    kept = triangle_tables(*_corners(geometry), count, planes, boxes, ids)
-    boxes, ids = boxes[:kept], ids[:kept]
-    rest = _without_triangles(geometry)
-    tables = prepare(rest)
-    if rest.size:
-        keep = torch.nonzero(tables.area)[:, 0]
-        more = torch.cat(primitive_bounds(rest)).T[keep].numpy()
-        boxes, ids = np.concatenate([boxes, more]), np.concatenate([ids, keep.int().numpy() + np.int32(count)])
-    return wide_tree(boxes, ids), planes, tables.rows.numpy()
+    kept = triangle_tables(*corners(geometry), count, planes, boxes, ids)
+    return planes, boxes[:kept], ids[:kept], Others(geometry)
 
 
-def write(tree: Tree, geometry: Geometry, planes: Floats, rows: Floats, line: int, memory: Floats) -> None:
+def mesh_tree(geometry: Geometry) -> tuple[Tree, Floats, Others]:
+    """The tree over a geometry's primitives, the planes ``(T, 4)`` of its triangles, and what there is of others."""
+    planes, boxes, ids, others = tables_of(geometry)
+    if others.area.size:
+        keep = np.flatnonzero(others.area)
+        boxes = np.concatenate([boxes, others.boxes[keep]])
+        ids = np.concatenate([ids, (keep + geometry.counts[0]).astype(np.int32)])
+    return wide_tree(boxes, ids), planes, others
+
+
+def write(tree: Tree, geometry: Geometry, planes: Floats, others: Others, line: int, memory: Floats) -> None:
     """Lays a tree out in ``memory`` from a line on."""
     codes, triangles = memory.view(np.int32), geometry.counts[0]
     disk = triangles + geometry.counts[1]
-    tables = (planes, corners_of(geometry), rows)
-    lay_out(tree.boxes, tree.child, tree.ids, *_corners(geometry), *tables, triangles, disk, line, memory, codes)
+    tables = (planes, others.tensors[0].numpy(), others.tensors[1].numpy())
+    lay_out(tree.boxes, tree.child, tree.ids, *corners(geometry), *tables, triangles, disk, line, memory, codes)
 
 
-def corners_of(geometry: Geometry) -> Floats:
-    """Corners of the primitives that are no triangles, and fourth corners ``(K, 12)``."""
-    p0, p1, p2 = (p[:, geometry.counts[0] :] for p in (geometry.p0, geometry.p1, geometry.p2))
-    return torch.cat([p0, p1, p2, (p1 + p2) - p0]).float().T.contiguous().numpy()
+def corners(geometry: Geometry) -> tuple[Floats, Floats, Floats]:
+    """The three corners ``(3, P)`` as arrays."""
+    return tuple(p.contiguous().numpy() for p in (geometry.p0, geometry.p1, geometry.p2))  # type: ignore[return-value]
 
 
 def _without_triangles(geometry: Geometry) -> Geometry:
     _, *counts = geometry.counts
     p0, p1, p2 = (p[:, geometry.counts[0] :] for p in (geometry.p0, geometry.p1, geometry.p2))
     return Geometry(p0, p1, p2, (0, counts[0], counts[1], counts[2], counts[3]), geometry.quadrics)
-
-
-def _corners(geometry: Geometry) -> tuple[Floats, Floats, Floats]:
-    return tuple(p.contiguous().numpy() for p in (geometry.p0, geometry.p1, geometry.p2))  # type: ignore[return-value]

@@ -1,17 +1,35 @@
-"""What the tree needs of triangles (numba): the float64 operations of ``tables.prepare`` and ``bounds`` in one pass."""
+"""What the tree needs of triangles (numba): the float64 operations of ``tables.prepare`` and ``bounds`` in one pass.
+
+Eight triangles go together, as vectors of float64.
+"""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
 from torchpt.native.jit import jit, part
+from torchpt.native.simd import (
+    absolute,
+    as_float,
+    as_int,
+    bits,
+    lane_numbers,
+    load_masked,
+    maximum,
+    minimum,
+    narrow,
+    select,
+    splat,
+    square_root,
+    store,
+    trailing_zeros,
+    widen,
+)
 
-__all__ = ["leaf_ids", "triangle_tables", "work"]
+__all__ = ["boxes_of", "leaf_ids", "planes_of", "triangle_tables", "work"]
 
 _MARGIN = 2.0**-22
-_INF32 = np.float32(np.inf)
+_ZERO = np.float32(0.0)
 
 
 @part(forceinline=True)
@@ -26,41 +44,70 @@ def _dot(a, b):
 
 @part(forceinline=True)
 def _finite(row, p):
-    """Whether an affine row about a point is finite in float32."""
-    total = np.float32(row[0]) + np.float32(row[1]) + np.float32(row[2]) + np.float32(-_dot(row, p))
-    return total * np.float32(0.0) == np.float32(0.0)
+    """Whether affine rows about points are finite in float32."""
+    total, zero = narrow(row[0]) + narrow(row[1]) + narrow(row[2]) + narrow(-_dot(row, p)), splat(_ZERO, 8)
+    return total * zero == zero
 
 
-@part()
-def _plane(a, b, c, planes, i):
-    """Writes the plane of a triangle; returns whether it can be hit, see :func:`torchpt.accel.tables.prepare`."""
+@part(forceinline=True)
+def planes_of(a, b, c):
+    """Unit normals and distances of eight triangles by float64 corners, and which can be hit.
+
+    See :func:`torchpt.accel.tables.prepare`. The numbers of those that cannot mean nothing.
+    """
     e1 = (b[0] - a[0], b[1] - a[1], b[2] - a[2])
     e2 = (c[0] - a[0], c[1] - a[1], c[2] - a[2])
     cross = _cross(e1, e2)
-    length = math.sqrt(_dot(cross, cross))
+    length = square_root(_dot(cross, cross))
     n = (cross[0] / length, cross[1] / length, cross[2] / length)
     u, v = _cross(e2, n), _cross(n, e1)
     u, v = (u[0] / length, u[1] / length, u[2] / length), (v[0] / length, v[1] / length, v[2] / length)
-    good = length > 0.0 and _finite(n, a) and _finite(u, a) and _finite(v, a)
-    for k in range(3):
-        planes[i, k] = n[k] if good else 0.0
-    planes[i, 3] = -_dot(n, a) if good else 0.0
-    return good
+    good = (length > splat(0.0, 8)) & _finite(n, a) & _finite(u, a) & _finite(v, a)
+    return narrow(n[0]), narrow(n[1]), narrow(n[2]), narrow(-_dot(n, a)), good
 
 
-@part()
-def _box(a, b, c, boxes, i):
-    """Writes the box of a triangle with its margin, see :func:`torchpt.accel.bounds.primitive_bounds`."""
-    size = 0.0
-    for k in range(3):
-        size = max(size, max(max(a[k], b[k]), c[k]) - min(min(a[k], b[k]), c[k]))
-    for k in range(3):
-        low, high = min(min(a[k], b[k]), c[k]), max(max(a[k], b[k]), c[k])
-        margin = _MARGIN * (max(abs(low), abs(high)) + size)
-        low, high = low - margin, high + margin
-        down, up = np.float32(low), np.float32(high)
-        boxes[i, k] = np.nextafter(down, -_INF32) if np.float64(down) > low else down
-        boxes[i, 3 + k] = np.nextafter(up, _INF32) if np.float64(up) < high else up
+@part(forceinline=True)
+def _down(x):
+    """The float32 below float64 lanes, or their own."""
+    near, one = narrow(x), splat(np.int32(1), 8)
+    whole, zero = as_int(near), splat(np.int32(0), 8)
+    # the next float32: one less in its bits, one more where they are those of a negative number
+    below = select(whole < zero, whole + one, whole - one)
+    below = select(near == splat(_ZERO, 8), splat(np.int32(-(2**31) + 1), 8), below)
+    return select(widen(near) > x, as_float(below), near)
+
+
+@part(forceinline=True)
+def _span(a, b, c):
+    return minimum(minimum(a, b), c), maximum(maximum(a, b), c)
+
+
+@part(forceinline=True)
+def boxes_of(a, b, c):
+    """Boxes of eight triangles with their margin: low x, y, z, high x, y, z.
+
+    See :func:`torchpt.accel.bounds.primitive_bounds`.
+    """
+    x0, x1 = _span(a[0], b[0], c[0])
+    y0, y1 = _span(a[1], b[1], c[1])
+    z0, z1 = _span(a[2], b[2], c[2])
+    size, share = maximum(maximum(x1 - x0, y1 - y0), z1 - z0), splat(_MARGIN, 8)
+    x = share * (maximum(absolute(x0), absolute(x1)) + size)
+    y = share * (maximum(absolute(y0), absolute(y1)) + size)
+    z = share * (maximum(absolute(z0), absolute(z1)) + size)
+    return _down(x0 - x), _down(y0 - y), _down(z0 - z), -_down(-(x1 + x)), -_down(-(y1 + y)), -_down(-(z1 + z))
+
+
+@part(forceinline=True)
+def _corner(p, i, some):
+    """Corners of the triangles from ``i`` on, where the mask is set."""
+    n, none = p.shape[1], splat(_ZERO, 8)
+    x, y, z = (
+        load_masked(p, i, some, none),
+        load_masked(p, n + i, some, none),
+        load_masked(p, 2 * n + i, some, none),
+    )
+    return widen(x), widen(y), widen(z)
 
 
 @jit()
@@ -80,13 +127,32 @@ def triangle_tables(p0, p1, p2, count, planes, boxes, ids):
         How many can be hit.
     """
     kept = 0
-    for i in range(count):
-        a = (np.float64(p0[0, i]), np.float64(p0[1, i]), np.float64(p0[2, i]))
-        b = (np.float64(p1[0, i]), np.float64(p1[1, i]), np.float64(p1[2, i]))
-        c = (np.float64(p2[0, i]), np.float64(p2[1, i]), np.float64(p2[2, i]))
-        if _plane(a, b, c, planes, i):
-            _box(a, b, c, boxes, kept)
-            ids[kept] = i
+    row, box, none = np.empty(32, np.float32), np.empty(48, np.float32), splat(_ZERO, 8)
+    for i in range(0, count, 8):
+        some = lane_numbers(8) < splat(np.int32(min(count - i, 8)), 8)
+        a, b, c = _corner(p0, i, some), _corner(p1, i, some), _corner(p2, i, some)
+        n0, n1, n2, d, good = planes_of(a, b, c)
+        store(row, 0, select(good, n0, none))
+        store(row, 8, select(good, n1, none))
+        store(row, 16, select(good, n2, none))
+        store(row, 24, select(good, d, none))
+        x0, y0, z0, x1, y1, z1 = boxes_of(a, b, c)
+        store(box, 0, x0)
+        store(box, 8, y0)
+        store(box, 16, z0)
+        store(box, 24, x1)
+        store(box, 32, y1)
+        store(box, 40, z1)
+        for k in range(min(count - i, 8)):
+            for j in range(4):
+                planes[i + k, j] = row[j * 8 + k]
+        left = bits(good)
+        while left != 0:
+            k = trailing_zeros(left)
+            left &= left - 1
+            for j in range(6):
+                boxes[kept, j] = box[j * 8 + k]
+            ids[kept] = i + k
             kept += 1
     return kept
 

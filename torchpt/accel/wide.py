@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from typing import Any
 
@@ -11,9 +12,9 @@ from torch import Tensor
 
 from torchpt.accel import kernels_search as kernels
 from torchpt.accel.base import Accel, Array, Hits
-from torchpt.accel.blocks import aligned, corners_of, lines_of, mesh_tree, room_of, write
+from torchpt.accel.blocks import Others, aligned, lines_of, mesh_tree, room_of, write
 from torchpt.accel.kernels_blocks import LINE
-from torchpt.accel.tables import inverses
+from torchpt.accel.topology import Topology
 from torchpt.native.jit import compiled, launch
 from torchpt.native.operators import choose, operator
 from torchpt.native.threads import thread_count
@@ -33,19 +34,38 @@ class Wide(Accel):
         threads: CPU threads; ``None`` is torch's number.
     """
 
-    name = "numba"
+    name, refits = "numba", True
 
     def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
         start = time.perf_counter()
         self.threads = thread_count(threads)
-        tree, planes, rows = mesh_tree(geometry)
-        self.primitives, self.depth, self.sah_cost = geometry.size, tree.depth, tree.cost
+        tree, planes, others = mesh_tree(geometry)
+        self.counts, self.depth, self.sah_cost = geometry.counts, tree.depth, tree.cost
         self.nodes, self.leaves = tree.nodes, tree.leaves
+        self.topology, self.copied = Topology(tree, geometry), geometry.copies is not None
         memory = aligned(lines_of(tree, geometry.counts) * LINE)
-        write(tree, geometry, planes, rows, 0, memory)
-        self.tensors = [torch.from_numpy(memory), *_others(geometry, rows, tree.depth)]
+        write(tree, geometry, planes, others, 0, memory)
+        self._take(memory, others, start)
+
+    def _take(self, memory: np.ndarray, others: Others, start: float) -> None:
+        kinds = torch.tensor([*(sum(self.counts[:k]) for k in range(1, 5)), room_of(self.depth)], dtype=torch.int64)
+        self.tensors = [torch.from_numpy(memory), *others.tensors, kinds]
         self.arrays = _arrays(self.tensors)
         self.build_seconds = time.perf_counter() - start
+
+    def refit(self, geometry: Geometry, threads: int | None = None) -> Wide | None:
+        """See :meth:`Accel.refit` and :meth:`Topology.refit`; the new tree has memory of its own."""
+        start = time.perf_counter()
+        if (geometry.copies is not None) != self.copied:
+            return None
+        others, memory = Others(geometry), aligned(len(self.arrays[0]))
+        topology = self.topology.refit(geometry, others, self.arrays[0], memory)
+        if topology is None:
+            return None
+        tree = copy.copy(self)
+        tree.threads, tree.topology = thread_count(threads), topology
+        tree._take(memory, others, start)
+        return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
         return choose(_intersect, _intersect_operator)(o, d, t_max, self.tensors, self.threads)
@@ -66,24 +86,20 @@ class Wide(Accel):
         compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
 
     def describe(self) -> dict[str, Any]:
-        """See :meth:`Accel.describe`; the cost is that of the binary tree before it was widened."""
+        """See :meth:`Accel.describe`.
+
+        The cost is that of the binary tree before it was widened, times what the wide one's has grown by since.
+        """
         return {
             "name": self.name,
-            "primitives": self.primitives,
+            "primitives": sum(self.counts),
             "nodes": self.nodes,
             "leaves": self.leaves,
-            "sah_cost": self.sah_cost,
+            "sah_cost": self.sah_cost * self.topology.growth,
             "depth": self.depth,
             "bytes": sum(x.nbytes for x in self.tensors),
             "build_seconds": self.build_seconds,
         }
-
-
-def _others(geometry: Geometry, rows: np.ndarray, depth: int) -> list[Tensor]:
-    """What the kernels take of primitives that are no triangles: corners, rows, quadrics, first ids and room of a stack."""
-    ends = [sum(geometry.counts[:k]) for k in range(1, 5)]
-    kinds = torch.tensor([*ends, room_of(depth)], dtype=torch.int64)
-    return [torch.from_numpy(corners_of(geometry)), torch.from_numpy(rows), inverses(geometry).T.contiguous(), kinds]
 
 
 def _arrays(tensors: list[Tensor]) -> tuple[np.ndarray, ...]:

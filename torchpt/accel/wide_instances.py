@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from typing import Any
 
@@ -11,12 +12,12 @@ from torch import Tensor
 
 from torchpt.accel import kernels_instances as kernels
 from torchpt.accel.base import Accel, Array, Hits
-from torchpt.accel.blocks import Tree, aligned, lines_of, mesh_tree, room_of, wide_tree, write
+from torchpt.accel.blocks import Others, Tree, aligned, lines_of, mesh_tree, room_of, wide_tree, write
 from torchpt.accel.instances import CopyTables
 from torchpt.accel.kernels_blocks import LINE
+from torchpt.accel.topology import Topology
 from torchpt.accel.wide import Wide
 from torchpt.native.jit import compiled, launch
-from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
 __all__ = ["WideInstanced"]
@@ -32,30 +33,56 @@ class WideInstanced(Accel):
         threads: CPU threads; ``None`` is torch's number.
     """
 
-    name = "numba"
+    name, refits = "numba", True
 
     def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
         start = time.perf_counter()
-        assert geometry.copies is not None
-        self.threads = thread_count(threads)
-        self.base = Wide(geometry, threads)
         tables = CopyTables(geometry)
-        trees, roots, lower = _meshes(tables.meshes)
+        trees, self.topologies, lower = _meshes(tables.meshes)
+        self._below = [sum(x.nodes for x in trees), sum(x.leaves for x in trees), max(x.depth for x in trees)]
+        self._take(geometry, Wide(geometry, threads), tables, lower, start)
+
+    def _take(self, geometry: Geometry, base: Wide, tables: CopyTables, lower: np.ndarray, start: float) -> None:
+        """Builds the upper level."""
+        assert geometry.copies is not None
+        self.base, self.threads, self.places = base, base.threads, geometry.copies[12:]
         some = np.flatnonzero([tables.meshes[k].size > 0 for k in tables.mesh.tolist()]).astype(np.int32)
         boxes = torch.cat((tables.low, tables.high)).T.contiguous().numpy()[some]
         top = wide_tree(boxes, some.copy())
         none = _nothing()
         upper = aligned(lines_of(top, none.counts) * LINE)
-        write(top, none, np.zeros((0, 4), np.float32), np.zeros((0, 12), np.float32), 0, upper)
-        depth = top.depth + max(tree.depth for tree in trees)
+        write(top, none, np.zeros((0, 4), np.float32), Others(none), 0, upper)
+        nodes, leaves, depth = self._below
+        depth += top.depth
+        roots = np.array([4 * x.line for x in self.topologies], np.int64)
         self.arrays = (
             upper, upper.view(np.int32), lower, lower.view(np.int32), tables.inverse.numpy(),
             tables.shift.numpy().astype(np.int32), roots[tables.mesh.numpy()], room_of(depth),
         )  # fmt: skip
-        self.depth, self.copies = depth, len(some)
-        self.nodes, self.leaves = (sum(getattr(x, part) for x in (top, *trees)) for part in ("nodes", "leaves"))
+        self.depth, self.copies, self.nodes, self.leaves = depth, len(some), top.nodes + nodes, top.leaves + leaves
         self.ids = int(geometry.size + geometry.copies[13].sum())
         self.build_seconds = time.perf_counter() - start
+
+    def refit(self, geometry: Geometry, threads: int | None = None) -> WideInstanced | None:
+        """See :meth:`Accel.refit`; the upper level, of a few boxes beside the primitives', is always built anew."""
+        start = time.perf_counter()
+        if geometry.copies is None or not torch.equal(geometry.copies[12:], self.places):
+            return None
+        base = self.base.refit(geometry, threads)
+        if base is None:
+            return None
+        tables, before, found = CopyTables(geometry), self.arrays[2], []
+        lower = aligned(len(before))
+        for topology, mesh in zip(self.topologies, tables.meshes, strict=True):
+            # no copy of an empty mesh is in the upper level
+            moved = topology if not mesh.size else topology.refit(mesh, Others(mesh), before, lower)
+            if moved is None:
+                return None
+            found.append(moved)
+        tree = copy.copy(self)
+        tree.topologies = found
+        tree._take(geometry, base, tables, lower, start)
+        return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
         hits = self.base._intersect(o, d, t_max)
@@ -108,11 +135,13 @@ def _nothing() -> Geometry:
     return Geometry(none, none, none, (0, 0, 0, 0, 0))
 
 
-def _meshes(meshes: list[Geometry]) -> tuple[list[Tree], np.ndarray, np.ndarray]:
-    """The trees of all meshes, the codes of their roots, and their blocks one after the other."""
+def _meshes(meshes: list[Geometry]) -> tuple[list[Tree], list[Topology], np.ndarray]:
+    """The trees of all meshes, where they lie, and their blocks one after the other."""
     built = [mesh_tree(mesh) for mesh in meshes]
-    lines = np.cumsum([0, *(lines_of(tree, mesh.counts) for (tree, _, _), mesh in zip(built, meshes, strict=True))])
-    memory = aligned(int(lines[-1]) * LINE)
-    for (tree, planes, rows), mesh, line in zip(built, meshes, lines[:-1], strict=True):
-        write(tree, mesh, planes, rows, int(line), memory)
-    return [tree for tree, _, _ in built], 4 * lines[:-1].astype(np.int64), memory
+    lines = [lines_of(tree, mesh.counts) for (tree, _, _), mesh in zip(built, meshes, strict=True)]
+    lines = np.cumsum([0, *lines]).tolist()
+    memory = aligned(lines[-1] * LINE)
+    for (tree, planes, others), mesh, line in zip(built, meshes, lines[:-1], strict=True):
+        write(tree, mesh, planes, others, line, memory)
+    trees = [tree for tree, _, _ in built]
+    return trees, [Topology(*args) for args in zip(trees, meshes, lines[:-1], strict=True)], memory

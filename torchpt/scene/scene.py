@@ -102,6 +102,7 @@ class Scene:
         self._lock = threading.RLock()
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
+        self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
         self._state: dict[str, tuple[Tensor, int]] = {}
 
     def weights(self) -> tuple[Tensor, ...]:
@@ -196,14 +197,25 @@ class Scene:
             return self._worlds[key]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
-        """A search structure: built for ``geometry``, or kept for the scene's own."""
-        if geometry is not None:
-            return search.build(geometry, kind, threads)
+        """A search structure: made for ``geometry``, or kept for the scene's own.
+
+        Where vertices move from render to render, as in an optimization, the latest one is refitted while it serves
+        (:meth:`Accel.refit`). Structures that are in use stay as they are.
+        """
+        key = kind, threads
         with self._lock:
-            _, own = self.world(torch.float32)
-            if (kind, threads) not in self._accels:
-                self._accels[kind, threads] = search.build(own, kind, threads)
-            return self._accels[kind, threads]
+            if geometry is None:
+                _, own = self.world(torch.float32)
+                if key not in self._accels:
+                    self._accels[key] = self._made(key, own)
+                return self._accels[key]
+        return self._made(key, geometry)
+
+    def _made(self, key: tuple[str, int | None], geometry: Geometry) -> Accel:
+        made = search.build(geometry, *key, before=self._latest.get(key))
+        if made.refits:
+            self._latest[key] = made
+        return made
 
     def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
         """The camera on a film of a given size, in the lanes' coordinates."""

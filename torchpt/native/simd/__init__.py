@@ -6,7 +6,17 @@ and none is reordered: each lane has the bits that the scalar operation gives. I
 bounds nor negative numbers are looked at.
 """
 
-from torchpt.native.simd.arithmetic import absolute, as_float, as_int, maximum, minimum, select
+from torchpt.native.simd.arithmetic import (
+    absolute,
+    as_float,
+    as_int,
+    maximum,
+    minimum,
+    narrow,
+    select,
+    square_root,
+    widen,
+)
 from torchpt.native.simd.lanes import (
     bits,
     highest,
@@ -36,6 +46,7 @@ __all__ = [
     "mask",
     "maximum",
     "minimum",
+    "narrow",
     "pointer",
     "population",
     "prefetch",
@@ -43,7 +54,9 @@ __all__ = [
     "select",
     "sort_descending",
     "splat",
+    "square_root",
     "store",
     "store_masked",
     "trailing_zeros",
+    "widen",
 ]

@@ -6,16 +6,16 @@ import operator
 from typing import Any
 
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import lower_builtin, type_callable
 
-from torchpt.native.simd.types import I32, Vector, intrinsic, splatted
+from torchpt.native.simd.types import I32, Vector, intrinsic
 
-__all__ = ["absolute", "as_float", "as_int", "maximum", "minimum", "select"]
+__all__ = ["absolute", "as_float", "as_int", "maximum", "minimum", "narrow", "select", "square_root", "widen"]
 
 
 def _is_float(kind: Any) -> bool:
-    return kind == types.float32 or getattr(kind, "element", None) == types.float32
+    return isinstance(getattr(kind, "element", kind), types.Float)
 
 
 def _binary(symbol: Any, for_floats: str | None, for_others: str | None) -> None:
@@ -109,7 +109,7 @@ def as_int(context, x):
     """The bits of float32, of a vector or a scalar, as int32."""
     if x == types.float32:
         return types.int32(x), lambda context, builder, signature, args: builder.bitcast(args[0], I32)
-    if not (isinstance(x, Vector) and _is_float(x)):
+    if not (isinstance(x, Vector) and x.element == types.float32):
         return None
     kind = ir.VectorType(I32, x.lanes)
     return Vector(types.int32, x.lanes)(x), lambda context, builder, signature, args: builder.bitcast(args[0], kind)
@@ -133,10 +133,35 @@ def absolute(context, x):
     """Float lanes without their sign bit."""
     if not (isinstance(x, Vector) and _is_float(x)):
         return None
+    return x(x), lambda context, builder, signature, args: _of_floats(builder, "fabs", x, args[0])
 
-    def generate(context, builder, signature, args):
-        whole = ir.VectorType(I32, x.lanes)
-        kept = builder.and_(builder.bitcast(args[0], whole), splatted(builder, ir.Constant(I32, 0x7FFFFFFF), x.lanes))
-        return builder.bitcast(kept, args[0].type)
 
-    return x(x), generate
+@intrinsic
+def square_root(context, x):
+    """The square root of float lanes, NaN of negative ones."""
+    if not (isinstance(x, Vector) and _is_float(x)):
+        return None
+    return x(x), lambda context, builder, signature, args: _of_floats(builder, "sqrt", x, args[0])
+
+
+def _of_floats(builder: Any, name: str, kind: Vector, x: Any) -> Any:
+    shape = ir.FunctionType(x.type, [x.type])
+    return builder.call(cgutils.get_or_insert_function(builder.module, shape, f"llvm.{name}.{kind.code}"), [x])
+
+
+@intrinsic
+def widen(context, x):
+    """float32 lanes as float64."""
+    if not (isinstance(x, Vector) and x.element == types.float32):
+        return None
+    kind = ir.VectorType(ir.DoubleType(), x.lanes)
+    return Vector(types.float64, x.lanes)(x), lambda context, builder, signature, args: builder.fpext(args[0], kind)
+
+
+@intrinsic
+def narrow(context, x):
+    """float64 lanes as the nearest float32."""
+    if not (isinstance(x, Vector) and x.element == types.float64):
+        return None
+    kind = ir.VectorType(ir.FloatType(), x.lanes)
+    return Vector(types.float32, x.lanes)(x), lambda context, builder, signature, args: builder.fptrunc(args[0], kind)

@@ -61,7 +61,7 @@ def _shuffled(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
 
 
 def _ordered(builder: Any, kind: Vector, code: str, a: Any, b: Any) -> Any:
-    compare = builder.fcmp_ordered if kind.element == types.float32 else builder.icmp_signed
+    compare = builder.fcmp_ordered if isinstance(kind.element, types.Float) else builder.icmp_signed
     return builder.select(compare(code, a, b), a, b)
 
 

@@ -1,4 +1,4 @@
-"""The vector type of numba: elements of float32, int32 or bool, known number of lanes."""
+"""The vector type of numba: elements of float32, float64, int32 or bool, known number of lanes."""
 
 from __future__ import annotations
 
@@ -17,14 +17,19 @@ intrinsic: Any = extending.intrinsic
 
 I32 = ir.IntType(32)
 #: What a vector may hold, and how LLVM has it.
-ELEMENTS = {types.float32: ir.FloatType(), types.int32: I32, types.boolean: ir.IntType(1)}
+ELEMENTS = {
+    types.float32: ir.FloatType(),
+    types.float64: ir.DoubleType(),
+    types.int32: I32,
+    types.boolean: ir.IntType(1),
+}
 
 
 class Vector(types.Type):
     """``lanes`` numbers (or truths) side by side, one LLVM value.
 
     Args:
-        element: float32, int32 or boolean of numba.
+        element: float32, float64, int32 or boolean of numba.
         lanes: how many.
     """
 
@@ -35,7 +40,7 @@ class Vector(types.Type):
     @property
     def code(self) -> str:
         """How LLVM's functions name the type: ``v8f32``."""
-        return f"v{self.lanes}{'f32' if self.element == types.float32 else 'i32'}"
+        return f"v{self.lanes}{'f' if isinstance(self.element, types.Float) else 'i'}{self.element.bitwidth}"
 
 
 @register_model(Vector)
@@ -66,7 +71,7 @@ def splatted(builder: Any, x: Any, lanes: int) -> Any:
 
 @intrinsic(prefer_literal=True)
 def splat(context, x, n):
-    """``splat(x, n)``: a float32, int32 or bool in each of ``n`` lanes."""
+    """``splat(x, n)``: a float32, float64, int32 or bool in each of ``n`` lanes."""
     element = x.literal_type if isinstance(x, types.Literal) else x
     if element not in ELEMENTS:
         return None
