@@ -10,9 +10,9 @@ import numpy as np
 
 from torchpt.accel.kernels_blocks import CHILDREN, FLOOR, IDS, PLANES, SLACK, VEILED, blocking, place, push
 from torchpt.accel.kernels_others import FOURTH, RECTANGLES, RULED, others
+from torchpt.accel.kernels_rays import AXIS, BEST, COLUMNS, INVERSE, SHEAR, D, O
 from torchpt.native.jit import part
 from torchpt.native.simd import (
-    absolute,
     as_float,
     as_int,
     bits,
@@ -38,44 +38,31 @@ RAYS = 16
 SPARE = 10 * RAYS
 #: Rays that repay a packet.
 FEWEST = 4
-_ZERO, _ONE, _INF = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
-_LEAST, _TINY = np.float32(1e-20), np.float32(1e-37)  # as in kernels_leaf.setup
+_ZERO, _INF = np.float32(0.0), np.float32(np.inf)
 
 
 @part(forceinline=True)
-def coherent(rays, i):
-    """Whether rays ``i`` to ``i + 15`` go as a packet: those that can hit are many, of one octant and one longest axis.
+def coherent(c, good, rows):
+    """Whether the rays in columns ``c`` to ``c + 15`` go as a packet: those in the mask ``good`` are many, and of one octant.
 
-    Returns also the mask of those that can hit, which axis that is and whether directions rise along x, y and z. Signs are
-    those of the sign bit, as -0 counts as falling.
+    Returns also whether directions rise along x, y and z. Signs are those of the sign bit, as -0 counts as falling.
     """
-    o, d, t_max, n = rays
-    ox, oy, oz = load(o, i, 16), load(o, n + i, 16), load(o, 2 * n + i, 16)
-    dx, dy, dz = load(d, i, 16), load(d, n + i, 16), load(d, 2 * n + i, 16)
-    zero, none = splat(_ZERO, 16), splat(np.int32(0), 16)
-    sum_ = ox * zero + oy * zero + oz * zero + dx * zero + dy * zero + dz * zero
-    good = bits((load(t_max, i, 16) > zero) & (sum_ == zero))
-    ax, ay, az = absolute(dx), absolute(dy), absolute(dz)
-    x = bits((ax >= ay) & (ax >= az)) & good
-    y = bits(ay >= az) & ~x & good
-    ux, uy, uz = bits(as_int(dx) >= none) & good, bits(as_int(dy) >= none) & good, bits(as_int(dz) >= none) & good
-    alike = (x == 0 or x == good) and (y == 0 or y == good) and (ux == 0 or ux == good)
-    alike = alike and (uy == 0 or uy == good) and (uz == 0 or uz == good) and population(good) >= FEWEST
-    axis = 0 if x != 0 else (1 if y != 0 else 2)
-    return alike, good, axis, ux != 0, uy != 0, uz != 0
+    none = splat(np.int32(0), 16)
+    ux = bits(as_int(load(rows, D + c, 16)) >= none) & good
+    uy = bits(as_int(load(rows, D + COLUMNS + c, 16)) >= none) & good
+    uz = bits(as_int(load(rows, D + 2 * COLUMNS + c, 16)) >= none) & good
+    alike = (ux == 0 or ux == good) and (uy == 0 or uy == good) and (uz == 0 or uz == good)
+    return alike and population(good) >= FEWEST, ux != 0, uy != 0, uz != 0
 
 
 @part(forceinline=True)
-def _inverse(d, least):
-    """Reciprocals that are never infinite."""
-    sign = as_int(d) & splat(np.int32(-(2**31)), 16)
-    return splat(_ONE, 16) / select(absolute(d) >= least, d, as_float(as_int(least) | sign))
-
-
-@part(forceinline=True)
-def _filled(a, i, first, whole):
-    """16 numbers from place ``i`` on, the one at ``first`` where a ray is none that can hit."""
-    return select(whole, load(a, i, 16), splat(item(a, first), 16))
+def _filled(rows, c, first, whole):
+    """Three rows of columns ``c`` to ``c + 15``, those of column ``first`` where a ray is none that can hit."""
+    return (
+        select(whole, load(rows, c, 16), splat(item(rows, first), 16)),
+        select(whole, load(rows, c + COLUMNS, 16), splat(item(rows, first + COLUMNS), 16)),
+        select(whole, load(rows, c + 2 * COLUMNS, 16), splat(item(rows, first + 2 * COLUMNS), 16)),
+    )
 
 
 @part(forceinline=True)
@@ -117,24 +104,26 @@ def _box(tree, at, nx, ny, nz, o, inverse, best):
 
 
 @part(forceinline=True)
-def _corner(tree, at, x, y, z, p, s):
-    """One corner of a triangle in the sheared place of every ray; see kernels_blocks.crossed."""
-    depth = splat(item(tree, at + z), 16) - p[2]
+def _corner(tree, at, m, p, s):
+    """A corner in the sheared place of every ray, see kernels_blocks.crossed; ``m``: whose longest axis is x, and whose is y."""
+    x = splat(item(tree, at), 16) - p[0]
+    y = splat(item(tree, at + 8), 16) - p[1]
+    z = splat(item(tree, at + 16), 16) - p[2]
+    depth = select(m[0], x, select(m[1], y, z))
     return (
-        (splat(item(tree, at + x), 16) - p[0]) - s[0] * depth,
-        (splat(item(tree, at + y), 16) - p[1]) - s[1] * depth,
+        select(m[0], y, select(m[1], z, x)) - s[0] * depth,
+        select(m[0], z, select(m[1], x, y)) - s[1] * depth,
         depth,
     )
 
 
 @part(forceinline=True)
-def _triangle(tree, at, axes, p, s, o, d, floor):
+def _triangle(tree, at, axes, s, o, d, floor):
     """16 rays against one triangle, whose first number lies at ``at``: mask, ``t``, and what ``u`` and ``v`` come from."""
-    x, y, z = axes[0] * 8, axes[1] * 8, axes[2] * 8
     zero = splat(_ZERO, 16)
-    ax, ay, za = _corner(tree, at, x, y, z, p, s)
-    bx, by, zb = _corner(tree, at + 24, x, y, z, p, s)
-    cx, cy, zc = _corner(tree, at + 48, x, y, z, p, s)
+    ax, ay, za = _corner(tree, at, axes, o, s)
+    bx, by, zb = _corner(tree, at + 24, axes, o, s)
+    cx, cy, zc = _corner(tree, at + 48, axes, o, s)
     e, f, g = cx * by - cy * bx, ax * cy - ay * cx, bx * ay - by * ax
     low, high = minimum(minimum(e, f), g), maximum(maximum(e, f), g)
     det = e + f + g
@@ -152,17 +141,16 @@ def _triangle(tree, at, axes, p, s, o, d, floor):
 
 
 @part(forceinline=True)
-def _rectangle(tree, at, axes, p, s, o, d):
+def _rectangle(tree, at, axes, s, o, d):
     """16 rays against one rectangle: mask, ``t``, u and v; the operations of :func:`torchpt.accel.kernels_others.others`."""
-    x, y, z = axes[0] * 8, axes[1] * 8, axes[2] * 8
     zero = splat(_ZERO, 16)
     n0, n1 = splat(item(tree, at + RULED), 16), splat(item(tree, at + RULED + 8), 16)
     n2, n3 = splat(item(tree, at + RULED + 16), 16), splat(item(tree, at + RULED + 24), 16)
     plane = -(n0 * o[0] + n1 * o[1] + n2 * o[2] + n3) / (n0 * d[0] + n1 * d[1] + n2 * d[2])
-    ax, ay, az = _corner(tree, at, x, y, z, p, s)
-    bx, by, bz = _corner(tree, at + 24, x, y, z, p, s)
-    cx, cy, cz = _corner(tree, at + 48, x, y, z, p, s)
-    qx, qy, qz = _corner(tree, at + FOURTH, x, y, z, p, s)
+    ax, ay, az = _corner(tree, at, axes, o, s)
+    bx, by, bz = _corner(tree, at + 24, axes, o, s)
+    cx, cy, cz = _corner(tree, at + 48, axes, o, s)
+    qx, qy, qz = _corner(tree, at + FOURTH, axes, o, s)
     az, bz, cz, qz = az * s[2], bz * s[2], cz * s[2], qz * s[2]
     f, g = ax * cy - ay * cx, bx * ay - by * ax
     h, k = qx * by - qy * bx, cx * qy - cy * qx
@@ -174,12 +162,12 @@ def _rectangle(tree, at, axes, p, s, o, d):
 
 
 @part(forceinline=True)
-def _rest(scene, code, base, rows, o, d, axes, shear, floor, lanes, best, prim, u, v, any_hit):
+def _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_hit):
     """Every ray of the mask, one by one, against a leaf's primitives that are neither triangles nor rectangles.
 
-    ``rows`` is memory for what lanes hold.
+    ``memory`` is for what lanes hold.
     """
-    spare, ids, scratch = rows
+    spare, ids, scratch = memory
     for k in range(3):
         store(spare, 16 * k, o[k])
         store(spare, 48 + 16 * k, d[k])
@@ -197,7 +185,7 @@ def _rest(scene, code, base, rows, o, d, axes, shear, floor, lanes, best, prim, 
             scene, code | 2, base,
             (item(spare, j), item(spare, 16 + j), item(spare, 32 + j)),
             (item(spare, 48 + j), item(spare, 64 + j), item(spare, 80 + j)),
-            axes, (_ZERO, _ZERO, _ZERO), item(spare, 96 + j), item(spare, 112 + j), had, scratch, any_hit,
+            (0, 1, 2), (_ZERO, _ZERO, _ZERO), item(spare, 96 + j), item(spare, 112 + j), had, scratch, any_hit,
         )  # fmt: skip
         if any_hit:
             put(ids, j, q)
@@ -212,7 +200,7 @@ def _rest(scene, code, base, rows, o, d, axes, shear, floor, lanes, best, prim, 
 
 
 @part(forceinline=True)
-def _leaf(scene, code, rows, axes, p, s, o, d, floor, lanes, best, prim, u, v, any_hit):
+def _leaf(scene, code, memory, axes, s, o, d, floor, lanes, best, prim, u, v, any_hit):
     """Takes a leaf into the hits of the packet's rays that are in the mask; a ray that any hit settles gets ``best`` -1."""
     tree, codes = scene[0], scene[1]
     base = place(code)
@@ -220,11 +208,11 @@ def _leaf(scene, code, rows, axes, p, s, o, d, floor, lanes, best, prim, u, v, a
     for k in range(8):
         q = item(codes, base + IDS + k)
         if q >= 0:
-            m, t, f, g, det = _triangle(tree, base + k, axes, p, s, o, d, floor)
+            m, t, f, g, det = _triangle(tree, base + k, axes, s, o, d, floor)
             a, b = f / det, g / det
         elif ruled and q < -1:
             q = np.int32(-2 - q)
-            m, t, a, b = _rectangle(tree, base + RECTANGLES + k, axes, p, s, o, d)
+            m, t, a, b = _rectangle(tree, base + RECTANGLES + k, axes, s, o, d)
             t = maximum(t, floor)
         else:
             continue
@@ -239,7 +227,7 @@ def _leaf(scene, code, rows, axes, p, s, o, d, floor, lanes, best, prim, u, v, a
             best, prim = select(m, t, best), select(m, id_, prim)
             u, v = select(m, a, u), select(m, b, v)
     if code & 1 == 0:
-        best, prim, u, v = _rest(scene, code, base, rows, o, d, axes, s, floor, lanes, best, prim, u, v, any_hit)
+        best, prim, u, v = _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_hit)
     return best, prim, u, v
 
 
@@ -258,23 +246,19 @@ def deliver(i, out, best, prim, u, v, any_hit):
 
 
 @part(forceinline=True)
-def packet(i, good, axis, ux, uy, uz, rays, scene, stack, rows, out, any_hit):
-    """The hits of rays ``i`` to ``i + 15``, which :func:`coherent` has found to go together."""
+def packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hit):
+    """The hits of rays ``i`` to ``i + 15`` in columns ``c`` to ``c + 15``, which :func:`coherent` has found to go together."""
     tree, codes = scene[0], scene[1]
     keys, parents = stack
-    o, d, t_max, n = rays
-    first, whole = i + trailing_zeros(good), mask(good, 16)
-    p = (_filled(o, i, first, whole), _filled(o, n + i, n + first, whole), _filled(o, 2 * n + i, 2 * n + first, whole))
-    r = (_filled(d, i, first, whole), _filled(d, n + i, n + first, whole), _filled(d, 2 * n + i, 2 * n + first, whole))
-    axes = (1, 2, 0) if axis == 0 else ((2, 0, 1) if axis == 1 else (0, 1, 2))
-    turned = (p[1], p[2], p[0]) if axis == 0 else ((p[2], p[0], p[1]) if axis == 1 else p)
-    ex, ey, ez = (r[1], r[2], r[0]) if axis == 0 else ((r[2], r[0], r[1]) if axis == 1 else r)
-    shear = (ex / ez, ey / ez, splat(_ONE, 16) / ez)
-    least = maximum(absolute(ez) * splat(_LEAST, 16), splat(_TINY, 16))
-    inverse = (_inverse(r[0], least), _inverse(r[1], least), _inverse(r[2], least))
+    first, whole = c + trailing_zeros(good), mask(good, 16)
+    p, r = _filled(rows, O + c, O + first, whole), _filled(rows, D + c, D + first, whole)
+    inverse = _filled(rows, INVERSE + c, INVERSE + first, whole)
+    shear = _filled(rows, SHEAR + c, SHEAR + first, whole)
+    longest = load(axis, AXIS + 2 * COLUMNS + c, 16)
+    axes = (longest == splat(np.int32(0), 16), longest == splat(np.int32(1), 16))
     nx, ny, nz = 0 if ux else 24, 8 if uy else 32, 16 if uz else 40
     x, y, z = _interval(p[0], inverse[0], ux), _interval(p[1], inverse[1], uy), _interval(p[2], inverse[2], uz)
-    best = select(whole, load(t_max, i, 16), splat(np.float32(-1.0), 16))
+    best = load(rows, BEST + c, 16)
     prim, u, v = splat(np.int32(-1), 16), splat(_ZERO, 16), splat(_ZERO, 16)
     entry, lanes = splat(_ZERO, 16), best > splat(_ZERO, 16)
     limit = highest(best) * SLACK
@@ -287,7 +271,7 @@ def packet(i, good, axis, ux, uy, uz, rays, scene, stack, rows, out, any_hit):
         else:
             floor = as_float(as_int(entry) & splat(np.int32(-8), 16)) * splat(FLOOR, 16)
             best, prim, u, v = _leaf(
-                scene, code, rows, axes, turned, shear, p, r, floor, lanes, best, prim, u, v, any_hit
+                scene, code, memory, axes, shear, p, r, floor, lanes, best, prim, u, v, any_hit
             )
             limit = highest(best) * SLACK
         while True:

@@ -19,11 +19,11 @@ def _trace(first, last, rays, scene, room, groups, columns, work, spare, out, an
     rows, ids = columns
     i, count = first, np.int64(0)
     while i < last:
-        together, good, axis, ux, uy, uz = coherent(rays, i)
+        good = prepare(i, rays, count, rows, ids)
+        together, ux, uy, uz = coherent(count, good, rows)
         if together:
-            packet(i, good, axis, ux, uy, uz, rays, scene, (work[0], work[1]), spare, out, any_hit)
+            packet(i, count, good, ux, uy, uz, rows, ids, scene, (work[0], work[1]), spare, out, any_hit)
         else:
-            prepare(i, rays, count, rows, ids)
             put(groups, count >> 4, i)
             count += 16
         i += 16
