@@ -9,6 +9,7 @@ square light, second and fourth are the bounces of diffuse paths. A line tells M
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import statistics
@@ -141,7 +142,8 @@ def ray_sets(g: Geometry, accel: Wide, first: Rays, light: np.ndarray, size: flo
 def embree(g: Geometry) -> Any:
     """Embree over the triangles, or None where it is not installed."""
     try:
-        from embreex import mesh_construction, rtcore_scene  # pyright: ignore[reportMissingImports]
+        mesh_construction: Any = importlib.import_module("embreex.mesh_construction")
+        rtcore_scene: Any = importlib.import_module("embreex.rtcore_scene")
     except ImportError:
         return None
     n = g.counts[0]

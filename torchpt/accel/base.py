@@ -76,13 +76,14 @@ class Accel(ABC):
         """
         return None
 
-    def blocked(
-        self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None
-    ) -> None:
+    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None) -> None:
         """Whether anything lies in ``(0, t_max)``: 1 or 0 in ``out (C,)`` int32; else as :meth:`nearest`.
 
         Args:
-            o, d, t_max, count: rays, as in :meth:`nearest`.
+            o: as in :meth:`nearest`.
+            d: likewise.
+            t_max: likewise.
+            count: how many rays.
             out: ``(C,)`` int32, filled.
             veils: a uint8 for each primitive, not 0 where light may pass it. A ray gets 2 where it may be that all it meets
                 lets light pass, so that it has to be looked at closer.

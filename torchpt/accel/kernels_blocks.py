@@ -86,7 +86,7 @@ def triangles_alone(code):
 def blocking(scene, prim):
     """The id of a primitive that any-hit rays end at, or :data:`VEILED`.
 
-    ``scene`` ends with a uint8 for each primitive that is not 0 where light may pass, and how many there are: 0 where all block.
+    ``scene`` ends with a uint8 for each primitive, not 0 where light may pass, and how many there are: none where all block.
     """
     return VEILED if scene[5] > 0 and item(scene[4], prim) != 0 else prim
 

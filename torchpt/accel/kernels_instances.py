@@ -85,7 +85,10 @@ def _search(
     keys, parents, scratch = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(SCRATCH, np.float32)
     none = np.empty(1, np.uint8)
     work = (pointer(keys), pointer(parents), pointer(scratch))
-    above, below = (pointer(upper), pointer(upper_codes)), (pointer(lower), pointer(lower_codes), 0, 0, pointer(none), 0)
+    above, below = (
+        (pointer(upper), pointer(upper_codes)),
+        (pointer(lower), pointer(lower_codes), 0, 0, pointer(none), 0),
+    )
     copies = (pointer(table), pointer(shift), pointer(roots))
     for i in range(first, last):
         p, r = (o[0, i], o[1, i], o[2, i]), (d[0, i], d[1, i], d[2, i])

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchpt.accel.kernels_blocks import CHILDREN, FLOOR, IDS, PLANES, SLACK, VEILED, blocking, place, push
 from torchpt.accel.kernels_others import FOURTH, RECTANGLES, RULED, others
-from torchpt.accel.kernels_rays import AXIS, BEST, COLUMNS, INVERSE, SHEAR, D, O
+from torchpt.accel.kernels_rays import AXIS, BEST, COLUMNS, DIRECTION, INVERSE, ORIGIN, SHEAR
 from torchpt.native.jit import part
 from torchpt.native.simd import (
     as_float,
@@ -48,9 +48,9 @@ def coherent(c, good, rows):
     Returns also whether directions rise along x, y and z. Signs are those of the sign bit, as -0 counts as falling.
     """
     none = splat(np.int32(0), 16)
-    ux = bits(as_int(load(rows, D + c, 16)) >= none) & good
-    uy = bits(as_int(load(rows, D + COLUMNS + c, 16)) >= none) & good
-    uz = bits(as_int(load(rows, D + 2 * COLUMNS + c, 16)) >= none) & good
+    ux = bits(as_int(load(rows, DIRECTION + c, 16)) >= none) & good
+    uy = bits(as_int(load(rows, DIRECTION + COLUMNS + c, 16)) >= none) & good
+    uz = bits(as_int(load(rows, DIRECTION + 2 * COLUMNS + c, 16)) >= none) & good
     alike = (ux == 0 or ux == good) and (uy == 0 or uy == good) and (uz == 0 or uz == good)
     return alike and population(good) >= FEWEST, ux != 0, uy != 0, uz != 0
 
@@ -105,7 +105,7 @@ def _box(tree, at, nx, ny, nz, o, inverse, best):
 
 @part(forceinline=True)
 def _corner(tree, at, m, p, s):
-    """A corner in the sheared place of every ray, see kernels_blocks.crossed; ``m``: whose longest axis is x, and whose is y."""
+    """A corner in the sheared place of every ray, see kernels_blocks.crossed; ``m`` says whose longest axis is x, whose y."""
     x = splat(item(tree, at), 16) - p[0]
     y = splat(item(tree, at + 8), 16) - p[1]
     z = splat(item(tree, at + 16), 16) - p[2]
@@ -251,7 +251,7 @@ def packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hi
     tree, codes = scene[0], scene[1]
     keys, parents = stack
     first, whole = c + trailing_zeros(good), mask(good, 16)
-    p, r = _filled(rows, O + c, O + first, whole), _filled(rows, D + c, D + first, whole)
+    p, r = _filled(rows, ORIGIN + c, ORIGIN + first, whole), _filled(rows, DIRECTION + c, DIRECTION + first, whole)
     inverse = _filled(rows, INVERSE + c, INVERSE + first, whole)
     shear = _filled(rows, SHEAR + c, SHEAR + first, whole)
     longest = load(axis, AXIS + 2 * COLUMNS + c, 16)
@@ -270,9 +270,7 @@ def packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hi
             top = push(keys, parents, top, base, a, met)
         else:
             floor = as_float(as_int(entry) & splat(np.int32(-8), 16)) * splat(FLOOR, 16)
-            best, prim, u, v = _leaf(
-                scene, code, memory, axes, shear, p, r, floor, lanes, best, prim, u, v, any_hit
-            )
+            best, prim, u, v = _leaf(scene, code, memory, axes, shear, p, r, floor, lanes, best, prim, u, v, any_hit)
             limit = highest(best) * SLACK
         while True:
             top -= 1

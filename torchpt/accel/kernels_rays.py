@@ -7,12 +7,27 @@ import numpy as np
 from torchpt.native.jit import part
 from torchpt.native.simd import absolute, as_float, as_int, bits, load, maximum, select, splat, store
 
-__all__ = ["AXIS", "BEST", "COLUMNS", "D", "FLOATS", "IDS", "INVERSE", "NEAR", "NUMBERS", "O", "SHEAR", "U", "V", "prepare"]
+__all__ = [
+    "AXIS",
+    "BEST",
+    "COLUMNS",
+    "DIRECTION",
+    "FLOATS",
+    "IDS",
+    "INVERSE",
+    "NEAR",
+    "NUMBERS",
+    "ORIGIN",
+    "SHEAR",
+    "U",
+    "V",
+    "prepare",
+]
 
 #: Rays that are held at a time; the length of a row.
 COLUMNS = 256
 #: Rows of float32: origin, direction, reciprocal direction, shear, best distance (-1: nothing is to be found), u, v.
-O, D, INVERSE, SHEAR, BEST, U, V = (k * COLUMNS for k in (0, 3, 6, 9, 12, 13, 14))
+ORIGIN, DIRECTION, INVERSE, SHEAR, BEST, U, V = (k * COLUMNS for k in (0, 3, 6, 9, 12, 13, 14))
 FLOATS = 15 * COLUMNS
 #: Rows of int32: the axes with the direction's longest last, where the planes that face the ray begin, the primitive hit.
 AXIS, NEAR, IDS = 0, 3 * COLUMNS, 6 * COLUMNS
@@ -49,12 +64,12 @@ def prepare(i, rays, c, rows, ids):
     ez = select(first, dx, select(second, dy, dz))
     least = maximum(absolute(ez) * splat(_LEAST, 16), splat(_TINY, 16))
     rx, ry, rz = _inverse(dx, least), _inverse(dy, least), _inverse(dz, least)
-    store(rows, O + c, ox)
-    store(rows, O + COLUMNS + c, oy)
-    store(rows, O + 2 * COLUMNS + c, oz)
-    store(rows, D + c, dx)
-    store(rows, D + COLUMNS + c, dy)
-    store(rows, D + 2 * COLUMNS + c, dz)
+    store(rows, ORIGIN + c, ox)
+    store(rows, ORIGIN + COLUMNS + c, oy)
+    store(rows, ORIGIN + 2 * COLUMNS + c, oz)
+    store(rows, DIRECTION + c, dx)
+    store(rows, DIRECTION + COLUMNS + c, dy)
+    store(rows, DIRECTION + 2 * COLUMNS + c, dz)
     store(rows, INVERSE + c, rx)
     store(rows, INVERSE + COLUMNS + c, ry)
     store(rows, INVERSE + 2 * COLUMNS + c, rz)

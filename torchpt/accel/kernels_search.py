@@ -13,6 +13,7 @@ from torchpt.native.simd import item, load, pointer, put
 
 __all__ = ["blocked", "blocked_parallel", "nearest", "nearest_parallel"]
 
+
 @part(inline="always")
 def _trace(first, last, rays, scene, room, groups, columns, work, spare, out, any_hit):
     """Rays ``first`` to ``last``, a multiple of 16."""
@@ -117,8 +118,8 @@ def nearest_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quad
 def blocked(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out):
     """What stands in the way of rays ``first <= i < last``: 1 in ``out`` ``(N,)`` int32 for what blocks, 0 for nothing.
 
-    Where ``veils`` is not empty it holds a uint8 for each primitive, not 0 where light may pass: 2 in ``out`` is for rays that meet
-    such primitives alone.
+    Where ``veils`` is not empty it holds a uint8 for each primitive, not 0 where light may pass: 2 in ``out`` is for rays that
+    meet such primitives alone.
     """
     _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, t_max, out, t_max, t_max, True)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from torchpt.accel.kernels_blocks import FLOOR, SLACK, boxes, crossed, fetch, place, push, triangles_alone
 from torchpt.accel.kernels_others import others
-from torchpt.accel.kernels_rays import AXIS, BEST, COLUMNS, IDS, INVERSE, NEAR, SHEAR, D, O, U, V
+from torchpt.accel.kernels_rays import AXIS, BEST, COLUMNS, DIRECTION, IDS, INVERSE, NEAR, ORIGIN, SHEAR, U, V
 from torchpt.accel.kernels_single import SCRATCH, blocker, nearer, pop
 from torchpt.native.jit import part
 from torchpt.native.simd import as_float, bits, item, put, splat
@@ -39,7 +39,8 @@ def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
     kx, ky, kz = _scalars(ids, AXIS + c)
     axes = (np.int64(kx), np.int64(ky), np.int64(kz))
     px, py, pz = (
-        item(rows, O + axes[0] * COLUMNS + c), item(rows, O + axes[1] * COLUMNS + c), item(rows, O + axes[2] * COLUMNS + c),
+        item(rows, ORIGIN + axes[0] * COLUMNS + c), item(rows, ORIGIN + axes[1] * COLUMNS + c),
+        item(rows, ORIGIN + axes[2] * COLUMNS + c),
     )  # fmt: skip
     sx, sy = splat(item(rows, SHEAR + c), 8), splat(item(rows, SHEAR + COLUMNS + c), 8)
     met = crossed(tree, base, axes[0], axes[1], axes[2], splat(px, 8), splat(py, 8), splat(pz, 8), sx, sy)
@@ -47,7 +48,7 @@ def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
         return False
     best, had = item(rows, BEST + c), item(ids, IDS + c)
     floor = as_float(key & -8) * FLOOR
-    o, d, shear = _scalars(rows, O + c), _scalars(rows, D + c), _scalars(rows, SHEAR + c)
+    o, d, shear = _scalars(rows, ORIGIN + c), _scalars(rows, DIRECTION + c), _scalars(rows, SHEAR + c)
     if any_hit:
         q = blocker(scene, base, met, shear[2], o, d, floor, best, had, np.int32(0)) if bits(met[0]) != 0 else had
         if mixed and q < 0:
@@ -108,7 +109,7 @@ def turn(count, scene, room, rows, ids, work, any_hit):
             if code >= 0:
                 base = place(code)
                 nx, ny, nz = _scalars(ids, NEAR + c)
-                ox, oy, oz = _splats(rows, O + c)
+                ox, oy, oz = _splats(rows, ORIGIN + c)
                 ix, iy, iz = _splats(rows, INVERSE + c)
                 a, met = boxes(
                     tree, base, np.int64(nx), np.int64(ny), np.int64(nz), ox, oy, oz, ix, iy, iz,

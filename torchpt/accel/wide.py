@@ -78,9 +78,7 @@ class Wide(Accel):
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
         compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
-    def blocked(
-        self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None
-    ) -> None:
+    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None) -> None:
         """See :meth:`Accel.blocked`."""
         args = (o, d, t_max, *self.arrays, _NO_VEILS if veils is None else veils, out)
         compiled(kernels.blocked, 0, 0, *args)(0, count, *args)

@@ -104,9 +104,7 @@ class WideInstanced(Accel):
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
         compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
-    def blocked(
-        self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None
-    ) -> None:
+    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None) -> None:
         """See :meth:`Accel.blocked`; where there are veils, every ray that meets anything is to be looked at closer."""
         self.base.blocked(o, d, t_max, count, out)
         args = (o, d, t_max, *self.arrays, out)
