@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchpt.errors import AssetError, SceneError
-from torchpt.math.transforms import is_singular, similarity_scale
+from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
 from torchpt.records import KINDS, SOURCES
 from torchpt.scene.description import Description
 from torchpt.scene.displacement import displaced
@@ -89,6 +89,9 @@ def _copies(
         known = f" ({', '.join(names[:8])}{', ...' if len(names) > 8 else ''})" if names else " (there is none)"
         raise SceneError(f"{key}.of", shape.of, f"the name of a mesh among the shapes{known}", file)
     parameters[f"{key}.to_world"] = shape.to_world()
+    if not is_usable(shape.to_world() @ np.linalg.inv(mesh.to_world())):
+        expected = f"a way from where {shape.of} lies to where it is copied that can be inverted, {WITHIN}"
+        raise SceneError(f"{key}.transform", shape.to_world().tolist(), expected, file)
     found = []
     for part in (part for part in parts if part.shape == shape.of):
         slot = part.material
@@ -126,10 +129,9 @@ def _shape_parts(
         if isinstance(shape, Sphere | Cylinder | Cone):
             with np.errstate(over="ignore", invalid="ignore"):
                 pose = pose @ shape.own()
-            if is_singular(pose):
-                raise SceneError(
-                    prefix, pose.tolist(), "a shape whose sizes differ by less than 1e12", description.file
-                )
+            if not is_usable(pose):
+                expected = f"sizes that differ by less than 1e12, and a place: {WITHIN}"
+                raise SceneError(prefix, pose.tolist(), expected, description.file)
         parameters[f"{prefix}.to_world"] = pose
         slot = _slot(description, shape, prefix, opener)
         return [

@@ -16,7 +16,7 @@ from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
 from torchpt.cameras import Camera, Orthographic, Perspective
 from torchpt.errors import RenderError, SceneError
-from torchpt.math.transforms import is_singular, similarity_scale
+from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
 from torchpt.records import Geometry, World
 from torchpt.scene import schema
 from torchpt.scene.assembly import assemble
@@ -84,7 +84,8 @@ class Scene:
         own_models: BSDFs that the caller wrote.
         params: every tensor by dotted name (``materials.*``, ``shapes.*``, ``lights.*``, ``camera.*``): colours ``(3,)``,
             vertices ``(V, 3)`` in the mesh's own space, poses ``(4, 4)``. Changing one in place takes effect at the
-            next render; to differentiate, hand replacements to ``torchpt.render(scene, params=...)``.
+            next render (which refuses places that no scene file could hold); to differentiate, hand replacements to
+            ``torchpt.render(scene, params=...)``.
     """
 
     def __init__(self, description: Description, device: torch.device, own_models: tuple[Bsdf, ...] = ()) -> None:
@@ -141,8 +142,8 @@ class Scene:
 
     def _check(self, name: str, value: Tensor) -> None:
         """Refuse numbers that no scene file could hold."""
-        if not bool(torch.isfinite(value).all()):
-            raise SceneError(f"params.{name}", "a value that is not finite", "finite numbers")
+        if not bool(torch.isfinite(value.float()).all()):
+            raise SceneError(f"params.{name}", "a value that is not finite in float32", "numbers finite in float32")
         low = 0.0
         if not name.endswith((*PLACES, ".direction")) and (
             ".material." in name
@@ -167,8 +168,8 @@ class Scene:
                 raise SceneError(f"params.{name}", float(value), expected)
         if name.endswith(".to_world"):
             matrix = value.double().cpu().numpy()
-            if is_singular(matrix):
-                raise SceneError(f"params.{name}", matrix.tolist(), "a matrix that can be inverted")
+            if not is_usable(matrix):
+                raise SceneError(f"params.{name}", matrix.tolist(), f"a matrix that can be inverted, {WITHIN}")
             if name.startswith("lights.") and similarity_scale(matrix, 1e-4) is None:
                 expected = "a transform that keeps angles (rotation, reflection, uniform scale)"
                 raise SceneError(f"params.{name}", matrix.tolist(), expected)
@@ -248,6 +249,10 @@ class Scene:
             for name, (value, version) in state.items()
         )
         if not same:
+            for name, (value, version) in state.items():
+                old = self._state.get(name)
+                if name.endswith(PLACES) and old is not None and (old[0] is not value or old[1] != version):
+                    self._check(name, value.detach())
             self._state = state
             self._worlds.clear()
             self._accels.clear()
