@@ -70,10 +70,24 @@ def test_the_error_names_the_file(tmp_path: Path) -> None:
         torchpt.load(file, device="cpu")
 
 
-@pytest.mark.parametrize("operations", [[{"scale": 1e38}], [{"scale": 1e-38}], [{"translate": [3e38, 0, 0]}]])
-@pytest.mark.parametrize("what", ["shining sphere", "shining rectangle", "cube", "cone"])
-def test_what_float32_holds_alone_is_accepted(what: str, operations: list[dict[str, Any]]) -> None:
-    load(shapes={"s": {**SHAPES[what], "transform": operations}})
+@pytest.mark.parametrize(
+    ("operation", "size", "place"),
+    [({"scale": 6e37}, 6e37, 0), ({"scale": 1e-38}, 1e-38, 0), ({"translate": [3e38, 0, 0]}, 1, 3e38)],
+)
+@pytest.mark.parametrize("what", ["shining sphere", "shining rectangle", "shining cube", "shining cone"])
+def test_the_limits_of_float32_show_the_same_picture(
+    what: str, operation: dict[str, Any], size: float, place: float
+) -> None:
+    shape = {"type": what.split()[1], **LIT}
+
+    def picture(camera: dict[str, Any], **keys: Any) -> torch.Tensor:
+        scene = torchpt.load({"camera": camera, "shapes": {"s": {**shape, **keys}}}, device="cpu")
+        return torchpt.render(scene, spp=4, film={"width": 8, "height": 8}, compile="off")
+
+    pose = [[-1, 0, 0, place], [0, 1, 0, 0], [0, 0, -1, 5 * size], [0, 0, 0, 1]]
+    there, here = picture({"to_world": pose}, transform=[operation]), picture(CAMERA)
+    assert here.mean() > 0.1
+    assert ((there - here).abs() < 1e-4).float().mean() > 0.95
 
 
 @pytest.mark.parametrize(

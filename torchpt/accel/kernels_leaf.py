@@ -94,7 +94,7 @@ def distance(prim, corner, rows, quadrics, n2, n3, n4, o, d, kx, ky, kz, sx, sy,
     f, g = ax * cy - ay * cx, bx * ay - by * ax
     h, k = qx * by - qy * bx, cx * qy - cy * qx
     low, high = min(min(f, g), min(h, k)), max(max(f, g), max(h, k))
-    det = (f + h) * (g + k)
+    det = min(abs(f + h), abs(g + k))  # a product would be the fourth power of a length
     if not ((low >= _ZERO or high <= _ZERO) and det != _ZERO):
         return _NAN, _ZERO, _ZERO
     near, far = min(min(min(az, bz), cz), qz), max(max(max(az, bz), cz), qz)

@@ -43,7 +43,7 @@ def file_lights(
             position, direction = apply_points(pose, light.position), pose[:3, :3] @ light.direction
             direction = direction / np.abs(direction).max()
             # Twice as far lies what a spot aims at.
-            held = np.isfinite(np.float32([2.0 * position, direction])).all()
+            held = np.isfinite(np.array([2.0 * position, direction]).astype(np.float32)).all()
         if not held:
             raise AssetError(source, f"light {light.name!r} has no finite place under the transform of {prefix}")
         direction = direction / np.linalg.norm(direction)
