@@ -86,8 +86,13 @@ def is_singular(matrix: Matrix) -> bool:
 
 def is_usable(matrix: Matrix) -> bool:
     """Whether a ``(4, 4)`` affine matrix can place things: it and its inverse exist and are finite in float32."""
-    if is_singular(matrix) or not np.abs(matrix).max() <= _LARGEST:
+    if not np.abs(matrix).max() <= _LARGEST:  # for NaN too
         return False
+    values = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if values[2] <= _SINGULAR * values[0]:
+        return False
+    if 1.0 + np.abs(matrix[:3, 3]).sum() <= _LARGEST * values[2]:  # no entry of the inverse is larger than their ratio
+        return True
     with np.errstate(all="ignore"):
         try:
             return bool(np.abs(np.linalg.inv(matrix)).max() <= _LARGEST)  # False for NaN too

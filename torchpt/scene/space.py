@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpt.errors import SceneError
-from torchpt.math.transforms import apply_points
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.scene.schema import Camera, Orthographic, ThinLens
 
@@ -81,23 +80,27 @@ def centre_and_unit(
     Raises:
         SceneError: a shape that lies beyond float32, or lengths too far apart for it.
     """
-    boxes = _boxes(parts, copies)
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for name, box, _ in boxes:
-        low, high = np.minimum(low, box.min(0)), np.maximum(high, box.max(0))
-        if not np.abs(box).max() <= np.finfo(np.float32).max:
-            expected = "a place that is finite in float32 (up to 3.4e38)"
-            raise SceneError(name, [box.min(0).tolist(), box.max(0).tolist()], expected, file)
+    names, boxes, sizes = _boxes(parts, copies)
     centre = np.zeros(3)
-    if boxes:
-        middle = 0.5 * (low + high)
-        if np.abs(middle).max() > RECENTRE * (high - low).max():
-            centre = middle
-    return centre, _unit(boxes, centre, _reaches(sources, parameters, camera, centre), file)
+    if not names:
+        return centre, 1.0
+    farthest = np.abs(boxes).max((1, 2))
+    if not farthest.max() <= np.finfo(np.float32).max:
+        worst = int(farthest.argmax())
+        expected = "a place that is finite in float32 (up to 3.4e38)"
+        raise SceneError(names[worst], [boxes[worst].min(0).tolist(), boxes[worst].max(0).tolist()], expected, file)
+    low, high = boxes.min((0, 1)), boxes.max((0, 1))
+    middle = 0.5 * (low + high)
+    if np.abs(middle).max() > RECENTRE * (high - low).max():
+        centre = middle
+    reaches = np.abs(boxes - centre).max((1, 2))
+    far, near = int(reaches.argmax()), int(sizes.argmin())
+    lengths = [(names[far], float(reaches[far])), *_reaches(sources, parameters, camera, centre)]
+    return centre, _unit(lengths, (names[near], float(sizes[near])), file)
 
 
-def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> list[tuple[str, Array, float]]:
-    """Name, corners ``(8, 3)`` of a box about it in the scene, and largest extent, of all that can be hit."""
+def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Array, Array]:
+    """Names ``N``, corners ``(N, 8, 3)`` of boxes in the scene, and largest extents ``(N,)`` of all that can be hit."""
     cube = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
     own: dict[str, Array] = {}
     found = []
@@ -112,11 +115,12 @@ def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> list[tuple[str, Arr
             corners = own[part.name] = 0.5 * (points.max(0) + points.min(0)) + cube * (0.5 * np.ptp(points, axis=0))
         found.append((part.name, corners, part.to_world))
     found += [(copy.name, own[copy.of], copy.to_world) for copy in copies if copy.of in own]
-    # A size is told from the linear part alone: far off, the difference of two corners would lose it.
-    return [
-        (name, apply_points(pose, corners), float(np.ptp(corners @ pose[:3, :3].T, axis=0).max()))
-        for name, corners, pose in found
-    ]
+    if not found:
+        return [], np.zeros((0, 8, 3)), np.zeros(0)
+    poses = np.stack([pose for _, _, pose in found])
+    turned = np.stack([corners for _, corners, _ in found]) @ poses[:, :3, :3].transpose(0, 2, 1)
+    # A size is told before the move: far off, the difference of two corners would lose it.
+    return [name for name, _, _ in found], turned + poses[:, None, :3, 3], np.ptp(turned, axis=1).max(1)
 
 
 def _reaches(
@@ -135,24 +139,15 @@ def _reaches(
     return found
 
 
-def _unit(
-    boxes: Sequence[tuple[str, Array, float]], centre: Array, others: Sequence[tuple[str, float]], file: str | None
-) -> float:
+def _unit(lengths: Sequence[tuple[str, float]], smallest: tuple[str, float], file: str | None) -> float:
     """One, or a power of two near the geometric mean of the longest length and the smallest shape."""
-    if not boxes:
-        return 1.0
-    far, longest = max(others, key=lambda item: item[1])
-    for name, box, _ in boxes:
-        reach = float(np.abs(box - centre).max())
-        if reach > longest:
-            far, longest = name, reach
-    near, _, smallest = min(boxes, key=lambda item: item[2])
-    longest = max(longest, smallest)
-    if longest > RANGE * smallest:
+    (far, longest), (near, size) = max(lengths, key=lambda item: item[1]), smallest
+    longest = max(longest, size)
+    if longest > RANGE * size:
         expected = (
             f"a size of at least {longest / RANGE:.3g} beside a length of {longest:.3g} ({far}): float32 holds no more"
         )
-        raise SceneError(near, float(f"{smallest:.3g}"), expected, file)
-    if longest <= ORDINARY and smallest * ORDINARY >= 1.0:
+        raise SceneError(near, float(f"{size:.3g}"), expected, file)
+    if longest <= ORDINARY and size * ORDINARY >= 1.0:
         return 1.0
-    return 2.0 ** round(0.5 * (math.log2(longest) + math.log2(smallest)))
+    return 2.0 ** round(0.5 * (math.log2(longest) + math.log2(size)))
