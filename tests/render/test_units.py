@@ -197,13 +197,21 @@ def test_the_unit_is_told_and_is_one_in_ordinary_scenes():
         assert torchpt.load(room(scale), device="cpu").space.unit == 1.0
 
 
-@pytest.mark.parametrize("name", ["shapes.walls", "shapes.lamp", "camera"])
+@pytest.mark.parametrize("name", ["shapes.walls", "shapes.lamp", "shapes.again", "camera"])
 def test_a_parameter_that_leaves_the_scene_far_behind_is_refused(name):
-    scene = torchpt.load(room(1.0, "rectangle"), device="cpu")
+    scene = torchpt.load(copies(1.0), device="cpu")
     pose = torch.eye(4)
     pose[0, 3] = 1e20
     with pytest.raises(SceneError, match=r"up to 4\.4e\+12 from the middle of this scene"):
         torchpt.render(scene, spp=1, params={f"{name}.to_world": pose})
+
+
+def test_a_parameter_that_makes_a_shape_too_large_is_refused():
+    scene = torchpt.load(room(1.0, "triangle"), device="cpu")
+    with pytest.raises(SceneError, match=r"params\.shapes\.lamp: expected places and sizes up to 4\.4e\+12"):
+        torchpt.render(scene, spp=1, params={"shapes.lamp.to_world": torch.diag(torch.tensor([1e20, 1e20, 1e20, 1.0]))})
+    with pytest.raises(SceneError, match=r"params\.shapes\.lamp: expected places and sizes up to 4\.4e\+12"):
+        torchpt.render(scene, spp=1, params={"shapes.lamp.vertices": scene.params["shapes.lamp.vertices"] * 1e20})
 
 
 def test_light_that_arrives_beyond_float32_is_refused():

@@ -173,7 +173,7 @@ class Scene:
             if not is_usable(matrix):
                 raise SceneError(f"params.{name}", matrix.tolist(), f"a matrix that can be inverted, {WITHIN}")
             reach = FARTHEST * self._space.unit
-            if kind == "camera" and not np.abs(matrix[:3, 3] - self._built.centre).max() <= reach:
+            if kind != "lights" and not np.abs(matrix[:3, 3] - self._built.centre).max() <= reach:
                 expected = f"a place up to {reach:.3g} from the middle of this scene as it was loaded"
                 raise SceneError(f"params.{name}", matrix[:3, 3].tolist(), expected)
             if name.startswith("lights.") and similarity_scale(matrix, 1e-4) is None:

@@ -113,6 +113,7 @@ def _in_units(slot: MaterialSlot, unit: float) -> MaterialSlot:
 
 
 def _check_reach(parts: Sequence[Part], primitives: Primitives, space: Space) -> None:
+    """Refuse parameters that make a part too large, or lay it too far off."""
     reach = torch.stack([x.detach().abs().amax(0) for x in (primitives.p0, primitives.e1, primitives.e2)]).amax(0)
     if len(reach) and not bool(reach.max() <= FARTHEST):
         farthest = int(torch.nan_to_num(reach, nan=torch.inf).argmax())
