@@ -41,6 +41,7 @@ from torchpt.scene.materials import (
 from torchpt.scene.parts import MaterialSlot, Part, Source, VertexColors
 from torchpt.scene.schema import Camera, Cone, Cube, Instance, Mesh, Orthographic, Perspective, Shape, ThinLens
 from torchpt.scene.settings import Film, Filter, PathIntegrator, Settings
+from torchpt.scene.space import Space
 from torchpt.scene.texels import images_of
 from torchpt.scene.textures import Slot
 from torchpt.textures import Node
@@ -512,7 +513,8 @@ def _bare(slot: MaterialSlot, opened: Opened) -> dict[str, Any]:
 
 def _write_part(file: Path, scene: Scene, part: Part) -> None:
     """A mesh in the world, each triangle with corners of its own so that Mitsuba interpolates the same normals."""
-    corners = corners_of(part, scene.params, torch.zeros(3, dtype=torch.float64), torch.float64)
+    own = Space(torch.zeros(3, dtype=torch.float64), 1.0)
+    corners = corners_of(part, scene.params, own, torch.float64)
     columns = [torch.stack((corners.p0, corners.p1, corners.p2))]  # (3 corners, 3, F)
     if corners.normals is not None:
         columns.append(torch.stack(corners.normals))

@@ -229,7 +229,7 @@ def make_wave(
         filter=Filter(own.type, own.radius, stddev, scene.device, *lobes),
         sampler=Sampler(settings.sampler.type, settings.render.seed, randomizations, spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
-        centre=scene.centre,
+        centre=scene.space.shift,
         preview=_preview(scene, world, own=not params) if isinstance(integrator, IblIntegrator) else None,
     )
 
@@ -370,7 +370,7 @@ class Run:
         self, scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
     ) -> None:
         self.start = time.perf_counter()
-        self.settings, self.device = settings, scene.device
+        self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.wave = make_wave(scene, settings, params, dtype)
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
@@ -490,7 +490,8 @@ class Run:
 
     def result(self) -> Rendering:
         """The picture so far."""
-        layers = {name: film.mean().to(self.dtype) for name, film in self.layers.items()}
+        lengths = {"depth": self.unit, "position": self.unit}  # lanes count them in a unit of the scene's own
+        layers = {name: (film.mean() * lengths.get(name, 1.0)).to(self.dtype) for name, film in self.layers.items()}
         aov = isinstance(self.settings.integrator, AovIntegrator)
         if layers:
             from torchpt.integrators.aov import NAMES

@@ -7,7 +7,7 @@ import numpy as np
 from torchpt.accel.kernels_blocks import IDS, LEAF, LINE, blocking
 from torchpt.accel.kernels_leaf import distance
 from torchpt.native.jit import part
-from torchpt.native.simd import bits, item, load, maximum, minimum, splat, store, trailing_zeros
+from torchpt.native.simd import absolute, bits, item, load, maximum, minimum, splat, store, trailing_zeros
 
 __all__ = ["FOURTH", "RECTANGLES", "RULED", "others"]
 
@@ -41,7 +41,8 @@ def _rectangles(tree, at, axes, o, d, p, s):
     f, g = ax * cy - ay * cx, bx * ay - by * ax
     h, k = qx * by - qy * bx, cx * qy - cy * qx
     low, high = minimum(minimum(f, g), minimum(h, k)), maximum(maximum(f, g), maximum(h, k))
-    met = ((low >= zero) | (high <= zero)) & ((f + h) * (g + k) != zero) & (plane > zero) & (plane < splat(_INF, 8))
+    det = minimum(absolute(f + h), absolute(g + k))  # a product would be the fourth power of a length
+    met = ((low >= zero) | (high <= zero)) & (det != zero) & (plane > zero) & (plane < splat(_INF, 8))
     near, far = minimum(minimum(minimum(az, bz), cz), qz), maximum(maximum(maximum(az, bz), cz), qz)
     t = minimum(maximum(plane, near), far)
     return met & (t > zero), t, f / (f + h), g / (g + k)

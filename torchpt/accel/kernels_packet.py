@@ -13,6 +13,7 @@ from torchpt.accel.kernels_others import FOURTH, RECTANGLES, RULED, others
 from torchpt.accel.kernels_rays import AXIS, BEST, COLUMNS, DIRECTION, INVERSE, ORIGIN, SHEAR
 from torchpt.native.jit import part
 from torchpt.native.simd import (
+    absolute,
     as_float,
     as_int,
     bits,
@@ -155,7 +156,8 @@ def _rectangle(tree, at, axes, s, o, d):
     f, g = ax * cy - ay * cx, bx * ay - by * ax
     h, k = qx * by - qy * bx, cx * qy - cy * qx
     low, high = minimum(minimum(f, g), minimum(h, k)), maximum(maximum(f, g), maximum(h, k))
-    m = ((low >= zero) | (high <= zero)) & ((f + h) * (g + k) != zero) & (plane > zero) & (plane < splat(_INF, 16))
+    det = minimum(absolute(f + h), absolute(g + k))  # a product would be the fourth power of a length
+    m = ((low >= zero) | (high <= zero)) & (det != zero) & (plane > zero) & (plane < splat(_INF, 16))
     near, far = minimum(minimum(minimum(az, bz), cz), qz), maximum(maximum(maximum(az, bz), cz), qz)
     t = minimum(maximum(plane, near), far)
     return m & (t > zero), t, f / (f + h), g / (g + k)

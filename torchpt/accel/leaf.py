@@ -115,7 +115,7 @@ def _polygon(rays: Rays, corner: Tensor, plane: Tensor, four: Tensor | None) -> 
         h = dx * by - dy * bx
         k = cx * dy - cy * dx
         u, v = torch.where(four, f / (f + h), u), torch.where(four, g / (g + k), v)
-        det = torch.where(four, (f + h) * (g + k), det)
+        det = torch.where(four, torch.minimum((f + h).abs(), (g + k).abs()), det)
         near, far = torch.where(four, torch.minimum(near, dz), near), torch.where(four, torch.maximum(far, dz), far)
         low = torch.where(four, torch.minimum(torch.minimum(f, g), torch.minimum(h, k)), low)
         high = torch.where(four, torch.maximum(torch.maximum(f, g), torch.maximum(h, k)), high)

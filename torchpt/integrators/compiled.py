@@ -60,7 +60,7 @@ class Stages:
     def bounce(
         self,
         model: int,
-        roulette: bool,
+        roulette: float,
         slide: bool,
         search: Search,
         state: PathState,
@@ -121,7 +121,7 @@ class CompiledStages(Stages):
     def bounce(
         self,
         model: int,
-        roulette: bool,
+        roulette: float,
         slide: bool,
         search: Search,
         state: PathState,

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchpt import lights
 from torchpt.accel import Accel
 from torchpt.integrators.compiled import Stages
+from torchpt.integrators.roulette import DEEP, DEEP_CAP
 from torchpt.integrators.search import Search
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, joined
@@ -22,8 +23,9 @@ from torchpt.samplers import salts
 
 __all__ = ["ENDLESS", "Limits", "Tally", "gather_light", "partition", "trace"]
 
-#: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted.
-ENDLESS = 4096
+#: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
+#: paths that lose nothing none comes so far (``DEEP_CAP``): only those are cut that roulette was told to leave alone.
+ENDLESS = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,12 @@ class Limits:
 
     max_depth: int  # -1: only roulette ends them
     rr_depth: int  # roulette from this vertex on
+
+    def roulette(self, depth: int) -> float:
+        """The most that roulette lets paths survive with at a vertex; 0 where it does not play."""
+        if depth < self.rr_depth:
+            return 0.0
+        return DEEP_CAP if self.max_depth < 0 and depth > DEEP else 1.0
 
 
 @dataclass
@@ -86,7 +94,7 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
         parts = []
         for model, index in groups:
             after, found, shadow = stages.bounce(
-                model, depth >= limits.rr_depth, slide, following, state, hit, index, salt
+                model, limits.roulette(depth), slide, following, state, hit, index, salt
             )
             if shadow is not None:
                 tally.rays += len(shadow.t_max)

@@ -7,19 +7,30 @@ from torch import Tensor
 
 from torchpt.samplers import Dimension, Draws
 
-__all__ = ["SURVIVAL_CAP", "survived"]
+__all__ = ["DEEP", "DEEP_CAP", "survived"]
 
-#: Roulette never lets a path live on for sure: throughput above one would make it immortal.
-SURVIVAL_CAP = 0.95
+#: Where nothing else ends paths, those of more vertices than this may be ended whatever they carry. Before it a cap below 1
+#: would only cost: each vertex of a path that loses nothing multiplies its variance by one over the cap.
+DEEP = 1000
+#: The most that those survive with. A path that loses the share ``a`` of its light has finite variance where the cap is above
+#: ``(1 - a)^2``, and a thousand more vertices on average end one that loses nothing.
+DEEP_CAP = 0.999
 
 
 def survived(
-    chance: float | None, draws: Draws, alive: Tensor, throughput: Tensor, brightest: Tensor, eta: Tensor | None
+    chance: float | None,
+    cap: float,
+    draws: Draws,
+    alive: Tensor,
+    throughput: Tensor,
+    brightest: Tensor,
+    eta: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Which paths are alive after roulette ``(N,)``, and their throughput ``(3, N)``.
 
     Args:
-        chance: to survive; None: as much as a path can still bring.
+        chance: to survive; None: as much as a path can still bring, ``min(cap, throughput * eta^2)``.
+        cap: of that.
         draws: the vertex's random numbers.
         alive: before.
         throughput: before.
@@ -29,7 +40,7 @@ def survived(
     if chance is None:
         # Radiance is scaled at refraction; what a path can still bring is not.
         expected = brightest if eta is None else brightest * eta * eta
-        survival = expected.clamp_max(SURVIVAL_CAP)
+        survival = expected.clamp_max(float(cap))
     else:
         survival = torch.full_like(brightest, chance)
     alive = alive & (draws.one(Dimension.ROULETTE) < survival)

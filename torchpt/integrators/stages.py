@@ -105,7 +105,7 @@ def bounce(
     plan: Plan,
     world: World,
     model: int,
-    roulette: bool,
+    roulette: float,
     slide: bool,
     search: Callable[[PathState], Hit],
     state: PathState,
@@ -120,7 +120,7 @@ def bounce(
         plan: static needs.
         world: the scene's tensors.
         model: number of the BSDF model.
-        roulette: whether roulette plays at this depth.
+        roulette: the most that roulette lets paths survive with at this depth; 0: it does not play.
         slide: see :func:`torchpt.shapes.interact`.
         search: finds hits; called only where ``plan.attached``.
         state: of the whole wave.
@@ -228,7 +228,7 @@ def scatter(
     at: Interaction,
     surface: Surface,
     salts: Tensor,
-    roulette: bool,
+    roulette: float,
     search: Callable[[PathState], Hit],
 ) -> tuple[PathState, Hit | None]:
     """Draw the next direction from the BSDF and let roulette decide who goes on.
@@ -280,7 +280,7 @@ def scatter(
     if eta is not None and drawn.eta is not None:
         eta = eta * drawn.eta.detach()
     if roulette:
-        alive, throughput = survived(plan.rr_prob, draws, alive, throughput, brightest, eta)
+        alive, throughput = survived(plan.rr_prob, roulette, draws, alive, throughput, brightest, eta)
     if hit is not None:
         hit = replace(hit, prim=torch.where(alive, hit.prim, -1))
     on = alive.to(plan.dtype)

@@ -35,7 +35,7 @@ class Wave:
         filter: reconstruction filter.
         sampler: random numbers.
         crop: ``(x, y, width, height)`` of the picture on the film.
-        centre: ``(3,)`` float64, see Scene.centre.
+        centre: ``(3,)`` float64, see Space.shift.
         preview: the environment of a split-sum preview; None where paths are traced.
     """
 

@@ -17,9 +17,11 @@ from torchpt.errors import SceneError
 
 __all__ = [
     "OPERATIONS",
+    "WITHIN",
     "apply_points",
     "compose",
     "is_singular",
+    "is_usable",
     "look_at",
     "matrix4",
     "rotate",
@@ -31,7 +33,11 @@ __all__ = [
 
 Matrix = NDArray[np.float64]
 
+#: What errors say of a matrix that is not usable.
+WITHIN = "it and its inverse finite in float32 (up to 3.4e38)"
+
 _SINGULAR = 1e-12  # smallest singular value over the largest; float64 products of a few matrices stay near 1e-15
+_LARGEST = float(np.finfo(np.float32).max)
 _PARALLEL = 1e-6  # sine of the angle between up and the viewing direction
 
 
@@ -76,6 +82,22 @@ def is_singular(matrix: Matrix) -> bool:
         return True
     values = np.linalg.svd(linear, compute_uv=False)
     return bool(values[2] <= _SINGULAR * values[0])
+
+
+def is_usable(matrix: Matrix) -> bool:
+    """Whether a ``(4, 4)`` affine matrix can place things: it and its inverse exist and are finite in float32."""
+    if not np.abs(matrix).max() <= _LARGEST:  # for NaN too
+        return False
+    values = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    if values[2] <= _SINGULAR * values[0]:
+        return False
+    if 1.0 + np.abs(matrix[:3, 3]).sum() <= _LARGEST * values[2]:  # no entry of the inverse is larger than their ratio
+        return True
+    with np.errstate(all="ignore"):
+        try:
+            return bool(np.abs(np.linalg.inv(matrix)).max() <= _LARGEST)  # False for NaN too
+        except np.linalg.LinAlgError:  # entries so small that their products are 0 in float64
+            return False
 
 
 def similarity_scale(matrix: Matrix, tolerance: float = 1e-5) -> float | None:
@@ -187,7 +209,8 @@ def compose(operations: Any) -> Matrix:
         operations: e.g. ``[{"scale": 2}, {"rotate": {"axis": [0, 1, 0], "angle": 30}}, {"translate": [0, 1, 0]}]``.
 
     Raises:
-        SceneError: an entry that is malformed or singular; its ``key`` is relative to the list, e.g. ``1.rotate.axis``.
+        SceneError: an entry that is malformed or singular (its ``key`` is relative to the list, e.g. ``1.rotate.axis``), or
+            a product that float32 cannot hold together with its inverse (the ``key`` is empty).
     """
     names = ", ".join(OPERATIONS)
     if not isinstance(operations, list | tuple):
@@ -201,8 +224,8 @@ def compose(operations: Any) -> Matrix:
             raise SceneError(f"{index}.{name}", argument, f"one of the operations {names}")
         with np.errstate(over="ignore", invalid="ignore"):
             total = OPERATIONS[name](argument, f"{index}.{name}") @ total
-    if is_singular(total):
-        raise SceneError("", operations, "operations whose product has an inverse")
+    if not is_usable(total):
+        raise SceneError("", operations, f"operations whose product can be inverted, {WITHIN}")
     return total
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchpt.errors import AssetError, SceneError
-from torchpt.math.transforms import is_singular, similarity_scale
+from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
 from torchpt.records import KINDS, SOURCES
 from torchpt.scene.description import Description
 from torchpt.scene.displacement import displaced
@@ -16,23 +16,22 @@ from torchpt.scene.materials import MATERIALS, Diffuse, check_material, read_mat
 from torchpt.scene.parts import Copy, MaterialSlot, Part, Source
 from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
 from torchpt.scene.sources import file_lights, labels_of, sources_of
+from torchpt.scene.space import centre_and_unit
 from torchpt.scene.texels import Opener
 from torchpt.textures import Node
 
 __all__ = ["Built", "build_parts"]
 
-#: A scene is moved to the origin where it lies further away than this many times its own size.
-RECENTRE = 8.0
-
 
 @dataclass(frozen=True)
 class Built:
-    """Parts in the order of ``records.KINDS``, their parameters, and where the origin is put.
+    """Parts in the order of ``records.KINDS``, their parameters, and the lanes' own coordinates (:mod:`torchpt.scene.space`).
 
     Attributes:
         parts: what can be hit.
         parameters: arrays by dotted name, float64.
         centre: ``(3,)`` float64, subtracted from all positions.
+        unit: what all lengths are divided by.
         sources: lights that are no surfaces, in the order of ``records.SOURCES``.
         copies: instances of parts.
     """
@@ -40,6 +39,7 @@ class Built:
     parts: tuple[Part, ...]
     parameters: dict[str, np.ndarray]
     centre: np.ndarray
+    unit: float
     sources: tuple[Source, ...] = ()
     copies: tuple[Copy, ...] = ()
 
@@ -48,7 +48,7 @@ def build_parts(description: Description) -> Built:
     """Resolve a description.
 
     Raises:
-        SceneError: more than one environment, or a shape that cannot be placed.
+        SceneError: more than one environment, a shape that cannot be placed, or sizes too far apart for float32.
         AssetError: a mesh file that is missing or malformed.
     """
     parameters: dict[str, np.ndarray] = {}
@@ -69,7 +69,8 @@ def build_parts(description: Description) -> Built:
     for name, number in description.camera.numbers().items():
         parameters[f"camera.{name}"] = np.asarray(number, np.float64)
     parts.sort(key=lambda part: KINDS.index(part.kind))
-    return Built(tuple(parts), parameters, _centre(parts, copies), tuple(sources), tuple(copies))
+    centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)
+    return Built(tuple(parts), parameters, centre, unit, tuple(sources), tuple(copies))
 
 
 def _copies(
@@ -89,6 +90,9 @@ def _copies(
         known = f" ({', '.join(names[:8])}{', ...' if len(names) > 8 else ''})" if names else " (there is none)"
         raise SceneError(f"{key}.of", shape.of, f"the name of a mesh among the shapes{known}", file)
     parameters[f"{key}.to_world"] = shape.to_world()
+    if not is_usable(shape.to_world() @ np.linalg.inv(mesh.to_world())):
+        expected = f"a way from where {shape.of} lies to where it is copied that can be inverted, {WITHIN}"
+        raise SceneError(f"{key}.transform", shape.to_world().tolist(), expected, file)
     found = []
     for part in (part for part in parts if part.shape == shape.of):
         slot = part.material
@@ -126,10 +130,9 @@ def _shape_parts(
         if isinstance(shape, Sphere | Cylinder | Cone):
             with np.errstate(over="ignore", invalid="ignore"):
                 pose = pose @ shape.own()
-            if is_singular(pose):
-                raise SceneError(
-                    prefix, pose.tolist(), "a shape whose sizes differ by less than 1e12", description.file
-                )
+            if not is_usable(pose):
+                expected = f"sizes that differ by less than 1e12, and a place: {WITHIN}"
+                raise SceneError(prefix, pose.tolist(), expected, description.file)
         parameters[f"{prefix}.to_world"] = pose
         slot = _slot(description, shape, prefix, opener)
         return [
@@ -322,30 +325,3 @@ def _solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
     square = (ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2
     solid = (longest > 0) & (square > 1e-24)
     return np.ascontiguousarray(piece.faces[solid]), int((~solid).sum())
-
-
-def _centre(parts: list[Part], copies: list[Copy]) -> np.ndarray:
-    """Where the origin goes: the middle of a scene that lies far off, else where it is."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    boxes: dict[str, np.ndarray] = {}
-    placed = []
-    for part in parts:
-        points = corners
-        if part.vertices is not None and part.faces is not None:
-            used = np.zeros(len(part.vertices), bool)
-            used[part.faces.reshape(-1)] = True
-            points = part.vertices[used]  # vertices of no face have no say
-            if len(points):
-                half, middle = 0.5 * np.ptp(points, axis=0), 0.5 * (points.max(0) + points.min(0))
-                boxes[part.name] = middle + corners * half
-        placed.append((points, part.to_world))
-    placed += [(boxes[copy.of], copy.to_world) for copy in copies if copy.of in boxes]
-    for points, to_world in placed:
-        world = points @ to_world[:3, :3].T + to_world[:3, 3]
-        if len(world):
-            low, high = np.minimum(low, world.min(0)), np.maximum(high, world.max(0))
-    if not np.isfinite(low).all():
-        return np.zeros(3)
-    middle = 0.5 * (low + high)
-    return middle if np.abs(middle).max() > RECENTRE * (high - low).max() else np.zeros(3)

@@ -225,9 +225,12 @@ def _affine(value: Any) -> NDArray[np.float64] | None:
     if value is None:
         return None
     try:
-        return transforms.matrix4(value, "")
+        matrix = transforms.matrix4(value, "")
     except SceneError as error:
         raise _relocated(error) from None
+    if not transforms.is_usable(matrix):
+        raise wrong(f"a matrix that can be inverted, {transforms.WITHIN}")
+    return matrix
 
 
 def _rows(columns: int, what: str) -> Check:

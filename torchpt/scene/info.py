@@ -69,6 +69,8 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         made["textures"] = {"reads": world.textures.places.shape[1], "bytes": texels.numel() * texels.element_size()}
     if built.centre.any():
         made["origin_moved_to"] = built.centre.tolist()
+    if built.unit != 1.0:
+        made["unit_of_length"] = built.unit
     return {
         "scene": {
             "file": description.file,

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +17,7 @@ from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
 from torchpt.cameras import Camera, Orthographic, Perspective
 from torchpt.errors import RenderError, SceneError
-from torchpt.math.transforms import is_singular, similarity_scale
+from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
 from torchpt.records import Geometry, World
 from torchpt.scene import schema
 from torchpt.scene.assembly import assemble
@@ -24,6 +25,7 @@ from torchpt.scene.build import Built, build_parts
 from torchpt.scene.description import Description, read_description, settings
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
+from torchpt.scene.space import FARTHEST, Space
 
 __all__ = ["INDICES", "MOVING", "Scene", "device_of", "load"]
 
@@ -84,7 +86,8 @@ class Scene:
         own_models: BSDFs that the caller wrote.
         params: every tensor by dotted name (``materials.*``, ``shapes.*``, ``lights.*``, ``camera.*``): colours ``(3,)``,
             vertices ``(V, 3)`` in the mesh's own space, poses ``(4, 4)``. Changing one in place takes effect at the
-            next render; to differentiate, hand replacements to ``torchpt.render(scene, params=...)``.
+            next render (which refuses places that no scene file could hold); to differentiate, hand replacements to
+            ``torchpt.render(scene, params=...)``.
     """
 
     def __init__(self, description: Description, device: torch.device, own_models: tuple[Bsdf, ...] = ()) -> None:
@@ -98,7 +101,7 @@ class Scene:
             )
             for name, value in self._built.parameters.items()
         }
-        self._centre = torch.from_numpy(self._built.centre).to(device)
+        self._space = Space(torch.from_numpy(self._built.centre).to(device), self._built.unit)
         self._lock = threading.RLock()
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
@@ -116,9 +119,9 @@ class Scene:
         return self._built
 
     @property
-    def centre(self) -> Tensor:
-        """``(3,)`` float64: where the lanes' origin lies in the scene's own coordinates."""
-        return self._centre
+    def space(self) -> Space:
+        """The lanes' own coordinates."""
+        return self._space
 
     def check(self, params: Mapping[str, Tensor] | None) -> None:
         """Refuse parameters that this scene cannot be rendered with.
@@ -142,8 +145,8 @@ class Scene:
 
     def _check(self, name: str, value: Tensor) -> None:
         """Refuse numbers that no scene file could hold."""
-        if not bool(torch.isfinite(value).all()):
-            raise SceneError(f"params.{name}", "a value that is not finite", "finite numbers")
+        if not bool(torch.isfinite(value.float()).all()):
+            raise SceneError(f"params.{name}", "a value that is not finite in float32", "numbers finite in float32")
         low = 0.0
         if not name.endswith((*PLACES, ".direction")) and (
             ".material." in name
@@ -168,8 +171,12 @@ class Scene:
                 raise SceneError(f"params.{name}", float(value), expected)
         if name.endswith(".to_world"):
             matrix = value.double().cpu().numpy()
-            if is_singular(matrix):
-                raise SceneError(f"params.{name}", matrix.tolist(), "a matrix that can be inverted")
+            if not is_usable(matrix):
+                raise SceneError(f"params.{name}", matrix.tolist(), f"a matrix that can be inverted, {WITHIN}")
+            reach = FARTHEST * self._space.unit
+            if kind != "lights" and not np.abs(matrix[:3, 3] - self._built.centre).max() <= reach:
+                expected = f"a place up to {reach:.3g} from the middle of this scene as it was loaded"
+                raise SceneError(f"params.{name}", matrix[:3, 3].tolist(), expected)
             if name.startswith("lights.") and similarity_scale(matrix, 1e-4) is None:
                 expected = "a transform that keeps angles (rotation, reflection, uniform scale)"
                 raise SceneError(f"params.{name}", matrix.tolist(), expected)
@@ -219,13 +226,12 @@ class Scene:
 
     def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
         """The camera on a film of a given size, in the lanes' coordinates."""
-        pose = params["camera.to_world"].double()
-        shift = torch.zeros(4, 4, dtype=torch.float64, device=self.device)
-        shift[:3, 3] = self._centre
-        kind = self.description.camera
-        number: dict[str, Any] = {name: params[f"camera.{name}"].to(dtype) for name in kind.numbers()}
+        pose, kind = params["camera.to_world"], self.description.camera
+        number: dict[str, Any] = {name: params[f"camera.{name}"] for name in kind.numbers()}
+        number |= {name: number[name].double() / self._space.unit for name in schema.CAMERA_LENGTHS if name in number}
+        number = {name: value.to(dtype) for name, value in number.items()}
         placed: dict[str, Any] = {
-            "to_world": (pose - shift).to(dtype),
+            "to_world": torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype),
             "width": film.width,
             "height": film.height,
             "film": torch.tensor((film.width, film.height), dtype=dtype, device=self.device),
@@ -249,7 +255,7 @@ class Scene:
         self, params: Mapping[str, Tensor], dtype: torch.dtype, uv: bool, choice: str
     ) -> tuple[World, Geometry]:
         built = self._built
-        return assemble(built.parts, params, built.sources, self._centre, dtype, built.copies, uv, choice)
+        return assemble(built.parts, params, built.sources, self._space, dtype, built.copies, uv, choice)
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""
@@ -260,6 +266,10 @@ class Scene:
             for name, (value, version) in state.items()
         )
         if not same:
+            for name, (value, version) in state.items():
+                old = self._state.get(name)
+                if name.endswith(PLACES) and old is not None and (old[0] is not value or old[1] != version):
+                    self._check(name, value.detach())
             self._state = state
             self._worlds.clear()
             self._accels.clear()

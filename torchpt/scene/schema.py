@@ -32,7 +32,7 @@ from torchpt.scene.textures import Slot, slot_value
 from torchpt.scene.validate import Model, construct, refuse_foreign, select
 
 __all__ = [
-    "CAMERAS", "CAMERA_NUMBERS", "FOV_AXES", "SHAPES", "Camera", "Cone", "Cube", "Cylinder",
+    "CAMERAS", "CAMERA_LENGTHS", "CAMERA_NUMBERS", "FOV_AXES", "SHAPES", "Camera", "Cone", "Cube", "Cylinder",
     "Disk", "Instance", "Mesh", "Orthographic", "Perspective", "Rectangle", "Shape", "Sphere", "ThinLens", "read_camera",
 ]  # fmt: skip
 
@@ -51,6 +51,8 @@ CAMERA_NUMBERS: dict[str, tuple[str, Callable[[float], bool]]] = {
     "focus_distance": ("a number > 0", lambda x: _rounded(x) > 0),
     "width": ("a number > 0", lambda x: _rounded(x) > 0),
 }
+#: Those of them that are lengths.
+CAMERA_LENGTHS = ("aperture_radius", "focus_distance", "width")
 
 
 class Camera(Model):

@@ -42,7 +42,9 @@ def file_lights(
         with np.errstate(over="ignore", invalid="ignore"):
             position, direction = apply_points(pose, light.position), pose[:3, :3] @ light.direction
             direction = direction / np.abs(direction).max()
-        if not np.isfinite([position, direction]).all():
+            # Twice as far lies what a spot aims at.
+            held = np.isfinite(np.array([2.0 * position, direction]).astype(np.float32)).all()
+        if not held:
             raise AssetError(source, f"light {light.name!r} has no finite place under the transform of {prefix}")
         direction = direction / np.linalg.norm(direction)
         place = {"direction": direction} if light.kind == "directional" else {"position": position}

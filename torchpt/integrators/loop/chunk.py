@@ -233,7 +233,7 @@ class Worker:
                 continue
             if not kernels.fused:
                 self._counters[0] = done
-            roulette = depth >= limits.rr_depth
+            roulette = limits.roulette(depth)
             if model in kernels.eager:
                 shadows += self._bounce_eagerly(model, roulette, here, there, now[model], count, done, depth)
             else:
@@ -246,7 +246,7 @@ class Worker:
     def _bounce_eagerly(
         self,
         model: int,
-        roulette: bool,
+        roulette: float,
         here: Memory,
         there: Memory,
         places: Memory,

@@ -144,7 +144,7 @@ class Kernels:
         found = {}
         for number in numbers:
             try:
-                self.bounce(number, False)
+                self.bounce(number, 0.0)
             except Unsupported as error:
                 found[number] = str(error)
         return found
@@ -179,7 +179,7 @@ class Kernels:
         """Light from outside, and the ends of those paths."""
         return self._get(("escape",), self._escape, listed=True)
 
-    def bounce(self, model: int, roulette: bool) -> Kernel:
+    def bounce(self, model: int, roulette: float) -> Kernel:
         """One vertex of the paths on surfaces of a model."""
         return self._get(
             ("bounce", model, roulette), lambda tracer: self._bounce(tracer, model, roulette), listed=self.listed
@@ -436,7 +436,7 @@ class Kernels:
         state, rest = self._state(tracer)
         return Sinks(scatter=[self._ended(tracer, -1, state.lane, state.radiance, rest)])
 
-    def _bounce(self, tracer: Tracer, model: int, roulette: bool) -> Sinks:
+    def _bounce(self, tracer: Tracer, model: int, roulette: float) -> Sinks:
         salts = self._salts(tracer)
         state, rest = self._state(tracer)
         hit = self._hit(tracer)

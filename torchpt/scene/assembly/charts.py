@@ -85,7 +85,7 @@ def _moves(
         linear = parameters[f"{part.name}.to_world"][:3, :3].to(c.p0)
         radius, zero = c.p1[0].abs(), torch.zeros_like(c.p1[0])
         turned = -1.0 if part.flip else 1.0  # the normal is
-        handed = torch.sign(torch.linalg.det(linear.detach())) * turned
+        handed = torch.sign(torch.linalg.det(linear.detach().double())).to(c.p0) * turned
         around = normalize(linear[:, 2:3]) * (2.0 * math.pi * radius * handed)
         return around, torch.stack((math.pi * radius * handed, zero, zero))
     if part.kind == "triangle" and part.uvs is None:

@@ -11,6 +11,7 @@ from torchpt.errors import SceneError
 from torchpt.math.vectors import cross, dot
 from torchpt.records import Copies
 from torchpt.scene.parts import Copy, Part
+from torchpt.scene.space import Space
 
 __all__ = ["MOST_PRIMITIVES", "copies_of", "copy_maps"]
 
@@ -20,7 +21,7 @@ MOST_PRIMITIVES = 2**31 - 1
 
 
 def copy_maps(
-    parts: Sequence[Part], sizes: list[int], copies: Sequence[Copy], parameters: Mapping[str, Tensor], centre: Tensor
+    parts: Sequence[Part], sizes: list[int], copies: Sequence[Copy], parameters: Mapping[str, Tensor], space: Space
 ) -> Tensor:
     """Where copies lie relative to their meshes: ``(15, I)`` float64, see :class:`~torchpt.records.Geometry`."""
     first, at = {}, 0
@@ -31,8 +32,7 @@ def copy_maps(
             "shapes", at + sum(first[c.of][1] for c in copies), "at most 2^31 - 1 primitives, copies included"
         )
     back = {name: torch.linalg.inv(parameters[f"{name}.to_world"].double()) for name in {copy.of for copy in copies}}
-    shift = torch.eye(4, dtype=torch.float64, device=centre.device)
-    shift[:3, 3] = centre
+    shift = space.matrix()
     columns = []
     for copy in copies:
         start, n = first[copy.of]

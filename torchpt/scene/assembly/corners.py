@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import cross, dot, normalize
 from torchpt.scene.parts import Part
+from torchpt.scene.space import Space
 from torchpt.shapes.normals import smooth_normals
 
 __all__ = ["Corners", "corners_of"]
@@ -34,13 +35,13 @@ class Corners:
     frame: Tensor | None = None  # (12, 1) float64: p0 e1 e2 e3 of a quadric
 
 
-def corners_of(part: Part, parameters: Mapping[str, Tensor], centre: Tensor, dtype: torch.dtype) -> Corners:
-    """Place a part in the world, moved by ``-centre (3,)`` (float64)."""
-    # The move is folded into the pose in float64, before anything is rounded to the lanes' dtype.
+def corners_of(part: Part, parameters: Mapping[str, Tensor], space: Space, dtype: torch.dtype) -> Corners:
+    """Place a part in the lanes' coordinates."""
+    # They are folded into the pose in float64, before anything is rounded to the lanes' dtype.
     pose = parameters[f"{part.name}.to_world"].double()
     if part.local is not None:
         pose = pose @ torch.from_numpy(part.local).to(pose.device)
-    linear, move = pose[:3, :3], pose[:3, 3:4] - centre[:, None]
+    linear, move = space.pose(pose).split((3, 1), 1)
     if part.kind == "sphere":
         radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)
         zero = torch.zeros_like(radius)

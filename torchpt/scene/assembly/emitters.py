@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel.bounds import chosen, primitive_bounds
+from torchpt.errors import SceneError
 from torchpt.lights import choice_of
 from torchpt.lights.solid_angle import shapes_of, table_of
 from torchpt.math.vectors import dot, luminance, normalize
@@ -19,6 +20,7 @@ from torchpt.scene.assembly.curved import quadric_area
 from torchpt.scene.assembly.primitives import Primitives
 from torchpt.scene.lights import ENVIRONMENTS
 from torchpt.scene.parts import Part, Source
+from torchpt.scene.space import Space
 from torchpt.scene.texels import images_of
 
 if TYPE_CHECKING:
@@ -66,7 +68,7 @@ def lights_of(
     primitives: Primitives,
     geometry: Geometry,
     parameters: Mapping[str, Tensor],
-    centre: Tensor,
+    space: Space,
     opacity: Tensor | None,
     emissive: Tensor,
     veiled: bool,
@@ -80,7 +82,7 @@ def lights_of(
         primitives: of ``parts``.
         geometry: of them, as the search sees it.
         parameters: every tensor by dotted name.
-        centre: ``(3,)`` float64 that becomes the origin.
+        space: the lanes' coordinates.
         opacity: ``(P + I,)``, or None.
         emissive: ``(P + I,)`` bool, which primitives emit.
         veiled: whether opacity textures cover any of them.
@@ -98,7 +100,7 @@ def lights_of(
     reach = _reach(geometry) if sources else torch.ones((), device=device)
     around = [_surroundings(source, parameters, dtype) for source in sources if source.kind in ENVIRONMENTS]
     environment = around[0] if around else None
-    groups += [_source(source, parameters, environment, centre, reach, dtype) for source in sources]
+    groups += [_source(source, parameters, environment, space, reach, dtype) for source in sources]
     names = [name for group in groups for name in group.kind]
     kinds = tuple(kind for kind in (*KINDS, *SOURCES) if kind in names)
     joined = {
@@ -161,9 +163,11 @@ def _surfaces(
         x.index_select(1, prim)
         for x in (primitives.p0, primitives.e1, primitives.e2, primitives.face, primitives.normal)
     )
-    area = dot(face, face).clamp_min(torch.finfo(dtype).tiny).sqrt() * share
-    area = torch.where(of_kind == KINDS.index("sphere"), (4.0 * math.pi) * e1[0] * e1[0], area)
-    whole, column = area.detach().double(), None
+    # In float64: the fourth power of a length leaves float32 long before the length is extreme.
+    area = dot(face.double(), face.double()).clamp_min(torch.finfo(torch.float64).tiny).sqrt() * share
+    area = torch.where(of_kind == KINDS.index("sphere"), (4.0 * math.pi) * e1[0].double() ** 2, area)
+    whole, column = area.detach(), None
+    area = area.to(dtype)
     if primitives.frame is not None and primitives.quadrics is not None and "quadric" in names:
         bent = of_kind == KINDS.index("quadric")
         column = torch.where(bent, prim - sum(primitives.counts[:4]), 0)
@@ -191,11 +195,21 @@ def _surroundings(source: Source, parameters: Mapping[str, Tensor], dtype: torch
     return envmap.build(texels.to(dtype), turn.to(dtype), scale.to(dtype))
 
 
+def _in_units(source: Source, intensity: Tensor, unit: float) -> Tensor:
+    """An intensity ``(3,)`` where lengths are counted in ``unit``: what arrives at a distance is the same."""
+    found = intensity / unit**2
+    if not bool(torch.isfinite(found.float()).all()):
+        most = torch.finfo(torch.float32).max * unit**2
+        expected = f"at most {most:.3g} in a scene this small: what arrives is beyond float32"
+        raise SceneError(f"{source.name}.intensity", intensity.tolist(), expected)
+    return found
+
+
 def _source(
     source: Source,
     parameters: Mapping[str, Tensor],
     environment: Tensor | EnvironmentMap | None,
-    centre: Tensor,
+    space: Space,
     reach: Tensor,
     dtype: torch.dtype,
 ) -> _Rows:
@@ -205,7 +219,7 @@ def _source(
         source: the light.
         parameters: every tensor by dotted name.
         environment: of the scene.
-        centre: ``(3,)`` float64 that becomes the origin.
+        space: the lanes' coordinates.
         reach: radius of the scene, float64.
         dtype: of the lanes.
     """
@@ -213,10 +227,10 @@ def _source(
     def given(key: str) -> Tensor:
         return parameters[f"{source.name}.{key}"].double()
 
-    blank = torch.zeros(3, dtype=torch.float64, device=centre.device)
+    blank = torch.zeros(3, dtype=torch.float64, device=space.centre.device)
     p0, e1, normal = blank, blank, blank
     if source.kind in ("point", "spot"):
-        p0, color = given("position") - centre, given("intensity")
+        p0, color = space.point(given("position")), _in_units(source, given("intensity"), space.unit)
         share = 4.0 * math.pi
         if source.kind == "spot":
             normal = normalize((given("target") - given("position"))[:, None])[:, 0]
@@ -234,7 +248,7 @@ def _source(
         else:
             color = (environment.mean * environment.scale.detach()).expand(3)
         share = 4.0 * math.pi**2 * reach**2
-    one = torch.ones(1, dtype=dtype, device=centre.device)
+    one = torch.ones(1, dtype=dtype, device=space.centre.device)
     p0, e1, e2, normal, light = (x[:, None].to(dtype) for x in (p0, e1, blank, normal, color))
     power = (share * luminance(color.detach().double().abs())).reshape(1)
     return _Rows([source.kind], p0, e1, e2, normal, one, one, one, light, power)
