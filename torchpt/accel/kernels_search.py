@@ -54,25 +54,21 @@ def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
     work = (pointer(keys), pointer(parents), pointer(slots), pointer(scratch))
     held = (pointer(columns), pointer(numbers))
     spare = (pointer(lanes), pointer(kept), pointer(scratch))
-    ray = (pointer(o), pointer(d), pointer(t_max), d.shape[1])
+    given = (pointer(o), pointer(d), pointer(t_max), d.shape[1])
+    found = (pointer(t), pointer(prim), pointer(u), pointer(v))
+    # rays beyond the last sixteen, with others that can hit nothing
     end = last - (last - first) % RAYS
     edge, number = np.zeros(10 * RAYS, np.float32), np.zeros(RAYS, np.int32)
-    for again in range(2):
-        out = (pointer(t), pointer(prim), pointer(u), pointer(v))
-        if again:
-            if end == last:
-                break
-            for j in range(last - end):
-                edge[6 * RAYS + j] = t_max[end + j]
-                for k in range(3):
-                    edge[k * RAYS + j], edge[(3 + k) * RAYS + j] = o[k, end + j], d[k, end + j]
-            e = pointer(edge)
-            ray = (e, pointer(edge[3 * RAYS :]), pointer(edge[6 * RAYS :]), RAYS)
-            out = (pointer(edge[7 * RAYS :]), pointer(number), pointer(edge[8 * RAYS :]), pointer(edge[9 * RAYS :]))
-            first, end_ = 0, RAYS
-        else:
-            end_ = end
-        _trace(first, end_, ray, scene, room, pointer(groups), held, work, spare, out, any_hit)
+    for j in range(last - end):
+        edge[6 * RAYS + j] = t_max[end + j]
+        for k in range(3):
+            edge[k * RAYS + j], edge[(3 + k) * RAYS + j] = o[k, end + j], d[k, end + j]
+    given_edge = (pointer(edge), pointer(edge[3 * RAYS :]), pointer(edge[6 * RAYS :]), RAYS)
+    found_edge = (pointer(edge[7 * RAYS :]), pointer(number), pointer(edge[8 * RAYS :]), pointer(edge[9 * RAYS :]))
+    for k in range(2):  # one place of call: what is inlined is compiled once
+        rays, out = (given, found) if k == 0 else (given_edge, found_edge)
+        start, stop = (first, end) if k == 0 else (0, RAYS if end < last else 0)
+        _trace(start, stop, rays, scene, room, pointer(groups), held, work, spare, out, any_hit)
     for j in range(last - end):
         prim[end + j] = number[j]
         if not any_hit:
