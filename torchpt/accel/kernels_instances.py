@@ -7,6 +7,7 @@ from numba import prange
 
 from torchpt.accel.kernels_blocks import IDS, SLACK, boxes, fits, place, push
 from torchpt.accel.kernels_leaf import setup
+from torchpt.accel.kernels_search import PIECES
 from torchpt.accel.kernels_single import SCRATCH, nearest_of, pop
 from torchpt.native.jit import jit, part
 from torchpt.native.simd import item, pointer, put, splat
@@ -155,10 +156,12 @@ def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, ta
 def nearest_parallel(
     chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v
 ):
-    """:func:`nearest` over equal chunks of the rays, one a thread."""
+    """:func:`nearest` over the rays in equal pieces, which the threads take in turn."""
+    pieces = chunks * PIECES
     for c in prange(chunks):
-        a, b = c * items // chunks, (c + 1) * items // chunks
-        nearest(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v)
+        for k in range(c, pieces, chunks):
+            a, b = k * items // pieces, (k + 1) * items // pieces
+            nearest(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v)
 
 
 @jit()
@@ -174,7 +177,9 @@ def blocked(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, ta
 def blocked_parallel(
     chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out
 ):
-    """:func:`blocked` over equal chunks of the rays, one a thread."""
+    """:func:`blocked` over the rays in equal pieces, which the threads take in turn."""
+    pieces = chunks * PIECES
     for c in prange(chunks):
-        a, b = c * items // chunks, (c + 1) * items // chunks
-        blocked(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out)
+        for k in range(c, pieces, chunks):
+            a, b = k * items // pieces, (k + 1) * items // pieces
+            blocked(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out)

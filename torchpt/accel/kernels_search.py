@@ -11,7 +11,11 @@ from torchpt.accel.kernels_turn import SCRATCH, STATE, TURNS, turn
 from torchpt.native.jit import jit, part
 from torchpt.native.simd import item, load, pointer, put
 
-__all__ = ["blocked", "blocked_parallel", "nearest", "nearest_parallel"]
+__all__ = ["PIECES", "blocked", "blocked_parallel", "nearest", "nearest_parallel"]
+
+
+#: Pieces of work a thread: rays of one place may take longer than those of another.
+PIECES = 8
 
 
 @part(inline="always")
@@ -104,10 +108,12 @@ def nearest(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
 
 @jit(parallel=True)
 def nearest_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v):
-    """:func:`nearest` over equal chunks of the rays, one a thread."""
+    """:func:`nearest` over the rays in equal pieces, which the threads take in turn."""
+    pieces = chunks * PIECES
     for c in prange(chunks):
-        a, b = c * items // chunks, (c + 1) * items // chunks
-        nearest(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v)
+        for k in range(c, pieces, chunks):
+            a, b = k * items // pieces, (k + 1) * items // pieces
+            nearest(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v)
 
 
 @jit()
@@ -122,7 +128,9 @@ def blocked(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
 
 @jit(parallel=True)
 def blocked_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out):
-    """:func:`blocked` over equal chunks of the rays, one a thread."""
+    """:func:`blocked` over the rays in equal pieces, which the threads take in turn."""
+    pieces = chunks * PIECES
     for c in prange(chunks):
-        a, b = c * items // chunks, (c + 1) * items // chunks
-        blocked(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out)
+        for k in range(c, pieces, chunks):
+            a, b = k * items // pieces, (k + 1) * items // pieces
+            blocked(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out)
