@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.records import Geometry
 
-__all__ = ["Accel", "Array", "Hits"]
+__all__ = ["Accel", "Array", "Hits", "closer"]
 
 #: A numpy array, float32 or int32.
 Array = np.ndarray[Any, Any]
@@ -90,8 +90,7 @@ class Accel(ABC):
         """
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         out[:count] = self.occluded(*rays).numpy()
-        if veils is not None:
-            np.left_shift(out[:count], 1, out=out[:count])
+        closer(out[:count], veils)
 
     @abstractmethod
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits: ...
@@ -102,6 +101,12 @@ class Accel(ABC):
     @abstractmethod
     def describe(self) -> dict[str, Any]:
         """What was built: name, primitives, nodes, leaves, sah_cost, depth, bytes, build_seconds."""
+
+
+def closer(out: Array, veils: Array | None) -> None:
+    """What was found without a look at ``veils`` as :meth:`Accel.blocked` tells it: 2 for 1 where there are any."""
+    if veils is not None:
+        np.left_shift(out, 1, out=out)
 
 
 def _rays(o: Tensor, d: Tensor, t_max: Tensor) -> tuple[Tensor, Tensor, Tensor]:

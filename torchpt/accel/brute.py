@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.accel.base import Accel, Array, Hits
+from torchpt.accel.base import Accel, Array, Hits, closer
 from torchpt.accel.tables import extent, inverses, prepare, tolerances
 from torchpt.errors import SceneError
 from torchpt.native.operators import choose, operator
@@ -85,11 +85,12 @@ class Brute(Accel):
         results = (t[:count], prim[:count], u[:count], v[:count])
         kernels.intersect(0, blocks, o, d, t_max[:count], *self.arrays, *results)
 
-    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array) -> None:
+    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None) -> None:
         """See :meth:`Accel.blocked`."""
         from torchpt.accel import kernels_brute as kernels
 
         kernels.occluded(0, -(-count // kernels.BLOCK), o, d, t_max[:count], *self.arrays, out[:count])
+        closer(out[:count], veils)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; there are no nodes, and the cost is one test a primitive."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import kernels_instances as kernels
-from torchpt.accel.base import Accel, Array, Hits
+from torchpt.accel.base import Accel, Array, Hits, closer
 from torchpt.accel.blocks import Others, Tree, aligned, lines_of, mesh_tree, room_of, wide_tree, write
 from torchpt.accel.instances import CopyTables
 from torchpt.accel.kernels_blocks import LINE
@@ -109,8 +109,7 @@ class WideInstanced(Accel):
         self.base.blocked(o, d, t_max, count, out)
         args = (o, d, t_max, *self.arrays, out)
         compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
-        if veils is not None:
-            np.left_shift(out[:count], 1, out=out[:count])
+        closer(out[:count], veils)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost is that of what is no copy."""
