@@ -18,6 +18,7 @@ from torchpt.bsdfs import Bsdf
 from torchpt.cameras import Camera, Orthographic, Perspective
 from torchpt.errors import RenderError, SceneError
 from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
+from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
 from torchpt.scene import schema
 from torchpt.scene.assembly import assemble
@@ -91,6 +92,7 @@ class Scene:
     """
 
     def __init__(self, description: Description, device: torch.device, own_models: tuple[Bsdf, ...] = ()) -> None:
+        settle()
         self.description, self.device, self.own_models = description, device, own_models
         self._built: Built = build_parts(description)
         # Geometry far from the origin would lose its detail in float32 before it can be moved there.
