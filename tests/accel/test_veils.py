@@ -53,7 +53,8 @@ def test_a_mesh_that_lets_light_pass_blocks_nothing():
     vertices, faces = sphere_mesh(30)
     corners = [vertices[faces[:, k]] for k in range(3)]
     wall = [np.array([[-9.0, -9, 3]]), np.array([[9.0, -9, 3]]), np.array([[-9.0, 9, 3]])]
-    g = geometry(*(np.concatenate([c, w]) for c, w in zip(corners, wall, strict=True)), (len(faces), 1, 0, 0))
+    p0, p1, p2 = (np.concatenate([c, w]) for c, w in zip(corners, wall, strict=True))
+    g = geometry(p0, p1, p2, (len(faces), 1, 0, 0))
     veils = np.append(np.ones(len(faces), np.uint8), np.uint8(0))
     o, d, t_max = bundles(0)
     o = o * 0.1
