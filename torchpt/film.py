@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.math.threads import mean_all
+
 __all__ = ["RELMSE_FLOOR", "Film", "Filter"]
 
 #: relMSE is the mean of ``(x - ref)^2 / (ref^2 + RELMSE_FLOOR)`` over pixels and channels.
@@ -192,4 +194,4 @@ class Film:
         variance = self.variance()
         if variance is None:
             return None
-        return float((variance / (self.mean() ** 2 + RELMSE_FLOOR)).mean())
+        return float(mean_all(variance / (self.mean() ** 2 + RELMSE_FLOOR)))

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import product
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from showcase import showcase
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import tree_leaves, tree_map
 from trials import film_of, shoot
 
 import torchpt
@@ -25,7 +27,8 @@ from torchpt.math.warps import concentric_disk, one_minus_cos, uniform_cone, uni
 from torchpt.samplers import KINDS as SAMPLERS
 from torchpt.samplers import Sampler, salts
 
-N = 70_003  # above torch's grain of 32,768: two threads share it, and the last vector is not full
+GRAIN = 32_768  # elements that torch leaves to one thread
+N = 70_003  # above that: two threads share it, and the last vector is not full
 
 MIXED: dict[str, Any] = {
     "camera": {"origin": [0, 0, 0.9], "target": [0, 0.1, -1], "fov": 80},
@@ -236,3 +239,76 @@ def test_the_audit_covers_what_waves_use(monkeypatch):
         shoot(scene, 2, 0, sampler, keys, {**film_of(8), "filter": filter}, accel="brute")
     assert "mul" in recorder.seen
     assert recorder.seen - EXACT - {name for name, _ in OPERATIONS} <= {"tan"}  # of the camera's angle: one number
+
+
+class _Twice(TorchDispatchMode):
+    """Repeats what is done with large tensors on one thread and on two, and names what gives other bits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+        self.other: set[str] = set()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        given, name = (args, kwargs or {}), func._schema.name.split("::")[1]
+        if "empty" not in name and any(x.numel() > GRAIN for x in tree_leaves(given) if isinstance(x, torch.Tensor)):
+            before = torch.get_num_threads()
+            one, two = (self._bits(func, given, threads) for threads in (1, 2))
+            torch.set_num_threads(before)
+            self.seen.add(name)
+            if any(not torch.equal(a, b) for a, b in zip(one, two, strict=True)):
+                self.other.add(name)
+        return func(*args, **(kwargs or {}))
+
+    @staticmethod
+    def _bits(func: Any, given: Any, threads: int) -> list[torch.Tensor]:
+        torch.set_num_threads(threads)
+        if func._schema.is_mutable:
+            given = tree_map(lambda x: x.detach().clone() if isinstance(x, torch.Tensor) else x, given)
+        found = func(*given[0], **given[1]), given if func._schema.is_mutable else ()
+        return [x.detach().contiguous().view(-1).view(torch.uint8) for x in tree_leaves(found) if torch.is_tensor(x)]
+
+
+def _large(folder: Path) -> dict[str, Any]:
+    """A mesh, an image and a map that threads divide, none of them into whole vectors."""
+    rng = np.random.default_rng(5)
+    torchpt.write_image(folder / "map.exr", torch.from_numpy(rng.random((181, 301, 3), np.float32)) ** 8)
+    torchpt.write_image(folder / "image.png", torch.from_numpy(rng.random((151, 223, 3), np.float32)))
+    side = 151
+    x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
+    vertices = np.stack((x, y, 0.02 * rng.random((side, side))), 2).reshape(-1, 3)
+    first = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).reshape(-1)
+    corners = np.stack((first, first + 1, first + side + 1, first + side), 1)
+    return {
+        "camera": {"origin": [0, 0, 2], "target": [0, 0, 0], "fov": 70},
+        "lights": {"sky": {"type": "envmap", "path": str(folder / "map.exr")}},
+        "materials": {
+            "cloth": {"type": "diffuse", "reflectance": {"type": "image", "path": str(folder / "image.png")}},
+            "metal": {"type": "roughconductor", "alpha": 0.2},
+        },
+        "shapes": {
+            "hills": {
+                "type": "mesh",
+                "vertices": vertices.tolist(),
+                "faces": corners[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3).tolist(),
+                "material": "metal",
+            },
+            "card": {
+                "type": "rectangle",
+                "transform": [{"scale": 0.3}, {"translate": [0, 0, 0.5]}],
+                "material": "cloth",
+            },
+            "lamp": {"type": "sphere", "center": [0.7, 0, 0.6], "radius": 0.2, "emission": [4, 5, 6]},
+        },
+    }
+
+
+def test_no_operation_of_a_render_depends_on_the_threads(tmp_path):
+    """From the files to the picture and its error; waves, and what is made for them once."""
+    description = _large(tmp_path)
+    twice = _Twice()
+    with twice:
+        scene = torchpt.load(description, device="cpu")
+        shoot(scene, 4, 1, "sobol", {"max_depth": 2}, film_of(96))
+    assert {"addcmul", "mean", "sqrt", "sum"} <= twice.seen
+    assert not twice.other

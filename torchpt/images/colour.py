@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchpt.errors import SceneError
+from torchpt.math.threads import in_pieces
 
 __all__ = ["TONEMAPS", "display", "linear_to_srgb", "luminance", "srgb_to_linear"]
 
@@ -24,15 +25,19 @@ def luminance(rgb: Tensor) -> Tensor:
     return 0.2126 * rgb[..., 0] + 0.7152 * rgb[..., 1] + 0.0722 * rgb[..., 2]
 
 
+def _power(x: Tensor, exponent: float) -> Tensor:
+    return in_pieces(lambda piece: piece**exponent, x)
+
+
 def linear_to_srgb(x: Tensor) -> Tensor:
     """Linear light to sRGB-encoded values (IEC 61966-2-1); negative values are taken as 0."""
     x = x.clamp(min=0)
-    return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
+    return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * _power(x.clamp(min=0.0031308), 1 / 2.4) - 0.055)
 
 
 def srgb_to_linear(x: Tensor) -> Tensor:
     """sRGB-encoded values to linear light (IEC 61966-2-1)."""
-    return torch.where(x <= 0.04045, x / 12.92, ((x.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4)
+    return torch.where(x <= 0.04045, x / 12.92, _power((x.clamp(min=0.04045) + 0.055) / 1.055, 2.4))
 
 
 def _reinhard(x: Tensor) -> Tensor:
@@ -84,4 +89,4 @@ def display(image: Tensor, exposure: float = 0.0, tonemap: str = "none", gamma: 
         raise SceneError("film.gamma", gamma, "'srgb' or an exponent > 0")
     x = torch.nan_to_num(image, nan=0.0, posinf=_BRIGHTEST).clamp(0, _BRIGHTEST)
     x = TONEMAPS[tonemap]((x * 2.0**exposure).clamp(max=_BRIGHTEST)).clamp(0, 1)
-    return linear_to_srgb(x) if gamma == "srgb" else x ** float(gamma)
+    return linear_to_srgb(x) if gamma == "srgb" else _power(x, float(gamma))

@@ -15,6 +15,7 @@ from torchpt.lights import tree
 from torchpt.lights.bounds import bounds_of
 from torchpt.lights.tree import LightTree
 from torchpt.math.distributions import Discrete
+from torchpt.math.threads import sum_all
 from torchpt.math.vectors import take
 from torchpt.records import Lights
 
@@ -60,7 +61,7 @@ def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: 
         return Discrete.of(power, dtype)
     beside = None
     if count < len(power):
-        beside = Discrete.of(torch.cat((power[:count].sum().reshape(1), power[count:])), dtype)
+        beside = Discrete.of(torch.cat((sum_all(power[:count]).reshape(1), power[count:])), dtype)
     shining = (power[:count] > 0).double()
     few = count <= FEW
     share = min(EVEN, EACH / max(float(shining.sum()), 1.0)) if few else 0.0

@@ -29,6 +29,7 @@ from torch import Tensor
 
 from torchpt.math.angles import azimuth
 from torchpt.math.distributions import Cells, invert_linear
+from torchpt.math.threads import sum_all
 from torchpt.math.vectors import dot, luminance, take
 
 __all__ = ["EVEN", "EnvironmentMap", "Grid", "build", "environment", "pdf", "radiance", "sample"]
@@ -112,14 +113,14 @@ def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None
         light = luminance(planes).clamp_min(0.0).view(height, width)
         zero = light.new_zeros(())
         weights = _weights(light, heights)
-        mean = weights.sum()
+        mean = sum_all(weights)
         black = not bool(mean > 0)
         plain = _grid(_weights(torch.ones_like(light), heights), zero - 1.0) if black else _grid(weights, zero)
         compensated = None
         if not black and compensation is not False:
             floor = mean.to(light.dtype)
             weights = _weights((light - floor).clamp_min(0.0), heights)
-            if bool(weights.sum() > 0) and (compensation or _uneven(weights, mean, heights)):
+            if bool(sum_all(weights) > 0) and (compensation or _uneven(weights, mean, heights)):
                 compensated = _grid(weights, floor)
     return EnvironmentMap(
         texels=planes,
@@ -145,14 +146,14 @@ def _weights(values: Tensor, heights: Tensor) -> Tensor:
 
 def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
     """Whether compensation repays: see :data:`EVEN`. ``weights`` are those of what lies above the mean."""
-    above = weights.sum()
-    spread = above * above / (weights * weights * (weights.shape[1] / heights[:, None])).sum()
+    above = sum_all(weights)
+    spread = above * above / sum_all(weights * weights * (weights.shape[1] / heights[:, None]))
     return bool((above > EVEN * mean) | (spread < EVEN))
 
 
 def _grid(weights: Tensor, floor: Tensor) -> Grid:
     """From integrals over the cells; the sphere counts as 1 in them, and as 4 pi in the density."""
-    return Grid(Cells.of(weights), floor, (1.0 / (4.0 * math.pi * weights.sum())).to(floor.dtype))
+    return Grid(Cells.of(weights), floor, (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype))
 
 
 class _Place(NamedTuple):

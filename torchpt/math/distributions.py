@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.math.threads import sum_all
 from torchpt.math.vectors import take
 
 __all__ = ["Cells", "Discrete", "invert_linear"]
@@ -35,7 +36,7 @@ class Discrete:
                 than that would never come up, or too often.
         """
         w = weights.detach().double()
-        total = w.sum()
+        total = sum_all(w)
         uniform = torch.full_like(w, 1.0 / max(len(w), 1))
         possible = (w > 0).double()
         floor = possible / possible.sum().clamp_min(1.0)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchpt.math.threads import in_pieces
 from torchpt.math.vectors import cross, dot, normalize
 
 __all__ = ["smooth_normals"]
@@ -27,6 +28,6 @@ def smooth_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     for k in range(3):
         a = normalize(corner[(k + 1) % 3] - corner[k])
         b = normalize(corner[(k + 2) % 3] - corner[k])
-        angle = 2.0 * torch.atan2(_length(a - b), _length(a + b))
+        angle = 2.0 * in_pieces(torch.atan2, _length(a - b), _length(a + b))
         total = total.index_add(1, faces[:, k], normal * angle)
     return normalize(total)

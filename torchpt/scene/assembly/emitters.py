@@ -14,6 +14,7 @@ from torchpt.accel.bounds import chosen, primitive_bounds
 from torchpt.errors import SceneError
 from torchpt.lights import choice_of
 from torchpt.lights.solid_angle import shapes_of, table_of
+from torchpt.math.threads import mean_all
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Geometry, Lights
 from torchpt.scene.assembly.curved import quadric_area
@@ -42,7 +43,7 @@ def _mean_glow(part: Part, parameters: Mapping[str, Tensor]) -> float:
     if part.glow is None:
         return 1.0
     image = images_of([part.glow], parameters)[part.glow.texels].detach().double()
-    color = image[..., :3].mean((0, 1)) if image.shape[2] >= 3 else image[..., 0].mean().expand(3)
+    color = image[..., :3].mean((0, 1)) if image.shape[2] >= 3 else mean_all(image[..., 0]).expand(3)
     return float(luminance((color * color.new_tensor(part.glow.scale)).abs()))
 
 
