@@ -7,8 +7,8 @@ import sys
 import torch
 
 import torchpt
+from torchpt.format.description import settings
 from torchpt.render import render_scene
-from torchpt.scene.description import settings
 
 
 def main(device: str) -> None:

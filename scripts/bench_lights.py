@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.format.description import settings
 from torchpt.render import render_scene
 from torchpt.scene import Scene
-from torchpt.scene.description import settings
 
 WAYS = ("uniform", "power", "tree")
 

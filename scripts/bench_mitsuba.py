@@ -333,7 +333,7 @@ def timed(shoot: Callable[[int], Any], arguments: argparse.Namespace) -> Turn:
 
 def wishes(scene: Any, arguments: argparse.Namespace) -> Any:
     """Complete settings of a render."""
-    from torchpt.scene.description import settings
+    from torchpt.format.description import settings
 
     blocks = {
         "film": {"width": arguments.size, "height": arguments.size, "filter": "box"},

@@ -21,9 +21,9 @@ from torch import Tensor
 
 import torchpt
 from torchpt.film import RELMSE_FLOOR
+from torchpt.format.description import settings
 from torchpt.render import render_scene
 from torchpt.scene import Scene
-from torchpt.scene.description import settings
 
 FLOOR = {"type": "rectangle", "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"scale": 4}]}
 BUNNY = ["$TORCHPT_ASSETS/bunny.ply", str(Path(__file__).parent.parent / "scenes" / "standin.ply")]

@@ -20,9 +20,9 @@ from mitsuba_scene import convert, find_llvm, lets_pass, load_mitsuba, nearest
 from torch import Tensor
 
 import torchpt
+from torchpt.format.description import settings
 from torchpt.render import render_scene
 from torchpt.scene import Scene
-from torchpt.scene.description import settings
 
 BLOCK = 8
 #: Where Mitsuba counts surfaces that light passes.

@@ -14,9 +14,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "references"))
 from features import FEATURES, Feature, kernels, with_feature
 
 import torchpt
+from torchpt.format.description import settings
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.render import render_scene
-from torchpt.scene.description import settings
 
 REPEATS = 15
 

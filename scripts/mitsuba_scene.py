@@ -22,11 +22,9 @@ import numpy as np
 import torch
 
 import torchpt
-from torchpt.math.vectors import cross, dot
-from torchpt.scene import Scene
-from torchpt.scene.assembly import corners_of
-from torchpt.scene.description import Description, read_description
-from torchpt.scene.materials import (
+from torchpt.bsdfs.resolved import ResolvedMaterial
+from torchpt.format.description import Description, read_description
+from torchpt.format.materials import (
     Blend,
     BlinnPhong,
     Conductor,
@@ -38,13 +36,16 @@ from torchpt.scene.materials import (
     RoughDielectric,
     RoughPlastic,
 )
-from torchpt.scene.parts import MaterialSlot, Part, Source, VertexColors
-from torchpt.scene.schema import Camera, Cone, Cube, Instance, Mesh, Orthographic, Perspective, Shape, ThinLens
-from torchpt.scene.settings import Film, Filter, PathIntegrator, Settings
+from torchpt.format.schema import Camera, Cone, Cube, Instance, Mesh, Orthographic, Perspective, Shape, ThinLens
+from torchpt.format.textures import TextureInput
+from torchpt.math.vectors import cross, dot
+from torchpt.scene import Scene
+from torchpt.scene.assembly import corners_of
+from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
 from torchpt.scene.texels import images_of
-from torchpt.scene.textures import Slot
-from torchpt.textures import Node
+from torchpt.settings import Film, Filter, PathIntegrator, Settings
+from torchpt.textures import Node, VertexColors
 
 __all__ = [
     "NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "lets_pass", "load_mitsuba", "nearest",
@@ -110,8 +111,8 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
     """
     integrator = settings.integrator
     assert isinstance(integrator, PathIntegrator)
-    if scene.parts.copies:
-        raise NoCounterpartError(f"{scene.parts.copies[0].name}: instances are not converted")
+    if scene.built.copies:
+        raise NoCounterpartError(f"{scene.built.copies[0].name}: instances are not converted")
     out: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": integrator.max_depth, "rr_depth": integrator.rr_depth},
@@ -121,9 +122,9 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
             "sampler": {"type": "independent", "sample_count": settings.render.spp},
         },
     }
-    for number, part in enumerate(scene.parts.parts):
+    for number, part in enumerate(scene.built.parts):
         out[f"part{number}"] = _shape(mitsuba, scene, part, folder / f"part{number}.ply")
-    for source in scene.parts.sources:
+    for source in scene.built.sources:
         out[source.name.replace(".", "_")] = _source(mitsuba, scene, source)
     return out
 
@@ -138,7 +139,7 @@ def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
         picture = mitsuba.Bitmap(np.ascontiguousarray(texels.cpu().numpy()))
         return {"type": "envmap", "bitmap": picture, "scale": float(scale), "to_world": mitsuba.ScalarTransform4f(turn)}
     name = source.name.removeprefix("lights.")
-    given = scene.description.lights[name].numbers()
+    given = scene.description.lights[name].values
     found: dict[str, Any] = {"type": source.kind}
     for key, value in given.items():
         if key in ("intensity", "irradiance", "radiance"):
@@ -186,7 +187,7 @@ def comparable(name: str) -> Scene:
     lacking = {
         shape for shape, value in scene.description.shapes.items() if len(getattr(value, "path", None) or ()) > 1
     }
-    for part in scene.parts.parts:
+    for part in scene.built.parts:
         try:
             _kind(part)
             bsdf(part.material, lambda _: {})
@@ -226,7 +227,7 @@ def _replaced(description: Description) -> tuple[Description, dict[str, str]]:
 
 def lets_pass(scene: Scene) -> bool:
     """Whether light passes some surface as if it were not there: in Mitsuba that is a bounce."""
-    slots = [slot for part in scene.parts.parts for slot in part.material.all()]
+    slots = [slot for part in scene.built.parts for slot in part.material.all()]
     return any(slot.model.name == "null" or slot.opacity != 1.0 for slot in slots)
 
 
@@ -266,7 +267,7 @@ class _Nearest:
             sides = {"a": material.a, "b": material.b}
             inner = {k: self.material(f"{name}.{k}", v) if isinstance(v, Material) else v for k, v in sides.items()}
             return material.model_copy(update=inner)
-        if isinstance(material.opacity, Slot) and material.alpha_cutoff is not None:
+        if isinstance(material.opacity, TextureInput) and material.alpha_cutoff is not None:
             self.said[f"{name}.alpha_cutoff"] = "cutoff left out: opacity is coverage"
             material = material.model_copy(update={"alpha_cutoff": None})
         if isinstance(material, RoughConductor | RoughDielectric) and material.energy_compensation:
@@ -316,7 +317,7 @@ def _coat(name: str, material: Material) -> tuple[Any, float, float, Any] | None
 
 
 def _numbers(name: str, value: Any) -> tuple[float, ...]:
-    if isinstance(value, Slot):
+    if isinstance(value, TextureInput):
         raise NoCounterpartError(f"{name}: a texture where its nearest takes a number")
     return value if isinstance(value, tuple) else (value,)
 
@@ -376,7 +377,7 @@ def _rgb(colour: Any) -> dict[str, Any]:
 
 
 def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]:
-    if part.glow is not None:
+    if part.emission_texture is not None:
         raise NoCounterpartError(f"{part.name}: emission by a texture is not converted")
     if part.emission is not None and _passing(part.material) != 1.0:
         raise NoCounterpartError(f"{part.name}: Mitsuba's lights shine in full whatever their opacity")
@@ -433,7 +434,7 @@ def _refuse(node: Node) -> dict[str, Any]:
 Opened = Callable[[Node], dict[str, Any]]
 
 
-def bsdf(slot: MaterialSlot, opened: Opened = _refuse) -> dict[str, Any]:
+def bsdf(slot: ResolvedMaterial, opened: Opened = _refuse) -> dict[str, Any]:
     """Mitsuba's dict of a material.
 
     Args:
@@ -470,7 +471,7 @@ def _value(value: Any, opened: Opened) -> Any:
     return _rgb(value) if isinstance(value, tuple) else value
 
 
-def _passing(slot: MaterialSlot) -> float | Node:
+def _passing(slot: ResolvedMaterial) -> float | Node:
     """Opacity of a material itself."""
     if isinstance(slot.opacity, Node):
         if slot.alpha_cutoff is not None:
@@ -479,7 +480,7 @@ def _passing(slot: MaterialSlot) -> float | Node:
     return slot.opacity if slot.alpha_cutoff is None else float(slot.opacity >= slot.alpha_cutoff)
 
 
-def _bare(slot: MaterialSlot, opened: Opened) -> dict[str, Any]:
+def _bare(slot: ResolvedMaterial, opened: Opened) -> dict[str, Any]:
     """A material as seen from its front, with nothing around it."""
     model, values = slot.model, dict(slot.values)
     if slot.inner:

@@ -13,9 +13,9 @@ import torch
 from trials import chi_square_p, z_limit
 
 import torchpt
+from torchpt.format.description import settings
 from torchpt.render import render_scene
 from torchpt.scene import Scene
-from torchpt.scene.description import settings
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 CAMERA = {"origin": [0, 1.4, 4.2], "target": [0, 0.6, 0], "fov": 45}
@@ -89,8 +89,8 @@ def test_what_is_replaced_is_said(scripts):
 def test_no_shape_is_dropped(scripts):
     mitsuba_scene, _, _ = scripts
     near = mitsuba_scene.nearest(lacking())
-    assert near.parts.copies == ()
-    assert {part.shape for part in near.parts.parts} == set(LACKING["shapes"])
+    assert near.built.copies == ()
+    assert {part.shape for part in near.built.parts} == set(LACKING["shapes"])
 
 
 def test_a_mesh_stands_where_its_cone_stood(scripts):

@@ -25,7 +25,7 @@ NEEDLESS = (
     *("antlr4", "networkx", "pandas", "rich", "scipy", "sympy", "triton"),
     *("torch._dynamo", "torch._inductor", "torch.onnx", "torch.utils.tensorboard"),
     *("hydra_plugins", "hydra._internal.core_plugins", "PIL.TiffImagePlugin", "logging.config"),
-    *(f"torchpt.scene.loaders.{name}" for name in ("gltf", "obj", "ply", "stl")),
+    *(f"torchpt.meshes.{name}" for name in ("gltf", "obj", "ply", "stl")),
 )
 SMALL = ("render", "scene=cornell_box", "render.spp=1", "film.width=64", "film.height=64")
 

@@ -1,4 +1,4 @@
-"""Look-ups into the atlas, against torch's own sampling of images and against plain loops."""
+"""MaterialTextures-ups into the atlas, against torch's own sampling of images and against plain loops."""
 
 from __future__ import annotations
 

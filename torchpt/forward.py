@@ -28,7 +28,7 @@ from torchpt.lanes.graph import Unsupported
 from torchpt.records import World
 from torchpt.samplers import Sampler
 from torchpt.scene import Scene
-from torchpt.scene.settings import (
+from torchpt.settings import (
     AovIntegrator,
     DirectIntegrator,
     GaussianFilter,
@@ -248,7 +248,7 @@ def _preview(scene: Scene, world: World, own: bool) -> Preview:
 
 def pixel_of(world: World, camera: Camera) -> Tensor | None:
     """What textures filtered by the pixel's footprint need of the camera; None where there are none."""
-    return camera.pixel() if world.textures is not None and world.textures.pyramids is not None else None
+    return camera.pixel() if world.textures.atlas is not None and world.textures.atlas.pyramids is not None else None
 
 
 def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: Tensor | None, own: bool) -> Stages:
@@ -260,7 +260,7 @@ def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: T
         mode = (
             "on"
             if own
-            and work >= COMPILE_REPAYS * len(world.models)  # each has graphs of its own
+            and work >= COMPILE_REPAYS * len(world.materials.models)  # each has graphs of its own
             and plan.dtype == torch.float32
             and not scene.own_models  # code of the user's own may hold what cannot be compiled
             else "off"
@@ -283,10 +283,14 @@ def looped(wave: Wave, settings: Settings, device: torch.device) -> bool:
 
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
     """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
-    packets = wave.accel.name == "brute" and not wave.stages.world.counts[4]
-    fused = packets and wave.stages.world.opacity is None and wave.preview is None
+    packets = wave.accel.name == "brute" and not wave.stages.world.geometry.counts[4]
+    fused = packets and wave.stages.world.materials.opacity is None and wave.preview is None
     kernels = Kernels(wave, packets, fused, before)
-    own = [k for k, model in enumerate(wave.stages.world.models) if any(model is mine for mine in scene.own_models)]
+    own = [
+        k
+        for k, model in enumerate(wave.stages.world.materials.models)
+        if any(model is mine for mine in scene.own_models)
+    ]
     eager = kernels.probe(own) if wave.limits is not None else {}
     if eager and kernels.fused:  # what runs as tensor operations hands its rays to the search structure
         kernels = Kernels(wave, packets, False)
@@ -302,7 +306,7 @@ def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
             return {"stages": "compiled by torch" if wave.stages.compiled else "eager, by tensor operations"}
         kernels = kernels_of(scene, wave)
     search = "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else wave.accel.name
-    names = [str(model) for model in wave.stages.world.models]
+    names = [str(model) for model in wave.stages.world.materials.models]
     eager = {names[number]: reason for number, reason in kernels.eager.items()}
     return {
         "stages": "compiled to loops over lanes",
@@ -395,7 +399,7 @@ class Run:
         """The compiled loop; its kernels are kept with the scene."""
         kernels = _kernels[scene] = kernels_of(scene, self.wave, _kernels.get(scene))
         for number, reason in kernels.eager.items():
-            name = str(self.wave.stages.world.models[number])
+            name = str(self.wave.stages.world.materials.models[number])
             self.eager.append(f"{name}: {reason}")
             say_once(
                 f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}"

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from torchpt.bsdfs import Bsdf, Parameters
     from torchpt.lights.choice import ByTree
-    from torchpt.lights.envmap import EnvironmentMap
+    from torchpt.lights.kinds.envmap import EnvironmentMap
     from torchpt.math.distributions import Discrete
-    from torchpt.textures import Atlas, Look, Veils
+    from torchpt.textures import Atlas, MaterialTextures, OpacityMaps
 
 __all__ = [
     "DISTANT",
@@ -30,6 +30,9 @@ __all__ = [
     "Geometry",
     "Hit",
     "Interaction",
+    "LaneGeometry",
+    "LaneMaterials",
+    "LaneTextures",
     "LightSample",
     "Lights",
     "PathState",
@@ -86,14 +89,14 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Quadrics:
-    """What lanes gather of a quadric beside ``World.p0, e1, e2``: one column a quadric."""
+    """What lanes gather of a quadric beside ``LaneGeometry.p0, e1, e2``: one column a quadric."""
 
     code: Tensor  # (Q,) int64 index into QUADRICS
     e3: Tensor  # (3, Q)
     n1: Tensor  # (3, Q) columns of the cofactor matrix of (e1, e2, e3), turned to the front; their common scale is free
     n2: Tensor  # (3, Q)
     n3: Tensor  # (3, Q)
-    reach: Tensor  # (3, Q) largest coordinate magnitudes that enter a point's sum, see World.bound
+    reach: Tensor  # (3, Q) largest coordinate magnitudes that enter a point's sum, see LaneGeometry.bound
 
 
 @dataclass(frozen=True)
@@ -131,13 +134,15 @@ class Lights:
     normal: Tensor  # (3, K) unit, the side that emits
     flip: Tensor  # (K,) -1 where a sphere emits inward
     area: Tensor  # (K,); of a quadric its own space's area times |det|, see torchpt.lights.quadric
-    bound: Tensor  # (K,) see World.bound
+    bound: Tensor  # (K,) see LaneGeometry.bound
     radiance: Tensor  # (3, K); of a point or spot its intensity, of a directional light its irradiance
     opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
     environment: Tensor | EnvironmentMap | None  # what comes from outside: one radiance (3,), or a map
     row_of_prim: Tensor | None  # (P + I,) int64, -1 where a primitive does not emit; None where none does
-    quadric: Tensor | None  # (K,) int64 column of World.quadrics, 0 for the other kinds; None where no quadric emits
-    quadrics: Quadrics | None  # World.quadrics where a quadric emits
+    quadric: (
+        Tensor | None
+    )  # (K,) int64 column of LaneGeometry.quadrics, 0 for the other kinds; None where no quadric emits
+    quadrics: Quadrics | None  # LaneGeometry.quadrics where a quadric emits
     prim: Tensor | None  # (K,) int64 the primitive; None where no texture says how much it emits
     solid: (
         Tensor | None
@@ -146,11 +151,8 @@ class Lights:
 
 
 @dataclass(frozen=True)
-class World:
-    """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``.
-
-    P primitives, and I copies (see :class:`Copies`).
-    """
+class LaneGeometry:
+    """Where surfaces lie, as the lanes gather it: P primitives, and I copies (see :class:`Copies`)."""
 
     counts: tuple[int, int, int, int, int]  # as in Geometry; static: lanes read `ends`
     ends: Tensor  # (5,) int64 the id after the last primitive of each kind
@@ -169,18 +171,7 @@ class World:
     axes: tuple[Tensor, Tensor, Tensor] | None  # (3, S) unit x, y, z of the spheres; None without textures or spheres
     mirrored: Tensor | None  # (P,) bool: disks whose u and v are swapped; None where none are, or none matter
     colors: tuple[Tensor, Tensor, Tensor] | None  # (3, P) at the corners, where vertex colours are read
-    opacity: Tensor | None  # (P + I,) chance that a ray meets the surface; None where it always does
-    material: Tensor  # (P + I,) int64 row in the parameters of its model
-    key: Tensor  # (P + I + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
-    models: tuple[Bsdf, ...]  # the BSDFs present
-    bsdfs: tuple[Parameters, ...]  # stacked parameters of each model; where it has a look, as its materials were given
-    looks: tuple[Look | None, ...]  # textures of each model; None where it has none
-    textures: Atlas | None  # None where no image is read
-    veils: Veils | None  # textures of opacity; None where there are none
-    glows: Tensor | None  # (P + I,) int64 node of the texture of emission, -1 where there is none; None where none is
-    two_sided: tuple[Tensor | None, ...]  # (M,) bool for the rows of each model; None where all are
     object_id: Tensor  # (P + I,) int64, order of the shape in the scene
-    lights: Lights | None  # None where nothing emits
     quadrics: Quadrics | None = None  # None where there are none
     copies: Copies | None = None  # None where there are no instances
 
@@ -199,6 +190,40 @@ class World:
 
         assert self.copies is not None
         return torch.searchsorted(self.copies.start[1:], prim, right=True)
+
+
+@dataclass(frozen=True)
+class LaneMaterials:
+    """What surfaces are made of: M models, and for each its materials as rows of its parameters."""
+
+    row: Tensor  # (P + I,) int64 row in the parameters of its model
+    key: Tensor  # (P + I + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
+    models: tuple[Bsdf, ...]  # the BSDFs present
+    parameters: tuple[Parameters, ...]  # stacked, of each model; where it reads textures, as its materials were given
+    textures: tuple[MaterialTextures | None, ...]  # of each model; None where it reads none
+    two_sided: tuple[Tensor | None, ...]  # (M,) bool for the rows of each model; None where all are
+    opacity: Tensor | None  # (P + I,) chance that a ray meets the surface; None where it always does
+
+
+@dataclass(frozen=True)
+class LaneTextures:
+    """The textures, and those that surfaces read whatever their model."""
+
+    atlas: Atlas | None = None  # None where no texture is read
+    opacity: OpacityMaps | None = None  # None where there are none
+    emission: Tensor | None = (
+        None  # (P + I,) int64 node of the emission map, -1 where there is none; None where none is
+    )
+
+
+@dataclass(frozen=True)
+class World:
+    """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``."""
+
+    geometry: LaneGeometry
+    materials: LaneMaterials
+    textures: LaneTextures
+    lights: Lights | None  # None where nothing emits
 
 
 @dataclass(frozen=True)
@@ -225,7 +250,7 @@ class Interaction:
     bitangent: Tensor | None  # (3, N) along v; None without bump maps
     prim: Tensor  # (N,) below P: of a copy the triangle of its mesh
     slot: Tensor  # (N,) row of what a copy has of its own; else prim
-    bound: Tensor | None  # (N,) in place of World.bound at prim; None where that holds everywhere
+    bound: Tensor | None  # (N,) in place of LaneGeometry.bound at prim; None where that holds everywhere
     u: Tensor  # (N,) of the primitive's own parametrization
     v: Tensor  # (N,)
     own: Tensor | None  # (3, N) point of a quadric in its own space; None where there are none

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchpt import adjoint as adjoints
 from torchpt.errors import EdgeWarning, SceneError
+from torchpt.format.description import settings as complete
 from torchpt.forward import (
     BYTES_PER_LANE,
     Progress,
@@ -27,9 +28,8 @@ from torchpt.forward import (
 from torchpt.integrators.compiled import Stages
 from torchpt.records import tensors_of
 from torchpt.scene import Scene
-from torchpt.scene.description import settings as complete
-from torchpt.scene.scene import INDICES, MOVING
-from torchpt.scene.settings import AovIntegrator, BoxFilter, Settings
+from torchpt.settings import AovIntegrator, BoxFilter, Settings
+from torchpt.spec import Moves
 
 __all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene"]
 
@@ -109,7 +109,7 @@ def render(
         raise SceneError("integrator.type", "aov", "path, direct or ibl where gradients are wanted")
     names = tuple(wanted)
     attached = _moves(scene, names)
-    if attached or any("lights." in name and name.endswith(MOVING) for name in names):
+    if attached or any(scene.spec(name).moves is Moves.SHADOWS for name in names):
         warnings.warn(
             "the gradient with respect to what moves or bends rays leaves out visibility edges (silhouettes and shadow edges "
             "that move); see docs/gradients.md",
@@ -138,16 +138,13 @@ def _same(wish: str | torch.device, own: torch.device) -> bool:
 
 
 def _moves(scene: Scene, names: Iterable[str]) -> bool:
-    """Whether any of the parameters moves the geometry or the camera, or bends rays."""
-    slots = [slot for part in scene.parts.parts for slot in part.material.all()]
-    bending = {slot.name for slot in slots if slot.model.refracts and slot.model.delta}
+    """Whether any of the parameters moves surfaces or the camera, or bends rays that a delta lobe sends on."""
+    materials = [material for part in scene.built.parts for material in part.material.all()]
+    bending = {material.name for material in materials if material.model.refracts and material.model.delta}
 
     def moves(name: str) -> bool:
-        if name.startswith("lights."):
-            return False  # a turned map moves no surface
-        if name.endswith((".vertices", ".to_world")) or name.startswith("camera."):
-            return True
-        return name.endswith(INDICES) and name.rpartition(".")[0] in bending
+        moved = scene.spec(name).moves
+        return moved is Moves.SURFACES or (moved is Moves.RAYS and name.rpartition(".")[0] in bending)
 
     return any(map(moves, names))
 

@@ -8,7 +8,7 @@ import pytest
 from accel_reference import sphere_mesh, triangles
 
 from torchpt.accel.wide import Wide
-from torchpt.scene.loaders import load_mesh
+from torchpt.meshes import load_mesh
 
 FAR = (148376.0, 1234.0, -223423.0)
 BLOCK = 250_000

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt.cameras import Camera
-from torchpt.scene.description import settings
+from torchpt.format.description import settings
 
 POSE = {"origin": [0.3, 1.1, 5], "target": [-0.2, 0.4, 0.1], "up": [0.1, 1, 0]}
 LENS = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.2, "fov": 35}
@@ -25,7 +25,7 @@ def made(camera: dict[str, Any], width: int = 8, height: int = 6, dtype: torch.d
     """The camera of an empty scene."""
     scene = torchpt.load({"camera": {**POSE, **camera}}, "cpu")
     film = settings(scene.description, {"film": {"width": width, "height": height}}).film
-    exact = {name: torch.as_tensor(value) for name, value in scene.parts.parameters.items()}  # params are float32
+    exact = {name: torch.as_tensor(value) for name, value in scene.built.parameters.items()}  # params are float32
     return scene.camera(film, exact, dtype)
 
 

@@ -13,7 +13,7 @@ from trials import coarse, film_of, shoot, spread, z_limit
 
 import torchpt
 from torchpt.cameras import FOV_AXES
-from torchpt.scene.description import settings
+from torchpt.format.description import settings
 
 pytestmark = pytest.mark.mitsuba
 SEEDS = 8

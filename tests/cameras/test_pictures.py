@@ -11,9 +11,9 @@ from optics import CAMERAS, LENS, POSE
 from trials import film_of, shoot
 
 import torchpt
+from torchpt.format.description import settings
 from torchpt.forward import BYTES_PER_LANE
 from torchpt.render import render_scene
-from torchpt.scene.description import settings
 
 AHEAD = {"origin": [0, 0, 0], "target": [0, 0, -1]}
 SIZE, BALL = 64, 0.03

@@ -9,8 +9,8 @@ import yaml
 
 from torchpt.cli import GROUPS, main
 from torchpt.paths import configs
-from torchpt.scene import not_built
-from torchpt.scene.settings import FILTERS, INTEGRATORS, SAMPLERS, Film, Render
+from torchpt.settings import FILTERS, INTEGRATORS, SAMPLERS, Film, Render
+from torchpt.spec import not_built
 
 from .conftest import Renderer
 

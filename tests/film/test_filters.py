@@ -12,9 +12,9 @@ from trials import film_of, shoot, z_limit
 
 import torchpt
 from torchpt.film import Filter
+from torchpt.format.description import settings
 from torchpt.render import first_hit, render_scene
 from torchpt.scene import Scene
-from torchpt.scene.description import settings
 
 CPU = torch.device("cpu")
 U = (torch.arange(1 << 20, dtype=torch.float64) + 0.5) / (1 << 20)

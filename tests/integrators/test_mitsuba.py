@@ -25,7 +25,7 @@ from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p, coarse, film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt.scene.description import settings
+from torchpt.format.description import settings
 
 ROOT = Path(__file__).parent.parent.parent
 SEEDS = 32

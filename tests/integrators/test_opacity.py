@@ -114,7 +114,7 @@ def test_blends_with_null_and_of_covered_materials():
     described = scene(ball, SKY, none={"type": "null"}, dark=black())
     seen(described, 0.7**2, depth=1)
     info = torchpt.load(described, device="cpu").world(torch.float32)[0]
-    assert [model.name for model in info.models] == ["diffuse"]
+    assert [model.name for model in info.materials.models] == ["diffuse"]
     # Opacities 0.2 and 0.6 in equal parts are met as 0.4.
     both = {"type": "blend", "a": black(opacity=0.2), "b": black(opacity=0.6), "weight": 0.5}
     seen(scene({"ball": {"type": "sphere", "material": both}}, SKY), 0.6**2, depth=1)

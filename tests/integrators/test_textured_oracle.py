@@ -116,7 +116,7 @@ def test_against_mitsuba(shape: str, mitsuba: Any, images: Path):
         scene = torchpt.load(
             {"camera": {"origin": [0, 0, 9], "target": [0, 0, 0]}, "shapes": {"it": {**ours, "material": mine}}}
         )
-        pose = scene.parts.parts[0].to_world
+        pose = scene.built.parts[0].to_world
         oracle = mitsuba.load_dict(
             {"type": "scene", "it": {**theirs, "to_world": mitsuba.ScalarTransform4f(pose.tolist()),
                                      "bsdf": {"type": "twosided", "bsdf": other}}}
@@ -139,7 +139,7 @@ def test_against_mitsuba(shape: str, mitsuba: Any, images: Path):
         at = interact(world, o64, d64, hit, slide=True)
         surface = surface_at(world, 0, d64, at)
         wi = surface.frame.to_local(take(w, lanes).double())
-        found = world.models[0].eval(surface.parameters, surface.wo, wi)
+        found = world.materials.models[0].eval(surface.parameters, surface.wo, wi)
         assert surface.side is not None
         through = dot(take(w, lanes).double(), at.ng) * wi[2] * surface.side > 0
         found = found * through

@@ -14,11 +14,11 @@ import torchpt
 from torchpt import lights
 from torchpt.accel.bounds import primitive_bounds
 from torchpt.errors import EdgeWarning, SceneError
+from torchpt.format.description import settings
 from torchpt.lights.bounds import bounds_of
 from torchpt.lights.choice import MANY, ByTree, draw, probability
 from torchpt.math.distributions import Discrete
 from torchpt.records import Hit
-from torchpt.scene.description import settings
 from torchpt.shapes import interact
 from torchpt.shapes.interaction import OFFSET
 

@@ -14,7 +14,7 @@ from trials import SIGNIFICANCE, chi_square_p, coarse, estimate, film_of, shoot,
 
 import torchpt
 from torchpt.errors import AssetError, SceneError
-from torchpt.lights.envmap import EnvironmentMap
+from torchpt.lights.kinds.envmap import EnvironmentMap
 from torchpt.math.distributions import Discrete
 
 ALBEDO = 0.6
@@ -273,7 +273,7 @@ def test_against_mitsuba(quadrants):
         import mitsuba_scene
     finally:
         sys.path.pop(0)
-    from torchpt.scene.description import settings
+    from torchpt.format.description import settings
 
     mi.set_variant("llvm_ad_rgb" if "llvm_ad_rgb" in mi.variants() else "scalar_rgb")
     turn = [{"rotate": {"axis": [1, 2, 3], "angle": 70}}, {"scale": [-1, 1, 1]}]

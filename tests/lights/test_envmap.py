@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p, z_limit
 
-from torchpt.lights import envmap
+from torchpt.lights.kinds import envmap
 from torchpt.math.distributions import Cells, invert_linear
 from torchpt.math.mis import power_heuristic
 from torchpt.math.warps import cosine_hemisphere, uniform_sphere

@@ -10,8 +10,8 @@ from significance import z_limit
 
 import torchpt
 from torchpt.errors import SceneError
+from torchpt.format.description import settings
 from torchpt.render import render_scene
-from torchpt.scene.description import settings
 
 UP = {"rotate": {"axis": [1, 0, 0], "angle": -90}}
 DOWN = {"rotate": {"axis": [1, 0, 0], "angle": 90}}

@@ -53,7 +53,7 @@ def facing(name: str) -> Tensor:
     world, _ = scene_of([name]).world(torch.float64)
     x = torch.zeros(3, 1, dtype=torch.float64)
     if name not in ("sphere", "small sphere", "shell"):
-        n, p = world.normal[:, :1], world.p0[:, :1]
+        n, p = world.geometry.normal[:, :1], world.geometry.p0[:, :1]
         height = dot(n, x - p)
         x = x if float(height) > 0 else x - 2 * height * n
     return x.float()
@@ -64,7 +64,7 @@ def solid_angle(name: str, x: Tensor) -> float:
     if name == "shell":
         return 4 * math.pi
     world, _ = scene_of([name]).world(torch.float64)
-    p0, e1, e2 = (a[:, :1] for a in (world.p0, world.e1, world.e2))
+    p0, e1, e2 = (a[:, :1] for a in (world.geometry.p0, world.geometry.e1, world.geometry.e2))
     if "sphere" in name:
         sin2 = float(e1[0, 0] ** 2 / dot(p0 - x, p0 - x))
         return 2 * math.pi * sin2 / (1 + math.sqrt(1 - sin2))
@@ -79,7 +79,7 @@ def solid_angle(name: str, x: Tensor) -> float:
     to = p0 + e1 * u + e2 * v - x
     area = torch.linalg.cross(e1, e2, dim=0).norm() * share
     square = dot(to, to)
-    return float((area * dot(to, world.normal[:, :1]).abs() / square**1.5).mean())
+    return float((area * dot(to, world.geometry.normal[:, :1]).abs() / square**1.5).mean())
 
 
 def drawn(scene: torchpt.Scene, x: Tensor, count: int = N):
@@ -128,8 +128,8 @@ def test_nothing_comes_from_behind(name):
         x = torch.tensor([[0.2], [2.0], [0.4]])  # its centre
     else:
         world, _ = scene_of([name]).world(torch.float32)
-        n = world.normal[:, :1]
-        x = x - 2 * dot(n, x - world.p0[:, :1]) * n
+        n = world.geometry.normal[:, :1]
+        x = x - 2 * dot(n, x - world.geometry.p0[:, :1]) * n
     _, light = drawn(scene_of([name]), x, 1000)
     assert not light.weight.any()
     assert torch.isfinite(light.pdf).all()
@@ -167,7 +167,7 @@ def test_a_mixture_integrates_to_the_sum(sky):
 
 def _front(name: str, x: Tensor) -> bool:
     world, _ = scene_of([name]).world(torch.float32)
-    return "sphere" in name or float(dot(world.normal[:, :1], x - world.p0[:, :1])) > 0
+    return "sphere" in name or float(dot(world.geometry.normal[:, :1], x - world.geometry.p0[:, :1])) > 0
 
 
 def test_the_environment_alone():

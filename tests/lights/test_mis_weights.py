@@ -69,7 +69,7 @@ def test_weights_of_random_pairs_sum_to_one(dtype):
     error = (power_heuristic(pdf, other) + power_heuristic(other, told) - 1).abs()
     # Density by area has a cosine and a distance in it, which edge-on are rounding of where the search found the point.
     front = same & (dot(d[:, hit], there.ng).abs() > 0.1)
-    of_prim = torch.repeat_interleave(torch.arange(len(KINDS)), torch.tensor(world.counts))[there.prim]
+    of_prim = torch.repeat_interleave(torch.arange(len(KINDS)), torch.tensor(world.geometry.counts))[there.prim]
     for number, kind in enumerate(KINDS):
         found = error[front & (of_prim == number)].double()
         assert len(found) > 50, kind

@@ -332,7 +332,7 @@ def test_a_near_light_is_far_less_noisy_than_by_area(name, place):
     uv, angle = drawn(name, x, u)
     assert bool((angle > 0).all())
     ours = estimate(uv, angle)
-    # Draws by area seldom find the spot that matters: their second moment comes from ours.
+    # Draws by area seldom find the point that matters: their second moment comes from ours.
     second = float((ours * estimate(uv, torch.zeros_like(angle))).mean())
     assert second - float(ours.mean()) ** 2 > 3 * float(ours.var())
     if place != "1e-4 away":

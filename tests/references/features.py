@@ -76,34 +76,38 @@ FEATURES: dict[str, Feature] = {
     "second material": Feature(
         ("bsdfs/roughconductor.py",),
         lambda scene: _material(scene, **{"type": "roughconductor", "material": "Au", "alpha": 0.2}),
-        ("world.bsdfs.1",),
+        ("world.materials.parameters.1",),
     ),
     "refraction": Feature(
-        ("bsdfs/dielectric.py",), lambda scene: _material(scene, type="dielectric"), ("world.bsdfs.1",), ("eta",)
+        ("bsdfs/dielectric.py",), lambda scene: _material(scene, type="dielectric"), ("world.materials.parameters.1",), ("eta",)
     ),
     "texture": Feature(
-        ("textures.py",), lambda scene: _material(scene, reflectance=_squares()), ("world.textures", "world.uvs")
+        ("textures/atlas.py",),
+        lambda scene: _material(scene, reflectance=_squares()),
+        ("world.textures.atlas", "world.geometry.uvs"),
     ),
     "normal map": Feature(
         ("integrators/relief.py",),
         lambda scene: _material(scene, normal_map=_squares(color0=[0.6, 0.45, 0.95], color1=[0.4, 0.5, 0.95])),
-        ("world.textures", "world.tangents"),
+        ("world.textures.atlas", "world.geometry.tangents"),
     ),
     "opacity": Feature(
-        ("integrators/search.py",), lambda scene: _material(scene, opacity=0.5), ("world.opacity",), ("clear",)
+        ("integrators/search.py",), lambda scene: _material(scene, opacity=0.5), ("world.materials.opacity",), ("clear",)
     ),
     "constant sky": Feature(
-        ("lights/constant.py",),
+        ("lights/kinds/constant.py",),
         lambda scene: _light(scene, type="constant", radiance=0.3),
         ("world.lights.environment",),
     ),
     "environment map": Feature(
-        ("lights/envmap.py",),
+        ("lights/kinds/envmap.py",),
         lambda scene: _light(scene, type="envmap", path=str(_SCENES / "sky.exr")),
         ("world.lights.environment",),
-        module="torchpt.lights.envmap",
+        module="torchpt.lights.kinds.envmap",
     ),
-    "point light": Feature(("lights/point.py",), lambda scene: _light(scene, type="point", position=[1, 2, 1], intensity=5)),
+    "point light": Feature(
+        ("lights/kinds/point.py",), lambda scene: _light(scene, type="point", position=[1, 2, 1], intensity=5)
+    ),
     "layer": Feature(
         ("integrators/aov.py",), lambda scene: scene["film"].update(aovs=["normal"]), module="torchpt.integrators.aov"
     ),

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.format.description import settings
 from torchpt.forward import kernels_of, make_wave
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.loop.chunk import Chunk, Worker
@@ -31,7 +32,6 @@ from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
 from torchpt.records import Hit, PathState, Shadow, rows
 from torchpt.samplers import salts
-from torchpt.scene.description import settings
 
 __all__ = ["ALLOWED", "TOLERANCE", "Differences", "compare", "loaded", "prepared", "run_bounce", "waves"]
 
@@ -249,7 +249,7 @@ def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recor
             if roulette is not natural and (model, roulette) in done:
                 continue
             done.add((model, roulette))
-            name = f"{kind} bounce {world.models[model]}{' with roulette' if roulette else ''}"
+            name = f"{kind} bounce {world.materials.models[model]}{' with roulette' if roulette else ''}"
             after, _, shadow = Stages.bounce(
                 recorder, model, roulette, False, _none, state, hit, index, salts(depth, torch.device("cpu"))
             )

@@ -10,11 +10,11 @@ from trials import film_of
 
 import torchpt
 from torchpt import forward
+from torchpt.format.description import settings
 from torchpt.integrators import compiled
 from torchpt.integrators.loop import kernels
 from torchpt.integrators.loop.schedule import Loop
 from torchpt.render import Rendering, render_scene
-from torchpt.scene.description import settings
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
 

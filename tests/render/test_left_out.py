@@ -15,10 +15,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
+from torchpt.format.description import settings
 from torchpt.integrators.loop import kernels as loop_kernels
 from torchpt.lanes.program import Program
 from torchpt.records import tensors_of
-from torchpt.scene.description import settings
 
 
 class _Counter(TorchDispatchMode):

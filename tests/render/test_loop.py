@@ -19,6 +19,7 @@ from trials import coarse, film_of
 import torchpt
 from torchpt.bsdfs import MODELS
 from torchpt.film import Film
+from torchpt.format.description import settings
 from torchpt.forward import kernels_of
 from torchpt.integrators.aov import CHANNELS
 from torchpt.integrators.loop.chunk import Chunk, Worker
@@ -28,7 +29,6 @@ from torchpt.integrators.stages import STRATEGIES
 from torchpt.records import Hit, rows
 from torchpt.render import Rendering, render_scene
 from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.scene.description import settings
 
 SCENES = sorted(path.stem for path in Path("configs/scene").glob("*.yaml")) or ["cornell_box"]
 DIFFUSE = ("cornell_box", "cornell_bunny", "cornell_statue_bunny_diffuse", "games101")
@@ -120,7 +120,7 @@ def test_what_goes_where_after_a_hit():
         wanted = torch.addcmul(state.radiance, light, clear)
         held = kernels.state.take(here, np.arange(n), ("radiance",))["radiance"]
         assert torch.allclose(held, wanted, rtol=1e-6, atol=0)
-        key = wave.stages.world.key[wave.stages.world.slot(hit.prim) + 1].long()
+        key = wave.stages.world.materials.key[wave.stages.world.geometry.slot(hit.prim) + 1].long()
         alive = state.t_max > 0
         expected = [(key == m) | (key == 2 + m) for m in range(2)]
         expected += [(key < 2) & (hit.prim >= 0), (hit.prim < 0) & alive]

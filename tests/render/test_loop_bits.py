@@ -17,12 +17,12 @@ from trials import film_of
 
 import torchpt
 from torchpt.errors import RenderError
+from torchpt.format.description import settings
 from torchpt.forward import BYTES_PER_LANE
 from torchpt.integrators.loop import schedule
 from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.path import Tally
 from torchpt.render import Progress, Rendering, render_scene
-from torchpt.scene.description import settings
 
 FILM = {**film_of(37, 23), "filter": "mitchell", "aovs": ["albedo", "normal", "variance"]}
 

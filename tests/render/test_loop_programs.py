@@ -18,13 +18,13 @@ from trials import film_of
 import torchpt
 from torchpt import forward
 from torchpt.bsdfs import Parameters
+from torchpt.format.description import settings
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.lanes import engine
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.warps import cosine_hemisphere
 from torchpt.records import BsdfSample
 from torchpt.render import Rendering, render_scene
-from torchpt.scene.description import settings
 
 
 def rendered(scene: torchpt.Scene, params: Any = None, **wishes: Any) -> Rendering:
@@ -258,7 +258,7 @@ def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
     capsys.readouterr()
     monkeypatch.setattr("torchpt.integrators.compiled.Stages.bounce", noted)
     found = rendered(scene, render={"spp": 4})
-    models = scene.world(torch.float32)[0].models
+    models = scene.world(torch.float32)[0].materials.models
     (own,) = [k for k, model in enumerate(models) if model.name == "odd"]
     assert set(asked) == {own}  # the others run as kernels
     assert len(found.eager) == 1 and "bessel_j0" in found.eager[0] and "odd" in found.eager[0]

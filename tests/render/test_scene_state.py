@@ -10,8 +10,8 @@ import torch
 import torchpt
 from torchpt import forward
 from torchpt.errors import SceneError
+from torchpt.format.description import settings
 from torchpt.render import render_scene
-from torchpt.scene.description import settings
 from torchpt.scene.sources import labels_of
 
 LAMP = {

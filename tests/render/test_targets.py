@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import torchpt
+from torchpt.format.description import settings
 from torchpt.integrators.loop import kernels
 from torchpt.lanes import engine
 from torchpt.render import render_scene
-from torchpt.scene.description import settings
 
 pytestmark = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="these are x86 machines")
 

@@ -10,8 +10,8 @@ import torch
 
 import torchpt
 from torchpt.errors import SceneError
+from torchpt.format.description import settings
 from torchpt.render import Rendering, render_scene
-from torchpt.scene.description import settings
 
 DOWN = {"rotate": {"axis": [1, 0, 0], "angle": 90}}
 SHEAR = {"matrix": [[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}

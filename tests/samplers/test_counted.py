@@ -9,9 +9,9 @@ from trials import SIGNIFICANCE, film_of, grid_cells, shoot, uniform_p, z_limit
 
 import torchpt
 from torchpt.errors import NotBuiltError, SceneError
+from torchpt.format.description import read_description, settings
 from torchpt.samplers import KINDS, Dimension, Sampler, salts, zsobol
 from torchpt.samplers.shuffling import shuffle
-from torchpt.scene.description import read_description, settings
 
 CPU = torch.device("cpu")
 COUNTED = [kind for kind, module in KINDS.items() if module.NEEDS_COUNT]

@@ -93,7 +93,7 @@ def test_rays_leave_copies():
     reach = torch.full((n,), torch.inf)
     accel = scene.accel("numba", None)
     t, prim, u, v = accel.intersect(o, d, reach)
-    copied = prim >= len(world.bound)
+    copied = prim >= len(world.geometry.bound)
     assert copied.sum() > 2000
     o, d = o[:, copied], d[:, copied]
     at = interact(world, o, d, Hit(t[copied], prim[copied].long(), u[copied], v[copied]))
@@ -162,7 +162,7 @@ def test_more_primitives_than_ids_are_refused(monkeypatch):
 
 def test_info_counts_instances():
     scene = torchpt.load(described(False), "cpu")
-    from torchpt.scene.description import settings
+    from torchpt.format.description import settings
 
     told = scene.info(settings(scene.description))
     assert told["scene"]["instances"] == 3 and told["built"]["accel"]["instances"] == 3

@@ -109,5 +109,5 @@ def test_the_offset_knows_no_world_unit():
     for scale in (1e-4, 1.0, 1e6):
         shape = {**SHAPES["rectangle"], "transform": [SPIN, {"translate": [0, 0, 1]}, {"scale": scale}]}
         world, _ = load(shape).world(torch.float32)
-        scales.append(float(world.bound[0]) / scale)
+        scales.append(float(world.geometry.bound[0]) / scale)
     assert max(scales) == pytest.approx(min(scales), rel=1e-4)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpt.scene.loaders import load_mesh, unit_cube
+from torchpt.meshes import load_mesh, unit_cube
 from torchpt.shapes.normals import smooth_normals
 
 BUNNY = Path(os.environ.get("TORCHPT_ASSETS", "")) / "bunny.ply"

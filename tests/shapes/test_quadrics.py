@@ -28,7 +28,7 @@ def scene_of(name: str, placed: str) -> tuple[torchpt.Scene, dict[str, Any], np.
     case, operations = CASES[name], TRANSFORMS[placed]
     scene = torchpt.load({"camera": CAMERA, "shapes": {"s": {**case, "transform": operations}}}, device="cpu")
     # Not rounded to float32, so that both sides mean the same surface.
-    scene.params["shapes.s.to_world"] = torch.from_numpy(scene.parts.parameters["shapes.s.to_world"])
+    scene.params["shapes.s.to_world"] = torch.from_numpy(scene.built.parameters["shapes.s.to_world"])
     return scene, case, compose(operations) if operations else np.eye(4)
 
 
@@ -58,7 +58,7 @@ def check(name: str, placed: str, n: int, seed: int, backends: tuple[str, ...]) 
     o, d, t_max = aimed(matrix, n, seed)
     truth = trace(case, matrix, o.numpy(), d.numpy())
     world, _ = scene.world(torch.float32)
-    first = sum(world.counts[:3])
+    first = sum(world.geometry.counts[:3])
     capped = case.get("capped", True) and case["type"] != "sphere"
     distance = np.linalg.norm(o.numpy(), axis=0)
     sure = truth["margin"] > (CAP * (1 + distance) * (1e3 if placed in ("needle", "sliver") else 1) if capped else SIDE)
@@ -81,13 +81,13 @@ def check(name: str, placed: str, n: int, seed: int, backends: tuple[str, ...]) 
         exact = o.double() + d.double() * torch.from_numpy(truth["t"])
         away = (at.p.double() - exact[:, side]).norm(dim=0)
         scale = float(np.abs(matrix).sum()) + (
-            0 if world.counts[4] else torch.from_numpy(distance)[side]
+            0 if world.geometry.counts[4] else torch.from_numpy(distance)[side]
         )  # spheres go by o + t d
         assert (away / scale).max() < 2e-6
         bend = torch.from_numpy(truth["normal"])[:, side]
         loose = {"needle": 2e-3, "sliver": 2e-3}.get(placed, 6e-6)  # normals turn quickly where a shape is thin
-        assert ((at.ng - bend).norm(dim=0) / (1 if world.counts[4] else 1 + scale)).max() < loose
-        if world.counts[4]:
+        assert ((at.ng - bend).norm(dim=0) / (1 if world.geometry.counts[4] else 1 + scale)).max() < loose
+        if world.geometry.counts[4]:
             assert at.own is not None
             uv = quadrics.surface_uv(quadrics.rows(world, at.prim).code, at.own).double()
             apart = (uv - torch.from_numpy(truth["uv"])[:, side]).abs()
@@ -124,7 +124,7 @@ def test_rays_leave_on_their_own_side(name, placed):
     o, d, t_max = aimed(matrix, 60_000, 5)
     t, prim, u, v = scene.accel("numba", None).intersect(o, d, t_max)
     world, _ = scene.world(torch.float32)
-    side = prim >= sum(world.counts[:3])
+    side = prim >= sum(world.geometry.counts[:3])
     o, d, hit = o[:, side], d[:, side], Hit(t[side], prim[side].long(), u[side], v[side])
     at = interact(world, o, d, hit)
     g = torch.Generator().manual_seed(6)
@@ -159,13 +159,18 @@ def test_bounds_are_tight():
     for name in ("sphere", "tube", "funnel"):
         scene, _, _ = scene_of(name, "sheared")
         world, geometry = scene.world(torch.float64)
-        assert world.quadrics is not None
+        assert world.geometry.quadrics is not None
         low, high = primitive_bounds(geometry)
         g = torch.Generator().manual_seed(7)
         n = 400_000
-        code = world.quadrics.code.expand(n)
+        code = world.geometry.quadrics.code.expand(n)
         own = quadrics.sample(code, torch.rand(2, n, generator=g, dtype=torch.float64))
-        p = world.p0 + world.e1 * own[0] + world.e2 * own[1] + world.quadrics.e3 * own[2]
+        p = (
+            world.geometry.p0
+            + world.geometry.e1 * own[0]
+            + world.geometry.e2 * own[1]
+            + world.geometry.quadrics.e3 * own[2]
+        )
         assert (p >= low).all() and (p <= high).all()
         reach = (high - low).double()
         assert ((p.amin(1, keepdim=True) - low) < 0.02 * reach).all()
@@ -199,12 +204,12 @@ def test_points_follow_their_rays_and_transforms(name):
 def test_tangents_are_the_inverse_of_how_texture_coordinates_change(name):
     scene, _, _ = scene_of(name, "sheared")
     world, _ = scene.world(torch.float64)
-    assert world.quadrics is not None
+    assert world.geometry.quadrics is not None
     n = 2000
-    code = world.quadrics.code.expand(n)
+    code = world.geometry.quadrics.code.expand(n)
     own = quadrics.sample(code, torch.rand(2, n, generator=torch.Generator().manual_seed(2), dtype=torch.float64))
-    e1, e2, e3 = (x.expand(3, n) for x in (world.e1, world.e2, world.quadrics.e3))
-    inverse = torch.linalg.inv(torch.cat((world.e1, world.e2, world.quadrics.e3), 1))
+    e1, e2, e3 = (x.expand(3, n) for x in (world.geometry.e1, world.geometry.e2, world.geometry.quadrics.e3))
+    inverse = torch.linalg.inv(torch.cat((world.geometry.e1, world.geometry.e2, world.geometry.quadrics.e3), 1))
     p = (e1 * own[0] + e2 * own[1] + e3 * own[2]).requires_grad_()
     u, v = quadrics.surface_uv(code, inverse @ p)
     slopes = [torch.autograd.grad(x.sum(), p, retain_graph=True)[0] for x in (u, v)]

@@ -76,7 +76,9 @@ class Accel(ABC):
         """
         return None
 
-    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None) -> None:
+    def blocked(
+        self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
+    ) -> None:
         """Whether anything lies in ``(0, t_max)``: 1 or 0 in ``out (C,)`` int32; else as :meth:`nearest`.
 
         Args:
@@ -85,12 +87,12 @@ class Accel(ABC):
             t_max: likewise.
             count: how many rays.
             out: ``(C,)`` int32, filled.
-            veils: a uint8 for each primitive, not 0 where light may pass it. A ray gets 2 where it may be that all it meets
-                lets light pass, so that it has to be looked at closer.
+            non_opaque: a uint8 for each primitive, not 0 where light may pass it. A ray gets 2 where it
+                may be that all it meets lets light pass, so that it has to be looked at closer.
         """
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         out[:count] = self.occluded(*rays).numpy()
-        closer(out[:count], veils)
+        closer(out[:count], non_opaque)
 
     @abstractmethod
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits: ...
@@ -103,9 +105,9 @@ class Accel(ABC):
         """What was built: name, primitives, nodes, leaves, sah_cost, depth, bytes, build_seconds."""
 
 
-def closer(out: Array, veils: Array | None) -> None:
-    """What was found without a look at ``veils`` as :meth:`Accel.blocked` tells it: 2 for 1 where there are any."""
-    if veils is not None:
+def closer(out: Array, non_opaque: Array | None) -> None:
+    """What was found without a look at ``non_opaque`` as :meth:`Accel.blocked` tells it: 2 for 1 where there are any."""
+    if non_opaque is not None:
         np.left_shift(out, 1, out=out)
 
 

@@ -85,12 +85,14 @@ class Brute(Accel):
         results = (t[:count], prim[:count], u[:count], v[:count])
         kernels.intersect(0, blocks, o, d, t_max[:count], *self.arrays, *results)
 
-    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None) -> None:
+    def blocked(
+        self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
+    ) -> None:
         """See :meth:`Accel.blocked`."""
         from torchpt.accel import kernels_brute as kernels
 
         kernels.occluded(0, -(-count // kernels.BLOCK), o, d, t_max[:count], *self.arrays, out[:count])
-        closer(out[:count], veils)
+        closer(out[:count], non_opaque)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; there are no nodes, and the cost is one test a primitive."""

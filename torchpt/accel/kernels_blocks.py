@@ -42,11 +42,11 @@ __all__ = [
     "IDS",
     "LEAF",
     "LINE",
+    "MAY_PASS",
     "MORE",
     "NODE",
     "PLANES",
     "SLACK",
-    "VEILED",
     "blocking",
     "boxes",
     "crossed",
@@ -65,7 +65,7 @@ PLANES, IDS = 72, 104  # where a leaf's planes and ids begin
 SLACK = np.float32(1.0 + 2.0**-16)
 FLOOR = np.float32(1.0 - 2.0**-17)
 #: In place of an id: an any-hit ray has met surfaces that may let light pass, and no others yet.
-VEILED = np.int32(-2)
+MAY_PASS = np.int32(-2)
 _ZERO = np.float32(0.0)
 _INF = np.float32(np.inf)
 
@@ -84,11 +84,11 @@ def triangles_alone(code):
 
 @part(forceinline=True)
 def blocking(scene, prim):
-    """The id of a primitive that any-hit rays end at, or :data:`VEILED`.
+    """The id of a primitive that any-hit rays end at, or :data:`MAY_PASS`.
 
     ``scene`` ends with a uint8 for each primitive, not 0 where light may pass, and how many there are: none where all block.
     """
-    return VEILED if scene[5] > 0 and item(scene[4], prim) != 0 else prim
+    return MAY_PASS if scene[5] > 0 and item(scene[4], prim) != 0 else prim
 
 
 @part(forceinline=True)

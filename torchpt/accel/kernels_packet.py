@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchpt.accel.kernels_blocks import CHILDREN, FLOOR, IDS, PLANES, SLACK, VEILED, blocking, place, push
+from torchpt.accel.kernels_blocks import CHILDREN, FLOOR, IDS, MAY_PASS, PLANES, SLACK, blocking, place, push
 from torchpt.accel.kernels_others import FOURTH, RECTANGLES, RULED, others
 from torchpt.accel.kernels_rays import AXIS, BEST, COLUMNS, DIRECTION, INVERSE, ORIGIN, SHEAR
 from torchpt.native.jit import part
@@ -238,7 +238,7 @@ def deliver(i, out, best, prim, u, v, any_hit):
     """Writes the hits of 16 rays, or for each 1 where it is blocked, 2 where it met what may let light pass, else 0."""
     missed = prim < splat(np.int32(0), 16)
     if any_hit:
-        open_ = select(prim == splat(VEILED, 16), splat(np.int32(2), 16), splat(np.int32(0), 16))
+        open_ = select(prim == splat(MAY_PASS, 16), splat(np.int32(2), 16), splat(np.int32(0), 16))
         store(out[1], i, select(missed, open_, splat(np.int32(1), 16)))
     else:
         store(out[0], i, select(missed, splat(_INF, 16), best))

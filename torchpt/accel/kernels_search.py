@@ -46,7 +46,7 @@ def _none():
 
 
 @part(inline="always")
-def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, t, prim, u, v, any_hit):
+def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, t, prim, u, v, any_hit):
     """:func:`_trace` with its memory; the rays beyond the last sixteen in memory of their own."""
     room = kinds[4]
     keys, parents = np.empty(TURNS * room, np.int32), np.empty(TURNS * room, np.int32)
@@ -54,7 +54,7 @@ def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
     columns, numbers = np.empty(FLOATS, np.float32), np.empty(NUMBERS, np.int32)
     lanes, kept = np.empty(SPARE, np.float32), np.empty(RAYS, np.int32)
     tables = (pointer(corner), pointer(rows), pointer(quadrics))
-    scene = (pointer(tree), pointer(codes), tables, pointer(kinds), pointer(veils), len(veils))
+    scene = (pointer(tree), pointer(codes), tables, pointer(kinds), pointer(non_opaque), len(non_opaque))
     work = (pointer(keys), pointer(parents), pointer(slots), pointer(scratch))
     held = (pointer(columns), pointer(numbers))
     spare = (pointer(lanes), pointer(kept), pointer(scratch))
@@ -117,20 +117,22 @@ def nearest_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quad
 
 
 @jit()
-def blocked(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out):
+def blocked(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, out):
     """What stands in the way of rays ``first <= i < last``: 1 in ``out`` ``(N,)`` int32 for what blocks, 0 for nothing.
 
-    Where ``veils`` is not empty it holds a uint8 for each primitive, not 0 where light may pass: 2 in ``out`` is for rays that
-    meet such primitives alone.
+    Where ``non_opaque`` is not empty it holds a uint8 for each primitive, not 0 where light may pass: 2 in ``out`` is
+    for rays that meet such primitives alone.
     """
-    _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, t_max, out, t_max, t_max, True)
+    _search(
+        first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, t_max, out, t_max, t_max, True
+    )
 
 
 @jit(parallel=True)
-def blocked_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out):
+def blocked_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, out):
     """:func:`blocked` over the rays in equal pieces, which the threads take in turn."""
     pieces = chunks * PIECES
     for c in prange(chunks):
         for k in range(c, pieces, chunks):
             a, b = k * items // pieces, (k + 1) * items // pieces
-            blocked(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, veils, out)
+            blocked(a, b, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, out)

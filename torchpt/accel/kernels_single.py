@@ -57,7 +57,7 @@ def nearer(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch):
 
 @part(forceinline=True)
 def blocker(scene, base, met, sz, o, d, floor, best, prim, shift):
-    """The id of a triangle that :func:`crossed` has found and that lets no light pass; else :data:`VEILED` or ``prim``."""
+    """The id of a triangle that :func:`crossed` has found and that lets no light pass; else :data:`MAY_PASS` or ``prim``."""
     tree, codes = scene[0], scene[1]
     t, ahead = planes(tree, base, o, d, met[1], met[2], met[3], splat(sz, 8), floor)
     w = bits(met[0] & ahead & (t < splat(best, 8)))

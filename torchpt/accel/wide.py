@@ -23,7 +23,7 @@ from torchpt.records import Geometry
 __all__ = ["Wide"]
 
 _GRAIN = 512  # rays that repay another thread
-_NO_VEILS = np.empty(0, np.uint8)
+_ALL_OPAQUE = np.empty(0, np.uint8)
 
 
 class Wide(Accel):
@@ -78,9 +78,11 @@ class Wide(Accel):
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
         compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
-    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None) -> None:
+    def blocked(
+        self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
+    ) -> None:
         """See :meth:`Accel.blocked`."""
-        args = (o, d, t_max, *self.arrays, _NO_VEILS if veils is None else veils, out)
+        args = (o, d, t_max, *self.arrays, _ALL_OPAQUE if non_opaque is None else non_opaque, out)
         compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
 
     def describe(self) -> dict[str, Any]:
@@ -129,7 +131,7 @@ def _(o, d, t_max, tensors, threads):
 def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], threads: int) -> Tensor:
     out = torch.empty_like(t_max, dtype=torch.int32)
     rays = (x.contiguous().numpy() for x in (o, d, t_max))
-    args = (*rays, *_arrays(tensors), _NO_VEILS, out.numpy())
+    args = (*rays, *_arrays(tensors), _ALL_OPAQUE, out.numpy())
     launch(kernels.blocked, kernels.blocked_parallel, t_max.shape[0], threads, _GRAIN, args)
     return out != 0
 

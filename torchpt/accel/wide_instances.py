@@ -104,12 +104,14 @@ class WideInstanced(Accel):
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
         compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
-    def blocked(self, o: Array, d: Array, t_max: Array, count: int, out: Array, veils: Array | None = None) -> None:
-        """See :meth:`Accel.blocked`; where there are veils, every ray that meets anything is to be looked at closer."""
+    def blocked(
+        self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
+    ) -> None:
+        """See :meth:`Accel.blocked`; where there are non_opaque, every ray that meets anything is to be looked at closer."""
         self.base.blocked(o, d, t_max, count, out)
         args = (o, d, t_max, *self.arrays, out)
         compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
-        closer(out[:count], veils)
+        closer(out[:count], non_opaque)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost is that of what is no copy."""

@@ -94,7 +94,7 @@ def described(job: Job) -> tuple[Any, Any]:
     Raises:
         TorchptError: a scene or setting that cannot be used.
     """
-    from torchpt.scene.description import read_description, settings
+    from torchpt.format.description import read_description, settings
 
     description = read_description(job.scene)
     for group, block in job.overrides.items():

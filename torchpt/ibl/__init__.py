@@ -6,13 +6,13 @@
 from torchpt.ibl.convolve import irradiance_map, prefiltered, roughnesses
 from torchpt.ibl.cube import cube_to_equirect, equirect_to_cube
 from torchpt.ibl.points import hammersley, van_der_corput
-from torchpt.ibl.shading import IblMaps, Sky, Surface, fresnel, maps, shade
+from torchpt.ibl.shading import IblMaps, Sky, SplitSumMaterial, fresnel, maps, shade
 from torchpt.ibl.table import brdf_table
 
 __all__ = [
     "IblMaps",
     "Sky",
-    "Surface",
+    "SplitSumMaterial",
     "brdf_table",
     "cube_to_equirect",
     "equirect_to_cube",

@@ -18,7 +18,7 @@ from torchpt.ibl.equirect import coordinates, corners
 from torchpt.ibl.table import brdf_table
 from torchpt.math.vectors import dot, take
 
-__all__ = ["F0", "IblMaps", "Sky", "Surface", "fresnel", "maps", "shade"]
+__all__ = ["F0", "IblMaps", "Sky", "SplitSumMaterial", "fresnel", "maps", "shade"]
 
 #: Reflectance at normal incidence of what is no metal.
 F0 = 0.04
@@ -108,13 +108,13 @@ def shade(
     coloured = isinstance(f0, Tensor) and f0.dim() > 0 and f0.shape[-1] == 3 and f0.dim() in (1, len(shape))
     clear = lanes(f0) if coloured and isinstance(f0, Tensor) else numbers("f0", f0)
     color = clear + (base - clear) * metal
-    surface = Surface(base * (1.0 - metal), color, torch.ones_like(rough), rough, color)
+    surface = SplitSumMaterial(base * (1.0 - metal), color, torch.ones_like(rough), rough, color)
     out = Sky.of(maps).reflected(lanes(n), lanes(v), surface)
     return out.T.reshape(shape)
 
 
 @dataclass(frozen=True)
-class Surface:
+class SplitSumMaterial:
     """What split-sum shading knows of surfaces.
 
     Attributes:
@@ -132,7 +132,7 @@ class Surface:
     over: Tensor | None
 
 
-def fresnel(cosine: Tensor, f0: Tensor, surface: Surface) -> Tensor:
+def fresnel(cosine: Tensor, f0: Tensor, surface: SplitSumMaterial) -> Tensor:
     """Schlick's ``F0 + (max((1 - roughness) F90, F0) - F0)(1 - cosine)^5``: rough surfaces rise less toward grazing."""
     grazing = 1.0 - cosine
     weight = (grazing * grazing) * (grazing * grazing) * grazing
@@ -177,7 +177,7 @@ class Sky:
             len(maps.brdf),
         )
 
-    def reflected(self, n: Tensor, v: Tensor, surface: Surface) -> Tensor:
+    def reflected(self, n: Tensor, v: Tensor, surface: SplitSumMaterial) -> Tensor:
         """Radiance ``(3, N)`` toward unit ``v (3, N)`` off surfaces with unit normals ``n (3, N)``."""
         cosine = dot(n, v)
         mirrored = torch.addcmul(-v, n, 2.0 * cosine)

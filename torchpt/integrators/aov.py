@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchpt.integrators.path import partition
 from torchpt.integrators.search import Search
-from torchpt.integrators.surfaces import parameters_at, shading_normal, spot_at
+from torchpt.integrators.surfaces import parameters_at, shading_normal, texture_point_at
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, rows
 from torchpt.shapes import interact, surface_uv
@@ -32,7 +32,7 @@ def first_hit(
     """The layers ``names``, each ``(C, N)``, for camera rays ``state``.
 
     ``albedo`` is the material's reflectance, ``normal`` the shading normal in the world, ``depth`` the distance from the
-    camera, ``object_id`` the order of the shape in the scene, from 1. ``pixel``: see ``surfaces.spot_at``.
+    camera, ``object_id`` the order of the shape in the scene, from 1. ``pixel``: see ``surfaces.texture_point_at``.
     """
     hit = search.nearest(state, 1)
     layers = {name: torch.zeros(CHANNELS[name], len(hit.t), dtype=dtype, device=centre.device) for name in names}
@@ -58,13 +58,13 @@ def values(
 ) -> dict[str, Tensor]:
     """The layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of one model; see :func:`first_hit`."""
     at = interact(world, o, d, hit)
-    spot = spot_at(world, model, at, pixel)
+    point = texture_point_at(world, model, at, pixel)
     found: dict[str, Tensor] = {}
     if "albedo" in names:
-        parameters = parameters_at(world, model, take(world.material, at.slot), at, spot)
-        found["albedo"] = world.models[model].albedo(parameters)
+        parameters = parameters_at(world, model, take(world.materials.row, at.slot), at, point)
+        found["albedo"] = world.materials.models[model].albedo(parameters)
     if "normal" in names:
-        found["normal"] = shading_normal(world, model, d, at, spot)
+        found["normal"] = shading_normal(world, model, d, at, point)
     if "uv" in names:
         found["uv"] = surface_uv(world, at)
     if "depth" in names:
@@ -72,5 +72,5 @@ def values(
     if "position" in names:
         found["position"] = at.p + centre.to(dtype)[:, None]
     if "object_id" in names:
-        found["object_id"] = take(world.object_id, at.slot).to(dtype)[None]
+        found["object_id"] = take(world.geometry.object_id, at.slot).to(dtype)[None]
     return found

@@ -37,7 +37,8 @@ class Stages:
     """The stages, eager: always complete and correct.
 
     Attributes:
-        pixel: how large a pixel is in the world, see :func:`torchpt.integrators.surfaces.spot_at`; None where nothing asks.
+        pixel: how large a pixel is in the world, see :func:`torchpt.integrators.surfaces.texture_point_at`;
+            None where nothing asks.
     """
 
     compiled = False
@@ -136,7 +137,7 @@ class CompiledStages(Stages):
         ) -> tuple[PathState, Hit | None, Shadow | None]:
             return stages.bounce(self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, pixel)
 
-        name = f"bounce {self.world.models[model]}"
+        name = f"bounce {self.world.materials.models[model]}"
         return self._get(name, (model, roulette, slide), stage)(state, hit, _padded(index), salts, self.pixel)
 
     def _get(self, name: str, variant: tuple[Any, ...], stage: Callable[..., Any]) -> Callable[..., Any]:
@@ -152,7 +153,7 @@ class CompiledStages(Stages):
         from torch.fx.experimental import _config
 
         options: dict[str, Any] = {"assert_indirect_indexing": False}
-        if self.world.textures is not None:
+        if self.world.textures.atlas is not None:
             options["realize_opcount_threshold"] = REALIZE
 
         def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Any:

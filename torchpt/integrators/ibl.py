@@ -99,7 +99,7 @@ def shaded(
     radiance = torch.zeros_like(state.radiance)
     if preview.sky is not None:
         n, v = preview.turned(surface.frame.n), preview.turned(-state.d)
-        radiance = state.throughput * under(preview.sky, world.models[model], surface.parameters, n, v)
+        radiance = state.throughput * under(preview.sky, world.materials.models[model], surface.parameters, n, v)
         if surface.shown is not None:
             radiance = radiance * surface.shown
     return radiance, shadow

@@ -58,13 +58,13 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
     gathered = torch.zeros_like(state.radiance)
 
     search = Search(accel, world, plan.sampler, plan.dtype)
-    if any(model.refracts for model in world.models):
+    if any(model.refracts for model in world.materials.models):
         state = replace(state, eta=torch.ones_like(state.t_max))
     if lights.local(world.lights):
         state = replace(state, p=state.o.clone(), n=torch.zeros_like(state.o))
     # Where a delta sends a ray on, its next point slides along it as the camera's does.
     exact = plan.attached or plan.dtype == torch.float64
-    sliding = exact and any(model.delta for model in world.models)
+    sliding = exact and any(model.delta for model in world.materials.models)
 
     def retire(index: Tensor) -> None:
         if len(index):
@@ -121,8 +121,8 @@ def partition(world: World, hit: Hit) -> tuple[Ends, list[tuple[int, Tensor]]]:
     Returns:
         Which lanes hit an emitter or nothing, and for each model present its number and lanes.
     """
-    models = len(world.models)
-    keys, order = torch.sort(take(world.key, world.slot(hit.prim) + 1), stable=True)
+    models = len(world.materials.models)
+    keys, order = torch.sort(take(world.materials.key, world.geometry.slot(hit.prim) + 1), stable=True)
     bounds = torch.searchsorted(keys, torch.arange(2 * models + 1, dtype=keys.dtype, device=keys.device)).tolist()
     bounds.append(len(order))
     groups = []

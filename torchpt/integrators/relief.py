@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpt.math.frames import Frame
 from torchpt.math.vectors import affine, cross, dot, normalize, take
 from torchpt.records import Interaction
-from torchpt.textures import Atlas, Look, slope
+from torchpt.textures import Atlas, MaterialTextures, slope
 
 __all__ = ["Relief", "mapped"]
 
@@ -34,8 +34,8 @@ class Relief:
 
 
 def mapped(
-    textures: Atlas,
-    look: Look,
+    atlas: Atlas,
+    textures: MaterialTextures,
     row: Tensor,
     local: Tensor | None,
     uv: Tensor,
@@ -52,12 +52,12 @@ def mapped(
     Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017): all as Mitsuba's ``normalmap`` and ``bumpmap``.
 
     Args:
-        textures: all of the scene.
-        look: of the model.
+        atlas: all of the scene.
+        textures: of the model.
         row: of the materials in it.
         local: what a normal map holds there ``(3, N)``; None where there is a bump map.
         uv: where textures are read.
-        footprint: see :class:`torchpt.integrators.surfaces.Spot`.
+        footprint: see :class:`torchpt.integrators.surfaces.TexturePoint`.
         d: directions of the rays that came.
         at: the points.
         side: see :class:`torchpt.integrators.surfaces.Surface`.
@@ -67,13 +67,13 @@ def mapped(
     if local is not None:
         local = local * 2.0 - 1.0
         x, y, z = local[0], local[1], local[2].clamp_min(1e-3)
-        if look.strength is not None:
-            strength = take(look.strength, row)
+        if textures.strength is not None:
+            strength = take(textures.strength, row)
             x, y = x * strength, y * strength
     else:
-        assert look.bump is not None and look.bump.nodes is not None and at.bitangent is not None
-        footprint = footprint if look.bump.filtered else None
-        du, dv = slope(textures, take(look.bump.nodes, row), uv, footprint)
+        assert textures.bump is not None and textures.bump.nodes is not None and at.bitangent is not None
+        footprint = footprint if textures.bump.filtered else None
+        du, dv = slope(atlas, take(textures.bump.nodes, row), uv, footprint)
         along = torch.addcmul(at.tangent, at.ns, du - dot(at.ns, at.tangent))
         across = torch.addcmul(at.bitangent, at.ns, dv - dot(at.ns, at.bitangent))
         x, y, z = base.to_local(cross(along, across))

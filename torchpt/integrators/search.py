@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
-from torchpt.integrators.surfaces import veil
+from torchpt.integrators.surfaces import opacity_map
 from torchpt.lanes.tracing import tracing
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, World, rows
@@ -25,18 +25,18 @@ PASSES = 1 << 13
 
 def passing(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
     """Opacity ``(N,)`` of what rays ``o, d`` hit; ``miss`` where they hit nothing."""
-    assert world.opacity is not None
+    assert world.materials.opacity is not None
     missed = hit.prim < 0
-    slot = world.slot(hit.prim).clamp_min(0)
-    opacity = torch.where(missed, miss, take(world.opacity, slot))
-    if world.veils is None:
+    slot = world.geometry.slot(hit.prim).clamp_min(0)
+    opacity = torch.where(missed, miss, take(world.materials.opacity, slot))
+    if world.textures.opacity is None:
         return opacity
-    textured = ~missed & (take(world.veils.nodes, slot) >= 0)
+    textured = ~missed & (take(world.textures.opacity.nodes, slot) >= 0)
     if tracing():  # in a loop over lanes each lane takes the same steps
-        return torch.where(textured, opacity * veil(world, interact(world, o, d, hit)), opacity)
-    veiled = textured.nonzero().squeeze(1)
-    at = interact(world, take(o, veiled), take(d, veiled), rows(hit, veiled))
-    return opacity.index_copy(0, veiled, take(opacity, veiled) * veil(world, at))
+        return torch.where(textured, opacity * opacity_map(world, interact(world, o, d, hit)), opacity)
+    some = textured.nonzero().squeeze(1)
+    at = interact(world, take(o, some), take(d, some), rows(hit, some))
+    return opacity.index_copy(0, some, take(opacity, some) * opacity_map(world, at))
 
 
 def beyond(world: World, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
@@ -60,11 +60,11 @@ class Search:
     def nearest(self, state: PathState, depth: int) -> Hit:
         """Where the rays of ``state`` meet a surface, at path vertex ``depth``."""
         hit = self._trace(state.o, state.d, state.t_max)
-        return hit if self._world.opacity is None else self._met(state, hit, depth)
+        return hit if self._world.materials.opacity is None else self._met(state, hit, depth)
 
     def clear(self, shadow: Shadow) -> Tensor:
         """How much of the light gets through ``(N,)``: 0 or 1 where all surfaces are opaque."""
-        if self._world.opacity is None:
+        if self._world.materials.opacity is None:
             return (~self._accel.occluded(shadow.o, shadow.d, shadow.t_max)).to(self._dtype)
         return self._filtered(shadow)
 

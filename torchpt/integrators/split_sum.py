@@ -18,7 +18,7 @@ from torchpt.bsdfs.conductor import metal_colour
 from torchpt.bsdfs.dielectric import tinted
 from torchpt.bsdfs.principled_lobes import tint
 from torchpt.bsdfs.roughconductor import alphas
-from torchpt.ibl import Sky, Surface, fresnel
+from torchpt.ibl import Sky, SplitSumMaterial, fresnel
 from torchpt.math.fresnel import fresnel_dielectric, fresnel_diffuse, refract
 from torchpt.math.vectors import dot
 
@@ -35,7 +35,7 @@ class _Approximation:
         eta: index of refraction ``(N,)`` of what lies below; None: light passes straight on.
     """
 
-    surface: Surface
+    surface: SplitSumMaterial
     through: Tensor | None = None
     eta: Tensor | None = None
 
@@ -71,7 +71,7 @@ def under(sky: Sky, model: Bsdf, parameters: Parameters, n: Tensor, v: Tensor) -
 
 def _matte(color: Tensor) -> _Approximation:
     none = torch.zeros_like(color[0])
-    return _Approximation(Surface(color, none, none, torch.ones_like(none), None))
+    return _Approximation(SplitSumMaterial(color, none, none, torch.ones_like(none), None))
 
 
 def _normal_incidence(eta: Tensor) -> Tensor:
@@ -89,7 +89,7 @@ def _metal(parameters: Parameters, roughness: Tensor) -> _Approximation:
     factor, one = parameters["specular_reflectance"], torch.ones_like(roughness)
     f0 = metal_colour(parameters, one)
     black = torch.zeros_like(f0)
-    return _Approximation(Surface(black, tinted(one, factor) * f0, tinted(one, factor), roughness, None))
+    return _Approximation(SplitSumMaterial(black, tinted(one, factor) * f0, tinted(one, factor), roughness, None))
 
 
 def _conductor(parameters: Parameters) -> _Approximation:
@@ -107,7 +107,7 @@ def _coat(parameters: Parameters, roughness: Tensor) -> _Approximation:
     one = torch.ones_like(eta)
     base = parameters["base"] * (1.0 - fresnel_diffuse(eta))
     f0 = _normal_incidence(eta)
-    return _Approximation(Surface(base, tinted(f0, factor), tinted(one, factor), roughness, f0))
+    return _Approximation(SplitSumMaterial(base, tinted(f0, factor), tinted(one, factor), roughness, f0))
 
 
 def _plastic(parameters: Parameters) -> _Approximation:
@@ -121,7 +121,9 @@ def _rough_plastic(parameters: Parameters) -> _Approximation:
 def _clear(parameters: Parameters, roughness: Tensor, f0: Tensor, eta: Tensor | None) -> _Approximation:
     one = torch.ones_like(f0)
     reflects, passes = parameters["specular_reflectance"], parameters["specular_transmittance"]
-    surface = Surface(torch.zeros_like(one).expand(3, -1), tinted(f0, reflects), tinted(one, reflects), roughness, f0)
+    surface = SplitSumMaterial(
+        torch.zeros_like(one).expand(3, -1), tinted(f0, reflects), tinted(one, reflects), roughness, f0
+    )
     return _Approximation(surface, tinted(one, passes), eta)
 
 
@@ -142,14 +144,14 @@ def _pane(parameters: Parameters) -> _Approximation:
 
 def _nothing(parameters: Parameters) -> _Approximation:
     none = torch.zeros(3, len(parameters["row"]), device=parameters["row"].device)
-    return _Approximation(Surface(none, none[0], none[0], none[0], none[0]), none + 1.0)
+    return _Approximation(SplitSumMaterial(none, none[0], none[0], none[0], none[0]), none + 1.0)
 
 
 def _lobe(parameters: Parameters, alpha2: Tensor, peak: Tensor | float) -> _Approximation:
     """A diffuse and a glossy lobe, added."""
     specular = parameters["specular"] * peak
     roughness = alpha2.clamp(0.0, 1.0).sqrt().sqrt()
-    return _Approximation(Surface(parameters["diffuse"], specular, specular, roughness, None))
+    return _Approximation(SplitSumMaterial(parameters["diffuse"], specular, specular, roughness, None))
 
 
 def _phong(parameters: Parameters) -> _Approximation:
@@ -165,14 +167,14 @@ def _blinn_phong(parameters: Parameters) -> _Approximation:
 def _nonmetal(parameters: Parameters) -> _Approximation:
     s = parameters["specular"]
     roughness = torch.where(parameters["smooth"], 0.0, parameters["alpha"].sqrt())
-    return _Approximation(Surface(parameters["base_color"], s, s, roughness, s))
+    return _Approximation(SplitSumMaterial(parameters["base_color"], s, s, roughness, s))
 
 
 def _microfacet(parameters: Parameters) -> _Approximation:
     specular = parameters["specular"]
     roughness = torch.where(parameters["smooth"], 0.0, parameters["alpha"].sqrt())
     f0 = _normal_incidence(parameters["ior"])
-    return _Approximation(Surface(parameters["diffuse"], f0 * specular, specular, roughness, f0))
+    return _Approximation(SplitSumMaterial(parameters["diffuse"], f0 * specular, specular, roughness, f0))
 
 
 def _principled(parameters: Parameters) -> _Approximation:
@@ -190,7 +192,7 @@ def _principled(parameters: Parameters) -> _Approximation:
     if through is not None:
         # Colour is taken at the way in and the way out.
         passing, rest = base.clamp_min(1e-12).sqrt() * (rest * through), rest * (1.0 - through)
-    surface = Surface(base * rest, f0, torch.ones_like(eta), (u * v).sqrt().sqrt(), over)
+    surface = SplitSumMaterial(base * rest, f0, torch.ones_like(eta), (u * v).sqrt().sqrt(), over)
     return _Approximation(surface, passing, None if through is None else eta)
 
 

@@ -17,7 +17,7 @@ from torchpt import lights
 from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.roulette import survived
-from torchpt.integrators.surfaces import Surface, glow, surface_at, veil
+from torchpt.integrators.surfaces import Surface, emission_map, opacity_map, surface_at
 from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import dot, largest, take
 from torchpt.math.warps import uniform_hemisphere, uniform_sphere
@@ -78,8 +78,8 @@ def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -
     # Where lights are chosen by place the density is that at the vertex itself, which is not quite where the ray begins.
     x = o if state.p is None else take(state.p, index)
     radiance, pdf = lights.emitted(world.lights, x, at, d, None if state.n is None else take(state.n, index))
-    if world.glows is not None:
-        radiance = radiance * glow(world, at)
+    if world.textures.emission is not None:
+        radiance = radiance * emission_map(world, at)
     return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
 
 
@@ -127,7 +127,7 @@ def bounce(
         hit: of the whole wave.
         index: lanes concerned ``(n,)``.
         salts: names of this depth's dimensions.
-        pixel: see :func:`torchpt.integrators.surfaces.spot_at`.
+        pixel: see :func:`torchpt.integrators.surfaces.texture_point_at`.
 
     Returns:
         The state of the ``n`` paths with their next rays, the next hits where they had to be found already, and the shadow
@@ -156,7 +156,7 @@ def shade(
     Returns:
         The surface, and the shadow rays (None where no light is sampled).
     """
-    surface, kind = surface_at(world, model, state.d, at, pixel), world.models[model]
+    surface, kind = surface_at(world, model, state.d, at, pixel), world.materials.models[model]
     if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
         return surface, None
     table = world.lights
@@ -201,17 +201,19 @@ def _shining(world: World, light: LightSample) -> Tensor:
     if light.at is None:
         return light.radiance
     share = torch.ones_like(light.radiance)
-    if world.glows is not None:
-        share = share * glow(world, light.at)
-    if world.veils is not None:
-        share = share * veil(world, light.at)
+    if world.textures.emission is not None:
+        share = share * emission_map(world, light.at)
+    if world.textures.opacity is not None:
+        share = share * opacity_map(world, light.at)
     return light.radiance * (share if light.bare is None else torch.where(light.bare, 1.0, share))
 
 
 def _leaning(world: World, model: int) -> bool:
     """Whether the shading normals of a model's surfaces may differ from the geometric ones."""
-    look = world.looks[model]
-    return world.normals is not None or (look is not None and (look.normal is not None or look.bump is not None))
+    textures = world.materials.textures[model]
+    return world.geometry.normals is not None or (
+        textures is not None and (textures.normal is not None or textures.bump is not None)
+    )
 
 
 def _through(at: Interaction, surface: Surface, world_wi: Tensor, wi: Tensor) -> Tensor:
@@ -236,7 +238,7 @@ def scatter(
     Where derivatives with respect to geometry are wanted, the next hit is found here already, since the throughput must
     follow both ends of the ray; it is returned beside the state.
     """
-    kind, frame, parameters, wo = world.models[model], surface.frame, surface.parameters, surface.wo
+    kind, frame, parameters, wo = world.materials.models[model], surface.frame, surface.parameters, surface.wo
     draws = Draws(plan.sampler, state.key, salts)
     u = draws.two(Dimension.BSDF).to(plan.dtype)
     if plan.strategy == "uniform" and not kind.delta:

@@ -14,23 +14,32 @@ from torchpt.math.frames import Frame
 from torchpt.math.vectors import cross, dot, luminance, normalize, take
 from torchpt.records import Interaction, World
 from torchpt.shapes import surface_uv, vertex_colors
-from torchpt.textures import Look, Pick, look_up
+from torchpt.textures import MaterialTextures, TextureBinding, look_up
 
-__all__ = ["Spot", "Surface", "glow", "parameters_at", "shading_normal", "spot_at", "surface_at", "veil"]
+__all__ = [
+    "Surface",
+    "TexturePoint",
+    "emission_map",
+    "opacity_map",
+    "parameters_at",
+    "shading_normal",
+    "surface_at",
+    "texture_point_at",
+]
 
 #: Seen more slantingly than this (as a cosine), a footprint grows no further.
 _SLANT = 1e-3
 
 
 @dataclass(frozen=True)
-class Spot:
+class TexturePoint:
     """Where textures are read."""
 
     uv: Tensor  # (2, N)
     footprint: Tensor | None  # (N,) area in texture coordinates; None: they are read at points
 
 
-def spot_at(world: World, number: int, at: Interaction, pixel: Tensor | None) -> Spot | None:
+def texture_point_at(world: World, number: int, at: Interaction, pixel: Tensor | None) -> TexturePoint | None:
     """Where the textures of model ``number`` are read; None where it reads no image.
 
     Args:
@@ -39,11 +48,11 @@ def spot_at(world: World, number: int, at: Interaction, pixel: Tensor | None) ->
         at: the points.
         pixel: how large a pixel is in the world, see :meth:`torchpt.cameras.Camera.pixel`; None: a point.
     """
-    look = world.looks[number]
-    if look is None or world.uvs is None:
+    textures = world.materials.textures[number]
+    if textures is None or world.geometry.uvs is None:
         return None
-    wide = look.filtered and pixel is not None
-    return Spot(surface_uv(world, at), _footprint(at, pixel) if wide and pixel is not None else None)
+    wide = textures.filtered and pixel is not None
+    return TexturePoint(surface_uv(world, at), _footprint(at, pixel) if wide and pixel is not None else None)
 
 
 def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
@@ -83,94 +92,107 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
         number: of the model that all of them have.
         d: directions ``(3, N)`` of the rays that came.
         at: the points.
-        pixel: see :func:`spot_at`.
+        pixel: see :func:`texture_point_at`.
     """
-    model, row = world.models[number], take(world.material, at.slot)
-    look = world.looks[number]
-    spot = spot_at(world, number, at, pixel)
+    model, row = world.materials.models[number], take(world.materials.row, at.slot)
+    textures = world.materials.textures[number]
+    point = texture_point_at(world, number, at, pixel)
     ns, side, shown, relief = at.ns, None, None, None
     if not model.transmits:
         side = torch.copysign(torch.ones_like(ns[0]), -dot(d, ns).detach())
-        both = world.two_sided[number]
+        both = world.materials.two_sided[number]
         if both is not None:
             shown = ((side > 0) | take(both, row)).to(side.dtype)
-    if look is not None and (look.normal is not None or look.bump is not None):
-        assert spot is not None
-        frame, relief = _mapped(world, look, row, spot, d, at, side)
+    if textures is not None and (textures.normal is not None or textures.bump is not None):
+        assert point is not None
+        frame, relief = _mapped(world, textures, row, point, d, at, side)
     else:
         ns = ns if side is None else ns * side
         frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
-    return Surface(frame, side, shown, parameters_at(world, number, row, at, spot), frame.to_local(-d), relief)
+    return Surface(frame, side, shown, parameters_at(world, number, row, at, point), frame.to_local(-d), relief)
 
 
-def parameters_at(world: World, number: int, row: Tensor, at: Interaction, spot: Spot | None) -> bsdfs.Parameters:
-    """Lane values of the BSDF ``number`` at rows ``(N,)``; ``spot`` where images are read."""
-    values, look = bsdfs.gather(world.bsdfs[number], row), world.looks[number]
-    if look is None:
+def parameters_at(
+    world: World, number: int, row: Tensor, at: Interaction, point: TexturePoint | None
+) -> bsdfs.Parameters:
+    """Lane values of the BSDF ``number`` at rows ``(N,)``; ``point`` where images are read."""
+    values, textures = bsdfs.gather(world.materials.parameters[number], row), world.materials.textures[number]
+    if textures is None:
         return values
-    return world.models[number].prepare(_filled(world, values, look.readings, row, at, spot))
+    return world.materials.models[number].prepare(_filled(world, values, textures.readings, row, at, point))
 
 
 def _filled(
-    world: World, values: bsdfs.Parameters, readings: dict[str, Any], row: Tensor, at: Interaction, spot: Spot | None
+    world: World,
+    values: bsdfs.Parameters,
+    readings: dict[str, Any],
+    row: Tensor,
+    at: Interaction,
+    point: TexturePoint | None,
 ) -> bsdfs.Parameters:
     """Values with those that textures give."""
     found = dict(values)
     for key, reading in readings.items():
-        if isinstance(reading, Pick):
-            found[key] = _read(world, reading, row, at, spot)
+        if isinstance(reading, TextureBinding):
+            found[key] = _read(world, reading, row, at, point)
         else:
-            found[key] = _filled(world, values.get(key, {}), reading, row, at, spot)
+            found[key] = _filled(world, values.get(key, {}), reading, row, at, point)
     return found
 
 
-def _read(world: World, pick: Pick, row: Tensor, at: Interaction, spot: Spot | None) -> Tensor:
-    if pick.nodes is None:
+def _read(world: World, binding: TextureBinding, row: Tensor, at: Interaction, point: TexturePoint | None) -> Tensor:
+    if binding.nodes is None:
         colors = vertex_colors(world, at)
-        if pick.channel is None:
+        if binding.channel is None:
             return colors
-        return colors[pick.channel] if pick.channel >= 0 else luminance(colors)
-    assert world.textures is not None and spot is not None
-    footprint = spot.footprint if pick.filtered else None
-    return look_up(world.textures, take(pick.nodes, row), spot.uv, pick.channel is None, footprint)
+        return colors[binding.channel] if binding.channel >= 0 else luminance(colors)
+    assert world.textures.atlas is not None and point is not None
+    footprint = point.footprint if binding.filtered else None
+    return look_up(world.textures.atlas, take(binding.nodes, row), point.uv, binding.channel is None, footprint)
 
 
-def veil(world: World, at: Interaction) -> Tensor:
+def opacity_map(world: World, at: Interaction) -> Tensor:
     """What textures make of the opacity ``(N,)`` of surfaces; 1 where they have no such texture."""
-    assert world.textures is not None and world.veils is not None
-    veils = world.veils
-    node = take(veils.nodes, at.slot)
-    value = look_up(world.textures, node.clamp_min(0), surface_uv(world, at), False)
-    value = torch.addcmul(take(veils.bias, at.slot), take(veils.factor, at.slot), value)
-    if veils.cutoff is not None:
-        cutoff = take(veils.cutoff, at.slot)
+    assert world.textures.atlas is not None and world.textures.opacity is not None
+    maps = world.textures.opacity
+    node = take(maps.nodes, at.slot)
+    value = look_up(world.textures.atlas, node.clamp_min(0), surface_uv(world, at), False)
+    value = torch.addcmul(take(maps.bias, at.slot), take(maps.factor, at.slot), value)
+    if maps.cutoff is not None:
+        cutoff = take(maps.cutoff, at.slot)
         value = torch.where(cutoff < 0, value, (value >= cutoff).to(value.dtype))
     return torch.where(node < 0, 1.0, value)
 
 
-def glow(world: World, at: Interaction) -> Tensor:
+def emission_map(world: World, at: Interaction) -> Tensor:
     """What textures make of the emission of surfaces ``(3, N)``; 1 where they have no such texture."""
-    assert world.textures is not None and world.glows is not None
-    node = take(world.glows, at.slot)
-    value = look_up(world.textures, node.clamp_min(0), surface_uv(world, at), True)
+    assert world.textures.atlas is not None and world.textures.emission is not None
+    node = take(world.textures.emission, at.slot)
+    value = look_up(world.textures.atlas, node.clamp_min(0), surface_uv(world, at), True)
     return torch.where(node < 0, 1.0, value)
 
 
-def shading_normal(world: World, number: int, d: Tensor, at: Interaction, spot: Spot | None) -> Tensor:
+def shading_normal(world: World, number: int, d: Tensor, at: Interaction, point: TexturePoint | None) -> Tensor:
     """The shading normal ``(3, N)`` on the shape's own outside, maps included."""
-    look = world.looks[number]
-    if look is None or (look.normal is None and look.bump is None):
+    textures = world.materials.textures[number]
+    if textures is None or (textures.normal is None and textures.bump is None):
         return at.ns
-    assert spot is not None
-    row = take(world.material, at.slot)
+    assert point is not None
+    row = take(world.materials.row, at.slot)
     side = torch.copysign(torch.ones_like(d[0]), -dot(d, at.ns))
-    return _mapped(world, look, row, spot, d, at, side)[0].n * side
+    return _mapped(world, textures, row, point, d, at, side)[0].n * side
 
 
 def _mapped(
-    world: World, look: Look, row: Tensor, spot: Spot, d: Tensor, at: Interaction, side: Tensor | None
+    world: World,
+    textures: MaterialTextures,
+    row: Tensor,
+    point: TexturePoint,
+    d: Tensor,
+    at: Interaction,
+    side: Tensor | None,
 ) -> tuple[Frame, Relief]:
     """The frame about the normal of a normal or bump map, and what the map did."""
-    assert world.textures is not None
-    local = None if look.normal is None else _read(world, look.normal, row, at, spot)
-    return mapped(world.textures, look, row, local, spot.uv, spot.footprint, d, at, side)
+    assert world.textures.atlas is not None
+    local = None if textures.normal is None else _read(world, textures.normal, row, at, point)
+    return mapped(world.textures.atlas, textures, row, local, point.uv, point.footprint, d, at, side)

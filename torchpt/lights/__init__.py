@@ -10,8 +10,13 @@ the light ``tree``.
 
 from __future__ import annotations
 
+from torchpt.lights.base import Light
 from torchpt.lights.choice import WAYS, choice_of, local
 from torchpt.lights.table import emitted, environment, sample
 from torchpt.lights.tree import fine
+from torchpt.spec import Kinds
 
-__all__ = ["WAYS", "choice_of", "emitted", "environment", "fine", "local", "sample"]
+#: The kinds of lights that are no surfaces.
+KINDS: Kinds[Light] = Kinds("torchpt.lights.kinds", ("point", "spot", "directional", "constant", "envmap"))
+
+__all__ = ["KINDS", "WAYS", "Light", "choice_of", "emitted", "environment", "fine", "local", "sample"]

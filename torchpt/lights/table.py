@@ -12,7 +12,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lights import area, choice, constant, point, quadric, solid_angle, sphere, spot
+from torchpt.lights import area, choice, quadric, solid_angle, sphere
+from torchpt.lights.kinds import constant, point, spot
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.math.warps import concentric_disk
 from torchpt.records import DISTANT, KINDS, Interaction, Lights, LightSample, Quadrics, rows
@@ -194,7 +195,7 @@ def _from_afar(
         pdf, weight = (torch.full_like(wi[0], value) for value in (1.0 / constant.INVERSE_PDF, constant.INVERSE_PDF))
     radiance = at.radiance.expand(3, u.shape[1])
     if lights.environment is not None and not isinstance(lights.environment, Tensor):
-        from torchpt.lights import envmap
+        from torchpt.lights.kinds import envmap
 
         wi, pdf, light = envmap.sample(lights.environment, u, mis)
         weight = torch.where(pdf > 0, safe_reciprocal(pdf), 0.0)
@@ -249,7 +250,7 @@ def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
     assert lights.environment is not None
     probability = choice.environment(lights.choice)
     if not isinstance(lights.environment, Tensor):
-        from torchpt.lights import envmap
+        from torchpt.lights.kinds import envmap
 
         radiance, pdf = envmap.environment(lights.environment, d, mis=True)
         return radiance, pdf * probability

@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.errors import AssetError, SceneError
+from torchpt.format.description import Description
+from torchpt.format.materials import MATERIALS, Diffuse, check_material, read_material, resolved
+from torchpt.format.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
 from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
+from torchpt.meshes import FileCamera, FileMaterial, MeshPart, load_mesh, unit_cube
+from torchpt.meshes.displacement import displaced
 from torchpt.records import KINDS, SOURCES
-from torchpt.scene.description import Description
-from torchpt.scene.displacement import displaced
-from torchpt.scene.loaders import FileCamera, FileMaterial, MeshPart, load_mesh, unit_cube
-from torchpt.scene.materials import MATERIALS, Diffuse, check_material, read_material, slot_of
-from torchpt.scene.parts import Copy, MaterialSlot, Part, Source
-from torchpt.scene.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
+from torchpt.scene.parameters import Parameters
+from torchpt.scene.parts import Copy, Part, Source
 from torchpt.scene.sources import file_lights, labels_of, sources_of
 from torchpt.scene.space import centre_and_unit
 from torchpt.scene.texels import Opener
@@ -29,7 +31,7 @@ class Built:
 
     Attributes:
         parts: what can be hit.
-        parameters: arrays by dotted name, float64.
+        parameters: arrays by dotted name.
         centre: ``(3,)`` float64, subtracted from all positions.
         unit: what all lengths are divided by.
         sources: lights that are no surfaces, in the order of ``records.SOURCES``.
@@ -37,7 +39,7 @@ class Built:
     """
 
     parts: tuple[Part, ...]
-    parameters: dict[str, np.ndarray]
+    parameters: Parameters
     centre: np.ndarray
     unit: float
     sources: tuple[Source, ...] = ()
@@ -51,7 +53,7 @@ def build_parts(description: Description) -> Built:
         SceneError: more than one environment, a shape that cannot be placed, or sizes too far apart for float32.
         AssetError: a mesh file that is missing or malformed.
     """
-    parameters: dict[str, np.ndarray] = {}
+    parameters = Parameters()
     parts: list[Part] = []
     found: list[Source] = []
     opener = Opener(description.textures, description.resolve, parameters, description.file)
@@ -63,7 +65,7 @@ def build_parts(description: Description) -> Built:
         if isinstance(shape, Instance):
             copies += _copies(description, name, shape, number, parts, parameters, opener)
     for name, material in description.materials.items():
-        _declare(slot_of(material, f"materials.{name}", description.materials, opener), parameters)
+        _declare(resolved(material, f"materials.{name}", description.materials, opener), parameters)
     sources = sorted([*sources_of(description, parameters), *found], key=lambda source: SOURCES.index(source.kind))
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
     for name, number in description.camera.numbers().items():
@@ -79,7 +81,7 @@ def _copies(
     shape: Instance,
     number: int,
     parts: list[Part],
-    parameters: dict[str, np.ndarray],
+    parameters: Parameters,
     opener: Opener,
 ) -> list[Copy]:
     """An instance, as one copy of each part of its mesh."""
@@ -97,11 +99,11 @@ def _copies(
     for part in (part for part in parts if part.shape == shape.of):
         slot = part.material
         if isinstance(shape.material, str):
-            slot = slot_of(
+            slot = resolved(
                 description.materials[shape.material], f"materials.{shape.material}", description.materials, opener
             )
         elif shape.material is not None:
-            slot = slot_of(shape.material, f"{key}.material", description.materials, opener)
+            slot = resolved(shape.material, f"{key}.material", description.materials, opener)
         if slot.emission is not None:
             raise SceneError(f"{key}.material", slot.name, "a material that does not emit: an instance cannot", file)
         _declare(slot, parameters)
@@ -110,7 +112,7 @@ def _copies(
     return found
 
 
-def _declare(slot: MaterialSlot, parameters: dict[str, np.ndarray]) -> None:
+def _declare(slot: ResolvedMaterial, parameters: Parameters) -> None:
     parameters.update({name: np.asarray(value, np.float64) for name, value in slot.numbers().items()})
 
 
@@ -119,7 +121,7 @@ def _shape_parts(
     name: str,
     shape: Shape,
     number: int,
-    parameters: dict[str, np.ndarray],
+    parameters: Parameters,
     opener: Opener,
     sources: list[Source],
 ) -> list[Part]:
@@ -157,7 +159,7 @@ def _shape_parts(
     sources += file_lights(lights, prefix, pose, source, parameters)
     labels = labels_of([piece.name for piece in pieces])
     parts: list[Part] = []
-    known: dict[int, MaterialSlot] = {}
+    known: dict[int, ResolvedMaterial] = {}
     for piece, label in zip(pieces, labels, strict=True):
         stem = prefix if len(pieces) == 1 else f"{prefix}.{label}"
         parameters[f"{stem}.vertices"] = np.asarray(piece.vertices, np.float64)
@@ -219,15 +221,15 @@ def _surfaces(shape: Shape, pose: np.ndarray) -> list[tuple[str, str, np.ndarray
     return side + ([("disk", "", local, name) for name, local in caps.items()] if shape.capped else [])
 
 
-def _slot(description: Description, shape: Shape, prefix: str, opener: Opener) -> MaterialSlot:
+def _slot(description: Description, shape: Shape, prefix: str, opener: Opener) -> ResolvedMaterial:
     """The material that the scene gives a shape, or the grey of one that has none."""
     given, known = shape.material, description.materials
     if isinstance(given, str):
-        return slot_of(known[given], f"materials.{given}", known, opener)
-    return slot_of(Diffuse() if given is None else given, f"{prefix}.material", known, opener)
+        return resolved(known[given], f"materials.{given}", known, opener)
+    return resolved(Diffuse() if given is None else given, f"{prefix}.material", known, opener)
 
 
-def _own_slot(own: FileMaterial, prefix: str, key: str, source: str, opener: Opener) -> MaterialSlot:
+def _own_slot(own: FileMaterial, prefix: str, key: str, source: str, opener: Opener) -> ResolvedMaterial:
     """A mesh file's own material.
 
     Raises:
@@ -236,7 +238,7 @@ def _own_slot(own: FileMaterial, prefix: str, key: str, source: str, opener: Ope
     try:
         material = read_material(own.material, key, MATERIALS, None)
         check_material(material, key, {}, {}, None)
-        return slot_of(material, key, {}, opener.sharing(f"{prefix}.textures"))
+        return resolved(material, key, {}, opener.sharing(f"{prefix}.textures"))
     except SceneError as error:
         raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None
 
@@ -249,8 +251,8 @@ def _part(
     kind: str,
     pose: np.ndarray,
     piece: MeshPart | None,
-    parameters: dict[str, np.ndarray],
-    slot: MaterialSlot,
+    parameters: Parameters,
+    slot: ResolvedMaterial,
     *,
     flat: bool = True,
     source: str = "",
@@ -260,8 +262,8 @@ def _part(
 ) -> Part:
     _declare(slot, parameters)
     emission, names = shape.emission, (f"shapes.{name}.emission",)
-    glow = slot.emission if emission is None and isinstance(slot.emission, Node) else None
-    if glow is not None:
+    emission_texture = slot.emission if emission is None and isinstance(slot.emission, Node) else None
+    if emission_texture is not None:
         emission, names = (1.0, 1.0, 1.0), (f"{slot.name}.emission_strength",)
     elif emission is None and isinstance(slot.emission, tuple):
         emission, names = slot.emission, (f"{slot.name}.emission", f"{slot.name}.emission_strength")
@@ -276,7 +278,7 @@ def _part(
         material=slot,
         emission=emission,
         emission_names=names if emission is not None else (),
-        glow=glow,
+        emission_texture=emission_texture,
         flip=shape.flip_normals,
         to_world=pose,
         local=local,

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from torchpt import bsdfs
 from torchpt.accel import Accel
+from torchpt.format.schema import ThinLens
 from torchpt.lights.choice import ByTree
 from torchpt.records import KINDS, Lights, World, tensors_of
-from torchpt.scene.schema import ThinLens
-from torchpt.scene.settings import Settings
+from torchpt.settings import Settings
 
 if TYPE_CHECKING:
+    from torchpt.format.description import Description
     from torchpt.scene.build import Built
-    from torchpt.scene.description import Description
 
 __all__ = ["describe"]
 
@@ -33,7 +33,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         count = len(part.faces) if part.faces is not None else 1
         row: dict[str, Any] = {"kind": part.quadric or part.kind, "primitives": count, "material": part.material.name}
         if part.emission is not None:
-            row["emission"] = list(part.emission) if part.glow is None else "a texture"
+            row["emission"] = list(part.emission) if part.emission_texture is None else "a texture"
         if part.source:
             row["file"] = part.source
         if part.dropped:
@@ -64,9 +64,12 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     if around is not None and not isinstance(around, Tensor):
         compensated = around.compensated is not None
         made["lights"]["envmap"] = {"texels": [around.width, around.height], "mis_compensation": compensated}
-    if world.textures is not None:
-        texels = world.textures.texels
-        made["textures"] = {"reads": world.textures.places.shape[1], "bytes": texels.numel() * texels.element_size()}
+    if world.textures.atlas is not None:
+        texels = world.textures.atlas.texels
+        made["textures"] = {
+            "reads": world.textures.atlas.places.shape[1],
+            "bytes": texels.numel() * texels.element_size(),
+        }
     if built.centre.any():
         made["origin_moved_to"] = built.centre.tolist()
     if built.unit != 1.0:
@@ -75,7 +78,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "scene": {
             "file": description.file,
             "camera": type(description.camera).__name__.lower(),
-            "primitives": {kind: n for kind, n in zip(KINDS, world.counts, strict=True) if n},
+            "primitives": {kind: n for kind, n in zip(KINDS, world.geometry.counts, strict=True) if n},
             **({"instances": len(built.copies)} if built.copies else {}),
             "parameters": len(built.parameters),
         },
@@ -99,24 +102,24 @@ def _lights(lights: Lights) -> dict[str, Any]:
 def _left_out(description: Description, world: World, settings: Settings) -> list[str]:
     """Features this scene does not need, for which there is no object, no tensor and no instruction."""
     lights = world.lights
-    absent = [f"{kind} primitives" for kind, n in zip(KINDS, world.counts, strict=True) if not n]
-    present = {model.name for model in world.models}
+    absent = [f"{kind} primitives" for kind, n in zip(KINDS, world.geometry.counts, strict=True) if not n]
+    present = {model.name for model in world.materials.models}
     absent += [f"{name} bsdf" for name in dict.fromkeys(model.name for model in bsdfs.MODELS) if name not in present]
-    if len(world.models) == 1:
+    if len(world.materials.models) == 1:
         absent.append("sorting by bsdf (one model)")
-    if world.normals is None:
+    if world.geometry.normals is None:
         absent.append("shading normals (all flat)")
-    if all(both is None for both in world.two_sided):
+    if all(both is None for both in world.materials.two_sided):
         absent.append("one-sided materials")
-    if world.opacity is None:
+    if world.materials.opacity is None:
         absent.append("opacity (every surface is met)")
-    if world.tangents is None:
+    if world.geometry.tangents is None:
         absent.append("tangents (nothing is anisotropic)")
-    if not any(model.refracts for model in world.models):
+    if not any(model.refracts for model in world.materials.models):
         absent.append("refraction (no index along paths)")
-    if not any(model.lobed for model in world.models):
+    if not any(model.lobed for model in world.materials.models):
         absent.append("choice among lobes")
-    if world.copies is None:
+    if world.geometry.copies is None:
         absent.append("instances")
     if lights is None:
         absent.append("light sampling and MIS (nothing emits)")
@@ -141,11 +144,13 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
         absent.append("Russian roulette (paths end before rr_depth)")
     if not settings.film.aovs:
         absent.append("aov layers")
-    if world.textures is None:
+    if world.textures.atlas is None:
         absent.append("textures (no image is read)")
-    if world.colors is None:
+    if world.geometry.colors is None:
         absent.append("vertex colours")
-    if all(look is None or (look.normal is None and look.bump is None) for look in world.looks):
+    if all(
+        textures is None or (textures.normal is None and textures.bump is None) for textures in world.materials.textures
+    ):
         absent.append("normal and bump maps")
     absent += ["volumes", "derivative tape (until a parameter requires gradients)"]
     return absent
@@ -154,13 +159,15 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
 def _groups(world: World) -> dict[str, int]:
     """Models by name, with what textures give them, and how many materials share each."""
     found: dict[str, int] = {}
-    for model, table, look in zip(world.models, world.bsdfs, world.looks, strict=True):
+    for model, table, textures in zip(
+        world.materials.models, world.materials.parameters, world.materials.textures, strict=True
+    ):
         name, rows = str(model), _rows(table)
-        if look is not None:
-            maps = ["normal_map"] * (look.normal is not None) + ["bump_map"] * (look.bump is not None)
-            name = f"{name}, textured: {', '.join([*_keys(look.readings), *maps])}"
-            picks = tensors_of(look)
-            rows = max([rows, *(len(pick) for pick in picks)])
+        if textures is not None:
+            maps = ["normal_map"] * (textures.normal is not None) + ["bump_map"] * (textures.bump is not None)
+            name = f"{name}, textured: {', '.join([*_keys(textures.readings), *maps])}"
+            bindings = tensors_of(textures)
+            rows = max([rows, *(len(binding) for binding in bindings)])
         while name in found:
             name += ", again"
         found[name] = rows

@@ -17,29 +17,18 @@ from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
 from torchpt.cameras import Camera, Orthographic, Perspective
 from torchpt.errors import RenderError, SceneError
-from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
+from torchpt.format import schema
+from torchpt.format.description import Description, read_description, settings
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
-from torchpt.scene import schema
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
-from torchpt.scene.description import Description, read_description, settings
 from torchpt.scene.info import describe
-from torchpt.scene.settings import Film, Settings
 from torchpt.scene.space import FARTHEST, Space
+from torchpt.settings import Film, Settings
+from torchpt.spec import Index, Moves, Pose, Refused, Scalar, Spec, Vertices
 
-__all__ = ["INDICES", "MOVING", "Scene", "device_of", "load"]
-
-#: Parameters that say where things are, in the scene's own coordinates.
-PLACES = (".vertices", ".to_world", ".position", ".target")
-#: Parameters of lights that move shadows.
-MOVING = (".position", ".direction")
-#: Parameters that are amounts of light.
-AMOUNTS = (".emission", ".radiance", ".intensity", ".irradiance")
-#: Parameters of environment maps that are amounts of light.
-MAPS = (".texels", ".scale")
-#: Parameters of materials that are indices of refraction.
-INDICES = (".int_ior", ".ext_ior", ".ior")
+__all__ = ["Scene", "device_of", "load"]
 
 
 def load(
@@ -99,7 +88,7 @@ class Scene:
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
             name: torch.from_numpy(value.copy()).to(
-                device, torch.float64 if far and name.endswith(PLACES) else torch.float32
+                device, torch.float64 if far and self.spec(name).place else torch.float32
             )
             for name, value in self._built.parameters.items()
         }
@@ -116,8 +105,8 @@ class Scene:
         return tuple(found.values())
 
     @property
-    def parts(self) -> Built:
-        """The resolved parts, static."""
+    def built(self) -> Built:
+        """What its description came to, static."""
         return self._built
 
     @property
@@ -145,48 +134,23 @@ class Scene:
         """All parameters, those of ``params`` (once checked) in place of the scene's."""
         return {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
 
+    def spec(self, name: str) -> Spec:
+        """What a parameter is."""
+        return self._built.parameters.specs.get(name) or _undeclared(name, self._built)
+
     def _check(self, name: str, value: Tensor) -> None:
         """Refuse numbers that no scene file could hold."""
-        if not bool(torch.isfinite(value.float()).all()):
-            raise SceneError(f"params.{name}", "a value that is not finite in float32", "numbers finite in float32")
-        low = 0.0
-        if not name.endswith((*PLACES, ".direction")) and (
-            ".material." in name
-            or name.startswith("materials.")
-            or name.endswith(AMOUNTS)
-            or (name.startswith("lights.") and name.endswith(MAPS))
-        ):
-            if name.endswith(INDICES):
-                low = 1e-3
-            if bool((value < low).any()):
-                bad = f"numbers below {low:g}" if low else "negative numbers"
-                shown = value.tolist() if value.numel() <= 16 else float(value.min())
-                raise SceneError(f"params.{name}", shown, f"no {bad} (clamp before rendering)")
-        if name.endswith(".direction") and not bool(value.any()):
-            raise SceneError(f"params.{name}", value.tolist(), "a direction other than [0, 0, 0]")
-        if name.endswith((".cutoff_angle", ".beam_width")) and not 0 < float(value) <= 180:
-            raise SceneError(f"params.{name}", float(value), "an angle in degrees, 0 < angle <= 180")
-        kind, _, key = name.partition(".")
-        if kind == "camera" and key in schema.CAMERA_NUMBERS:
-            expected, accepted = schema.CAMERA_NUMBERS[key]
-            if not accepted(float(value)):
-                raise SceneError(f"params.{name}", float(value), expected)
-        if name.endswith(".to_world"):
-            matrix = value.double().cpu().numpy()
-            if not is_usable(matrix):
-                raise SceneError(f"params.{name}", matrix.tolist(), f"a matrix that can be inverted, {WITHIN}")
-            reach = FARTHEST * self._space.unit
-            if kind != "lights" and not np.abs(matrix[:3, 3] - self._built.centre).max() <= reach:
+        spec = self.spec(name)
+        try:
+            spec.check(value)
+        except Refused as error:
+            shown = value.tolist() if error.value is ... else error.value
+            raise SceneError(f"params.{name}", shown, error.expected) from None
+        if isinstance(spec, Pose) and spec.moves is Moves.SURFACES:
+            reach, place = FARTHEST * self._space.unit, value.double().cpu().numpy()[:3, 3]
+            if not np.abs(place - self._built.centre).max() <= reach:
                 expected = f"a place up to {reach:.3g} from the middle of this scene as it was loaded"
-                raise SceneError(f"params.{name}", matrix[:3, 3].tolist(), expected)
-            if name.startswith("lights.") and similarity_scale(matrix, 1e-4) is None:
-                expected = "a transform that keeps angles (rotation, reflection, uniform scale)"
-                raise SceneError(f"params.{name}", matrix.tolist(), expected)
-            if any(part.kind == "sphere" and name == f"{part.name}.to_world" for part in self._built.parts):
-                if similarity_scale(matrix, 1e-4) is None:
-                    raise SceneError(
-                        f"params.{name}", matrix.tolist(), "a transform that keeps a sphere round (uniform scale)"
-                    )
+                raise SceneError(f"params.{name}", place.tolist(), expected)
 
     def world(
         self, dtype: torch.dtype, params: Mapping[str, Tensor] | None = None, uv: bool = False, choice: str = "auto"
@@ -270,8 +234,25 @@ class Scene:
         if not same:
             for name, (value, version) in state.items():
                 old = self._state.get(name)
-                if name.endswith(PLACES) and old is not None and (old[0] is not value or old[1] != version):
+                if self.spec(name).place and old is not None and (old[0] is not value or old[1] != version):
                     self._check(name, value.detach())
             self._state = state
             self._worlds.clear()
             self._accels.clear()
+
+
+def _undeclared(name: str, built: Built) -> Spec:
+    """What a parameter is whose kind does not declare it yet, by its name."""
+    key = name.rpartition(".")[2]
+    if key == "vertices":
+        return Vertices()
+    if key == "to_world":
+        return Pose(angles=any(part.kind == "sphere" and name == f"{part.name}.to_world" for part in built.parts))
+    if name.startswith("camera."):
+        low: dict[str, Any] = (
+            {"above": 0.0, "below": 180.0} if key == "fov" else {} if key == "aperture_radius" else {"above": 0.0}
+        )
+        return Scalar(moves=Moves.SURFACES, **low)
+    if ".material." in name or name.startswith("materials."):
+        return Index() if key in ("int_ior", "ext_ior", "ior") else Scalar()
+    return Scalar() if key in ("emission", "texels") else Scalar(low=None)

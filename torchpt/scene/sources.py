@@ -5,35 +5,37 @@ from __future__ import annotations
 import numpy as np
 
 from torchpt.errors import AssetError, SceneError
+from torchpt.format.description import Description
+from torchpt.lights import KINDS as LIGHTS
 from torchpt.math.transforms import apply_points
-from torchpt.scene.description import Description
-from torchpt.scene.lights import ENVIRONMENTS, EnvmapLight
-from torchpt.scene.loaders import FileLight
+from torchpt.meshes import FileLight
+from torchpt.scene.parameters import Parameters
 from torchpt.scene.parts import Source
 from torchpt.scene.texels import radiance_of
+from torchpt.spec import Texels
 
 __all__ = ["file_lights", "labels_of", "sources_of"]
 
 
-def sources_of(description: Description, parameters: dict[str, np.ndarray]) -> list[Source]:
+def sources_of(description: Description, parameters: Parameters) -> list[Source]:
     """The lights block; its numbers become parameters."""
     lights = description.lights
-    around = [name for name, light in lights.items() if light.type in ENVIRONMENTS]
+    around = [name for name, light in lights.items() if light.kind.environment]
     if len(around) > 1:
         first, second = around[:2]
         expected = f"one environment only ({first} is one)"
-        raise SceneError(f"lights.{second}", lights[second].type, expected, description.file)
+        raise SceneError(f"lights.{second}", lights[second].name, expected, description.file)
     for name, light in lights.items():
-        parameters.update({f"lights.{name}.{key}": np.asarray(x, np.float64) for key, x in light.numbers().items()})
-        if isinstance(light, EnvmapLight):
+        parameters.declare_all(f"lights.{name}", light.kind, light.values)
+        if light.name == "envmap":
             key = f"lights.{name}.path"
-            source = description.resolve(light.path, key)
-            parameters[f"lights.{name}.texels"] = radiance_of(source, key, description.file)
-    return [Source(f"lights.{name}", light.type) for name, light in lights.items()]
+            source = description.resolve(light["path"], key)
+            parameters.declare(f"lights.{name}.texels", radiance_of(source, key, description.file), Texels())
+    return [Source(f"lights.{name}", light.name) for name, light in lights.items()]
 
 
 def file_lights(
-    lights: list[FileLight], prefix: str, pose: np.ndarray, source: str, parameters: dict[str, np.ndarray]
+    lights: list[FileLight], prefix: str, pose: np.ndarray, source: str, parameters: Parameters
 ) -> list[Source]:
     """The lights of a mesh file, placed in the scene; their numbers become parameters."""
     found = []
@@ -51,15 +53,14 @@ def file_lights(
         if light.kind == "spot":
             # As far off as the origin, so that the difference of the two is as exact as they are.
             place["target"] = position + direction * max(1.0, np.abs(position).max())
-        for key, value in {**place, **light.numbers}.items():
-            parameters[f"{stem}.{key}"] = np.asarray(value, np.float64)
+        parameters.declare_all(stem, LIGHTS[light.kind], {**place, **light.numbers})
         found.append(Source(stem, light.kind))
     return found
 
 
 def labels_of(names: list[str]) -> list[str]:
     """Distinct labels without dots for the pieces of a mesh."""
-    labels: dict[str, None] = {}  # in order, and quick to look up
+    labels: dict[str, None] = {}  # in order, and quick to textures up
     for number, name in enumerate(names):
         base = name.replace(".", "_") or f"part{number}"
         label, again = base, number

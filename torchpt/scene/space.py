@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpt.errors import SceneError
+from torchpt.format.schema import Camera, Orthographic, ThinLens
 from torchpt.scene.parts import Copy, Part, Source
-from torchpt.scene.schema import Camera, Orthographic, ThinLens
 
 __all__ = ["FARTHEST", "Space", "centre_and_unit"]
 

@@ -11,13 +11,12 @@ import numpy as np
 import torch
 
 from torchpt.errors import AssetError, SceneError
+from torchpt.format.textures import CHANNELS, Checkerboard, Image, Named, Texture, TextureInput, VertexColor
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS
 from torchpt.math.transforms import uv_matrix
-from torchpt.scene.parts import Reading, VertexColors
-from torchpt.scene.textures import CHANNELS, Checkerboard, Image, Named, Slot, Texture, VertexColor
-from torchpt.textures import Node, atlas_of, look_up
+from torchpt.textures import Node, Reading, VertexColors, atlas_of, look_up
 
 __all__ = ["Opener", "images_of", "radiance_of"]
 
@@ -50,7 +49,7 @@ class Opener:
         self._decoded: dict[str, bool] = {}
         self._shared: dict[str, dict[str, str]] = {}
 
-    def __call__(self, slot: Slot, key: str) -> Reading:
+    def __call__(self, slot: TextureInput, key: str) -> Reading:
         """The node of the slot ``key``.
 
         Raises:
@@ -61,7 +60,7 @@ class Opener:
             self._nodes[key] = self._found(slot, key)
         return self._nodes[key]
 
-    def _found(self, slot: Slot, key: str) -> Reading:
+    def _found(self, slot: TextureInput, key: str) -> Reading:
         texture = slot.texture
         if isinstance(texture, Named):
             return self._opened(
@@ -69,7 +68,9 @@ class Opener:
             )
         return self._opened(slot, texture, key, None, key)
 
-    def _opened(self, slot: Slot, texture: Texture | Named, name: str, channel: str | None, key: str) -> Reading:
+    def _opened(
+        self, slot: TextureInput, texture: Texture | Named, name: str, channel: str | None, key: str
+    ) -> Reading:
         """The node of a slot whose texels are called ``name``."""
         if isinstance(texture, Image):
             return self._image(slot, texture, name, channel or texture.channel or "luminance", key)
@@ -83,14 +84,14 @@ class Opener:
         assert isinstance(texture, Checkerboard)
         return self._checkerboard(slot, texture, name, channel, key)
 
-    def sharing(self, prefix: str) -> Callable[[Slot, str], Reading]:
+    def sharing(self, prefix: str) -> Callable[[TextureInput, str], Reading]:
         """The same for the materials of a mesh file, whose images are named after themselves and shared.
 
         Args:
             prefix: dotted name before theirs.
         """
 
-        def opened(slot: Slot, key: str) -> Reading:
+        def opened(slot: TextureInput, key: str) -> Reading:
             texture, name = slot.texture, key
             if isinstance(texture, Image):
                 path = texture.path
@@ -104,7 +105,7 @@ class Opener:
 
         return opened
 
-    def values(self, slot: Slot, key: str) -> Callable[[np.ndarray], np.ndarray]:
+    def values(self, slot: TextureInput, key: str) -> Callable[[np.ndarray], np.ndarray]:
         """A number texture as a function from texture coordinates ``(V, 2)`` to values ``(V,)``, float64."""
         before = dict(self._parameters)
         node = self._found(slot, key)
@@ -118,13 +119,13 @@ class Opener:
             self._decoded.pop(name, None)
         atlas = atlas_of([node], images, torch.float64, torch.device("cpu"))
 
-        def look(uvs: np.ndarray) -> np.ndarray:
+        def textures(uvs: np.ndarray) -> np.ndarray:
             lanes = torch.zeros(len(uvs), dtype=torch.int64)
             return look_up(atlas, lanes, torch.from_numpy(np.ascontiguousarray(uvs.T)), False).numpy()
 
-        return look
+        return textures
 
-    def _checkerboard(self, slot: Slot, texture: Checkerboard, name: str, channel: str, key: str) -> Node:
+    def _checkerboard(self, slot: TextureInput, texture: Checkerboard, name: str, channel: str, key: str) -> Node:
         if channel == "a":
             raise SceneError(f"{key}.channel", channel, "one of luminance, r, g, b (squares have no alpha)", self.file)
         for which in _COLORS:
@@ -138,7 +139,7 @@ class Opener:
             name, None if slot.coloured else CHANNELS.index(channel) - 1, "repeat", True, matrix, _ONE, filtered
         )
 
-    def _image(self, slot: Slot, texture: Image, name: str, channel: str, key: str) -> Node:
+    def _image(self, slot: TextureInput, texture: Image, name: str, channel: str, key: str) -> Node:
         if isinstance(texture.path, EncodedImage):
             label, source = texture.path.label, texture.path
         else:
@@ -190,7 +191,7 @@ class Opener:
         return name
 
     def _check(
-        self, values: np.ndarray, slot: Slot, key: str, label: str, scale: tuple[float, float, float] = _ONE
+        self, values: np.ndarray, slot: TextureInput, key: str, label: str, scale: tuple[float, float, float] = _ONE
     ) -> None:
         """Refuse texels that the slot does not accept."""
         ends = [float(end) * factor for end in (values.min(), values.max()) for factor in scale]

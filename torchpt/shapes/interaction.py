@@ -22,8 +22,8 @@ from torchpt.shapes import quadrics
 
 __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
 
-#: Rays leave a surface ``OFFSET * World.bound`` off its plane. Re-deriving a point and evaluating its plane in the search
-#: each round by less than ``4 * 2^-24 * 2 bound``; this is two and a half times their sum, and free of world units.
+#: Rays leave a surface ``OFFSET * LaneGeometry.bound`` off its plane. Re-deriving a point and evaluating its plane in the
+#: search each round by less than ``4 * 2^-24 * 2 bound``; this is two and a half times their sum, and free of world units.
 OFFSET = 2.0**-19
 
 
@@ -66,12 +66,20 @@ def _linear(copies: Copies, w: Tensor) -> Tensor:
 
 def _placed(world: World, prim: Tensor) -> _Place:
     """Places of primitives by ids as the search gives them, none of them a miss."""
-    if world.copies is None:
-        return _Place(prim, take(world.p0, prim), take(world.e1, prim), take(world.e2, prim), None, None, None)
-    column = world.copy(prim)
-    table = rows(world.copies, column)
+    if world.geometry.copies is None:
+        return _Place(
+            prim,
+            take(world.geometry.p0, prim),
+            take(world.geometry.e1, prim),
+            take(world.geometry.e2, prim),
+            None,
+            None,
+            None,
+        )
+    column = world.geometry.copy(prim)
+    table = rows(world.geometry.copies, column)
     prim = prim - table.start + table.first
-    p0, e1, e2 = take(world.p0, prim), take(world.e1, prim), take(world.e2, prim)
+    p0, e1, e2 = take(world.geometry.p0, prim), take(world.geometry.e1, prim), take(world.geometry.e2, prim)
     size = (p0.abs() + e1.abs() + e2.abs()).detach()
     reach = affine(table.x.abs() * size[0], table.y.abs(), size[1], table.z.abs(), size[2]) + table.move.abs()
     p0, e1, e2 = _linear(table, p0) + table.move, _linear(table, e1), _linear(table, e2)
@@ -97,18 +105,18 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         if other is not None:
             u, v = torch.where(other, 0.0, u), torch.where(other, 0.0, v)
     p = affine(p0, e1, u, e2, v)
-    ng = take(world.normal, prim) if place.copies is None else place.turned(take(world.normal, prim))
+    ng = take(world.geometry.normal, prim) if place.copies is None else place.turned(take(world.geometry.normal, prim))
     if ball is not None:
-        assert world.flip is not None
+        assert world.geometry.flip is not None
         radius = torch.where(ball, e1[0], 1.0)
         t = _sphere_distance(o, d, p0, radius, hit.t) if slide else hit.t
         t = torch.where(ball, t, 0.0)
         outward = normalize(torch.where(ball, o + d * t - p0, torch.ones_like(p)))
         p = torch.where(ball, p0 + outward * radius, p)
-        ng = torch.where(ball, outward * take(world.flip, prim), ng)
+        ng = torch.where(ball, outward * take(world.geometry.flip, prim), ng)
     bound = None
     if place.copied is not None and place.reach is not None:
-        bound = torch.where(place.copied, dot(ng.detach().abs(), place.reach), take(world.bound, prim))
+        bound = torch.where(place.copied, dot(ng.detach().abs(), place.reach), take(world.geometry.bound, prim))
     own = None
     if curved is not None:
         table = quadrics.rows(world, prim)
@@ -118,16 +126,16 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         p = torch.where(curved, affine(p0 + e1 * own[0], e2, own[1], table.e3, own[2]), p)
         ng = torch.where(curved, quadrics.outward(table, own), ng)
         # At the point itself: a needle is far thinner than it is long.
-        other = take(world.bound, prim) if bound is None else bound
+        other = take(world.geometry.bound, prim) if bound is None else bound
         bound = torch.where(curved, dot(ng.detach().abs(), table.reach), other)
     ns = ng
-    if world.normals is not None:
-        corners = [take(n, prim) for n in world.normals]
+    if world.geometry.normals is not None:
+        corners = [take(n, prim) for n in world.geometry.normals]
         if place.copies is not None:
             corners = [place.turned(n) for n in corners]
         ns = normalize(affine(corners[0] * (1.0 - u - v), corners[1], u, corners[2], v))
-        if any(world.counts[1:]):
-            ns = torch.where(prim < world.ends[0], ns, ng)
+        if any(world.geometry.counts[1:]):
+            ns = torch.where(prim < world.geometry.ends[0], ns, ng)
     tangent, bitangent = _tangents(world, prim, u, v, e1, e2, ng)
     if tangent is not None and place.copied is not None:
         tangent = torch.where(place.copied, place.moved(tangent), tangent)
@@ -136,46 +144,46 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         tangent = torch.where(curved, quadrics.tangent(e1, e2, own), tangent)
         if bitangent is not None:
             bitangent = torch.where(curved, quadrics.bitangent(quadrics.rows(world, prim), e1, e2, own), bitangent)
-    return Interaction(p, ng, ns, tangent, bitangent, prim, world.slot(hit.prim), bound, u, v, own)
+    return Interaction(p, ng, ns, tangent, bitangent, prim, world.geometry.slot(hit.prim), bound, u, v, own)
 
 
 def _spheres(world: World, prim: Tensor) -> Tensor | None:
     """Which of the primitives are spheres; None where the scene has none."""
-    if not world.counts[3]:
+    if not world.geometry.counts[3]:
         return None
-    found = prim >= world.ends[2]
-    return found if not world.counts[4] else found & (prim < world.ends[3])
+    found = prim >= world.geometry.ends[2]
+    return found if not world.geometry.counts[4] else found & (prim < world.geometry.ends[3])
 
 
 def _quadrics(world: World, prim: Tensor) -> Tensor | None:
     """Which of the primitives are quadrics; None where the scene has none."""
-    return prim >= world.ends[3] if world.counts[4] else None
+    return prim >= world.geometry.ends[3] if world.geometry.counts[4] else None
 
 
 def _tangents(
     world: World, prim: Tensor, u: Tensor, v: Tensor, e1: Tensor, e2: Tensor, ng: Tensor
 ) -> tuple[Tensor | None, Tensor | None]:
     """How points move with their texture coordinates: on a disk outward and around, on a sphere around and down (Mitsuba)."""
-    if world.tangents is None:
+    if world.geometry.tangents is None:
         return None, None
-    tangent = take(world.tangents, prim)
-    bitangent = None if world.bitangents is None else take(world.bitangents, prim)
+    tangent = take(world.geometry.tangents, prim)
+    bitangent = None if world.geometry.bitangents is None else take(world.geometry.bitangents, prim)
     ball = _spheres(world, prim)
     if ball is not None:
         around = cross(tangent, ng)
         if bitangent is not None:
             bitangent = torch.where(ball, cross(normalize(around), ng) * bitangent[0], bitangent)
         tangent = torch.where(ball, around, tangent)
-    if world.counts[2]:
-        disk = (prim >= world.ends[1]) & (prim < world.ends[2])
+    if world.geometry.counts[2]:
+        disk = (prim >= world.geometry.ends[1]) & (prim < world.geometry.ends[2])
         away = torch.addcmul(e1 * u, e2, v)
         square = torch.where(disk, u * u + v * v, 1.0)
         some = square > 0
         tangent = torch.where(disk, torch.where(some, away / torch.where(some, square, 1.0).sqrt(), e1), tangent)
         if bitangent is not None:
             around = torch.addcmul(e2 * u, e1, v, value=-1) * (2.0 * math.pi)
-            if world.mirrored is not None:
-                around = torch.where(take(world.mirrored, prim), -around, around)
+            if world.geometry.mirrored is not None:
+                around = torch.where(take(world.geometry.mirrored, prim), -around, around)
             bitangent = torch.where(disk, around, bitangent)
     return tangent, bitangent
 
@@ -235,5 +243,5 @@ def offset_origin(world: World, at: Interaction, w: Tensor) -> Tensor:
 
     Waechter and Binder (*A Fast and Robust Method for Avoiding Self-Intersection*, Ray Tracing Gems, 2019) for the idea.
     """
-    step = (take(world.bound, at.prim) if at.bound is None else at.bound) * OFFSET
+    step = (take(world.geometry.bound, at.prim) if at.bound is None else at.bound) * OFFSET
     return torch.addcmul(at.p, at.ng, torch.copysign(step, dot(w, at.ng)))

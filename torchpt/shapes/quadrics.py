@@ -39,9 +39,9 @@ _ELLIPSOID, _CYLINDER, _CONE = range(len(QUADRICS))
 
 def rows(world: World, prim: Tensor) -> Quadrics:
     """The columns ``(., N)`` of primitives ``prim (N,)``; any where one is no quadric."""
-    assert world.quadrics is not None
-    index = (prim - world.ends[3]).clamp_min(0)
-    return columns(world.quadrics, index)
+    assert world.geometry.quadrics is not None
+    index = (prim - world.geometry.ends[3]).clamp_min(0)
+    return columns(world.geometry.quadrics, index)
 
 
 def place(code: Tensor, u: Tensor, v: Tensor) -> Tensor:

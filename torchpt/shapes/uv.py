@@ -22,10 +22,10 @@ __all__ = ["surface_uv", "vertex_colors"]
 
 def surface_uv(world: World, at: Interaction) -> Tensor:
     """Texture coordinates ``(2, N)``."""
-    assert world.uvs is not None
-    a, b, c = (take(x, at.prim) for x in world.uvs)
+    assert world.geometry.uvs is not None
+    a, b, c = (take(x, at.prim) for x in world.geometry.uvs)
     uv = torch.addcmul(torch.addcmul(a * (1.0 - at.u - at.v), b, at.u), c, at.v)
-    if not any(world.counts[2:]):
+    if not any(world.geometry.counts[2:]):
         return uv
     x, y, z, level = _own(world, at)
     square = torch.addcmul(x * x, y, y)
@@ -36,27 +36,27 @@ def surface_uv(world: World, at: Interaction) -> Tensor:
     first = torch.where(disk, across, turn)
     # On sides the height, on balls the angle from the pole.
     second = torch.where(disk, turn, torch.where(level > 1, azimuth(z, across) * (1.0 / math.pi), z))
-    return torch.where(at.prim >= world.ends[1], torch.stack((first, second)), uv)
+    return torch.where(at.prim >= world.geometry.ends[1], torch.stack((first, second)), uv)
 
 
 def _own(world: World, at: Interaction) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points ``x, y, z (N,)`` of round shapes in their own space, and 0 on disks, 1 on sides, 2 on balls."""
-    spheres, curved = world.counts[3:]
+    spheres, curved = world.geometry.counts[3:]
     x, y, z, level = at.u, at.v, torch.zeros_like(at.u), torch.zeros_like(at.prim)
-    if world.mirrored is not None:
-        turned = take(world.mirrored, at.prim)
+    if world.geometry.mirrored is not None:
+        turned = take(world.geometry.mirrored, at.prim)
         x, y = torch.where(turned, y, x), torch.where(turned, x, y)
     if spheres:
-        assert world.axes is not None
-        first, end = world.ends[2], world.ends[3]
+        assert world.geometry.axes is not None
+        first, end = world.geometry.ends[2], world.geometry.ends[3]
         ball = (at.prim >= first) & (at.prim < end)
         row = torch.minimum((at.prim - first).clamp_min(0), end - first - 1)
-        away = at.p - take(world.p0, at.prim)
-        axes = [dot(take(axis, row), away) for axis in world.axes]
+        away = at.p - take(world.geometry.p0, at.prim)
+        axes = [dot(take(axis, row), away) for axis in world.geometry.axes]
         x, y, z = (torch.where(ball, axis, other) for axis, other in zip(axes, (x, y, z), strict=True))
         level = torch.where(ball, 2, level)
     if curved and at.own is not None:  # a point on lights of other kinds has none
-        other = at.prim >= world.ends[3]
+        other = at.prim >= world.geometry.ends[3]
         x, y, z = (torch.where(other, own, value) for own, value in zip(at.own, (x, y, z), strict=True))
         code = quadrics.rows(world, at.prim).code
         level = torch.where(other, torch.where(code == 0, 2, 1), level)
@@ -65,6 +65,6 @@ def _own(world: World, at: Interaction) -> tuple[Tensor, Tensor, Tensor, Tensor]
 
 def vertex_colors(world: World, at: Interaction) -> Tensor:
     """Colours ``(3, N)`` interpolated from the vertices; those of surfaces without are 1."""
-    assert world.colors is not None
-    a, b, c = (take(x, at.prim) for x in world.colors)
+    assert world.geometry.colors is not None
+    a, b, c = (take(x, at.prim) for x in world.geometry.colors)
     return torch.addcmul(torch.addcmul(a * (1.0 - at.u - at.v), b, at.u), c, at.v)

@@ -57,7 +57,7 @@ class Worker:
     def __init__(self, kernels: Kernels, halt: threading.Event | None = None) -> None:
         self.kernels, self.wave, self._halt = kernels, kernels.wave, halt or threading.Event()
         self._arenas = [Memory(kernels.state.count) for _ in range(2)]
-        self._passed = [Memory(kernels.passed.count) for _ in range(2)] if kernels.veiled else []
+        self._passed = [Memory(kernels.passed.count) for _ in range(2)] if kernels.has_opacity else []
         self._sifted = Memory(1)
         count = kernels.models + 2
         self._lists = [[Memory(1) for _ in range(count)] for _ in range(2)]
@@ -281,7 +281,7 @@ class Worker:
     def _nearest(self, here: Memory, count: int, depth: int) -> None:
         rows = self.kernels.state
         self._search(here, rows, "o", "d", "t_max", count)
-        if not self.kernels.veiled:
+        if not self.kernels.has_opacity:
             return
         self._name_salts(depth)
         self._clear()
@@ -307,10 +307,10 @@ class Worker:
         if not kernels.packets:
             o, d, t_max = (_row(there.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
             blocked = _row(there.words, rows, "blocked", 1)[0]
-            self.wave.accel.blocked(o, d, t_max[0], count, blocked, kernels.veils)
-        elif not kernels.veiled:
+            self.wave.accel.blocked(o, d, t_max[0], count, blocked, kernels.non_opaque)
+        elif not kernels.has_opacity:
             self._run(kernels.block(), count, there, there)
-        if not kernels.veiled:
+        if not kernels.has_opacity:
             return
         source, target = self._passed
         self._clear()

@@ -92,13 +92,13 @@ class Kernels:
         self.plan, self.world = wave.stages.plan, wave.stages.world
         self.numbers = wave.sampler.numbers(torch.device("cpu"))
         world, table = self.world, self.world.lights
-        self.models = len(world.models)
+        self.models = len(world.materials.models)
         self.around = table is not None and table.environment is not None
         self.emitters = table is not None and table.row_of_prim is not None
         self.listed = not fused or self.models > 1 or self.around
-        self.veiled = world.opacity is not None
+        self.has_opacity = world.materials.opacity is not None
         self.state, self.passed = (
-            _state_rows(wave, packets, fused, self.veiled),
+            _state_rows(wave, packets, fused, self.has_opacity),
             Rows({**PASS, "clear": ((), "f"), **_key(wave), **HIT}),
         )
         self._leaves = dict(
@@ -133,9 +133,9 @@ class Kernels:
         self._lock = threading.Lock()
         self.search = _search_words(wave) if packets else None
         #: For each primitive whether a ray may pass it, as uint8.
-        self.veils: np.ndarray | None = None
-        if self.veiled and not packets:
-            self.veils = self._passing(torch.arange(sum(world.counts))).to(torch.uint8).numpy()
+        self.non_opaque: np.ndarray | None = None
+        if self.has_opacity and not packets:
+            self.non_opaque = self._passing(torch.arange(sum(world.geometry.counts))).to(torch.uint8).numpy()
         self.seconds = 0.0
         self.eager: dict[int, str] = {}
 
@@ -275,7 +275,7 @@ class Kernels:
             sinks = build(tracer)
         search = None
         if any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes):
-            search = packet_search(_kinds(self.world.counts), engine.estimates())
+            search = packet_search(_kinds(self.world.geometry.counts), engine.estimates())
         ir, needed = text(tracer.graph, sinks, len(tracer.tables), len(self._uniforms), self._tensors, listed, search)
         made = engine.compiled(ir)
         nodes: dict[str, int] = {}
@@ -338,7 +338,7 @@ class Kernels:
         """
         world = self.world
         with tracer:
-            key = torch.index_select(world.key, 0, world.slot(prim) + 1)
+            key = torch.index_select(world.materials.key, 0, world.geometry.slot(prim) + 1)
             met, alive = prim >= 0, state.t_max > 0
             masks = [(key == m) | (key == self.models + m) for m in range(self.models)]
             shining = (key < self.models) & met
@@ -524,11 +524,11 @@ class Kernels:
     def _passing(self, prim: Tensor) -> Tensor:
         """Which primitives may let a ray pass."""
         world = self.world
-        assert world.opacity is not None
-        slot = world.slot(prim)
-        some = torch.index_select(world.opacity, 0, slot) < 1
-        if world.veils is not None:
-            some = some | (torch.index_select(world.veils.nodes, 0, slot) >= 0)
+        assert world.materials.opacity is not None
+        slot = world.geometry.slot(prim)
+        some = torch.index_select(world.materials.opacity, 0, slot) < 1
+        if world.textures.opacity is not None:
+            some = some | (torch.index_select(world.textures.opacity.nodes, 0, slot) >= 0)
         return some
 
     def _meet(self, tracer: Tracer, again: bool) -> Sinks:
@@ -621,7 +621,7 @@ def _key(wave: Wave) -> dict[str, tuple[tuple[int, ...], str]]:
     return {"key": ((rows,), "i")}
 
 
-def _state_rows(wave: Wave, packets: bool, fused: bool, veiled: bool) -> Rows:
+def _state_rows(wave: Wave, packets: bool, fused: bool, has_opacity: bool) -> Rows:
     """Only what the scene needs."""
     world = wave.stages.world
     found: dict[str, tuple[tuple[int, ...], str]] = {
@@ -634,7 +634,7 @@ def _state_rows(wave: Wave, packets: bool, fused: bool, veiled: bool) -> Rows:
         "lane": ((), "l"),
         **_key(wave),
     }
-    if any(model.refracts for model in world.models):
+    if any(model.refracts for model in world.materials.models):
         found["eta"] = ((), "f")
     if lights.local(world.lights):
         found |= {"p": ((3,), "f"), "n": ((3,), "f")}
@@ -643,8 +643,8 @@ def _state_rows(wave: Wave, packets: bool, fused: bool, veiled: bool) -> Rows:
     found |= HIT
     if not fused and world.lights is not None:
         found |= SHADOW
-        found |= {"clear": ((), "f")} if veiled else {}
-        found |= {} if veiled and packets else {"blocked": ((), "i")}
+        found |= {"clear": ((), "f")} if has_opacity else {}
+        found |= {} if has_opacity and packets else {"blocked": ((), "i")}
     return Rows(found)
 
 

@@ -24,7 +24,7 @@ __all__ = ["Loop", "Share"]
 TASKS = 6
 #: Fewest lanes that repay a task.
 FEWEST = 1024
-#: Seconds between two looks at signals.
+#: Seconds between two textures at signals.
 PATIENCE = 0.05
 
 
@@ -88,7 +88,7 @@ class Loop:
             Whether all were taken.
         """
         blocks = list(self._blocks(count))
-        # Tasks never run in this thread: it looks after signals.
+        # Tasks never run in this thread: it textures after signals.
         pool = ThreadPoolExecutor(min(self.threads, len(blocks)), thread_name_prefix="torchpt")
         try:
             waiting: set[Future[Share]] = {pool.submit(self._task, start, size, first, count) for start, size in blocks}

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from torchpt.bsdfs import Bsdf
+from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.math.vectors import normalize
 from torchpt.scene.assembly.corners import Corners
-from torchpt.scene.parts import MaterialSlot, Part, VertexColors
-from torchpt.textures import Node
+from torchpt.scene.parts import Part
+from torchpt.textures import Node, VertexColors
 
 __all__ = ["charts_of"]
 
@@ -23,16 +24,20 @@ def charts_of(
     corners: Sequence[Corners],
     sizes: list[int],
     parameters: Mapping[str, Tensor],
-    slots: Mapping[str, MaterialSlot],
+    materials: Mapping[str, ResolvedMaterial],
     models: Sequence[Bsdf],
     uv: bool,
 ) -> dict[str, Any]:
     """What of :class:`World` says where a point lies on its surface, each thing only where something reads it."""
-    readings = [reading for slot in slots.values() for reading in slot.readings()]
-    # Filtered look-ups ask how large a surface's texels are.
-    bumpy = any(slot.bump_map is not None for slot in slots.values())
+    readings = [reading for material in materials.values() for reading in material.readings()]
+    # Filtered textures-ups ask how large a surface's texels are.
+    bumpy = any(material.bump_map is not None for material in materials.values())
     bumpy = bumpy or any(isinstance(reading, Node) and reading.filtered for reading in readings)
-    framed = bumpy or any(slot.normal_map is not None for slot in slots.values()) or any(m.anisotropic for m in models)
+    framed = (
+        bumpy
+        or any(material.normal_map is not None for material in materials.values())
+        or any(m.anisotropic for m in models)
+    )
     imaged = uv or any(isinstance(reading, Node) for reading in readings)
     coloured = any(isinstance(reading, VertexColors) for reading in readings)
     pairs = list(zip(parts, corners, strict=True))

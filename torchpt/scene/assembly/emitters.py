@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchpt.accel.bounds import chosen, primitive_bounds
 from torchpt.errors import SceneError
+from torchpt.lights import KINDS as LIGHTS
 from torchpt.lights import choice_of
 from torchpt.lights.solid_angle import shapes_of, table_of
 from torchpt.math.threads import mean_all
@@ -19,13 +20,12 @@ from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Geometry, Lights
 from torchpt.scene.assembly.curved import quadric_area
 from torchpt.scene.assembly.primitives import Primitives
-from torchpt.scene.lights import ENVIRONMENTS
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
 from torchpt.scene.texels import images_of
 
 if TYPE_CHECKING:
-    from torchpt.lights.envmap import EnvironmentMap
+    from torchpt.lights.kinds.envmap import EnvironmentMap
 
 __all__ = ["lights_of"]
 
@@ -33,18 +33,18 @@ __all__ = ["lights_of"]
 def _emission(part: Part, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> Tensor:
     """Radiance ``(3,)`` of a part that emits."""
     radiance, *strength = (parameters[name].to(dtype) for name in part.emission_names)
-    if part.glow is not None:
+    if part.emission_texture is not None:
         return radiance.expand(3)  # the strength alone: the texture's share is looked up
     return radiance if not strength else radiance * strength[0]
 
 
-def _mean_glow(part: Part, parameters: Mapping[str, Tensor]) -> float:
+def _mean_emission(part: Part, parameters: Mapping[str, Tensor]) -> float:
     """Mean luminance of the texture that a part shines by; 1 without."""
-    if part.glow is None:
+    if part.emission_texture is None:
         return 1.0
-    image = images_of([part.glow], parameters)[part.glow.texels].detach().double()
+    image = images_of([part.emission_texture], parameters)[part.emission_texture.texels].detach().double()
     color = image[..., :3].mean((0, 1)) if image.shape[2] >= 3 else mean_all(image[..., 0]).expand(3)
-    return float(luminance((color * color.new_tensor(part.glow.scale)).abs()))
+    return float(luminance((color * color.new_tensor(part.emission_texture.scale)).abs()))
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def lights_of(
     space: Space,
     opacity: Tensor | None,
     emissive: Tensor,
-    veiled: bool,
+    opacity_mapped: bool,
     choice: str = "auto",
 ) -> Lights | None:
     """The lights; None where nothing emits.
@@ -86,20 +86,20 @@ def lights_of(
         space: the lanes' coordinates.
         opacity: ``(P + I,)``, or None.
         emissive: ``(P + I,)`` bool, which primitives emit.
-        veiled: whether opacity textures cover any of them.
+        opacity_mapped: whether opacity textures opacity_texture any of them.
         choice: how one of them is chosen, from ``lights.WAYS``.
     """
     prim = emissive.nonzero().squeeze(1)
     if not len(prim) and not sources:
         return None
     dtype, device = primitives.p0.dtype, primitives.p0.device
-    glowing = [(part, n) for part, n in zip(parts, primitives.sizes, strict=True) if part.emission is not None and n]
+    emitting = [(part, n) for part, n in zip(parts, primitives.sizes, strict=True) if part.emission is not None and n]
     groups, column = [], None
-    if glowing:
-        surfaces, column = _surfaces(glowing, primitives, parameters, prim)
+    if emitting:
+        surfaces, column = _surfaces(emitting, primitives, parameters, prim)
         groups.append(surfaces)
     reach = _reach(geometry) if sources else torch.ones((), device=device)
-    around = [_surroundings(source, parameters, dtype) for source in sources if source.kind in ENVIRONMENTS]
+    around = [_surroundings(source, parameters, dtype) for source in sources if LIGHTS[source.kind].environment]
     environment = around[0] if around else None
     groups += [_source(source, parameters, environment, space, reach, dtype) for source in sources]
     names = [name for group in groups for name in group.kind]
@@ -119,7 +119,7 @@ def lights_of(
         index[prim] = torch.arange(len(prim), device=device)
     if column is not None:
         column = torch.cat((column, column.new_zeros(rest)))
-    textured = veiled or any(part.glow is not None for part, _ in glowing)
+    textured = opacity_mapped or any(part.emission_texture is not None for part, _ in emitting)
     many = len(names) > 1
     solid = table_of(names, joined["p0"], joined["e1"], joined["e2"])
     lights = Lights(
@@ -151,13 +151,13 @@ _SHARES = {"triangle": 0.5, "rectangle": 1.0, "disk": math.pi, "sphere": 0.0, "q
 
 
 def _surfaces(
-    glowing: Sequence[tuple[Part, int]], primitives: Primitives, parameters: Mapping[str, Tensor], prim: Tensor
+    emitting: Sequence[tuple[Part, int]], primitives: Primitives, parameters: Mapping[str, Tensor], prim: Tensor
 ) -> tuple[_Rows, Tensor | None]:
     """Rows of emissive primitives ``prim``, and where any is a quadric their columns among the quadrics."""
     dtype, device = primitives.p0.dtype, primitives.p0.device
-    counts = torch.tensor([n for _, n in glowing], dtype=torch.int64, device=device)
-    names = [part.kind for part, n in glowing for _ in range(n)]
-    of_kind = torch.tensor([KINDS.index(part.kind) for part, _ in glowing], dtype=torch.int64, device=device)
+    counts = torch.tensor([n for _, n in emitting], dtype=torch.int64, device=device)
+    names = [part.kind for part, n in emitting for _ in range(n)]
+    of_kind = torch.tensor([KINDS.index(part.kind) for part, _ in emitting], dtype=torch.int64, device=device)
     of_kind = torch.repeat_interleave(of_kind, counts)
     share = torch.tensor([_SHARES[kind] for kind in KINDS], dtype=dtype, device=device)[of_kind]
     p0, e1, e2, face, normal = (
@@ -175,10 +175,10 @@ def _surfaces(
         own, world_area = quadric_area(primitives.quadrics.code, primitives.frame)
         area = torch.where(bent, own.to(dtype).index_select(0, column), area)
         whole = torch.where(bent, world_area.index_select(0, column), whole)
-    radiance = torch.cat([_emission(part, parameters, dtype)[:, None].expand(3, n) for part, n in glowing], 1)
+    radiance = torch.cat([_emission(part, parameters, dtype)[:, None].expand(3, n) for part, n in emitting], 1)
     power = math.pi * luminance(radiance.detach().double().abs()) * whole
-    if any(part.glow is not None for part, _ in glowing):
-        shares = [_mean_glow(part, parameters) for part, _ in glowing]
+    if any(part.emission_texture is not None for part, _ in emitting):
+        shares = [_mean_emission(part, parameters) for part, _ in emitting]
         power = power * torch.repeat_interleave(torch.tensor(shares, dtype=torch.float64, device=device), counts)
     flip, bound = (x.index_select(0, prim) for x in (primitives.sign, primitives.bound))
     return _Rows(names, p0, e1, e2, normal, flip, area, bound, radiance, power), column
@@ -191,7 +191,7 @@ def _surroundings(source: Source, parameters: Mapping[str, Tensor], dtype: torch
     texels, scale, pose = (parameters[f"{source.name}.{key}"] for key in ("texels", "scale", "to_world"))
     linear = pose[:3, :3].double()
     turn = torch.linalg.inv(linear) * torch.linalg.det(linear).abs() ** (1.0 / 3.0)
-    from torchpt.lights import envmap
+    from torchpt.lights.kinds import envmap
 
     return envmap.build(texels.to(dtype), turn.to(dtype), scale.to(dtype))
 

@@ -11,17 +11,18 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.errors import SceneError
-from torchpt.records import Geometry, World
+from torchpt.records import Geometry, LaneGeometry, LaneMaterials, LaneTextures, World
 from torchpt.scene.assembly.charts import charts_of
 from torchpt.scene.assembly.copies import copies_of, copy_maps
 from torchpt.scene.assembly.corners import corners_of
 from torchpt.scene.assembly.emitters import lights_of
-from torchpt.scene.assembly.materials import materials_of, nodes_of, opacity_of, veils_of
+from torchpt.scene.assembly.lane_material import lane_material
+from torchpt.scene.assembly.materials import Groups, groups_of, nodes_of, opacity_maps_of, opacity_of
 from torchpt.scene.assembly.primitives import Primitives, primitives_of
-from torchpt.scene.parts import Copy, MaterialSlot, Part, Source
+from torchpt.scene.parts import Copy, Part, Source
 from torchpt.scene.space import FARTHEST, Space
-from torchpt.scene.surfaces import surface_of
 from torchpt.scene.texels import images_of
 from torchpt.textures import atlas_of
 
@@ -43,7 +44,7 @@ def assemble(
     Args:
         parts: ordered by kind as ``records.KINDS``.
         parameters: every tensor by dotted name.
-        sources: lights that are no surfaces, ordered by kind as ``records.SOURCES``.
+        sources: lights that are no made, ordered by kind as ``records.SOURCES``.
         space: the lanes' coordinates.
         dtype: of the lanes.
         copies: instances of parts.
@@ -58,58 +59,75 @@ def assemble(
     primitives = primitives_of(parts, corners, dtype, device)
     _check_reach(parts, primitives, space)
     owners: list[Part | Copy] = [*parts, *copies]
-    slots = {owner.material.name: _in_units(owner.material, space.unit) for owner in owners}
-    surfaces = {name: surface_of(slot, parameters, dtype) for name, slot in slots.items()}
-    nodes = nodes_of(slots.values())
-    kinds, rows, tables, looks, two_sided = materials_of(slots, surfaces, nodes, parameters, dtype, device)
-    models = tuple(model for model, _ in kinds)
+    materials = {owner.material.name: _in_units(owner.material, space.unit) for owner in owners}
+    made = {name: lane_material(material, parameters, dtype) for name, material in materials.items()}
+    nodes = nodes_of(materials.values())
+    groups = groups_of(materials, made, nodes, parameters, dtype, device)
     wide = primitives.sizes + [1] * len(copies)
-    opacity = opacity_of(owners, surfaces, wide, dtype, device)
+    opacity = opacity_of(owners, made, wide, dtype, device)
     dark = primitives.spread([int(part.emission is None) for part in parts] + [1] * len(copies))
-    keys = dark * len(models) + primitives.spread([rows[owner.material.name][0] for owner in owners])
-    key = torch.cat((torch.full((1,), 2 * len(models), device=device), keys)).to(torch.uint8)
-    veiled = any(part.emission is not None and surfaces[part.material.name].cover for part in parts)
-    glows = None
-    if any(part.glow is not None for part in parts):
-        glowing = [-1 if part.glow is None else nodes[part.glow] for part in parts]
-        glows = primitives.spread(glowing + [-1] * len(copies))
+    emission_maps = None
+    if any(part.emission_texture is not None for part in parts):
+        emitting = [-1 if part.emission_texture is None else nodes[part.emission_texture] for part in parts]
+        emission_maps = primitives.spread(emitting + [-1] * len(copies))
     maps = copy_maps(parts, primitives.sizes, copies, parameters, space) if copies else None
     geometry = primitives.geometry(maps)
+    opacity_mapped = any(part.emission is not None and made[part.material.name].opacity_texture for part in parts)
+    lights = lights_of(
+        parts, sources, primitives, geometry, parameters, space, opacity, dark == 0, opacity_mapped, choice
+    )
     world = World(
-        counts=primitives.counts,
-        ends=torch.tensor(primitives.counts, dtype=torch.int64, device=device).cumsum(0),
-        p0=primitives.p0,
-        e1=primitives.e1,
-        e2=primitives.e2,
-        normal=primitives.normal,
-        bound=primitives.bound,
-        flip=primitives.sign if primitives.counts[3] else None,
-        normals=primitives.normals,
-        **charts_of(parts, corners, primitives.sizes, parameters, slots, models, uv),
-        opacity=opacity,
-        material=primitives.spread([rows[owner.material.name][1] for owner in owners]),
-        key=key,
-        models=models,
-        bsdfs=tables,
-        looks=looks,
-        textures=atlas_of(list(nodes), images_of(list(nodes), parameters), dtype, device) if nodes else None,
-        veils=veils_of(owners, surfaces, nodes, wide, dtype, device),
-        glows=glows,
-        two_sided=two_sided,
-        object_id=primitives.spread([owner.object_id for owner in owners]),
-        lights=lights_of(parts, sources, primitives, geometry, parameters, space, opacity, dark == 0, veiled, choice),
-        quadrics=primitives.quadrics,
-        copies=None if maps is None else copies_of(maps, copies, dtype),
+        geometry=LaneGeometry(
+            counts=primitives.counts,
+            ends=torch.tensor(primitives.counts, dtype=torch.int64, device=device).cumsum(0),
+            p0=primitives.p0,
+            e1=primitives.e1,
+            e2=primitives.e2,
+            normal=primitives.normal,
+            bound=primitives.bound,
+            flip=primitives.sign if primitives.counts[3] else None,
+            normals=primitives.normals,
+            **charts_of(parts, corners, primitives.sizes, parameters, materials, groups.models, uv),
+            object_id=primitives.spread([owner.object_id for owner in owners]),
+            quadrics=primitives.quadrics,
+            copies=None if maps is None else copies_of(maps, copies, dtype),
+        ),
+        materials=_materials(owners, primitives, groups, dark, opacity),
+        textures=LaneTextures(
+            atlas=atlas_of(list(nodes), images_of(list(nodes), parameters), dtype, device) if nodes else None,
+            opacity=opacity_maps_of(owners, made, nodes, wide, dtype, device),
+            emission=emission_maps,
+        ),
+        lights=lights,
     )
     return world, geometry
 
 
-def _in_units(slot: MaterialSlot, unit: float) -> MaterialSlot:
+def _materials(
+    owners: Sequence[Part | Copy], primitives: Primitives, groups: Groups, dark: Tensor, opacity: Tensor | None
+) -> LaneMaterials:
+    """Who is made of what; ``dark``: ``(P + I,)`` 0 where a surface emits, else 1."""
+    count = len(groups.models)
+    group, row = zip(*(groups.place[owner.material.name] for owner in owners), strict=True) if owners else ((), ())
+    keys = dark * count + primitives.spread(group)
+    missed = torch.full((1,), 2 * count, device=keys.device)
+    return LaneMaterials(
+        row=primitives.spread(row),
+        key=torch.cat((missed, keys)).to(torch.uint8),
+        models=groups.models,
+        parameters=groups.parameters,
+        textures=groups.textures,
+        two_sided=groups.two_sided,
+        opacity=opacity,
+    )
+
+
+def _in_units(material: ResolvedMaterial, unit: float) -> ResolvedMaterial:
     """A material where lengths are counted in ``unit``: the heights of a bump map are lengths."""
-    if unit == 1.0 or slot.bump_map is None:
-        return slot
-    x, y, z = slot.bump_map.scale
-    return replace(slot, bump_map=replace(slot.bump_map, scale=(x / unit, y / unit, z / unit)))
+    if unit == 1.0 or material.bump_map is None:
+        return material
+    x, y, z = material.bump_map.scale
+    return replace(material, bump_map=replace(material.bump_map, scale=(x / unit, y / unit, z / unit)))
 
 
 def _check_reach(parts: Sequence[Part], primitives: Primitives, space: Space) -> None:

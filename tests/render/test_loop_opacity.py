@@ -1,0 +1,74 @@
+"""Shadow rays past surfaces that let light pass, compiled beside eager: every search structure, with and without instances."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from trials import film_of
+
+import torchpt
+from torchpt.format.description import settings
+from torchpt.render import render_scene
+
+MESH = str(Path(__file__).parents[2] / "scenes" / "standin.ply")
+
+
+def flat(material: str, angle: float, size: float, at: list[float]) -> dict[str, Any]:
+    """A square turned about x."""
+    turn = {"rotate": {"axis": [1, 0, 0], "angle": angle}}
+    return {"type": "rectangle", "material": material, "transform": [{"scale": size}, turn, {"translate": at}]}
+
+
+def description(copies: bool) -> dict[str, Any]:
+    shapes: dict[str, Any] = {
+        "floor": flat("grey", -90.0, 2.0, [0, 0, 0]),
+        "lamp": flat("lamp", 90.0, 0.4, [0, 2, 0]),
+        "pane": flat("film", 90.0, 0.7, [0, 0.9, 0]),
+        "tube": {"type": "cylinder", "material": "film", "center": [0.5, 0.4, 0.3], "radius": 0.2, "height": 0.6},
+        "ball": {"type": "sphere", "material": "grey", "center": [-0.5, 0.3, 0.2], "radius": 0.3},
+    }
+    if copies:
+        shapes |= {
+            "block": {
+                "type": "mesh",
+                "path": MESH,
+                "material": "film",
+                "transform": [{"scale": 3}, {"translate": [-0.3, 0, -0.4]}],
+            },
+            "there": {
+                "type": "instance",
+                "of": "block",
+                "material": "film",
+                "transform": [{"translate": [0.2, 0.5, -0.5]}],
+            },
+        }
+    return {
+        "camera": {"type": "perspective", "origin": [0, 1.2, 4], "target": [0, 0.6, 0], "fov": 40},
+        "materials": {
+            "grey": {"type": "diffuse", "reflectance": 0.6},
+            "film": {"type": "diffuse", "reflectance": [0.7, 0.4, 0.3], "opacity": 0.4},
+            "lamp": {"type": "diffuse", "reflectance": 0.0, "emission": 9.0},
+        },
+        "shapes": shapes,
+    }
+
+
+@pytest.mark.parametrize(("accel", "copies"), [("brute", False), ("numba", False), ("torch", False), ("numba", True)])
+def test_light_that_passes_is_the_same_compiled(accel, copies):
+    scene = torchpt.load(description(copies), "cpu")
+    pictures = []
+    for compile in ("on", "off"):
+        wish = {
+            "film": film_of(24, 16),
+            "integrator": {"type": "path", "max_depth": 3},
+            "render": {"spp": 16, "seed": 1, "compile": compile, "accel": accel},
+        }
+        pictures.append(render_scene(scene, settings(scene.description, wish)).image)
+    on, off = pictures
+    assert float(off.mean()) > 0.01
+    far = (on - off).abs() > 1e-3 * (1 + off.abs())
+    assert float(far.float().mean()) < 0.01, float((on - off).abs().amax())
+    torch.testing.assert_close(on.mean((0, 1)), off.mean((0, 1)), rtol=1e-3, atol=1e-5)

@@ -1,0 +1,1 @@
+"""The scene file: YAML, fields, validation, and the description that they come to."""

@@ -1,0 +1,224 @@
+"""A scene file as it was written, checked: names, files and numbers, nothing built yet."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from torchpt import paths
+from torchpt import settings as run_settings
+from torchpt.bsdfs import Bsdf
+from torchpt.errors import AssetError, SceneError
+from torchpt.format import schema
+from torchpt.format.materials import MATERIALS, Material, check_material, custom_types, read_material
+from torchpt.format.schema import Camera, Shape
+from torchpt.format.textures import TEXTURES, Named, Texture
+from torchpt.format.yaml_file import plain, read_yaml
+from torchpt.lights import KINDS as LIGHTS
+from torchpt.settings import BLOCKS, Settings
+from torchpt.spec.declared import Described, described
+from torchpt.spec.validate import check_keys, select
+
+__all__ = ["ASSETS", "Description", "read_description", "scene_names", "settings"]
+
+ASSETS = "$TORCHPT_ASSETS"
+_KEYS = ("version", "camera", *BLOCKS, "textures", "materials", "shapes", "lights")
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Description:
+    """A checked scene description.
+
+    Attributes:
+        file: the scene file, or None for a scene given as a dict.
+        base: the folder that relative paths start from.
+        camera: the camera.
+        version: 1 where the file states it, else None.
+        film: the film settings that the file really sets, as written.
+        integrator: the same for the integrator.
+        sampler: the same for the sampler.
+        render: the same for the run.
+        textures: by name.
+        materials: by name.
+        shapes: by name, in file order.
+        lights: by name.
+    """
+
+    file: str | None
+    base: Path
+    camera: Camera
+    version: int | None = None
+    film: dict[str, Any] = field(default_factory=dict)
+    integrator: dict[str, Any] = field(default_factory=dict)
+    sampler: dict[str, Any] = field(default_factory=dict)
+    render: dict[str, Any] = field(default_factory=dict)
+    textures: dict[str, Texture] = field(default_factory=dict)
+    materials: dict[str, Material] = field(default_factory=dict)
+    shapes: dict[str, Shape] = field(default_factory=dict)
+    lights: dict[str, Described] = field(default_factory=dict)
+
+    def resolve(self, path: str | tuple[str, ...], key: str) -> Path:
+        """The file that a scene names, or the first existing one of several.
+
+        A relative path starts at the scene file's folder; a leading ``$TORCHPT_ASSETS`` is expanded, no other variable.
+
+        Args:
+            path: as written in the scene.
+            key: dotted key for the error.
+
+        Raises:
+            SceneError: ``$TORCHPT_ASSETS`` is used and not set.
+            AssetError: no such file.
+        """
+        candidates = (path,) if isinstance(path, str) else path
+        problems: list[SceneError | AssetError] = []
+        for candidate in candidates:
+            try:
+                return self._existing(candidate, key)
+            except (SceneError, AssetError) as error:
+                problems.append(error)
+        raise problems[-1]
+
+    def _existing(self, path: str, key: str) -> Path:
+        head, _, rest = path.partition("/")
+        if head == ASSETS:
+            folder = os.environ.get(ASSETS[1:], "")
+            if not folder:
+                expected = f"a file that can be found (the environment variable {ASSETS[1:]} is not set)"
+                raise SceneError(key, path, expected, self.file)
+            found = Path(folder) / rest
+        else:
+            found = self.base / path
+        if not found.is_file():
+            problem = "is a folder" if found.is_dir() else "no such file"
+            hint = f"; only {ASSETS} is expanded" if path.startswith(("$", "~")) and head != ASSETS else ""
+            where = f"{key} of {self.file}" if self.file else key
+            raise AssetError(found, f"{problem}, named by {where}{hint}")
+        return found
+
+
+def scene_names() -> list[str]:
+    """The scenes that ship, by name."""
+    return sorted(path.stem for path in (paths.configs() / "scene").glob("*.yaml"))
+
+
+def read_description(
+    source: str | os.PathLike[str] | Mapping[str, Any], bsdfs: Mapping[str, Bsdf] | None = None
+) -> Description:
+    """A checked scene description.
+
+    Args:
+        source: the name of a scene in ``configs/scene/``, a path ending in ``.yaml``, or a mapping of the same schema
+            (its relative paths start at the current folder).
+        bsdfs: material types of the caller's own: type name to model instance.
+
+    Raises:
+        SceneError: what is wrong first, with file, dotted key, value and what is accepted.
+        NotBuiltError: something that the format knows and this version does not build.
+
+    Warns:
+        EnergyWarning: a material may reflect more light than it receives.
+    """
+    types = {**MATERIALS, **custom_types(bsdfs)}
+    if isinstance(source, Mapping):
+        return _describe(plain(source), types, None, Path.cwd())
+    if not isinstance(source, str | os.PathLike):
+        raise SceneError("scene", source, "a scene's name, a path ending in .yaml, or a mapping")
+    file = os.fspath(source)
+    if file.endswith((".yaml", ".yml")):
+        path = Path(file)
+    elif file in scene_names():
+        path = paths.configs() / "scene" / f"{file}.yaml"
+        file = str(path)
+    else:
+        raise SceneError("scene", file, f"one of {', '.join(scene_names())}, or a path ending in .yaml")
+    return _describe(plain(read_yaml(path, file), file), types, file, path.resolve().parent)
+
+
+def settings(description: Description, overrides: Mapping[str, Any] | None = None) -> Settings:
+    """The complete run settings: built-in default < scene file < override.
+
+    Args:
+        description: whose blocks film, integrator, sampler and render count as the scene's wishes.
+        overrides: by block, e.g. ``{"render": {"spp": 16}}``; None means unset.
+
+    Raises:
+        SceneError: key such as ``render.spp``.
+    """
+    blocks = {name: getattr(description, name) for name in BLOCKS}
+    return run_settings.merge(blocks, overrides or {}, description.file)
+
+
+def _describe(raw: dict[str, Any], types: Mapping[str, type[Material]], file: str | None, base: Path) -> Description:
+    check_keys(raw, _KEYS, "", "a scene", file)
+    version = raw.get("version")
+    if version is not None and (isinstance(version, bool) or version != 1):
+        raise SceneError("version", version, "1", file)
+    if raw.get("camera") is None:
+        raise SceneError("camera", None, "a camera (every scene needs one)", file)
+    camera = schema.read_camera(raw["camera"], file)
+    blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
+    run_settings.merge(blocks, {}, file)
+    textures = _named(raw, "textures", file, lambda item, key: select("texture", TEXTURES, item, key, file))
+    materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
+    for name, material in materials.items():
+        check_material(material, f"materials.{name}", materials, textures, file)
+    shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, textures, types, file))
+    lights = _named(raw, "lights", file, lambda item, key: described("light", LIGHTS, item, key, file))
+    return Description(
+        file, base, camera, version, **blocks, textures=textures, materials=materials, shapes=shapes, lights=lights
+    )
+
+
+def _settings_block(raw: Mapping[str, Any], name: str, file: str | None) -> dict[str, Any]:
+    block = raw.get(name)
+    if block is None:
+        return {}
+    if not isinstance(block, dict):
+        raise SceneError(name, block, "a mapping of settings", file)
+    return {key: value for key, value in block.items() if value is not None}
+
+
+def _named(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[[Any, str], T]) -> dict[str, T]:
+    items = raw.get(block)
+    if items is None:
+        return {}
+    if not isinstance(items, dict):
+        raise SceneError(block, items, f"a mapping from names to {block}", file)
+    return {name: read(item, f"{block}.{name}") for name, item in items.items()}
+
+
+def _shape(
+    item: Any,
+    key: str,
+    materials: Mapping[str, Material],
+    textures: Mapping[str, Texture],
+    types: Mapping[str, type[Material]],
+    file: str | None,
+) -> Shape:
+    if isinstance(item, dict) and isinstance(item.get("material"), dict):
+        inline = read_material(item["material"], f"{key}.material", types, file)
+        check_material(inline, f"{key}.material", materials, textures, file)
+        item = {**item, "material": inline}
+    shape = select("shape", schema.SHAPES, item, key, file)
+    displacement = getattr(shape, "displacement", None)
+    if displacement is not None and isinstance(displacement.texture.texture, Named):
+        name = displacement.texture.texture.texture
+        if name not in textures:
+            known = ", ".join(textures) or "none is defined"
+            raise SceneError(f"{key}.displacement.texture", name, f"the name of a texture ({known})", file)
+    material, where = shape.material, f"{key}.material"
+    if isinstance(material, str):
+        if material not in materials:
+            known = ", ".join(materials) or "none is defined"
+            raise SceneError(where, material, f"the name of a material ({known}) or a material", file)
+        material, where = materials[material], f"materials.{material}"
+    if shape.emission is not None and material is not None and material.emission is not None:
+        expected = f"no emission where the material emits as well ({where}.emission)"
+        raise SceneError(f"{key}.emission", shape.emission, expected, file)
+    return shape

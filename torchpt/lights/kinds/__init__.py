@@ -1,0 +1,1 @@
+"""Lights that are no surfaces: one kind a file."""

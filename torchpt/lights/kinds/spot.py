@@ -1,0 +1,60 @@
+"""Spots: points that shine within a cone about ``Lights.normal``; ``Lights.e1`` holds the cutoff angle and the slope.
+
+Whole up to the beam's edge, from there falling linearly in the angle to zero at the cutoff, as Mitsuba's ``spot``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.lights.base import Light
+from torchpt.math.angles import azimuth
+from torchpt.math.vectors import cross, dot
+from torchpt.spec import Angle, Color, Moves, Point, Refused
+
+__all__ = ["Spot", "falloff"]
+
+
+def falloff(wi: Tensor, axis: Tensor, cutoff: Tensor, slope: Tensor) -> Tensor:
+    """Share ``(N,)`` of the intensity that goes along ``-wi``.
+
+    Args:
+        wi: unit directions toward the light ``(3, N)``.
+        axis: unit ``(3, N)``.
+        cutoff: in radians ``(N,)``.
+        slope: one over the angle from the beam's edge to the cutoff ``(N,)``.
+    """
+    aside = cross(axis.expand_as(wi), wi)
+    sine = dot(aside, aside).clamp_min(torch.finfo(wi.dtype).tiny).sqrt()
+    return ((cutoff - azimuth(-dot(wi, axis), sine)) * slope).clamp(0.0, 1.0)
+
+
+class Spot(Light):
+    """A point that shines within a cone about the direction to ``target``."""
+
+    name = "spot"
+    parameters: ClassVar = {
+        "position": Point(moves=Moves.SHADOWS, doc="where it is"),
+        "target": Point(moves=Moves.SHADOWS, doc="a point that it aims at"),
+        "intensity": Color((1.0, 1.0, 1.0), doc="power per solid angle within the beam"),
+        "cutoff_angle": Angle(20.0, above=0.0, high=180.0, doc="from the axis; nothing shines beyond"),
+        "beam_width": Angle(
+            lambda values: 0.75 * values["cutoff_angle"],
+            above=0.0,
+            high=180.0,
+            doc="from the axis, up to which the intensity is whole; from there it falls linearly to 0 at the cutoff",
+        ),
+    }
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Light`."""
+        if values["position"] == values["target"]:
+            raise Refused("a point other than the position", list(values["target"]), ("target",))
+        if values["beam_width"] > values["cutoff_angle"]:
+            expected = f"an angle of at most cutoff_angle ({values['cutoff_angle']:g})"
+            raise Refused(expected, values["beam_width"], ("beam_width",))

@@ -1,0 +1,84 @@
+"""Tables of kinds: the files of a folder, each imported when its kind is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, Generic, TypeVar
+
+from torchpt.spec.parameters import Spec, spec_of
+
+__all__ = ["Kinds", "parameters_of"]
+
+K = TypeVar("K")
+
+
+class Kinds(Mapping[str, type[K]], Generic[K]):
+    """The kinds in a folder by name: ``point`` is the class with ``name = "point"`` in ``point.py``.
+
+    Args:
+        package: the folder, as a dotted name.
+        first: names that lists begin with; the others follow in the alphabet's order.
+    """
+
+    def __init__(self, package: str, first: tuple[str, ...] = ()) -> None:
+        self.package, self._first = package, first
+        self._known: dict[str, type[K]] = {}
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of all kinds; nothing is imported for it but the folder itself."""
+        found = find_spec(self.package)
+        assert found is not None and found.submodule_search_locations is not None
+        every = [module.name for module in iter_modules(list(found.submodule_search_locations))]
+        rest = sorted(name for name in every if not name.startswith("_") and name not in self._first)
+        return (*self._first, *rest)
+
+    def __getitem__(self, name: str) -> type[K]:
+        if name not in self._known:
+            if name not in self.names:
+                raise KeyError(name)
+            module = import_module(f"{self.package}.{name}")
+            own = [value for value in vars(module).values() if isinstance(value, type) and _named(value, module, name)]
+            if len(own) != 1:
+                raise TypeError(f"{module.__name__} has to define one class with name = {name!r}")
+            self._known[name] = own[0]
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def file(self, name: str) -> Path:
+        """The file of a kind."""
+        return Path(str(import_module(f"{self.package}.{name}").__file__))
+
+
+def _named(kind: type[Any], module: Any, name: str) -> bool:
+    return kind.__module__ == module.__name__ and vars(kind).get("name") == name
+
+
+def parameters_of(kind: Any) -> dict[str, Spec]:
+    """What a kind declares, that of the classes it is made of first.
+
+    Args:
+        kind: a class, or an instance where each declares parameters of its own.
+    """
+    own = kind if isinstance(kind, type) else type(kind)
+    found: dict[str, Spec] = {}
+    layers = [vars(base).get("parameters", {}) for base in reversed(own.__mro__)]
+    if kind is not own:
+        layers.append(vars(kind).get("parameters", {}) if hasattr(kind, "__dict__") else {})
+    for layer in layers:
+        if isinstance(layer, Mapping):
+            found |= {name: spec_of(value) for name, value in layer.items()}
+    return found

@@ -1,0 +1,193 @@
+"""Plain values read: each function takes what a file or a caller gave to a value, or says what is accepted instead.
+
+Numbers are strict: no booleans, no numeric text, nothing that is not finite in float32.
+"""
+
+from __future__ import annotations
+
+import re
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.errors import SceneError
+from torchpt.math import transforms
+
+__all__ = [
+    "LARGEST", "Refused", "bounded", "faces", "file_paths", "flag", "matrix", "memory_size", "number", "pair", "rows", "text",
+    "transform", "vector", "within",
+]  # fmt: skip
+
+LARGEST = float(np.finfo(np.float32).max)
+
+
+class Refused(ValueError):
+    """A value that is not accepted.
+
+    Attributes:
+        expected: what is.
+        value: the part of it that is wrong; ``...``: all of it.
+        at: where in it that part lies.
+        not_built: whether it would be right in a version that builds more.
+    """
+
+    def __init__(
+        self, expected: str, value: Any = ..., at: tuple[str | int, ...] = (), *, not_built: bool = False
+    ) -> None:
+        self.expected, self.value, self.at, self.not_built = expected, value, at, not_built
+        super().__init__(expected)
+
+
+def within(error: SceneError) -> Refused:
+    """The same refusal of a part of a value, by its key relative to the value."""
+    return Refused(error.expected, error.value, tuple(part for part in error.key.split(".") if part))
+
+
+def number(value: Any, expected: str = "a finite number") -> float:
+    """A finite float from an int or float (numpy's too), never from a boolean or text."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
+        raise Refused(expected)
+    if not -LARGEST <= value <= LARGEST:  # false for NaN too
+        raise Refused(expected)
+    return float(value)
+
+
+def vector(value: Any, expected: str = "three finite numbers [x, y, z]") -> tuple[float, float, float]:
+    """Three finite numbers from a list, tuple or array."""
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) != 3:
+        raise Refused(expected)
+    x, y, z = (number(item, expected) for item in value)
+    return x, y, z
+
+
+def bounded(value: Any, low: float, high: float, expected: str) -> float:
+    """A finite float in ``low..high``."""
+    result = number(value, expected)
+    if not low <= result <= high:
+        raise Refused(expected)
+    return result
+
+
+def pair(value: Any, expected: str, *, single: bool = False) -> tuple[float, float]:
+    """Two finite numbers; with ``single`` one number stands for both."""
+    if single and not isinstance(value, list | tuple | np.ndarray):
+        value = (value, value)
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) != 2:
+        raise Refused(expected)
+    return number(value[0], expected), number(value[1], expected)
+
+
+def file_paths(value: Any) -> tuple[str, ...]:
+    """One file path, or a list of candidates of which the first existing one is used."""
+    paths = tuple(value) if isinstance(value, list | tuple) else (value,)
+    if not paths or not all(isinstance(path, str) and path.strip() and path.isprintable() for path in paths):
+        raise Refused("a file path, or a list of them (the first that is there is used)")
+    return paths
+
+
+def flag(value: Any) -> bool:
+    """A boolean."""
+    if not isinstance(value, bool):
+        raise Refused("true or false")
+    return value
+
+
+def text(value: Any) -> str:
+    """A line of text that is not blank."""
+    if not isinstance(value, str) or not value.strip() or not value.isprintable():
+        raise Refused("printable text")
+    return value
+
+
+def transform(value: Any) -> NDArray[np.float64]:
+    """A list of operations as one matrix ``(4, 4)``, see :func:`torchpt.math.transforms.compose`."""
+    try:
+        return transforms.compose(value)
+    except SceneError as error:
+        raise within(error) from None
+
+
+def matrix(value: Any) -> NDArray[np.float64]:
+    """An affine ``(4, 4)`` matrix that can be inverted."""
+    try:
+        found = transforms.matrix4(value, "")
+    except SceneError as error:
+        raise within(error) from None
+    if not transforms.is_usable(found):
+        raise Refused(f"a matrix that can be inverted, {transforms.WITHIN}")
+    return found
+
+
+def rows(value: Any, columns: int, what: str) -> NDArray[np.float64]:
+    """``(V, columns)`` float64 from nested lists or an array; checked and converted in bulk."""
+    expected = f"a list of {what}, finite numbers each"
+    if isinstance(value, list | tuple):
+        if not value or not set(map(type, value)) <= {list, tuple} or set(map(len, value)) != {columns}:
+            _first_bad(value, columns, expected)
+            raise Refused(expected)
+        if not set(map(type, chain.from_iterable(value))) <= {int, float}:
+            _first_bad(value, columns, expected)
+    try:
+        found = np.array(value, dtype=np.float64)
+    except (OverflowError, TypeError, ValueError, RuntimeError):
+        raise Refused(expected) from None
+    if isinstance(value, np.ndarray) and value.dtype.kind not in "iuf":
+        raise Refused(expected, value.dtype)
+    if found.ndim != 2 or found.shape[1] != columns or not len(found):
+        raise Refused(expected)
+    bad = np.flatnonzero(~(np.abs(found) <= LARGEST).all(axis=1))
+    if len(bad):
+        raise Refused(expected, found[bad[0]].tolist(), (int(bad[0]),))
+    return found
+
+
+def _first_bad(value: Any, columns: int, expected: str) -> None:
+    """Raises for the first row of a list that is not ``columns`` numbers."""
+    for index, row in enumerate(value):
+        if not isinstance(row, list | tuple) or len(row) != columns or not all(type(x) in (int, float) for x in row):
+            raise Refused(expected, row, (index,))
+
+
+def faces(value: Any) -> NDArray[np.int64]:
+    """``(F, 3)`` int64 from lists of three or more indices; polygons are split into fans."""
+    expected = "a list of faces, each three or more vertex indices (whole numbers >= 0)"
+    if isinstance(value, list | tuple):
+        lists = bool(value) and set(map(type, value)) <= {list, tuple}
+        if not lists or set(map(type, chain.from_iterable(value))) != {int} or min(map(len, value)) < 3:
+            for index, row in enumerate(value):
+                if not isinstance(row, list | tuple) or len(row) < 3 or not all(type(x) is int for x in row):
+                    raise Refused(expected, row, (index,))
+            raise Refused(expected)
+        triangles: Any = value
+        if max(map(len, value)) > 3:
+            triangles = [(row[0], row[i], row[i + 1]) for row in value for i in range(1, len(row) - 1)]
+    else:
+        triangles = value
+    try:
+        found = np.array(triangles)
+    except (OverflowError, TypeError, ValueError, RuntimeError):
+        raise Refused(expected) from None
+    if found.ndim != 2 or found.shape[1] != 3 or not len(found) or found.dtype.kind not in "iu":
+        raise Refused(expected)
+    return found.astype(np.int64)
+
+
+_SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([kKMGT]?)(i?)[bB]?\s*\Z")
+
+
+def memory_size(value: Any) -> int | None:
+    """Bytes from a whole number or text such as ``4GB`` (10^9) or ``512 MiB`` (2^20)."""
+    expected = "null, a number of bytes, or a size such as 4GB or 512MiB"
+    if value is None:
+        return None
+    if isinstance(value, str):
+        match = _SIZE.match(value)
+        if not match:
+            raise Refused(expected)
+        base = 1024 if match[3] else 1000
+        value = int(float(match[1]) * base ** " KMGT".index(match[2].upper() or " "))
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 2**60:
+        raise Refused(expected)
+    return value
