@@ -122,14 +122,16 @@ class _Numbers(Spec):
 
     @property
     def _range(self) -> str:
-        low, high = (None if self.above is not None else self.low), self.high
-        if self.above is not None and self.below is not None:
-            return f" above {self.above:g} and below {self.below:g}"
-        if self.above is not None:
-            return f" above {self.above:g}" + (f", at most {high:g}" if high is not None else "")
-        if low is None:
-            return "" if high is None else f" <= {high:g}"
-        return f" in {low:g}..{high:g}" if high is not None else f" >= {low:g}"
+        low, high = self.low, self.high
+        if self.above is None and self.below is None and low is not None and high is not None:
+            return f" in {low:g}..{high:g}"
+        least = f">= {low:g}" if low is not None and self.above is None else ""
+        ends = [
+            least if self.above is None else f"> {self.above:g}",
+            ("" if high is None else f"<= {high:g}") if self.below is None else f"< {self.below:g}",
+        ]
+        words = " and ".join(end for end in ends if end)
+        return f" {words}" if words else ""
 
     def _fits(self, number: float) -> bool:
         """Whether a number is in the range, as the float32 that it becomes."""
@@ -348,8 +350,10 @@ class Pose(Spec):
 
     def check(self, value: Tensor) -> None:
         """See :class:`Spec`."""
+        import torch
+
         matrix = value.double().cpu().numpy()
-        if not np.isfinite(matrix.astype(np.float32)).all():
+        if not bool(torch.isfinite(value.float()).all()):
             raise Refused("numbers finite in float32", "a value that is not finite in float32")
         if not is_usable(matrix):
             raise Refused(f"a matrix that can be inverted, {WITHIN}", matrix.tolist())
