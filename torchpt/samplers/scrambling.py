@@ -1,4 +1,4 @@
-"""Owen-scrambled Sobol' points, padded: each 1D or 2D set of dimensions is its own shuffled, scrambled (0, 2)-sequence.
+"""Owen scrambling and Sobol' points on bit-reversed int32 lanes.
 
 Burley, *Practical Hash-based Owen Scrambling*, JCGT 10(4), 2020. The scrambling hash is Vegdahl's refinement
 ("Owen scrambling based permutation hash", 2021) of the Laine-Karras permutation.
@@ -10,17 +10,15 @@ of ``i`` (its direction numbers are the powers of ``x + 1``), and that shift tak
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from torchpt.samplers.hashing import as_int32, logical_shift, mix, to_unit
+from torchpt.samplers.hashing import as_int32, logical_shift
 
-__all__ = ["NEEDS_COUNT", "draw_1d", "draw_2d", "reverse_bits", "scramble", "second_dimension"]
+__all__ = ["X", "Y", "reverse_bits", "scramble", "second_dimension"]
 
-#: Any number of points may be drawn, and then more.
-NEEDS_COUNT = False
+#: What a seed is mixed with for the first and for the second coordinate.
+X, Y = as_int32(0x68BC21EB), as_int32(0x02E5BE93)
 _K0, _K1, _K2 = 0x3D20ADEA, 0x05526C56, 0x53A22864
-_X, _Y = as_int32(0x68BC21EB), as_int32(0x02E5BE93)
 _HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
 
 
@@ -45,20 +43,3 @@ def second_dimension(index: Tensor) -> Tensor:
     for shift, mask in reversed(_HALVES):
         index = index ^ ((index >> shift) & mask)
     return index
-
-
-def draw_1d(key: Tensor, salt: Tensor | int) -> Tensor:
-    """``(N,)`` float32 in ``[0, 1)``. ``key (2, N)`` int32 holds the pixel's seed and the sample's index."""
-    # Shuffled before it is scrambled: scrambled alone, all 1D sets would share their order and move together.
-    seed = mix(key[0] ^ salt)
-    index = reverse_bits(scramble(reverse_bits(key[1]), seed))
-    return to_unit(reverse_bits(scramble(index, mix(seed ^ _X))))
-
-
-def draw_2d(key: Tensor, salt: Tensor | int) -> Tensor:
-    """``(2, N)`` float32 in ``[0, 1)``."""
-    seed = mix(key[0] ^ salt)
-    index = reverse_bits(scramble(reverse_bits(key[1]), seed))
-    x = scramble(index, mix(seed ^ _X))
-    y = scramble(second_dimension(index), mix(seed ^ _Y))
-    return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))
