@@ -13,8 +13,9 @@ from torchpt import settings as run_settings
 from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, SceneError
 from torchpt.format import schema
+from torchpt.format.cameras import read_camera
 from torchpt.format.materials import MATERIALS, Material, check_material, custom_types, read_material
-from torchpt.format.schema import Camera, Shape
+from torchpt.format.schema import Shape
 from torchpt.format.textures import TEXTURES, Named, Texture
 from torchpt.format.yaml_file import plain, read_yaml
 from torchpt.lights import KINDS as LIGHTS
@@ -51,7 +52,7 @@ class Description:
 
     file: str | None
     base: Path
-    camera: Camera
+    camera: Described
     version: int | None = None
     film: dict[str, Any] = field(default_factory=dict)
     integrator: dict[str, Any] = field(default_factory=dict)
@@ -161,8 +162,8 @@ def _describe(raw: dict[str, Any], types: Mapping[str, type[Material]], file: st
         raise SceneError("version", version, "1", file)
     if raw.get("camera") is None:
         raise SceneError("camera", None, "a camera (every scene needs one)", file)
-    camera = schema.read_camera(raw["camera"], file)
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
+    camera = read_camera(raw["camera"], blocks["film"], file)
     run_settings.merge(blocks, {}, file)
     textures = _named(raw, "textures", file, lambda item, key: select("texture", TEXTURES, item, key, file))
     materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))

@@ -67,9 +67,7 @@ def build_parts(description: Description) -> Built:
     for name, material in description.materials.items():
         _declare(resolved(material, f"materials.{name}", description.materials, opener), parameters)
     sources = sorted([*sources_of(description, parameters), *found], key=lambda source: SOURCES.index(source.kind))
-    parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
-    for name, number in description.camera.numbers().items():
-        parameters[f"camera.{name}"] = np.asarray(number, np.float64)
+    parameters.declare_all("camera", description.camera.kind, description.camera.values)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)
     return Built(tuple(parts), parameters, centre, unit, tuple(sources), tuple(copies))

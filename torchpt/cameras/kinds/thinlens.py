@@ -8,15 +8,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchpt.cameras.perspective import Perspective
+from torchpt.cameras.pinhole import Pinhole
 from torchpt.math.vectors import normalize
 from torchpt.math.warps import concentric_disk, uniform_polygon
+from torchpt.spec import Moves, Scalar, Whole
 
 __all__ = ["ThinLens"]
 
 
-@dataclass(frozen=True)
-class ThinLens(Perspective):
+@dataclass(frozen=True, kw_only=True)
+class ThinLens(Pinhole):
     """A perspective camera whose rays start on a lens, and meet in the plane in focus.
 
     What lies at depth ``z`` is spread over a disk of radius ``aperture_radius |1/focus_distance - 1/z|``, as slopes of the
@@ -28,11 +29,20 @@ class ThinLens(Perspective):
         blades: corners of the aperture, the first of them up; 0 is a disk.
     """
 
+    name = "thinlens"
+    parameters: ClassVar = {
+        "aperture_radius": Scalar(length=True, moves=Moves.SURFACES, doc="of the lens; 0 is a pinhole"),
+        "focus_distance": Scalar(
+            above=0.0, length=True, moves=Moves.SURFACES, doc="depth of the plane in focus, along the viewing direction"
+        ),
+        "blades": Whole(0, low=3, high=64, also=(0,), doc="corners of the aperture, the first of them up; 0 is a disk"),
+    }
+    lens: ClassVar[bool] = True
+    reaches: ClassVar[tuple[str, ...]] = ("aperture_radius",)
+
     aperture_radius: Tensor
     focus_distance: Tensor
     blades: int
-
-    lens: ClassVar[bool] = True
 
     def rays(self, x: Tensor, y: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
         """See :meth:`Camera.rays`."""
