@@ -26,7 +26,7 @@ from torchpt.scene.build import Built, build_parts
 from torchpt.scene.info import describe
 from torchpt.scene.space import FARTHEST, Space
 from torchpt.settings import Film, Settings
-from torchpt.spec import Index, Moves, Pose, Refused, Scalar, Spec, Vertices
+from torchpt.spec import Moves, Pose, Refused, Scalar, Spec, Vertices
 
 __all__ = ["Scene", "device_of", "load"]
 
@@ -253,6 +253,4 @@ def _undeclared(name: str, built: Built) -> Spec:
             {"above": 0.0, "below": 180.0} if key == "fov" else {} if key == "aperture_radius" else {"above": 0.0}
         )
         return Scalar(moves=Moves.SURFACES, **low)
-    if ".material." in name or name.startswith("materials."):
-        return Index() if key in ("int_ior", "ext_ior", "ior") else Scalar()
     return Scalar() if key in ("emission", "texels") else Scalar(low=None)
