@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from torchpt.errors import SceneError
-from torchpt.format.materials import Material
 from torchpt.format.textures import TextureInput, texture_input
-from torchpt.math import transforms
+from torchpt.spec.declared import Described
 from torchpt.spec.fields import (
     Check,
     FaceArray,
@@ -36,7 +35,7 @@ __all__ = [
 
 def _material(value: Any) -> Any:
     """A material's name; an inline one has become a model before the shape is validated."""
-    if value is None or isinstance(value, Material) or (isinstance(value, str) and value):
+    if value is None or isinstance(value, Described) or (isinstance(value, str) and value):
         return value
     raise wrong("the name of a material, or a material")
 
@@ -51,7 +50,7 @@ class Shape(Model):
         flip_normals: turn the front side around.
     """
 
-    material: Annotated[str | Material | None, Check(_material)] = None
+    material: Annotated[str | Described | None, Check(_material)] = None
     transform: Transform | None = None
     emission: Annotated[tuple[float, float, float] | None, color(optional=True)] = None
     flip_normals: Flag = False

@@ -104,7 +104,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
     lights = world.lights
     absent = [f"{kind} primitives" for kind, n in zip(KINDS, world.geometry.counts, strict=True) if not n]
     present = {model.name for model in world.materials.models}
-    absent += [f"{name} bsdf" for name in dict.fromkeys(model.name for model in bsdfs.MODELS) if name not in present]
+    absent += [f"{name} bsdf" for name in bsdfs.KINDS if name not in present]
     if len(world.materials.models) == 1:
         absent.append("sorting by bsdf (one model)")
     if world.geometry.normals is None:

@@ -26,7 +26,7 @@ from torchpt.scene.build import Built, build_parts
 from torchpt.scene.info import describe
 from torchpt.scene.space import FARTHEST, Space
 from torchpt.settings import Film, Settings
-from torchpt.spec import Index, Moves, Pose, Refused, Scalar, Spec, Vertices, parameters_of
+from torchpt.spec import Moves, Pose, Refused, Scalar, Spec, Vertices, parameters_of
 
 __all__ = ["Scene", "device_of", "load"]
 
@@ -221,7 +221,9 @@ class Scene:
         merged, size = self.merged(params), settings(self.description, {"film": film or {}}).film
         matrix = self.camera(size, merged, torch.float64).intrinsics()
         if matrix is None:
-            raise SceneError("camera.type", self.description.camera.name, "a camera with an angle of view", self.description.file)
+            raise SceneError(
+                "camera.type", self.description.camera.name, "a camera with an angle of view", self.description.file
+            )
         turn, move = extrinsics(merged["camera.to_world"].double())
         return PinholeMatrices(matrix.to(dtype), turn.to(dtype), move.to(dtype))
 
@@ -262,6 +264,4 @@ def _undeclared(name: str, built: Built) -> Spec:
         return Vertices()
     if key == "to_world":
         return Pose(angles=any(part.kind == "sphere" and name == f"{part.name}.to_world" for part in built.parts))
-    if ".material." in name or name.startswith("materials."):
-        return Index() if key in ("int_ior", "ext_ior", "ior") else Scalar()
     return Scalar() if key in ("emission", "texels") else Scalar(low=None)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters
-from torchpt.records import BsdfSample
+from torchpt.bsdfs.base import Bsdf, Parameters, Values
+from torchpt.records import BsdfSample, SplitSumMaterial
+from torchpt.spec import Refused
 
 __all__ = ["Null"]
 
@@ -19,9 +20,19 @@ class Null(Bsdf):
     """Straight through, from both sides."""
 
     name = "null"
+    sheer = True
     delta = True
     smooth = True
     transmits = True
+
+    @classmethod
+    def check(cls, values: Values, given: frozenset[str]) -> None:
+        """Nothing can cover it, and it does not shine."""
+        super().check(values, given)
+        for key in ("opacity", "alpha_cutoff", "emission"):
+            if key in given:
+                why = "a null surface has nothing to cover or to emit (use another type with opacity)"
+                raise Refused(f"no {key}, as {why}", values[key], (key,))
 
     def prepare(self, values: Parameters) -> Parameters:
         """One flag that stands for the row: it has no parameters."""
@@ -38,3 +49,8 @@ class Null(Bsdf):
     def albedo(self, parameters: Parameters) -> Tensor:
         """White: all light goes on."""
         return torch.ones_like(parameters["row"], dtype=torch.float32).expand(3, -1)
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """All passes."""
+        none = torch.zeros(3, len(parameters["row"]), device=parameters["row"].device)
+        return SplitSumMaterial(none, none[0], none[0], none[0], none[0], none + 1.0)

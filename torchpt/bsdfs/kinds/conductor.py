@@ -4,37 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters
-from torchpt.math.fresnel import fresnel_conductor, schlick
-from torchpt.records import BsdfSample
+from torchpt.bsdfs.base import Bsdf, Parameters, Values
+from torchpt.bsdfs.metal import Metal, by_reflectance, metal, metal_colour, mirrored
+from torchpt.bsdfs.specs import smooth
+from torchpt.records import BsdfSample, SplitSumMaterial
 
-__all__ = ["Conductor", "metal", "metal_colour"]
-
-
-def metal(values: Parameters) -> Parameters:
-    """What :func:`metal_colour` reads: ``eta`` and ``k``, or ``reflectance``; the others are None."""
-    names = ("reflectance",) if "reflectance" in values else ("eta", "k")
-    absent = dict.fromkeys(("eta", "k", "reflectance", "specular_reflectance"))
-    return {
-        **absent,
-        **{name: values[name] for name in names},
-        "specular_reflectance": values.get("specular_reflectance"),
-    }
-
-
-def metal_colour(parameters: Parameters, cos: Tensor) -> Tensor:
-    """Reflectance ``(3, N)`` at a cosine ``(N,)``, without the factor ``specular_reflectance``."""
-    if parameters["reflectance"] is not None:
-        return schlick(cos, parameters["reflectance"])
-    return fresnel_conductor(cos, parameters["eta"], parameters["k"])
+__all__ = ["Conductor"]
 
 
 @dataclass(frozen=True)
-class Conductor(Bsdf):
+class Conductor(Metal):
     """A mirror.
 
     Attributes:
@@ -42,16 +26,21 @@ class Conductor(Bsdf):
     """
 
     name = "conductor"
-    parameters = {  # noqa: RUF012
-        "eta": (0.0, 0.0, 0.0),
-        "k": (1.0, 1.0, 1.0),
-        "reflectance": (1.0, 1.0, 1.0),
-        "specular_reflectance": (1.0, 1.0, 1.0),
-    }
+    parameters: ClassVar = dict.fromkeys(("alpha", "roughness", "alpha_u", "alpha_v"), smooth("roughconductor"))
     delta = True
     smooth = True
 
     schlick: bool = False
+
+    @classmethod
+    def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
+        """See :class:`Bsdf`."""
+        return cls(by_reflectance(values)), cls.given(values)
+
+    @classmethod
+    def variants(cls) -> tuple[Bsdf, ...]:
+        """See :class:`Bsdf`."""
+        return cls(), cls(schlick=True)
 
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
@@ -74,3 +63,8 @@ class Conductor(Bsdf):
         some = parameters["eta"] if parameters["reflectance"] is None else parameters["reflectance"]
         colour = metal_colour(parameters, torch.ones_like(some[0]))
         return colour if parameters["specular_reflectance"] is None else colour * parameters["specular_reflectance"]
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """A mirror."""
+        like = next(parameters[key] for key in ("reflectance", "eta") if parameters[key] is not None)
+        return mirrored(parameters, torch.zeros_like(like[0]))

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters
+from torchpt.bsdfs.base import Bsdf, Parameters, Values
 from torchpt.bsdfs.lobes import weighed, with_delta
-from torchpt.records import BsdfSample
+from torchpt.bsdfs.specs import Inner, fraction
+from torchpt.records import BsdfSample, SplitSumMaterial
+from torchpt.spec import REQUIRED
 
 __all__ = ["Blend"]
 
@@ -28,8 +31,32 @@ class Blend(Bsdf):
     b: Bsdf
 
     name = "blend"
-    parameters = {"weight": 0.5}  # noqa: RUF012
+    parameters: ClassVar = {
+        "a": Inner(doc="the material at weight 0"),
+        "b": Inner(doc="the material at weight 1"),
+        "weight": fraction(REQUIRED, "share of `b`"),
+    }
     lobed = True
+
+    @classmethod
+    def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
+        """See :class:`Bsdf`."""
+        return cls(values["a"], values["b"]), cls.given(values)
+
+    @classmethod
+    def variants(cls) -> tuple[Bsdf, ...]:
+        """Of one kind and of two, of what light passes and what it does not, and of a blend."""
+        from torchpt.bsdfs import KINDS
+
+        made: dict[str, Any] = {name: KINDS[name] for name in KINDS}
+        matt, rough, glass = made["diffuse"](), made["roughconductor"](), made["dielectric"]()
+        inner = cls(matt, made["conductor"](schlick=True))
+        return cls(matt, rough), cls(glass, matt), cls(inner, made["roughdielectric"]())
+
+    @property
+    def factors(self) -> tuple[str, ...]:
+        """Those of both."""
+        return (*self.a.factors, *self.b.factors)
 
     @property
     def delta(self) -> bool:
@@ -107,6 +134,11 @@ class Blend(Bsdf):
         """Blended likewise."""
         a, b = self.a.albedo(parameters["a"]), self.b.albedo(parameters["b"])
         return a + parameters["weight"].clamp(0.0, 1.0) * (b - a)
+
+    def preview(self, parameters: Parameters, shade: Callable[[SplitSumMaterial], Tensor]) -> Tensor:
+        """Blended likewise."""
+        a, b = self.a.preview(parameters["a"], shade), self.b.preview(parameters["b"], shade)
+        return a + (b - a) * parameters["weight"].clamp(0.0, 1.0)
 
     def weights(self) -> Iterator[Tensor]:
         """Those of both."""

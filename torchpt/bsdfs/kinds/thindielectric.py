@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters
-from torchpt.bsdfs.dielectric import choose, clear, tinted
+from torchpt.bsdfs.base import Parameters
+from torchpt.bsdfs.glass import Glass, choose, clear, passing, tinted
+from torchpt.bsdfs.lobes import reflectance_at_normal
+from torchpt.bsdfs.specs import smooth
 from torchpt.math.fresnel import fresnel_dielectric
-from torchpt.records import BsdfSample
+from torchpt.records import BsdfSample, SplitSumMaterial
 
 __all__ = ["ThinDielectric"]
 
 
 @dataclass(frozen=True)
-class ThinDielectric(Bsdf):
+class ThinDielectric(Glass):
     """Reflection, or straight through; both count the series of reflections between its boundaries."""
 
     name = "thindielectric"
-    parameters = {  # noqa: RUF012
-        "int_ior": 1.5046,
-        "ext_ior": 1.000277,
-        "specular_reflectance": (1.0, 1.0, 1.0),
-        "specular_transmittance": (1.0, 1.0, 1.0),
-    }
+    parameters: ClassVar = dict.fromkeys(("alpha", "roughness"), smooth("roughdielectric"))
     lobed = True
     delta = True
     smooth = True
@@ -58,3 +56,8 @@ class ThinDielectric(Bsdf):
     def albedo(self, parameters: Parameters) -> Tensor:
         """White: what it takes is what it gives."""
         return torch.ones_like(parameters["eta"]).expand(3, -1)
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """What both boundaries reflect, and the rest straight on."""
+        f0 = reflectance_at_normal(parameters["eta"])
+        return passing(parameters, torch.zeros_like(f0), 2.0 * f0 / (1.0 + f0), None)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
 from torchpt.bsdfs.base import Bsdf, Parameters
+from torchpt.bsdfs.specs import GREY, reflectance
 from torchpt.math.warps import cosine_hemisphere
 from torchpt.records import BsdfSample
 
@@ -19,7 +21,7 @@ class Diffuse(Bsdf):
     """The same radiance into all directions."""
 
     name = "diffuse"
-    parameters = {"reflectance": (0.5, 0.5, 0.5)}  # noqa: RUF012
+    parameters: ClassVar = {"reflectance": reflectance(GREY, "share of the light that is reflected")}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """See :class:`Bsdf`."""

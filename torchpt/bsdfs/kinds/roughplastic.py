@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters, Table
-from torchpt.bsdfs.dielectric import tinted
+from torchpt.bsdfs.base import Bsdf, Parameters, Table, Values
+from torchpt.bsdfs.coat import Coat, coated, over_base
+from torchpt.bsdfs.glass import tinted
 from torchpt.bsdfs.lobes import share, weighed, with_delta
-from torchpt.bsdfs.plastic import Plastic, coated
-from torchpt.bsdfs.roughconductor import rough
+from torchpt.bsdfs.rough import Rough, mean_roughness, rough
 from torchpt.math import microfacet
 from torchpt.math.fresnel import fresnel_dielectric
 from torchpt.math.vectors import dot
 from torchpt.math.warps import cosine_hemisphere
-from torchpt.records import BsdfSample
+from torchpt.records import BsdfSample, SplitSumMaterial
 
 __all__ = ["RoughPlastic"]
 
@@ -25,7 +26,7 @@ _ENTRIES = 64  # cosines of the tables, as Mitsuba has them
 
 
 @dataclass(frozen=True)
-class RoughPlastic(Bsdf):
+class RoughPlastic(Rough, Coat):
     """A coat of GGX microfacets over a diffuse base. A row with a roughness below ``1e-4`` has a mirror for a coat.
 
     What the coat lets through is tabulated for each material over the cosine of a direction.
@@ -36,11 +37,20 @@ class RoughPlastic(Bsdf):
 
     name = "roughplastic"
     tabulated = ("alpha", "roughness", "int_ior", "ext_ior")
-    parameters = {**Plastic.parameters, "alpha": 0.1}  # noqa: RUF012
     lobed = True
     delta = True
 
     nonlinear: bool = False
+
+    @classmethod
+    def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
+        """See :class:`Bsdf`."""
+        return cls(values["nonlinear"]), cls.given(values)
+
+    @classmethod
+    def variants(cls) -> tuple[Bsdf, ...]:
+        """See :class:`Bsdf`."""
+        return cls(), cls(nonlinear=True)
 
     def tabulate(self, values: Parameters) -> Parameters:
         """How much the coat lets through by cosine, and how much of the base's light it sends back."""
@@ -94,6 +104,10 @@ class RoughPlastic(Bsdf):
     def albedo(self, parameters: Parameters) -> Tensor:
         """That of the base."""
         return parameters["diffuse_reflectance"]
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """A rough mirror over the base."""
+        return over_base(parameters, mean_roughness(parameters))
 
     def _specular(self, parameters: Parameters, t_o: Tensor) -> Tensor:
         """How often the coat is chosen."""

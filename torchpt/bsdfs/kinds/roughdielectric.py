@@ -6,24 +6,25 @@ Walter, Marschner, Li, Torrance, *Microfacet Models for Refraction through Rough
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters
-from torchpt.bsdfs.dielectric import Dielectric, clear, tinted
-from torchpt.bsdfs.lobes import weighed
-from torchpt.bsdfs.roughconductor import alphas, energy_at, energy_table, rough
+from torchpt.bsdfs.base import Bsdf, Parameters, Values
+from torchpt.bsdfs.glass import Glass, clear, passing, polished, tinted
+from torchpt.bsdfs.lobes import reflectance_at_normal, weighed
+from torchpt.bsdfs.rough import Anisotropic, alphas, energy_at, energy_table, mean_roughness, rough
 from torchpt.math import microfacet
 from torchpt.math.fresnel import INDEX_MATCHED, fresnel_dielectric, refract
 from torchpt.math.vectors import dot, normalize
-from torchpt.records import BsdfSample
+from torchpt.records import BsdfSample, SplitSumMaterial
 
 __all__ = ["RoughDielectric"]
 
 
 @dataclass(frozen=True)
-class RoughDielectric(Bsdf):
+class RoughDielectric(Anisotropic, Glass):
     """Frosted glass. A row with both roughnesses below ``1e-4`` is polished glass, one with equal indices is nothing.
 
     Attributes:
@@ -33,7 +34,6 @@ class RoughDielectric(Bsdf):
     """
 
     name = "roughdielectric"
-    parameters = {**Dielectric.parameters, "alpha": 0.1, "alpha_u": 0.1, "alpha_v": 0.1}  # noqa: RUF012
     lobed = True
     delta = True
     transmits = True
@@ -41,6 +41,16 @@ class RoughDielectric(Bsdf):
 
     anisotropic: bool = False
     energy_compensation: bool = False
+
+    @classmethod
+    def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
+        """See :class:`Bsdf`."""
+        return cls(values["alpha_u"] is not None, values["energy_compensation"]), cls.given(values)
+
+    @classmethod
+    def variants(cls) -> tuple[Bsdf, ...]:
+        """See :class:`Bsdf`."""
+        return tuple(cls(anisotropic, compensated) for compensated in (False, True) for anisotropic in (False, True))
 
     @property
     def reciprocal(self) -> bool:
@@ -105,18 +115,23 @@ class RoughDielectric(Bsdf):
         # A facet may send the ray to the other side of the surface than is meant: no pair of directions is drawn so.
         kept = ((wi[2] * wo[2] > 0) == reflects).to(wo.dtype)
         drawn = weighed(self, parameters, wo, wi, kept)
-        polished = Dielectric().sample(parameters, wo, lobe, u)
-        assert polished.eta is not None
+        clean = polished(parameters, wo, lobe)
+        assert clean.eta is not None
         return BsdfSample(
-            torch.where(smooth, polished.wi, drawn.wi),
-            torch.where(smooth, polished.pdf, drawn.pdf),
-            torch.where(smooth, polished.weight, drawn.weight),
-            torch.where(smooth, polished.eta, torch.where(reflects, 1.0, side.eta_it)).detach(),
+            torch.where(smooth, clean.wi, drawn.wi),
+            torch.where(smooth, clean.pdf, drawn.pdf),
+            torch.where(smooth, clean.weight, drawn.weight),
+            torch.where(smooth, clean.eta, torch.where(reflects, 1.0, side.eta_it)).detach(),
         )
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """White: what it takes is what it gives."""
         return torch.ones_like(parameters["eta"]).expand(3, -1)
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """A rough boundary."""
+        eta = parameters["eta"]
+        return passing(parameters, mean_roughness(parameters), reflectance_at_normal(eta), eta)
 
 
 _TINY = 1e-30

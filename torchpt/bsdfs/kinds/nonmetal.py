@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
 from torchpt.bsdfs.base import Parameters
 from torchpt.bsdfs.glossy import Glossy
+from torchpt.bsdfs.specs import GREY, fraction, reflectance
+from torchpt.records import SplitSumMaterial
 
 __all__ = ["Nonmetal"]
 
@@ -17,7 +20,11 @@ class Nonmetal(Glossy):
     """Facets of one reflectance at every angle over a diffuse base."""
 
     name = "nonmetal"
-    parameters = {"base_color": (0.5, 0.5, 0.5), "specular": 0.04, "roughness": 0.5}  # noqa: RUF012
+    parameters: ClassVar = {
+        "base_color": reflectance(GREY, "colour of the diffuse base"),
+        "specular": fraction(0.04, "share of the highlight"),
+        "roughness": fraction(0.5, "of its facets: the square root of GGX's alpha"),
+    }
 
     def amounts(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
         """See :class:`Glossy`."""
@@ -28,3 +35,8 @@ class Nonmetal(Glossy):
         """Both lobes."""
         diffuse, specular = self.amounts(parameters, parameters["base_color"])
         return diffuse + specular
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """Reflectance alike at every angle."""
+        s = parameters["specular"]
+        return SplitSumMaterial(parameters["base_color"], s, s, self.roughness(parameters), s)

@@ -8,26 +8,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters
+from torchpt.bsdfs.base import Parameters
 from torchpt.bsdfs.lobes import above, cosine_power, drop_of_power, mean, share, weighed
+from torchpt.bsdfs.power import Power, added
+from torchpt.bsdfs.specs import reflectance
 from torchpt.math.vectors import dot
 from torchpt.math.warps import cosine_hemisphere
-from torchpt.records import BsdfSample
+from torchpt.records import BsdfSample, SplitSumMaterial
 
 __all__ = ["BlinnPhong"]
 
 
 @dataclass(frozen=True)
-class BlinnPhong(Bsdf):
+class BlinnPhong(Power):
     """A diffuse lobe and one about the half vector."""
 
     name = "blinn_phong"
-    parameters = {"diffuse": (0.5, 0.5, 0.5), "specular": (0.2, 0.2, 0.2), "exponent": 30.0}  # noqa: RUF012
-    lobed = True
+    parameters: ClassVar = {
+        "specular": reflectance((0.1, 0.1, 0.1), "reflectance of the glossy lobe, up to four times")
+    }
+    most = 4.0
     conserves = False
 
     def prepare(self, values: Parameters) -> Parameters:
@@ -69,3 +74,8 @@ class BlinnPhong(Bsdf):
     def albedo(self, parameters: Parameters) -> Tensor:
         """Both reflectances; where they create energy, no more than 1."""
         return (parameters["diffuse"] + parameters["specular"]).clamp_max(1.0)
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """Facets as wide, and as bright as the lobe is at normal incidence."""
+        n = parameters["exponent"]
+        return added(parameters, 2.0 / (n + 2.0), 4.0 * (n + torch.exp(-0.34657359 * n)) / (n + 4.0))

@@ -6,12 +6,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
 from torchpt.bsdfs.base import Parameters
 from torchpt.bsdfs.glossy import Glossy
+from torchpt.bsdfs.lobes import reflectance_at_normal
+from torchpt.bsdfs.specs import GREY, WHITE, fraction, index, reflectance
 from torchpt.math.fresnel import fresnel_dielectric
+from torchpt.records import SplitSumMaterial
 
 __all__ = ["Microfacet"]
 
@@ -21,11 +25,11 @@ class Microfacet(Glossy):
     """Dielectric facets over a diffuse base; not reciprocal, as Fresnel knows of ``wo`` only."""
 
     name = "microfacet"
-    parameters = {  # noqa: RUF012
-        "diffuse": (0.5, 0.5, 0.5),
-        "specular": (1.0, 1.0, 1.0),
-        "roughness": 0.4,
-        "ior": 1.85,
+    parameters: ClassVar = {
+        "diffuse": reflectance(GREY, "colour of the diffuse base"),
+        "specular": reflectance(WHITE, "factor of what the facets reflect"),
+        "roughness": fraction(0.4, "of the facets: the square root of GGX's alpha"),
+        "ior": index(1.85, "index of refraction of the facets"),
     }
     reciprocal = False
 
@@ -36,6 +40,10 @@ class Microfacet(Glossy):
 
     def albedo(self, parameters: Parameters) -> Tensor:
         """Both lobes at normal incidence."""
-        f0 = (parameters["ior"] - 1.0) / (parameters["ior"] + 1.0)
-        f0 = f0 * f0
+        f0 = reflectance_at_normal(parameters["ior"])
         return (1.0 - f0) * parameters["diffuse"] + f0 * parameters["specular"]
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """Facets over the base."""
+        specular, f0 = parameters["specular"], reflectance_at_normal(parameters["ior"])
+        return SplitSumMaterial(parameters["diffuse"], f0 * specular, specular, self.roughness(parameters), f0)

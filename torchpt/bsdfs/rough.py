@@ -1,24 +1,67 @@
-"""A rough metal: GGX microfacets of a conductor, reflected once, or with the energy of further reflections given back."""
+"""What GGX facets have in common: their roughness, by one of three ways to say it, and the energy that they lose."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters, Table
-from torchpt.bsdfs.conductor import metal, metal_colour
-from torchpt.bsdfs.lobes import weighed, with_delta
+from torchpt.bsdfs.base import Bsdf, Parameters, Table, Values
+from torchpt.bsdfs.specs import fraction
 from torchpt.math import microfacet
-from torchpt.math.vectors import dot
-from torchpt.records import BsdfSample
+from torchpt.spec import Flag, Refused, parameters_of
 
-__all__ = ["RoughConductor", "alphas", "energy_at", "energy_table", "rough"]
+__all__ = ["Anisotropic", "Rough", "alphas", "energy_at", "energy_table", "mean_roughness", "rough"]
+
+_ALPHA = 0.1  # where none is said
 
 #: Entries of an energy table: cosines, at squares of equal steps, and azimuths where the surface is anisotropic.
 _COSINES, _COSINES_ANISOTROPIC, _AZIMUTHS = 64, 32, 17
+
+
+class Rough(Bsdf, part=True):
+    """A part of a model: the roughness of its facets, the same along u and v."""
+
+    parameters: ClassVar = {
+        "alpha": fraction(None, f"roughness of the facets; {_ALPHA:g} where none is said"),
+        "roughness": fraction(None, "the same as `alpha = roughness^2`"),
+    }
+
+    @classmethod
+    def check(cls, values: Values, given: frozenset[str]) -> None:
+        """One roughness only."""
+        super().check(values, given)
+        said = [key for key in ("alpha", "roughness", "alpha_u", "alpha_v") if values.get(key) is not None]
+        if len(said) > 1 and said != ["alpha_u", "alpha_v"]:
+            raise Refused(f"either {said[0]} or {said[1]}, not both", values[said[1]], (said[1],))
+        if said in (["alpha_u"], ["alpha_v"]):
+            raise Refused("alpha_u and alpha_v together", None, ("alpha_v" if said == ["alpha_u"] else "alpha_u",))
+
+    @classmethod
+    def given(cls, values: Values) -> dict[str, Any]:
+        """With a roughness, whether or not one is said."""
+        found = super().given(values)
+        return found if found.keys() & {"alpha", "roughness", "alpha_u"} else {**found, "alpha": _ALPHA}
+
+
+class Anisotropic(Rough, part=True):
+    """The same, with another roughness along u and v, and the energy that facets lose given back if wanted."""
+
+    parameters: ClassVar = {
+        "alpha_u": fraction(None, "`alpha` along the surface's u, with `alpha_v`"),
+        "alpha_v": fraction(None, "`alpha` along its v, with `alpha_u`"),
+        "energy_compensation": Flag(False, doc="whether light that facets pass on among each other is given back"),
+    }
+
+    energy_compensation: bool
+
+    @property
+    def tabulated(self) -> tuple[str, ...]:
+        """All of it where energy is given back: its table is made once a material."""
+        own = (key for key in parameters_of(type(self)) if key not in Bsdf.parameters)
+        return tuple(own) if self.energy_compensation else ()
 
 
 def rough(values: Parameters, anisotropic: bool) -> Parameters:
@@ -101,69 +144,7 @@ def energy_at(table: Table, parameters: Parameters, wo: Tensor, block: Tensor | 
     return low + (table.at((place + (below + 1.0) * cosines) * (1.0 / last)) - low) * (step - below)
 
 
-@dataclass(frozen=True)
-class RoughConductor(Bsdf):
-    """A rough mirror. A row with both roughnesses below ``1e-4`` is a smooth one: a delta lobe.
-
-    Facets shade one another; light that meets more than one of them is lost, unless it is given back as Turquin does
-    (*Practical Multiple Scattering Compensation for Microfacet Models*, 2019, equation 16): each direction ``wo`` has its
-    lobe scaled by ``1 + F0 (1 - E) / E``, with ``E(wo)`` what facets of reflectance 1 give back.
-
-    Attributes:
-        schlick: its colour is given as ``reflectance`` at normal incidence rather than as ``eta`` and ``k``.
-        anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
-        energy_compensation: scaled so, and with masking correlated by height; not reciprocal then.
-    """
-
-    name = "roughconductor"
-    parameters = {  # noqa: RUF012
-        "eta": (0.0, 0.0, 0.0),
-        "k": (1.0, 1.0, 1.0),
-        "reflectance": (1.0, 1.0, 1.0),
-        "specular_reflectance": (1.0, 1.0, 1.0),
-        "alpha": 0.1,
-        "alpha_u": 0.1,
-        "alpha_v": 0.1,
-    }
-    delta = True
-
-    schlick: bool = False
-    anisotropic: bool = False
-    energy_compensation: bool = False
-
-    @property
-    def reciprocal(self) -> bool:
-        """See :class:`Bsdf`."""
-        return not self.energy_compensation
-
-    def prepare(self, values: Parameters) -> Parameters:
-        """See :class:`Bsdf`."""
-        out = {**metal(values), **rough(values, self.anisotropic)}
-        if self.energy_compensation:
-            out["energy"] = energy_table(out, [None])
-        return out
-
-    def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
-        """See :class:`Bsdf`."""
-        at = microfacet.reflection(wo, wi, *alphas(parameters), microfacet.BOUNDED, self.energy_compensation)
-        on = (~parameters["smooth"]).to(wo.dtype)
-        value = self._colour(parameters, at.cos_m) * (at.value * on)
-        if self.energy_compensation:
-            f0 = metal_colour(parameters, torch.ones_like(wo[2]))
-            value = torch.addcmul(value, value * f0, 1.0 / energy_at(parameters["energy"], parameters, wo) - 1.0)
-        return value, at.pdf * on
-
-    def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
-        """Reflect at a visible normal; at the surface's own where it is smooth."""
-        m = microfacet.sample_normal(wo, *alphas(parameters), u, microfacet.BOUNDED)
-        drawn = weighed(self, parameters, wo, microfacet.reflect(wo, m, dot(wo, m)))
-        mirrored = torch.stack((-wo[0], -wo[1], wo[2]))
-        return with_delta(drawn, parameters["smooth"] & (wo[2] > 0), mirrored, self._colour(parameters, wo[2]))
-
-    def albedo(self, parameters: Parameters) -> Tensor:
-        """The colour at normal incidence."""
-        return self._colour(parameters, torch.ones_like(parameters["alpha_u"]))
-
-    def _colour(self, parameters: Parameters, cos: Tensor) -> Tensor:
-        colour = metal_colour(parameters, cos)
-        return colour if parameters["specular_reflectance"] is None else colour * parameters["specular_reflectance"]
+def mean_roughness(parameters: Parameters) -> Tensor:
+    """``sqrt(alpha)``, of the mean of both where they differ; 0 where the surface is smooth."""
+    u, v = alphas(parameters)
+    return torch.where(parameters["smooth"], 0.0, (u * v).sqrt().sqrt())

@@ -11,23 +11,22 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters
+from torchpt.bsdfs.base import Parameters
 from torchpt.bsdfs.lobes import above, cosine_power, drop_of_power, mean, share, weighed
+from torchpt.bsdfs.power import Power, added
 from torchpt.math.frames import Frame
 from torchpt.math.vectors import dot
 from torchpt.math.warps import cosine_hemisphere
-from torchpt.records import BsdfSample
+from torchpt.records import BsdfSample, SplitSumMaterial
 
 __all__ = ["Phong"]
 
 
 @dataclass(frozen=True)
-class Phong(Bsdf):
+class Phong(Power):
     """A diffuse lobe and one about the mirror direction; conserves energy where ``diffuse + specular <= 1``."""
 
     name = "phong"
-    parameters = {"diffuse": (0.5, 0.5, 0.5), "specular": (0.2, 0.2, 0.2), "exponent": 30.0}  # noqa: RUF012
-    lobed = True
 
     def prepare(self, values: Parameters) -> Parameters:
         """Adds how often the diffuse lobe is drawn."""
@@ -60,3 +59,7 @@ class Phong(Bsdf):
     def albedo(self, parameters: Parameters) -> Tensor:
         """Both reflectances."""
         return parameters["diffuse"] + parameters["specular"]
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """The lobe about the mirror direction is as narrow as one about half vectors of four times the exponent."""
+        return added(parameters, 2.0 / (4.0 * parameters["exponent"] + 2.0), 1.0)

@@ -9,66 +9,47 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters
-from torchpt.bsdfs.lobes import weighed
+from torchpt.bsdfs.base import Bsdf, Parameters, Values
+from torchpt.bsdfs.lobes import reflectance_at_normal, weighed
 from torchpt.bsdfs.principled_lobes import (
+    Facet,
+    Main,
+    Probabilities,
     clearcoat_alpha,
     clearcoat_masking,
     fake_subsurface,
     gtr1,
     lerp,
-    reflectance_at_normal,
+    or_zero,
     retro_diffuse,
     sample_gtr1,
     schlick_weight,
     tint,
+    up,
+    upward,
     wide_ggx,
 )
+from torchpt.bsdfs.rough import alphas
+from torchpt.bsdfs.specs import GREY, fraction, reflectance
 from torchpt.math import microfacet
-from torchpt.math.fresnel import INDEX_MATCHED, Interface, fresnel_dielectric, refract
+from torchpt.math.fresnel import INDEX_MATCHED, fresnel_dielectric, refract
 from torchpt.math.vectors import dot, luminance
 from torchpt.math.warps import cosine_hemisphere
-from torchpt.records import BsdfSample
+from torchpt.records import BsdfSample, SplitSumMaterial
+from torchpt.spec import Refused, Scalar
 
-__all__ = ["Facet", "Principled", "Probabilities"]
+__all__ = ["Principled"]
 
 #: Least alpha of the main lobes, as Mitsuba's.
 ALPHA_MIN = 1e-3
-
-
-class Facet(NamedTuple):
-    """What happens at one facet; ``wo`` has been turned to the upper side."""
-
-    interface: Interface  # with the far side's index over that of wo's side
-    cos: Tensor  # (N,) of wo and the facet's normal, >= 0
-    schlick: Tensor  # (N,) Schlick's weight there
-    reflected: Tensor  # (3, N)
-    refracted: Tensor | None  # (3, N), without the radiance factor; None where nothing refracts
-
-
-class Probabilities(NamedTuple):
-    """Of drawing each lobe, each ``(N,)`` and detached. Only how the last two share their sum depends on the facet."""
-
-    diffuse: Tensor
-    clearcoat: Tensor | None
-    reflect: Tensor
-    refract: Tensor | None
-
-
-class _Main(NamedTuple):
-    """The main lobes between ``wo`` and ``wi`` as if all were reflected, and all refracted; each ``(N,)``."""
-
-    m: Tensor  # (3, N) half vector
-    cos: Tensor  # of wo and m, >= 0
-    reflection: Tensor  # f cos(theta_i)
-    reflection_pdf: Tensor
-    refraction: Tensor  # the last two are those of reflection, and idle, where nothing refracts
-    refraction_pdf: Tensor
+#: What every material of the model is given, and features that only shape another.
+_ALWAYS = ("base_color", "roughness", "specular", "eta")
+_PART_OF = {"sheen_tint": "sheen", "clearcoat_gloss": "clearcoat"}
 
 
 @dataclass(frozen=True)
@@ -84,23 +65,51 @@ class Principled(Bsdf):
     anisotropic: bool = False
 
     name = "principled"
-    parameters = {  # noqa: RUF012
-        "base_color": (0.5, 0.5, 0.5),
-        "roughness": 0.5,
-        "metallic": 0.0,
-        "specular": 0.5,
-        "eta": 1.5,
-        "spec_tint": 0.0,
-        "anisotropic": 0.0,
-        "sheen": 0.0,
-        "sheen_tint": 0.0,
-        "clearcoat": 0.0,
-        "clearcoat_gloss": 0.0,
-        "spec_trans": 0.0,
-        "flatness": 0.0,
+    parameters: ClassVar = {
+        "base_color": reflectance(GREY, "colour of the surface"),
+        "roughness": fraction(0.5, "from a mirror to plaster"),
+        "metallic": fraction(0.0, "share that is metal"),
+        "specular": fraction(None, "how much a dielectric reflects: 0.08 of it at normal incidence; 0.5 without `eta`"),
+        "eta": Scalar(None, low=1e-3, high=1e3, texture=True, doc="its index of refraction, in place of `specular`"),
+        "spec_tint": fraction(0.0, "how much of the base's hue that reflection takes"),
+        "anisotropic": fraction(0.0, "how much longer highlights are across the tangent than along it"),
+        "sheen": fraction(0.0, "glow of cloth at grazing angles"),
+        "sheen_tint": fraction(0.0, "how much of the base's hue it takes"),
+        "clearcoat": fraction(0.0, "amount of a second, clear highlight"),
+        "clearcoat_gloss": fraction(0.0, "how sharp that is"),
+        "spec_trans": fraction(0.0, "share of what is no metal that is glass"),
+        "flatness": fraction(0.0, "from the diffuse lobe to one that stands in for scattering below the surface"),
     }
     lobed = True
     conserves = False
+
+    @classmethod
+    def check(cls, values: Values, given: frozenset[str]) -> None:
+        """One index only."""
+        super().check(values, given)
+        if values["specular"] is not None and values["eta"] is not None:
+            raise Refused("either specular or eta, not both", values["eta"], ("eta",))
+
+    @classmethod
+    def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
+        """See :class:`Bsdf`."""
+        return cls(values["spec_trans"] != 0.0, values["anisotropic"] != 0.0), cls.given(values)
+
+    @classmethod
+    def given(cls, values: Values) -> dict[str, Any]:
+        """Features whose amount is 0 are left out, with what would only shape them."""
+        found = super().given(values)
+        if "specular" not in found and "eta" not in found:
+            found["specular"] = 0.5
+        for feature, whole in _PART_OF.items():
+            if found[whole] == 0.0:
+                found[feature] = 0.0
+        return {key: value for key, value in found.items() if key in _ALWAYS or value != 0.0}
+
+    @classmethod
+    def variants(cls) -> tuple[Bsdf, ...]:
+        """See :class:`Bsdf`."""
+        return tuple(cls(transmissive, anisotropic) for anisotropic in (False, True) for transmissive in (False, True))
 
     @property
     def transmits(self) -> bool:
@@ -155,7 +164,7 @@ class Principled(Bsdf):
         eta = parameters["eta"]
         front = None
         if self.transmissive:
-            wo, wi, eta, front = _upward(wo, wi, eta)
+            wo, wi, eta, front = upward(wo, wi, eta)
         main = self._main(parameters, wo, wi, eta)
         facet = self._facet(parameters, wo, main.m, main.cos, eta, front)
         chance = self.probabilities(parameters, wo, facet, front)
@@ -172,8 +181,8 @@ class Principled(Bsdf):
         value = torch.addcmul(value, self._diffuse(parameters, cos_o, cos_i, main.cos), shown)
         pdf = pdf + chance.diffuse * (cos_i * seen * (1.0 / math.pi))
         if chance.clearcoat is not None:
-            m = torch.where(seen > 0, main.m, _up(main.m))
-            d = gtr1(m, clearcoat_alpha(_or_zero(parameters["clearcoat_gloss"], cos_o)))
+            m = torch.where(seen > 0, main.m, up(main.m))
+            d = gtr1(m, clearcoat_alpha(or_zero(parameters["clearcoat_gloss"], cos_o)))
             f = lerp(0.04, 1.0, facet.schlick)
             cos_o, cos_i = torch.where(seen > 0, cos_o, 1.0), torch.where(seen > 0, cos_i, 1.0)
             g = clearcoat_masking(wo, wi, cos_o, cos_i)
@@ -188,8 +197,8 @@ class Principled(Bsdf):
         eta, above, front, side = parameters["eta"], wo, None, None
         if self.transmissive:
             side = torch.copysign(torch.ones_like(wo[2]), wo[2])
-            above, _, eta, front = _upward(wo, wo, eta)
-        alpha_u, alpha_v = _alphas(parameters)
+            above, _, eta, front = upward(wo, wo, eta)
+        alpha_u, alpha_v = alphas(parameters)
         m = microfacet.sample_normal(above, alpha_u, alpha_v, u, self._bounded)
         cos = dot(above, m)
         facet = self._facet(parameters, above, m, cos.clamp_min(0.0), eta, front)
@@ -198,7 +207,7 @@ class Principled(Bsdf):
         threshold = chance.diffuse
         wi = torch.where(lobe < threshold, cosine_hemisphere(u), wi)
         if chance.clearcoat is not None:
-            coat = sample_gtr1(clearcoat_alpha(_or_zero(parameters["clearcoat_gloss"], lobe)), u)
+            coat = sample_gtr1(clearcoat_alpha(or_zero(parameters["clearcoat_gloss"], lobe)), u)
             coated = (lobe >= threshold) & (lobe < threshold + chance.clearcoat)
             wi = torch.where(coated, microfacet.reflect(above, coat, dot(above, coat)), wi)
             threshold = threshold + chance.clearcoat
@@ -214,6 +223,25 @@ class Principled(Bsdf):
     def albedo(self, parameters: Parameters) -> Tensor:
         """The base colour."""
         return parameters["base_color"]
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """Metal, dielectric and glass; sheen and coat are left out."""
+        base, eta = parameters["base_color"], parameters["eta"]
+        f0 = reflectance_at_normal(eta).expand_as(base)
+        if parameters["spec_tint"] is not None:
+            f0 = f0 + (f0 * tint(base) - f0) * parameters["spec_tint"]
+        over = f0
+        rest: Tensor = torch.ones_like(eta)
+        if parameters["metallic"] is not None:
+            f0 = f0 + (base - f0) * parameters["metallic"]
+            rest = rest - parameters["metallic"]
+        u, v = alphas(parameters)
+        through, passing = parameters.get("spec_trans"), None
+        if through is not None:
+            # Colour is taken at the way in and the way out.
+            passing, rest = base.clamp_min(1e-12).sqrt() * (rest * through), rest * (1.0 - through)
+        roughness, below = (u * v).sqrt().sqrt(), None if through is None else eta
+        return SplitSumMaterial(base * rest, f0, torch.ones_like(eta), roughness, over, passing, below)
 
     def probabilities(
         self, parameters: Parameters, wo: Tensor, facet: Facet, front: Tensor | None = None
@@ -272,18 +300,18 @@ class Principled(Bsdf):
     def _bounded(self) -> bool:
         return microfacet.BOUNDED and not (self.transmissive or self.anisotropic)
 
-    def _main(self, parameters: Parameters, wo: Tensor, wi: Tensor, eta: Tensor) -> _Main:
+    def _main(self, parameters: Parameters, wo: Tensor, wi: Tensor, eta: Tensor) -> Main:
         """Both main lobes; with the half vector ``s = wo + wi`` or ``wo + eta wi``, ``s . m = |s|``: nothing cancels."""
-        alpha_u, alpha_v = _alphas(parameters)
+        alpha_u, alpha_v = alphas(parameters)
         if not (self.transmissive or self.anisotropic):
             r = microfacet.reflection(wo, wi, alpha_u, alpha_v, self._bounded)
-            return _Main(r.m, r.cos_m.clamp_min(0.0), r.value, r.pdf, r.value, r.pdf)
+            return Main(r.m, r.cos_m.clamp_min(0.0), r.value, r.pdf, r.value, r.pdf)
         below = wi[2] < 0
         s = torch.where(below, wo + wi * eta, wo + wi) if self.transmissive else wo + wi
         square = dot(s, s)
         usable = square > 0
         square = torch.where(usable, square, 1.0)
-        m = torch.where(usable, s * torch.copysign(square.rsqrt(), s[2]), _up(s))
+        m = torch.where(usable, s * torch.copysign(square.rsqrt(), s[2]), up(s))
         cos, far = dot(wo, m), dot(wi, m)
         meets = usable & (wo[2] > 0) & (wi[2] != 0) & (cos > 0)
         reflects, refracts = meets & ~below & (far > 0), meets & below & (far < 0)
@@ -294,7 +322,7 @@ class Principled(Bsdf):
         d = 2.0 * d / (cos_o + s_o)
         g = 2.0 * cos_i / (cos_i + s_i)
         jacobian = cos * far.abs() / square
-        return _Main(
+        return Main(
             m,
             torch.where(meets, cos, 0.0),
             torch.where(reflects, 0.25 * d * g, 0.0),
@@ -358,26 +386,3 @@ class Principled(Bsdf):
         if parameters["sheen_tint"] is None:
             return value + sheen
         return torch.addcmul(value, sheen, lerp(1.0, tint(base), parameters["sheen_tint"]))
-
-
-def _alphas(parameters: Parameters) -> tuple[Tensor, Tensor]:
-    u, v = parameters["alpha_u"], parameters["alpha_v"]
-    return u, u if v is None else v
-
-
-def _up(like: Tensor) -> Tensor:
-    """The normal in every lane: what stands in where there is no half vector."""
-    zero = torch.zeros_like(like[0])
-    return torch.stack((zero, zero, torch.ones_like(zero)))
-
-
-def _or_zero(value: Tensor | None, like: Tensor) -> Tensor:
-    return torch.zeros_like(like) if value is None else value
-
-
-def _upward(wo: Tensor, wi: Tensor, eta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The pair turned so that ``wo`` is above, the far side's index over the near one's, and 1 where nothing was turned."""
-    side = torch.copysign(torch.ones_like(wo[2]), wo[2])
-    front = (side > 0).to(side.dtype)
-    wo, wi = (torch.stack((w[0], w[1], w[2] * side)) for w in (wo, wi))
-    return wo, wi, torch.where(side > 0, eta, 1.0 / eta), front

@@ -4,46 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.base import Bsdf, Parameters
-from torchpt.bsdfs.dielectric import tinted
+from torchpt.bsdfs.base import Bsdf, Parameters, Values
+from torchpt.bsdfs.coat import Coat, coated, over_base
+from torchpt.bsdfs.glass import tinted
 from torchpt.bsdfs.lobes import share, weighed, with_delta
+from torchpt.bsdfs.specs import smooth
 from torchpt.math.fresnel import fresnel_dielectric, fresnel_diffuse
 from torchpt.math.warps import cosine_hemisphere
-from torchpt.records import BsdfSample
+from torchpt.records import BsdfSample, SplitSumMaterial
 
-__all__ = ["Plastic", "coated"]
-
-
-def coated(values: Parameters, eta: Tensor, inner: Tensor, nonlinear: bool) -> Parameters:
-    """What the coats have in common.
-
-    Args:
-        values: as given.
-        eta: ``(1,)`` index of the coat over that outside.
-        inner: ``(1,)`` reflectance of the coat for diffuse light from within.
-        nonlinear: whether light that the coat throws back takes the base's colour again, which saturates it.
-    """
-    diffuse, specular = values["diffuse_reflectance"], values.get("specular_reflectance")
-    mean = _mean(diffuse)
-    return {
-        "eta": eta,
-        "base": diffuse / ((1.0 - inner * (diffuse if nonlinear else 1.0)) * eta * eta),
-        "diffuse_reflectance": diffuse,
-        "specular_reflectance": specular,
-        "specular_share": share(torch.ones_like(mean) if specular is None else _mean(specular), mean),
-    }
-
-
-def _mean(color: Tensor) -> Tensor:
-    return (color[0] + color[1] + color[2]) * (1.0 / 3.0)
+__all__ = ["Plastic"]
 
 
 @dataclass(frozen=True)
-class Plastic(Bsdf):
+class Plastic(Coat):
     """A mirror coat over a diffuse base. Its diffuse fits (see ``fresnel_diffuse``) conserve energy to 0.2 %.
 
     Attributes:
@@ -51,16 +30,21 @@ class Plastic(Bsdf):
     """
 
     name = "plastic"
-    parameters = {  # noqa: RUF012
-        "diffuse_reflectance": (0.5, 0.5, 0.5),
-        "int_ior": 1.49,
-        "ext_ior": 1.000277,
-        "specular_reflectance": (1.0, 1.0, 1.0),
-    }
+    parameters: ClassVar = dict.fromkeys(("alpha", "roughness"), smooth("roughplastic"))
     lobed = True
     delta = True
 
     nonlinear: bool = False
+
+    @classmethod
+    def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
+        """See :class:`Bsdf`."""
+        return cls(values["nonlinear"]), cls.given(values)
+
+    @classmethod
+    def variants(cls) -> tuple[Bsdf, ...]:
+        """See :class:`Bsdf`."""
+        return cls(), cls(nonlinear=True)
 
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
@@ -89,6 +73,10 @@ class Plastic(Bsdf):
     def albedo(self, parameters: Parameters) -> Tensor:
         """That of the base."""
         return parameters["diffuse_reflectance"]
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """A mirror over the base."""
+        return over_base(parameters, torch.zeros_like(parameters["eta"]))
 
     def _specular(self, parameters: Parameters, f_o: Tensor) -> Tensor:
         """How often the coat is chosen."""
