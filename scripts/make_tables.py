@@ -3,8 +3,8 @@
     python scripts/make_tables.py            # writes docs/*.md
     python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
 
-A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), or ``common.lights``: what all kinds of
-it have.
+A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), or ``common.lights``: what all
+kinds of it have.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ TABLES = {
     "materials": ("torchpt.bsdfs", "KINDS"),
     "lights": ("torchpt.lights", "KINDS"),
     "cameras": ("torchpt.cameras", "KINDS"),
-    "samplers": ("torchpt.samplers", "KINDS"),
-    "filters": ("torchpt.film", "FILTERS"),
+        "filters": ("torchpt.film", "FILTERS"),
     "integrators": ("torchpt.integrators", "KINDS"),
     "shapes": ("torchpt.shapes", "KINDS"),
     "textures": ("torchpt.textures", "KINDS"),
