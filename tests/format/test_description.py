@@ -12,9 +12,9 @@ import pytest
 from torchpt import paths
 from torchpt.errors import AssetError, NotBuiltError, SceneError
 from torchpt.format.description import read_description, scene_names, settings
-from torchpt.format.materials import Diffuse
 from torchpt.format.schema import Mesh, Perspective, Sphere
 from torchpt.scene.build import build_parts
+from torchpt.spec.declared import Described
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
 TRIANGLE = {"type": "mesh", "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "faces": [[0, 1, 2]]}
@@ -208,11 +208,16 @@ def test_a_whole_scene() -> None:
     assert found.version == 1 and found.file is None
     assert list(found.shapes) == ["tri", "ball", "lamp"]
     ball, tri = found.shapes["ball"], found.shapes["tri"]
-    assert isinstance(ball, Sphere) and ball.radius == 2 and isinstance(ball.material, Diffuse)
+    assert (
+        isinstance(ball, Sphere)
+        and ball.radius == 2
+        and isinstance(ball.material, Described)
+        and ball.material.name == "diffuse"
+    )
     assert isinstance(tri, Mesh) and tri.faces is not None and tri.faces.dtype == np.int64 and tri.material == "red"
     assert found.shapes["lamp"].emission == (3, 3, 3)
     assert found.shapes["lamp"].to_world()[1, 3] == 5
-    assert not found.materials["red"].two_sided
+    assert not found.materials["red"]["two_sided"]
     assert found.lights["sky"].values == {"radiance": (1, 2, 3)}
 
 

@@ -74,12 +74,17 @@ def _light(scene: dict[str, Any], **keys: Any) -> None:
 #: By name.
 FEATURES: dict[str, Feature] = {
     "second material": Feature(
-        ("bsdfs/roughconductor.py",),
+        ("bsdfs/kinds/roughconductor.py",),
         lambda scene: _material(scene, **{"type": "roughconductor", "material": "Au", "alpha": 0.2}),
         ("world.materials.parameters.1",),
+        module="torchpt.bsdfs.kinds.roughconductor",
     ),
     "refraction": Feature(
-        ("bsdfs/dielectric.py",), lambda scene: _material(scene, type="dielectric"), ("world.materials.parameters.1",), ("eta",)
+        ("bsdfs/kinds/dielectric.py", "bsdfs/glass.py"),
+        lambda scene: _material(scene, type="dielectric"),
+        ("world.materials.parameters.1",),
+        ("eta",),
+        module="torchpt.bsdfs.kinds.dielectric",
     ),
     "texture": Feature(
         ("textures/atlas.py",),
