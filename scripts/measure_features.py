@@ -16,7 +16,7 @@ from features import FEATURES, Feature, kernels, with_feature
 import torchpt
 from torchpt.format.description import settings
 from torchpt.integrators.loop.kernels import Kernels
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 
 REPEATS = 15
 

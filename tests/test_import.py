@@ -41,7 +41,7 @@ def test_the_public_names_load_on_use() -> None:
 
 
 def test_render_stays_the_function_when_its_module_is_imported() -> None:
-    code = "from torchpt.render import render_scene; import torchpt, torchpt.render; assert callable(torchpt.render)"
+    code = "from torchpt.rendering import render_scene; import torchpt, torchpt.render; assert callable(torchpt.render)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

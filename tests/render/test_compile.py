@@ -14,7 +14,7 @@ from torchpt.format.description import settings
 from torchpt.integrators import compiled
 from torchpt.integrators.loop import kernels
 from torchpt.integrators.loop.schedule import Loop
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
 

@@ -27,7 +27,7 @@ from torchpt.integrators.loop.rows import HIT
 from torchpt.integrators.loop.schedule import Loop
 from torchpt.integrators.stages import STRATEGIES
 from torchpt.records import Hit, rows
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 from torchpt.samplers import KINDS as SAMPLERS
 
 SCENES = sorted(path.stem for path in Path("configs/scene").glob("*.yaml")) or ["cornell_box"]

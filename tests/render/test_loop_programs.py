@@ -24,7 +24,7 @@ from torchpt.lanes import engine
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.warps import cosine_hemisphere
 from torchpt.records import BsdfSample
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 
 
 def rendered(scene: torchpt.Scene, params: Any = None, **wishes: Any) -> Rendering:

@@ -11,7 +11,7 @@ import torchpt
 from torchpt import forward
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 from torchpt.scene.sources import labels_of
 
 LAMP = {
