@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchpt.forward.schedule import BYTES_PER_LANE, Span, chunks_of, lanes_for
-from torchpt.forward.threads import limited_threads
-from torchpt.forward.wave import make_wave, rebound
+from torchpt.forward import BYTES_PER_LANE, chunks_of, lanes_for, limited_threads, make_wave, rebound
+from torchpt.forward.schedule import Span
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 from torchpt.spec import Moves

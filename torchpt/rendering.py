@@ -13,12 +13,11 @@ from torch import Tensor
 from torchpt import adjoint as adjoints
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
-from torchpt.forward.result import Progress, Rendering
-from torchpt.forward.run import Run
-from torchpt.forward.threads import limited_threads
+from torchpt.forward import Progress, Rendering, Run, limited_threads
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.scene import Scene
 from torchpt.settings import FILTERS, Settings
+from torchpt.spec.declared import Described
 
 __all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene"]
 
@@ -152,7 +151,7 @@ def _differentiable(
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:
     """Layers ``(H, W, C)`` of the first surface at one sample a pixel: a preview that is there at once."""
-    film = settings.film.but(aovs=names, filter=FILTERS["box"]())  # one sample fills no wider filter
+    film = settings.film.but(aovs=names, filter=Described(FILTERS["box"], {}))  # one sample fills no wider filter
     quick = replace(settings, film=film, integrator=INTEGRATORS["aov"](), render=settings.render.but(spp=1))
     return render_scene(scene, quick).layers
 

@@ -23,40 +23,36 @@ MAX_SIDE = 65_536
 MAX_PIXELS = 2**28
 
 
-class Box(Valued):
-    """The pixel's own square (radius 0.5 pixels)."""
+class Box:
+    """The pixel's own square."""
 
     name = "box"
-    radius = 0.5
+    parameters: ClassVar = {}
 
 
-class Tent(Valued):
+class Tent:
     """A triangle that falls to zero at ``radius`` pixels, as Mitsuba's."""
 
     name = "tent"
     parameters: ClassVar = {"radius": Scalar(1.0, above=0.0, words="a number > 0", doc="half width in pixels")}
 
 
-class Gaussian(Valued):
+class Gaussian:
     """A truncated gaussian, as Mitsuba's: ``exp(-x^2 / 2 stddev^2)`` minus its value at ``radius``, in pixels."""
 
     name = "gaussian"
     parameters: ClassVar = {
         "stddev": Scalar(0.5, above=0.0, words="a number > 0", doc="in pixels"),
         "radius": Scalar(
-            lambda values: 4.0 * values["stddev"],
-            above=0.0,
-            words="a number > 0",
-            doc="half width in pixels; by default four standard deviations",
+            lambda values: 4.0 * values["stddev"], above=0.0, words="a number > 0", doc="where it ends, in pixels"
         ),
     }
 
 
-class Mitchell(Valued):
+class Mitchell:
     """Mitchell and Netravali's cubic, two pixels wide, with Mitsuba's names; its lobes are negative where ``C`` > 0."""
 
     name = "mitchell"
-    radius = 2.0
     parameters: ClassVar = {
         "B": Scalar(1 / 3, high=1.0, words="a number in 0..1", doc="blur"),
         "C": Scalar(1 / 3, high=1.0, words="a number in 0..1", doc="ringing"),
@@ -65,7 +61,8 @@ class Mitchell(Valued):
 
 FILTERS: Mapping[str, type[Any]] = {"gaussian": Gaussian, "box": Box, "tent": Tent, "mitchell": Mitchell}
 SAMPLERS: Mapping[str, Any] = {
-    name: type(name, (Valued,), {"name": name, "needs_count": module.NEEDS_COUNT}) for name, module in _SAMPLERS.items()
+    name: type(name, (), {"name": name, "parameters": {}, "needs_count": module.NEEDS_COUNT})
+    for name, module in _SAMPLERS.items()
 }
 
 #: What has a type: the kinds it may be of, and the one it is of where nothing is said.
@@ -107,28 +104,28 @@ class Film(Valued):
     """The picture: its size in pixels, its reconstruction filter, and how 8-bit files show it."""
 
     parameters: ClassVar = {
-        "width": Whole(512, low=1, high=MAX_SIDE, doc="of the film in pixels"),
-        "height": Whole(512, low=1, high=MAX_SIDE, doc="of the film in pixels"),
-        "filter": Other(Gaussian(), doc="how samples make pixels: a type, or a mapping with its keys"),
+        "width": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
+        "height": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
+        "filter": Other(lambda _: _typed("filter", {}, "film.filter"), doc="a type, or a mapping"),
         "crop": Other(
             None,
             reader=_crop,
             words="[x, y, width, height]",
-            doc="the part that is rendered, in pixels; null: all of it",
+            doc="the part that is rendered, in pixels",
         ),
         "aovs": Other(
             (),
             reader=_aovs,
             words=f"a list of {', '.join(LAYERS)}",
-            doc="layers beside the picture, kept by `.exr`",
+            doc="layers, kept by .exr",
         ),
-        "exposure": Scalar(0.0, low=-64, high=64, words="a number of stops in -64..64", doc="for 8-bit files"),
-        "tonemap": Choice("none", names=("none", "filmic", "aces", "reinhard"), doc="for 8-bit files"),
+        "exposure": Scalar(0.0, low=-64, high=64, words="a number of stops in -64..64", doc="of 8-bit files"),
+        "tonemap": Choice("none", names=("none", "filmic", "aces", "reinhard"), doc="of 8-bit files"),
         "gamma": Other(
             "srgb",
             reader=_gamma,
             words="srgb or an exponent > 0",
-            doc="for 8-bit files: out = in^gamma",
+            doc="of 8-bit files: out = in^gamma",
         ),
     }
 
@@ -162,24 +159,33 @@ class Render(Valued):
 
     parameters: ClassVar = {
         "spp": Whole(64, low=1, doc="samples a pixel"),
-        "seed": Whole(0, high=2**63 - 1, doc="of all random numbers"),
+        "seed": Whole(0, high=2**63 - 1, doc="the same seed gives the same picture"),
         "device": Other("auto", reader=_device, words="auto, cpu, cuda or cuda:N", doc="auto: CUDA where there is one"),
         "accel": Choice("auto", names=("auto", "torch", "numba", "brute"), doc="the search structure"),
         "compile": Choice(
             "auto",
             names=("auto", "on", "off"),
             booleans={True: "on", False: "off"},
-            doc="whether stages are compiled; auto: always on a CPU, on CUDA where it repays",
+            doc="auto: always on a CPU, on CUDA where it repays",
         ),
-        "threads": Whole("auto", low=1, high=1024, also=("auto",), doc="auto: as many as torch uses"),
+        "threads": Whole(
+            "auto",
+            low=1,
+            high=1024,
+            also=("auto",),
+            doc="auto: as many as torch uses",
+        ),
         "max_memory": Other(
-            None, reader=reading.memory_size, words="null, bytes, or a size such as 4GB", doc="of the lanes at once"
+            None,
+            reader=reading.memory_size,
+            words="null, bytes, or a size such as 4GB",
+            doc="of what is traced at once",
         ),
         "preview": Other(
             None,
             reader=_preview,
             words="null or a file path",
-            doc="a file: albedo and normal beside it first, then the picture so far after each pass",
+            doc="albedo and normal beside it first, then the picture so far after each pass",
         ),
     }
 
@@ -191,13 +197,13 @@ class Settings:
     Attributes:
         film: the picture.
         integrator: what it estimates.
-        sampler: where sample points come from: its ``name`` is its type.
+        sampler: where sample points come from.
         render: how the work is done.
     """
 
     film: Film
     integrator: Integrator
-    sampler: Any
+    sampler: Described
     render: Render
 
     @property
@@ -213,8 +219,8 @@ class Settings:
 def _plain(value: Any) -> Any:
     if not isinstance(value, Valued | Described):
         return value
-    kind = getattr(value, "name", None)
-    return {**({"type": kind} if kind else {}), **{key: _plain(item) for key, item in value.values.items()}}
+    kind = {"type": value.name} if hasattr(value, "name") else {}
+    return kind | {key: _plain(item) for key, item in value.values.items()}
 
 
 def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
@@ -269,10 +275,10 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
     return settings
 
 
-def _open_end(raw: Mapping[str, Any], sampler: Any) -> None:
+def _open_end(raw: Mapping[str, Any], sampler: Described) -> None:
     """Raises where something else than ``spp`` is to end a render whose points depend on their number."""
     for name in ("time_limit", "target_error"):
-        if sampler.needs_count and raw.get(name) is not None:
+        if sampler.kind.needs_count and raw.get(name) is not None:
             free = ", ".join(kind for kind in SAMPLERS if not SAMPLERS[kind].needs_count)
             expected = (
                 f"null where sampler is {sampler.name}, whose points depend on how many there are (free of it: {free})"
@@ -293,7 +299,8 @@ def _given(overrides: Mapping[str, Any], key: str) -> bool:
 def _block(block: str, raw: dict[str, Any]) -> Any:
     if block in TYPED:
         refuse_foreign(block, TYPED[block][0], raw, TYPED[block][1], None)
-        return _typed(block, raw, block)
+        made = _typed(block, raw, block)
+        return made.kind(**made.values) if block == "integrator" else made
     if block == "film":
         if "filter" in raw:
             raw["filter"] = _typed("filter", raw["filter"], "film.filter")
@@ -304,7 +311,6 @@ def _block(block: str, raw: dict[str, Any]) -> Any:
     return Render(**values_of(Render, rest, block, None, what).values)
 
 
-def _typed(what: str, raw: dict[str, Any], key: str) -> Any:
-    """A thing whose type picks its kind: an instance, where the kind makes any of its values."""
-    made = described(what, TYPED[what][0], raw, key, None, TYPED[what][1])
-    return made.kind(**made.values) if issubclass(made.kind, Valued) else made
+def _typed(what: str, raw: dict[str, Any], key: str) -> Described:
+    """A thing whose type picks its kind."""
+    return described(what, TYPED[what][0], raw, key, None, TYPED[what][1])

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torchpt.integrators.ibl import without_environment
 
 import torchpt
 from torchpt import bsdfs
 from torchpt.ibl import IblMaps, Sky, brdf_table
+from torchpt.integrators.kinds.ibl import without_environment
 from torchpt.integrators.split_sum import RULES, under
 from torchpt.math.distributions import Discrete
 

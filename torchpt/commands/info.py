@@ -22,7 +22,7 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
         TorchptError: bad input.
         Interrupted: a signal came.
     """
-    from torchpt.forward.wave import loop_facts
+    from torchpt.forward import loop_facts
     from torchpt.scene.scene import Scene, device_of
 
     collector.resume()

@@ -54,9 +54,10 @@ def make_wave(
     own = not params  # the world is the scene's own, and what is made of it may be kept
     if not integrator.lit:
         world = _dark(scene, world, own)
-    own_filter = film.filter
-    stddev = getattr(own_filter, "stddev", 0.5)
-    lobes = (own_filter.B, own_filter.C) if own_filter.name == "mitchell" else ()
+    widths = {"box": 0.5, "mitchell": 2.0}
+    shape = film.filter.values
+    radius, stddev = shape.get("radius", widths.get(film.filter.name)), shape.get("stddev", 0.5)
+    lobes = (shape["B"], shape["C"]) if "B" in shape else ()
     plan = integrator.plan(settings.sampler.name, dtype, tape, attached)
     camera = scene.camera(film, scene.merged(params), dtype)
     return Wave(
@@ -64,7 +65,7 @@ def make_wave(
         integrator=integrator,
         accel=accel,
         camera=camera,
-        filter=Filter(own_filter.name, own_filter.radius, stddev, scene.device, *lobes),
+        filter=Filter(film.filter.name, radius, stddev, scene.device, *lobes),
         sampler=Sampler(settings.sampler.name, settings.render.seed, randomizations_of(spp), spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.space.shift,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 
 from torchpt.integrators.roulette import DEEP, DEEP_CAP
+from torchpt.integrators.stages import STRATEGIES, Plan
 from torchpt.lights import WAYS
 from torchpt.spec import Choice, Flag, Scalar, Spec, Valued
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from torchpt.accel import Accel
     from torchpt.integrators.compiled import Stages
     from torchpt.integrators.first_surface import FirstSurface
-    from torchpt.integrators.stages import Plan
     from torchpt.records import PathState, World
 
 __all__ = ["LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits", "Tally"]
@@ -26,21 +26,19 @@ __all__ = ["LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits", "Tally
 STRATEGY: dict[str, Spec] = {
     "strategy": Choice(
         "mis",
-        names=("mis", "bsdf", "light", "uniform"),
-        doc="how light is found: by sampling lights and BSDF together (mis), one of them alone, or the hemisphere evenly",
+        names=STRATEGIES,
+        doc="how light is found: BSDF and lights, one alone, or evenly",
     ),
 }
 LIGHT_CHOICE: dict[str, Spec] = {
     "light_choice": Choice(
         "auto",
         names=WAYS,
-        doc="which of many lights is sampled: all alike, by power, by the light tree, or as many lights ask",
+        doc="which of many lights is sampled",
     ),
 }
 SAMPLES: dict[str, Spec] = {
-    "clamp": Scalar(
-        None, above=0.0, words="null or a number > 0", doc="largest component of a sample's radiance; biased"
-    ),
+    "clamp": Scalar(None, above=0.0, words="null or a number > 0", doc="largest component of a sample; biased"),
     "strict": Flag(False, doc="whether a sample that is not finite is an error"),
 }
 
@@ -98,8 +96,6 @@ class Integrator(Valued):
 
     def plan(self, sampler: str, dtype: torch.dtype, tape: bool = False, attached: bool = False) -> Plan:
         """What it asks of the stages."""
-        from torchpt.integrators.stages import Plan
-
         return Plan(sampler, self.strategy, self.rr_prob, dtype, tape, attached)
 
     def first(self, world: World) -> FirstSurface | None:

@@ -27,7 +27,7 @@ __all__ = ["Ibl", "Preview", "without_environment"]
 
 
 class Ibl(FirstSurfaceIntegrator):
-    """A preview: the first surface under the environment by split sum, unshadowed, and other lights with their shadows."""
+    """A preview: the first surface under the environment by split sum (unshadowed), and under other lights."""
 
     name = "ibl"
     parameters: ClassVar = {**LIGHT_CHOICE, **SAMPLES}

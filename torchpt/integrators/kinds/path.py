@@ -20,15 +20,15 @@ class Path(PathIntegrator):
         "max_depth": Whole(
             16,
             low=-1,
-            doc="longest path in edges: 1 sees emission only, 2 adds direct light, -1 until roulette ends it",
+            doc="longest path in edges: 1 emission only, 2 direct light, -1 until roulette ends it",
         ),
-        "rr_depth": Whole(5, low=1, doc="the depth from which Russian roulette may end a path"),
+        "rr_depth": Whole(5, low=1, doc="roulette may end paths from this depth on"),
         "rr_prob": Scalar(
             None,
             above=0.0,
             high=1.0,
             words="null or a number, 0 < rr_prob <= 1",
-            doc="a constant survival probability; null: by throughput",
+            doc="chance to survive roulette; null: by throughput",
         ),
         **STRATEGY,
         **LIGHT_CHOICE,
