@@ -44,7 +44,7 @@ from torchpt.scene.assembly import corners_of
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
 from torchpt.scene.texels import images_of
-from torchpt.settings import Film, Filter, PathIntegrator, Settings
+from torchpt.settings import Film, Settings
 from torchpt.textures import Node, VertexColors
 
 __all__ = [
@@ -110,7 +110,7 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
         NoCounterpartError: a material or camera that Mitsuba cannot express.
     """
     integrator = settings.integrator
-    assert isinstance(integrator, PathIntegrator)
+    assert integrator.name == "path"
     if scene.built.copies:
         raise NoCounterpartError(f"{scene.built.copies[0].name}: instances are not converted")
     out: dict[str, Any] = {
@@ -363,9 +363,10 @@ def _crop(film: Film) -> dict[str, int]:
     return dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), film.crop, strict=True))
 
 
-def _rfilter(filter: Filter) -> dict[str, Any]:
+def _rfilter(filter: Any) -> dict[str, Any]:
     # Mitsuba's gaussian has no radius of its own: it is four deviations, as ours is where none is given.
-    return {key: value for key, value in filter.model_dump().items() if key != "radius" or filter.type == "tent"}
+    own = {key: value for key, value in filter.values.items() if key != "radius" or filter.name == "tent"}
+    return {"type": filter.name, **own}
 
 
 def _transform(mitsuba: Any, matrix: np.ndarray) -> Any:

@@ -12,7 +12,7 @@ import torch
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 from torchpt.scene import texels
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0], "fov": 20}

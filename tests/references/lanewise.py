@@ -134,7 +134,7 @@ def compare(scene: torchpt.Scene, wishes: Mapping[str, Any], pixels: int, sample
     wave, _ = prepared(scene, wishes)
     with torch.no_grad():
         chosen = kernels_of(scene, wave)
-        if wave.preview is not None:
+        if wave.first is not None:
             _first_hits(found, wave, chosen, pixels, samples)
             return found
         recorder = waves(wave, pixels, samples)
@@ -364,7 +364,7 @@ def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, s
     took = worker.trace(Chunk(0, pixels, 0, samples))
     assert took.rays == tally.rays
     slots = torch.from_numpy(worker.slots.floats[:, : pixels * samples].copy())
-    found.add("preview", "radiance", eager.reshape(3, -1), slots)
+    found.add("first", "radiance", eager.reshape(3, -1), slots)
 
 
 def _none(state: PathState) -> Hit:

@@ -21,16 +21,18 @@ from torchpt.bsdfs import KINDS
 from torchpt.film import Film
 from torchpt.format.description import settings
 from torchpt.forward import kernels_of
-from torchpt.integrators.aov import CHANNELS
+from torchpt.integrators import LAYERS
 from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.loop.rows import HIT
 from torchpt.integrators.loop.schedule import Loop
 from torchpt.integrators.stages import STRATEGIES
 from torchpt.records import Hit, rows
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 from torchpt.samplers import KINDS as SAMPLERS
 
 SCENES = sorted(path.stem for path in Path("configs/scene").glob("*.yaml")) or ["cornell_box"]
+#: Layers of first surfaces.
+SEEN = [name for name in LAYERS if not LAYERS[name].light]
 DIFFUSE = ("cornell_box", "cornell_bunny", "cornell_statue_bunny_diffuse", "games101")
 
 
@@ -295,14 +297,14 @@ def test_depths_and_roulette(limits):
 @pytest.mark.parametrize("name", quick(("cornell_box",), ["cornell_box", "showcase"]))
 def test_layers(name, integrator):
     scene = loaded(showcase("lattice", "glass", "tiles", "patches") if name == "showcase" else name)
-    wish = {"integrator": {"type": integrator}, "film": {"aovs": list(CHANNELS), "filter": "mitchell"}}
+    wish = {"integrator": {"type": integrator}, "film": {"aovs": SEEN, "filter": "mitchell"}}
     assert paired(scene, wish, 16, 4) <= 1.0
 
 
 def test_first_surfaces_agree_pixel_by_pixel():
     """No path to go astray: but for edges that rays graze, layers are equal to rounding."""
     scene = loaded(showcase("lattice", "glass", "tiles", "patches"))
-    wish = {"integrator": {"type": "aov"}, "film": {**film_of(40, 30), "aovs": list(CHANNELS)}}
+    wish = {"integrator": {"type": "aov"}, "film": {**film_of(40, 30), "aovs": SEEN}}
     on, off = (layers_of(rendered(scene, mode, 1, 2, wish)) for mode in ("on", "off"))
     for name in on:
         near = torch.isclose(

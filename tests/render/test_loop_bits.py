@@ -22,7 +22,7 @@ from torchpt.forward import BYTES_PER_LANE
 from torchpt.integrators.loop import schedule
 from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.path import Tally
-from torchpt.render import Progress, Rendering, render_scene
+from torchpt.rendering import Progress, Rendering, render_scene
 
 FILM = {**film_of(37, 23), "filter": "mitchell", "aovs": ["albedo", "normal", "variance"]}
 

@@ -16,15 +16,16 @@ from torch import Tensor, nn
 from trials import film_of
 
 import torchpt
-from torchpt import forward
 from torchpt.bsdfs import Parameters
 from torchpt.format.description import settings
+from torchpt.forward import say_once
+from torchpt.integrators.compiled import Stages
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.lanes import engine
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.warps import cosine_hemisphere
 from torchpt.records import BsdfSample
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 
 
 def rendered(scene: torchpt.Scene, params: Any = None, **wishes: Any) -> Rendering:
@@ -245,11 +246,11 @@ def close(a: Rendering, b: Rendering) -> bool:
 
 
 def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
-    monkeypatch.setattr(forward, "_said", set())
+    say_once.cache_clear()
     scene = torchpt.load(room("odd"), "cpu", bsdfs={"odd": Odd()})
     eager = rendered(scene, render={"compile": "off", "spp": 4})
     asked: list[int] = []
-    kept = forward.Stages.bounce
+    kept = Stages.bounce
 
     def noted(self: Any, model: int, *args: Any) -> Any:
         asked.append(model)
@@ -328,7 +329,7 @@ class Lambert(torchpt.Bsdf):
 
 
 def test_a_stage_that_turns_out_not_to_compile_renders_all_eagerly(monkeypatch, capsys):
-    monkeypatch.setattr(forward, "_said", set())
+    say_once.cache_clear()
     scene = torchpt.load("cornell_box", "cpu")
     eager = rendered(scene, render={"compile": "off"})
 

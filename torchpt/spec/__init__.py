@@ -29,6 +29,7 @@ from torchpt.spec.parameters import (
     spec_of,
 )
 from torchpt.spec.reading import Refused
+from torchpt.spec.valued import Valued
 
 __all__ = [
     "REQUIRED",
@@ -48,6 +49,7 @@ __all__ = [
     "Scalar",
     "Spec",
     "Texels",
+    "Valued",
     "Vertices",
     "Whole",
     "parameters_of",

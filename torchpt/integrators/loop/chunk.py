@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from torchpt.accel import Accel
+from torchpt.integrators import LAYERS
 from torchpt.integrators.loop.kernels import PLACE, Kernel, Kernels
 from torchpt.integrators.loop.rows import HIT, Memory, Rows
 from torchpt.integrators.path import ENDLESS, Tally
@@ -75,8 +76,8 @@ class Worker:
         self._start(chunk)
         tally = Tally()
         count = chunk.pixels * chunk.samples
-        if self.wave.preview is not None:
-            self._previewed(count, tally)
+        if self.wave.first is not None:
+            self._first_surfaces(count, tally)
         elif self.kernels.fused:
             self._fused(count, tally)
         else:
@@ -85,11 +86,9 @@ class Worker:
 
     def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
         """Fills ``shown`` with layers of the first surfaces, channel after channel; returns how many rays it took."""
-        from torchpt.integrators.aov import CHANNELS
-
         self._start(chunk)
         kernels, count = self.kernels, chunk.pixels * chunk.samples
-        channels = sum(CHANNELS[name] for name in names)
+        channels = sum(len(LAYERS[name].channels) for name in names)
         if self.shown is None or len(self.shown.words) != channels:
             self.shown = Memory(channels)
         self.shown.words[:, :count] = 0
@@ -110,8 +109,8 @@ class Worker:
 
     # -- the loop over depth
 
-    def _previewed(self, count: int, tally: Tally) -> None:
-        """The first surfaces under prefiltered maps, and other lights with their shadows."""
+    def _first_surfaces(self, count: int, tally: Tally) -> None:
+        """The first surfaces, with the shadow rays that they ask for, and no further."""
         kernels = self.kernels
         here, there = self._arenas
         now, then = self._lists
@@ -129,7 +128,7 @@ class Worker:
         for model, lanes in enumerate(places[: kernels.models]):
             if lanes:
                 self._counters[0] = done
-                kernel = kernels.preview(model)
+                kernel = kernels.first(model)
                 self._run(kernel, lanes, here, there, now[model])
                 tally.rays += lanes * kernel.program.shadows
                 done += lanes

@@ -109,7 +109,7 @@ class Kernels:
                 ("sampler", self.numbers),
                 ("centre", wave.centre),
                 ("pixel", wave.stages.pixel),
-                ("preview", wave.preview),
+                ("first", wave.first),
             )
             for item in leaves_of(record, name)
         )
@@ -119,7 +119,7 @@ class Kernels:
             for path, tensor in self._leaves.items()
         }
         self._ids = {id(tensor): (path, tensor) for path, tensor in self._leaves.items()}
-        structure = (world, wave.camera.kind(), wave.filter.kind(), self.plan, wave.preview, self._leaves)
+        structure = (world, wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, self._leaves)
         self._structure = (*map(signature, structure), packets, fused)
         self._before = before if before is not None and before._structure == self._structure else None
         self._laid_out: dict[Any, Tensor] = {}
@@ -218,9 +218,9 @@ class Kernels:
             ("layers", model, names), lambda tracer: self._layers(tracer, model, names), listed=self.listed
         )
 
-    def preview(self, model: int) -> Kernel:
-        """The first surfaces of a model under the environment's prefiltered maps."""
-        return self._get(("preview", model), lambda tracer: self._preview(tracer, model), listed=True)
+    def first(self, model: int) -> Kernel:
+        """The first surfaces of a model, where paths end at them."""
+        return self._get(("first", model), lambda tracer: self._first(tracer, model), listed=True)
 
     def deposit(self, channels: int, clamp: bool) -> Kernel:
         """One sample of each pixel added to sums; those that are not finite are counted, and taken as black."""
@@ -484,20 +484,18 @@ class Kernels:
                 names, self.world, model, state.o, state.d, hit, wave.centre, self.plan.dtype, wave.stages.pixel
             )
             if "weight" in rest:
-                found = {name: value if name in aov.NAMES else value * rest["weight"] for name, value in found.items()}
+                found = aov.weighted(found, rest["weight"])
         nodes = [node for name in names for node in tracer.nodes(found[name])]
         return Sinks(scatter=[Scatter(-1, tracer.nodes(state.lane)[0], tuple(enumerate(nodes)), slots=True)])
 
-    def _preview(self, tracer: Tracer, model: int) -> Sinks:
-        from torchpt.integrators import ibl
-
+    def _first(self, tracer: Tracer, model: int) -> Sinks:
         salts = self._salts(tracer)
         state, rest = self._state(tracer)
         hit = self._hit(tracer)
-        assert self.wave.preview is not None
+        assert self.wave.first is not None
         with tracer:
-            radiance, shadow = ibl.shaded(
-                self.plan, self.world, self.wave.preview, model, state, hit, salts, self.wave.stages.pixel, False
+            radiance, shadow = self.wave.first.shade(
+                self.plan, self.world, model, state, hit, salts, self.wave.stages.pixel, False
             )
             # No ray goes on: the lane ends where its shadow ray is known.
             after = replace(state, radiance=state.radiance + radiance, t_max=torch.zeros_like(state.t_max))
@@ -639,7 +637,7 @@ def _state_rows(wave: Wave, packets: bool, fused: bool, has_opacity: bool) -> Ro
     if wave.filter.signed:
         found["weight"] = ((), "f")
     found |= HIT
-    if not fused and world.lights is not None:
+    if not fused and (world.lights is not None if wave.first is None else wave.first.shadows(world)):
         found |= SHADOW
         found |= {"clear": ((), "f")} if has_opacity else {}
         found |= {} if has_opacity and packets else {"blocked": ((), "i")}

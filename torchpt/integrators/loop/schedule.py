@@ -12,6 +12,7 @@ import numpy as np
 
 from torchpt.errors import RenderError
 from torchpt.film import Film
+from torchpt.integrators import LAYERS
 from torchpt.integrators.loop.chunk import LANES, Chunk, Halted, Worker
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.path import Tally
@@ -150,14 +151,12 @@ class Loop:
             raise self._not_finite(used, chunk)
 
     def _layers(self, worker: Worker, chunk: Chunk, share: Share) -> None:
-        from torchpt.integrators.aov import CHANNELS
-
         names = tuple(self.layers)
         share.tally.rays += worker.layers(chunk, names)
         assert worker.shown is not None
         at = 0
         for name in names:
-            channels = CHANNELS[name]
+            channels = len(LAYERS[name].channels)
             values = worker.shown.floats[at : at + channels]
             self._deposit(worker, values, chunk, self.layers[name], channels, None)
             at += channels
