@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpt.lanes.tracing import tracing
-from torchpt.native.operators import choose, operator
+from torchpt.native.operators import operator
 from torchpt.samplers import hammersley, independent, sobol, stratified, zsobol
 from torchpt.samplers.dimensions import Dimension, salt
 from torchpt.samplers.hashing import as_int32, mix, mix_int
@@ -122,29 +122,25 @@ class Draws:
     def one(self, dimension: Dimension) -> Tensor:
         """``(N,)`` float32 in ``[0, 1)``."""
         if self._key.device.type == "cpu" and not tracing():
-            return choose(_draw_on_cpu, _draw_operator)(self._kind, 1, self._key, self._salts, int(dimension))[0]
+            return _draw_on_cpu(self._kind, 1, self._key, self._salts, int(dimension))[0]
         return KINDS[self._kind].draw_1d(self._key, self._salts[int(dimension)])
 
     def two(self, dimension: Dimension) -> Tensor:
         """``(2, N)`` float32 in ``[0, 1)``."""
         if self._key.device.type == "cpu" and not tracing():
-            return choose(_draw_on_cpu, _draw_operator)(self._kind, 2, self._key, self._salts, int(dimension))
+            return _draw_on_cpu(self._kind, 2, self._key, self._salts, int(dimension))
         return KINDS[self._kind].draw_2d(self._key, self._salts[int(dimension)])
 
 
+@operator(
+    "torchpt::draw",
+    lambda kind, rows, key, salts, dimension: key.new_empty(rows, key.shape[1], dtype=torch.float32),
+)
 def _draw_on_cpu(kind: str, rows: int, key: Tensor, salts: Tensor, dimension: int) -> Tensor:
     """``(rows, N)`` numbers from the kernels."""
     from torchpt.samplers import kernels
 
     return kernels.draw(kind, rows, key, int(salts[dimension]))
-
-
-_draw_operator = operator("torchpt::draw", _draw_on_cpu)
-
-
-@_draw_operator.register_fake
-def _(kind: str, rows: int, key: Tensor, salts: Tensor, dimension: int) -> Tensor:
-    return torch.empty(rows, key.shape[1], dtype=torch.float32, device=key.device)
 
 
 @lru_cache(maxsize=4096)
