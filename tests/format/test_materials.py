@@ -498,7 +498,7 @@ def test_blends_of_names_and_of_materials_in_place() -> None:
 
 def test_a_blend_in_a_shape() -> None:
     found = read({"d": DIFFUSE}, material={"type": "blend", "a": "d", "b": {"type": "phong"}, "weight": 0})
-    material = found.shapes["s"].material
+    material = found.shapes["s"]["material"]
     assert isinstance(material, Described)
     inner = resolved(material, "shapes.s.material", found.materials).inner
     assert [slot.name for slot in inner] == ["materials.d", "shapes.s.material.b"]
@@ -548,7 +548,7 @@ def test_shape_and_material_do_not_both_emit(glow: dict[str, Any]) -> None:
 
 def test_either_may_emit() -> None:
     found = read({"m": {**DIFFUSE, "emission": 2}, "n": DIFFUSE}, emission=1, material="n")
-    assert found.shapes["s"].emission == (1, 1, 1)
+    assert found.shapes["s"]["emission"] == (1, 1, 1)
     assert found.materials["m"]["emission"] == (2, 2, 2) and found.materials["m"]["emission_strength"] == 1
 
 
@@ -656,7 +656,7 @@ def test_their_own_model_in_a_blend_and_in_a_shape() -> None:
     blend = {"type": "blend", "a": {"type": "mine", "amount": 3}, "b": DIFFUSE, "weight": 0.5}
     found = slot(OWN, **blend).inner[0]
     assert found.name == "materials.m.a" and found.values["amount"] == 3 and found.model is OWN["mine"]
-    assert isinstance(read({}, OWN, material=blend).shapes["s"].material, Described)
+    assert isinstance(read({}, OWN, material=blend).shapes["s"]["material"], Described)
 
 
 OWN_BAD: dict[str, tuple[dict[str, Any], str, str]] = {

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from torchpt.errors import AssetError
-from torchpt.meshes.cube import unit_cube
 from torchpt.meshes.mesh_part import FileCamera, FileLight, FileMaterial, MeshPart, checked
 from torchpt.meshes.normals import smooth_normals
 
-__all__ = ["FORMATS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals", "unit_cube"]
+__all__ = ["FORMATS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals"]
 
 #: File ending -> module here, whose ``load_<module>(path, data, materials)`` gives the parts.
 FORMATS = {".obj": "obj", ".ply": "ply", ".stl": "stl", ".glb": "gltf", ".gltf": "gltf"}
