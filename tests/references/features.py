@@ -112,10 +112,10 @@ FEATURES: dict[str, Feature] = {
         ("integrators/aov.py",), lambda scene: scene["film"].update(aovs=["normal"]), module="torchpt.integrators.aov"
     ),
     "lens": Feature(
-        ("cameras/thinlens.py",),
+        ("cameras/kinds/thinlens.py",),
         lambda scene: scene["camera"].update(type="thinlens", aperture_radius=0.05, focus_distance=4),
         ("camera.aperture", "camera.lens"),
-        module="torchpt.cameras.thinlens",
+        module="torchpt.cameras.kinds.thinlens",
     ),
     "preview": Feature(
         ("integrators/ibl.py", "integrators/split_sum.py"),

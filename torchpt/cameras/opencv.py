@@ -19,7 +19,17 @@ from torch import Tensor
 from torchpt.math.vectors import normalize
 from torchpt.spec import Refused, reading
 
-__all__ = ["K_WORDS", "PinholeMatrices", "angles", "calibration", "extrinsics", "pose", "rotation", "size", "translation"]
+__all__ = [
+    "K_WORDS",
+    "PinholeMatrices",
+    "angles",
+    "calibration",
+    "extrinsics",
+    "pose",
+    "rotation",
+    "size",
+    "translation",
+]
 
 #: OpenCV's axes in ours, which are left, up, ahead.
 _TURN = np.diag([-1.0, -1.0, 1.0])

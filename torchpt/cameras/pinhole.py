@@ -35,7 +35,11 @@ class Pinhole(Camera):
 
     parameters: ClassVar = {
         "fov": Angle(
-            39.3, above=0.0, below=180.0, moves=Moves.SURFACES, doc="full angle of view along `fov_axis` of the whole film"
+            39.3,
+            above=0.0,
+            below=180.0,
+            moves=Moves.SURFACES,
+            doc="full angle of view along `fov_axis` of the whole film",
         ),
         "fov_axis": Choice("x", names=FOV_AXES, doc="what `fov` spans: a side of the film, or its diagonal"),
         "principal_point_offset_x": Scalar(
@@ -82,7 +86,9 @@ class Pinhole(Camera):
             if name in given:
                 raise Refused(f"either K or {name}, not both", values[name], (name,))
         if values["size"] is None:
-            raise Refused("[width, height] of the picture that K belongs to, or film.width and film.height", None, ("size",))
+            raise Refused(
+                "[width, height] of the picture that K belongs to, or film.width and film.height", None, ("size",)
+            )
         values |= opencv.angles(values["K"], values["size"])
         try:
             for name in ("fov", "pixel_aspect"):

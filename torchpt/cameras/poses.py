@@ -83,7 +83,9 @@ def pose_of(values: Mapping[str, Any], given: frozenset[str], sized_by: str = ""
         return pose
     for name in ("origin", "target"):
         if values[name] is None:
-            raise Refused("a point [x, y, z] (a camera needs origin and target, or to_world, or R and t)", None, (name,))
+            raise Refused(
+                "a point [x, y, z] (a camera needs origin and target, or to_world, or R and t)", None, (name,)
+            )
     try:
         return look_at(values["origin"], values["target"], values["up"] or _UP, key="")
     except SceneError as error:

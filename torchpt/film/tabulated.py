@@ -107,7 +107,9 @@ def _tables(profile: _Profile) -> Tables:
     half = len(weight) // 2
     left = [round(float(cdf[k + 1] / cdf[-1]) * _STEPS) for k in np.flatnonzero(below[1:half] != below[: half - 1])]
     ends = [0, *left, *(_STEPS - k for k in reversed(left)), _STEPS]
-    runs = [(first, end, (k % 2 == 0) == bool(below[0])) for k, (first, end) in enumerate(pairwise(ends)) if end > first]
+    runs = [
+        (first, end, (k % 2 == 0) == bool(below[0])) for k, (first, end) in enumerate(pairwise(ends)) if end > first
+    ]
     negative = [(first, end) for first, end, is_below in reversed(runs) if is_below]
     if not negative:
         return inverse, 0.0, ()

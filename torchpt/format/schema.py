@@ -12,7 +12,6 @@ from pydantic import model_validator
 from torchpt.errors import SceneError
 from torchpt.format.materials import Material
 from torchpt.format.textures import TextureInput, texture_input
-from torchpt.math import transforms
 from torchpt.spec.fields import (
     Check,
     FaceArray,

@@ -221,7 +221,9 @@ class Scene:
         merged, size = self.merged(params), settings(self.description, {"film": film or {}}).film
         matrix = self.camera(size, merged, torch.float64).intrinsics()
         if matrix is None:
-            raise SceneError("camera.type", self.description.camera.name, "a camera with an angle of view", self.description.file)
+            raise SceneError(
+                "camera.type", self.description.camera.name, "a camera with an angle of view", self.description.file
+            )
         turn, move = extrinsics(merged["camera.to_world"].double())
         return PinholeMatrices(matrix.to(dtype), turn.to(dtype), move.to(dtype))
 
