@@ -23,10 +23,12 @@ from torchpt.errors import (
 
 if TYPE_CHECKING:
     from torchpt import ibl
+    from torchpt.images import metrics
     from torchpt.bsdfs import Bsdf
     from torchpt.images import read_image, read_layers, write_image
     from torchpt.render import render
     from torchpt.scene import Scene, load
+    from torchpt.scene.from_trimesh import from_trimesh
 
 __version__ = "0.1.0"
 __all__ = [
@@ -40,8 +42,10 @@ __all__ = [
     "Scene",
     "SceneError",
     "TorchptError",
+    "from_trimesh",
     "ibl",
     "load",
+    "metrics",
     "read_image",
     "read_layers",
     "render",
@@ -52,6 +56,7 @@ __all__ = [
 _LAZY = {
     "Bsdf": "torchpt.bsdfs",
     "Scene": "torchpt.scene",
+    "from_trimesh": "torchpt.scene.from_trimesh",
     "load": "torchpt.scene",
     "read_image": "torchpt.images",
     "read_layers": "torchpt.images",
@@ -59,12 +64,15 @@ _LAZY = {
     "write_image": "torchpt.images",
 }
 
+#: Public modules.
+_MODULES = {"ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics"}
+
 
 def __getattr__(name: str) -> Any:
     from importlib import import_module
 
-    if name == "ibl":
-        return import_module("torchpt.ibl")
+    if name in _MODULES:
+        return import_module(_MODULES[name])
     if name not in _LAZY:
         raise AttributeError(f"module 'torchpt' has no attribute {name!r}")
     value = getattr(import_module(_LAZY[name]), name)

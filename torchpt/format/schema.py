@@ -13,6 +13,7 @@ from torchpt.errors import SceneError
 from torchpt.format.materials import Material
 from torchpt.format.textures import TextureInput, texture_input
 from torchpt.math import transforms
+from torchpt.meshes import MeshPart
 from torchpt.spec.fields import (
     Affine,
     Check,
@@ -205,11 +206,25 @@ def _displacement(value: Any) -> Displacement | None:
         raise wrong(error.expected, error.value, tuple(part for part in error.key.split(".") if part)) from None
 
 
+def _object(value: Any) -> tuple[MeshPart, ...] | None:
+    """A trimesh object as parts; or parts, which Python code read itself."""
+    if value is None:
+        return None
+    if isinstance(value, list | tuple) and value and all(isinstance(part, MeshPart) for part in value):
+        return tuple(value)
+    if type(value).__module__.split(".")[0] != "trimesh":
+        raise wrong("a trimesh.Trimesh or trimesh.Scene (an object of Python; files have a path)")
+    from torchpt.meshes.trimesh_parts import mesh_parts_of
+
+    return tuple(mesh_parts_of(value))
+
+
 class Mesh(Shape):
-    """Triangles from a file, or from inline ``vertices`` and ``faces``.
+    """Triangles from a file, from inline ``vertices`` and ``faces``, or from an object of trimesh.
 
     Attributes:
         path: candidates, the first existing one is used; None for an inline mesh.
+        mesh: what a ``trimesh.Trimesh`` or ``trimesh.Scene`` holds, read once; None where there is none.
         vertices: ``(V, 3)`` float64.
         faces: ``(F, 3)`` int64, polygons already split into fans.
         normals: ``(V, 3)`` or None.
@@ -220,6 +235,7 @@ class Mesh(Shape):
 
     type: Literal["mesh"] = "mesh"
     path: Annotated[tuple[str, ...] | None, Check(_path)] = None
+    mesh: Annotated[tuple[MeshPart, ...] | None, Check(_object)] = None
     vertices: Rows3 = None
     faces: FaceArray = None
     normals: Rows3 = None
@@ -230,10 +246,13 @@ class Mesh(Shape):
     @model_validator(mode="after")
     def _complete(self) -> Mesh:
         inline = {name: getattr(self, name) for name in ("vertices", "faces", "normals", "uvs")}
-        if self.path is not None:
+        if self.path is not None and self.mesh is not None:
+            raise wrong("either path or mesh, not both", "an object", ("mesh",))
+        if self.path is not None or self.mesh is not None:
             for name, value in inline.items():
                 if value is not None:
-                    raise wrong("either path or an inline mesh, not both", value.tolist(), (name,))
+                    given = "path" if self.path is not None else "mesh"
+                    raise wrong(f"either {given} or an inline mesh, not both", value.tolist(), (name,))
             return self
         if self.vertices is None or self.faces is None:
             missing = (

@@ -146,6 +146,8 @@ def _shape_parts(
         ]  # fmt: skip
     if isinstance(shape, Cube):
         pieces, source, flat = [unit_cube()], "", True
+    elif shape.mesh is not None:
+        pieces, source, flat = list(shape.mesh), "trimesh", shape.face_normals
     elif shape.path is None:
         assert shape.vertices is not None and shape.faces is not None
         piece = MeshPart("", shape.vertices, shape.faces, shape.normals, shape.uvs, None)
