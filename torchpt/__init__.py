@@ -23,9 +23,8 @@ from torchpt.errors import (
 
 if TYPE_CHECKING:
     from torchpt import ibl
-    from torchpt.images import metrics
     from torchpt.bsdfs import Bsdf
-    from torchpt.images import read_image, read_layers, write_image
+    from torchpt.images import metrics, read_image, read_layers, write_image
     from torchpt.render import render
     from torchpt.scene import Scene, load
     from torchpt.scene.from_trimesh import from_trimesh

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 from importlib.util import find_spec
 from typing import Any
@@ -82,11 +81,8 @@ def test_flip_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
         flip(REFERENCE, REFERENCE)
 
 
-def test_metrics_are_public_and_light() -> None:
+def test_metrics_are_public() -> None:
     assert torchpt.metrics.METRICS is METRICS
-    code = "import sys, torchpt; torchpt.metrics; print([n for n in ('kornia', 'flip_evaluator') if n in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 def test_our_srgb_is_kornias() -> None:

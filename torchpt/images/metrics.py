@@ -95,7 +95,7 @@ def flip(image: Tensor, reference: Tensor) -> float:
     arrays = [values.clamp(min=0).float().contiguous().numpy() for values in (ref, x)]
     if not float(arrays[0].max()) > 1e-5:  # below it the evaluator ends the process
         raise ValueError("flip: the reference is black, so there is no exposure to look at it by")
-    return float(flip_evaluator.evaluate(*arrays, "HDR", applyMagma=False)[1])
+    return float(flip_evaluator.evaluate(arrays[0], arrays[1], "HDR", applyMagma=False)[1])
 
 
 #: Name -> measure. Smaller is better, except for ``psnr`` and ``ssim``.

@@ -92,20 +92,20 @@ class Looks:
 
         Trimesh fills in a grey for colours that a file does not give, which cannot be told from the same grey given.
         """
-        found = Statements()
+        statements = Statements()
         files: dict[str, Any] = {}
         for key, value in (("kd", material.diffuse), ("ks", material.specular)):
             if tuple(np.asarray(value).tolist()) != _UNSAID:
                 red, green, blue = (float(level) / 255.0 for level in value[:3])
-                found.colors[key] = red, green, blue
+                statements.colors[key] = red, green, blue
         if material.diffuse[3] < 255:
-            found.numbers["d"] = float(material.diffuse[3]) / 255.0
+            statements.numbers["d"] = float(material.diffuse[3]) / 255.0
         if material.glossiness != _UNSAID_EXPONENT:
-            found.numbers["ns"] = float(material.glossiness)
+            statements.numbers["ns"] = float(material.glossiness)
         if material.image is not None:
-            found.maps["map_kd"] = Map("map_Kd", "", 0)
+            statements.maps["map_kd"] = Map("map_Kd", "", 0)
             files["map_kd"] = self.picture(material.image, "image")
-        made, ignored = material_of(found, files)
+        made, ignored = material_of(statements, files)
         extra = [str(key)[:80] for key in material.kwargs if key not in ("kd", "ka", "ks", "ns")]
         name = str(material.name or "material")[:80]
         return FileMaterial(name, made, tuple(dict.fromkeys([*ignored, *extra]))), None

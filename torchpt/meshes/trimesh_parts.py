@@ -56,10 +56,13 @@ def mesh_parts_of(source: Any, label: str = "trimesh", *, most: int = MOST_PLACE
         if total > most:
             raise AssetError(label, f"more than {most} vertices or faces once nodes are placed")
         if name not in known:
-            known[name] = parts_of(geometry, str(name)[:80], looks)
-        parts += [transformed(part, matrix) for part in known[name]]
+            known[name] = parts_of(geometry, str(name)[:80] if len(source.geometry) > 1 else "", looks)
+        stays = np.array_equal(matrix, np.eye(4))
+        parts += known[name] if stays else [transformed(part, matrix) for part in known[name]]
     parts = checked(parts, Path(label))
-    others = [f"{type(geometry).__name__} {name}"[:80] for name, geometry in source.geometry.items() if not _solid(geometry)]
+    others = [
+        f"{type(geometry).__name__} {name}"[:80] for name, geometry in source.geometry.items() if not _solid(geometry)
+    ]
     lights, ignored = lights_of(source, label)
     first = parts[0]
     ignored = tuple(dict.fromkeys((*first.ignored, *others, *ignored)))
@@ -116,11 +119,11 @@ def parts_of(mesh: Any, name: str, looks: Looks) -> list[MeshPart]:
         material, colors = looks.of(visual.material, colors)
         return [MeshPart(name, vertices, faces, normals, uvs, colors, material)]
     which = np.asarray(visual.face_materials)
-    found = []
+    parts = []
     for number, each in enumerate(several):
         material, tinted = looks.of(each, colors)
-        found.append(MeshPart(f"{name}{number}", vertices, faces[which == number], normals, uvs, tinted, material))
-    return found
+        parts.append(MeshPart(f"{name}{number}", vertices, faces[which == number], normals, uvs, tinted, material))
+    return parts
 
 
 def _linear(colors: Any) -> Matrix:
@@ -135,13 +138,15 @@ def lights_of(scene: Any, label: str) -> tuple[list[FileLight], list[str]]:
     Raises:
         AssetError: a light that has no place in the graph, or numbers that none can have.
     """
-    found: list[FileLight] = []
+    lights: list[FileLight] = []
     left_out: list[str] = []
     for light in vars(scene).get("_lights") or ():
         try:
             matrix = np.array(scene.graph[light.name][0], np.float64)
         except (KeyError, ValueError):
-            raise AssetError(label, f"the light {light.name!r} has no place: scene.graph[light.name] = matrix") from None
+            raise AssetError(
+                label, f"the light {light.name!r} has no place: scene.graph[light.name] = matrix"
+            ) from None
         kind = type(light).__name__.removesuffix("Light").lower()
         color = (np.asarray(light.color, np.float64)[:3] / 255.0).tolist()
         block: dict[str, Any] = {"name": str(light.name), "type": kind, "color": color, "intensity": light.intensity}
@@ -151,8 +156,8 @@ def lights_of(scene: Any, label: str) -> tuple[list[FileLight], list[str]]:
             block["range"] = light.radius
         text = json.dumps({"extensions": {PUNCTUAL: {"lights": [block]}}})
         node = {"extensions": {PUNCTUAL: {"light": 0}}}
-        found.append(light_at(Document(Path(label), text.encode()), node, matrix, left_out))
-    return found, left_out
+        lights.append(light_at(Document(Path(label), text.encode()), node, matrix, left_out))
+    return lights, left_out
 
 
 def _cameras(scene: Any) -> Iterator[FileCamera]:

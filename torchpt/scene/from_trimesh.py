@@ -41,9 +41,13 @@ def from_trimesh(
 
     Args:
         source: the object, which stays as it is.
-        camera, lights, film, integrator, sampler, render: blocks of a scene file. ``camera`` and ``lights`` stand in place of
-            the object's own, ``film`` beside what its camera says. Without a camera one looks at all of it along -z; where
-            nothing shines a sky of radiance 1 does.
+        camera: block of a scene file in place of the object's own camera. Where there is neither, one looks at all of it
+            along -z.
+        lights: block in place of the object's own lights. Where nothing shines, a sky of radiance 1 does.
+        film: block beside the size that the object's camera says.
+        integrator: block.
+        sampler: block.
+        render: block.
         device: as for :func:`torchpt.load`.
 
     Raises:
@@ -51,16 +55,16 @@ def from_trimesh(
         SceneError: a block that is wrong, a node's transform that has no inverse.
     """
     blocks = {"film": film, "integrator": integrator, "sampler": sampler, "render": render}
-    found = description_of(source)
+    description = description_of(source)
     if camera is not None:
-        found["camera"] = camera
-        found.pop("film", None)
+        description["camera"] = camera
+        description.pop("film", None)
     if lights is not None:
-        found["lights"] = lights
+        description["lights"] = lights
     for name, block in blocks.items():
         if block is not None:
-            found[name] = {**found.get(name, {}), **block}
-    return load(found, device)
+            description[name] = {**description.get(name, {}), **block}
+    return load(description, device)
 
 
 def description_of(source: Any) -> dict[str, Any]:
@@ -74,14 +78,14 @@ def description_of(source: Any) -> dict[str, Any]:
     shapes, glows = _shapes(source)
     if not shapes:
         raise AssetError(_LABEL, "the scene is empty (no mesh with a face)")
-    found: dict[str, Any] = {"shapes": shapes, **_view(source)}
+    description: dict[str, Any] = {"shapes": shapes, **_view(source)}
     lights, _ = lights_of(source, _LABEL)
     if lights:
         names = labels_of([light.name for light in lights])
-        found["lights"] = {name: _light(light) for name, light in zip(names, lights, strict=True)}
+        description["lights"] = {name: _light(light) for name, light in zip(names, lights, strict=True)}
     elif not glows:
-        found["lights"] = {"sky": {"type": "constant", "radiance": 1.0}}
-    return found
+        description["lights"] = {"sky": {"type": "constant", "radiance": 1.0}}
+    return description
 
 
 def _shapes(source: Any) -> tuple[dict[str, Any], bool]:
