@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchpt.cameras import Camera
 from torchpt.errors import RenderError
-from torchpt.film import Film, Filter
+from torchpt.film import FILTERS, Film
 from torchpt.integrators import Wave
 from torchpt.integrators.compiled import CompiledStages, Stages
 from torchpt.integrators.loop.kernels import Kernels
@@ -26,14 +26,13 @@ from torchpt.integrators.path import Limits, Tally
 from torchpt.integrators.stages import Plan
 from torchpt.lanes.graph import Unsupported
 from torchpt.records import World
+from torchpt.samplers import KINDS as SAMPLERS
 from torchpt.samplers import Sampler
 from torchpt.scene import Scene
 from torchpt.settings import (
     AovIntegrator,
     DirectIntegrator,
-    GaussianFilter,
     IblIntegrator,
-    MitchellFilter,
     PathIntegrator,
     Settings,
 )
@@ -205,19 +204,17 @@ def make_wave(
     moved = any(name.startswith("shapes.") and name.endswith((".vertices", ".to_world")) for name in params or {})
     accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
     film, integrator = settings.film, settings.integrator
-    own = film.filter
-    stddev = own.stddev if isinstance(own, GaussianFilter) else 0.5
-    lobes = (own.B, own.C) if isinstance(own, MitchellFilter) else ()
-    limits, plan = None, Plan(settings.sampler.type, "mis", None, dtype, tape, attached)
+    points = SAMPLERS[settings.sampler.type](**settings.sampler.model_dump(exclude={"type"}))
+    limits, plan = None, Plan(points, "mis", None, dtype, tape, attached)
     if isinstance(integrator, PathIntegrator):
         limits = Limits(integrator.max_depth, integrator.rr_depth)
-        plan = Plan(settings.sampler.type, integrator.strategy, integrator.rr_prob, dtype, tape, attached)
+        plan = Plan(points, integrator.strategy, integrator.rr_prob, dtype, tape, attached)
     elif isinstance(integrator, DirectIntegrator):
         limits = Limits(2, 3)
-        plan = Plan(settings.sampler.type, integrator.strategy, None, dtype, tape, attached)
+        plan = Plan(points, integrator.strategy, None, dtype, tape, attached)
     elif isinstance(integrator, IblIntegrator):
         limits = Limits(2, 3)
-        plan = Plan(settings.sampler.type, "light", None, dtype, tape, attached)
+        plan = Plan(points, "light", None, dtype, tape, attached)
     spp = settings.render.spp
     camera = scene.camera(film, scene.merged(params), dtype)
     randomizations = min(spp, 4 if spp >= MANY_SAMPLES else 2)
@@ -226,8 +223,8 @@ def make_wave(
         limits=limits,
         accel=accel,
         camera=camera,
-        filter=Filter(own.type, own.radius, stddev, scene.device, *lobes),
-        sampler=Sampler(settings.sampler.type, settings.render.seed, randomizations, spp, film.width),
+        filter=FILTERS[film.filter.type](film.filter.model_dump(exclude={"type"}), scene.device),
+        sampler=Sampler(points, settings.render.seed, randomizations, spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.space.shift,
         preview=_preview(scene, world, own=not params) if isinstance(integrator, IblIntegrator) else None,

@@ -38,6 +38,7 @@ __all__ = [
     "PathState",
     "Quadrics",
     "Shadow",
+    "SplitSumMaterial",
     "World",
     "joined",
     "rows",
@@ -264,6 +265,29 @@ class BsdfSample:
     pdf: Tensor  # (N,) in solid angle; 0 where the draw failed, inf where the lobe is a delta
     weight: Tensor  # (3, N) = eval / pdf
     eta: Tensor | None = None  # (N,) index of the side of wi over that of wo, 1 for reflection; None: never refracts
+
+
+@dataclass(frozen=True)
+class SplitSumMaterial:
+    """What split-sum shading knows of surfaces, see :mod:`torchpt.ibl`.
+
+    Attributes:
+        diffuse: colour of the diffuse part ``(3, N)``: base colour by ``1 - metallic``.
+        f0: reflectance of the mirror at normal incidence, ``(3, N)`` or ``(N,)``.
+        f90: at grazing incidence, likewise.
+        roughness: ``(N,)`` from 0 to 1.
+        over: F0 of the mirror over the diffuse part, whose light is missing there, as ``f0``; None where the two are added.
+        through: colour of what is not mirrored but passes ``(3, N)``; None where nothing does. It needs ``over``.
+        eta: index of refraction ``(N,)`` of what lies below; None: light passes straight on.
+    """
+
+    diffuse: Tensor
+    f0: Tensor
+    f90: Tensor
+    roughness: Tensor
+    over: Tensor | None
+    through: Tensor | None = None
+    eta: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -139,12 +139,12 @@ def _same(wish: str | torch.device, own: torch.device) -> bool:
 
 def _moves(scene: Scene, names: Iterable[str]) -> bool:
     """Whether any of the parameters moves surfaces or the camera, or bends rays that a delta lobe sends on."""
-    materials = [material for part in scene.built.parts for material in part.material.all()]
-    bending = {material.name for material in materials if material.model.refracts and material.model.delta}
+    owners = [*scene.built.parts, *scene.built.copies]
+    bending = {name for owner in owners for material in owner.material.all() for name in material.bending()}
 
     def moves(name: str) -> bool:
-        moved = scene.spec(name).moves
-        return moved is Moves.SURFACES or (moved is Moves.RAYS and name.rpartition(".")[0] in bending)
+        # A texture's numbers are called after it.
+        return scene.spec(name).moves is Moves.SURFACES or bool({name, name.rpartition(".")[0]} & bending)
 
     return any(map(moves, names))
 

@@ -220,12 +220,12 @@ INTEGRATORS: dict[str, type[Any]] = {
 class Sampler(Model):
     """Where sample points come from."""
 
-    type: Literal["sobol", "independent", "stratified", "hammersley", "zsobol"] = "sobol"
+    type: Annotated[str, choice(*KINDS)] = "sobol"
 
     @property
     def needs_count(self) -> bool:
         """Whether ``render.spp`` must be known before the first sample, so that nothing else may end a render."""
-        return KINDS[self.type].NEEDS_COUNT
+        return KINDS[self.type].needs_count
 
 
 SAMPLERS: dict[str, type[Sampler]] = dict.fromkeys(KINDS, Sampler)
@@ -341,7 +341,7 @@ def _open_end(raw: Mapping[str, Any], sampler: Sampler) -> None:
     """Raises where something else than ``spp`` is to end a render whose points depend on their number."""
     for name in ("time_limit", "target_error"):
         if sampler.needs_count and raw.get(name) is not None:
-            free = ", ".join(kind for kind, module in KINDS.items() if not module.NEEDS_COUNT)
+            free = ", ".join(name for name, kind in KINDS.items() if not kind.needs_count)
             expected = (
                 f"null where sampler is {sampler.type}, whose points depend on how many there are (free of it: {free})"
             )

@@ -112,8 +112,8 @@ def test_parameters(name, keys):
 @pytest.mark.parametrize(
     ("name", "key", "value", "words"),
     [
-        ("perspective", "fov", 180.0, "0 < fov < 180"),
-        ("perspective", "fov", 0.0, "0 < fov < 180"),
+        ("perspective", "fov", 180.0, "> 0 and < 180"),
+        ("perspective", "fov", 0.0, "> 0 and < 180"),
         ("thinlens", "aperture_radius", -1e-6, ">= 0"),
         ("thinlens", "focus_distance", 0.0, "> 0"),
         ("thinlens", "focus_distance", float("nan"), "finite"),

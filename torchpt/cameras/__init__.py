@@ -6,22 +6,11 @@ so that image right is ``(target - origin) x up``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 from torchpt.cameras.base import Camera
-from torchpt.cameras.orthographic import Orthographic
-from torchpt.cameras.perspective import FOV_AXES, Perspective
+from torchpt.cameras.opencv import PinholeMatrices
+from torchpt.spec import Kinds
 
-if TYPE_CHECKING:
-    from torchpt.cameras.thinlens import ThinLens
+__all__ = ["KINDS", "Camera", "PinholeMatrices"]
 
-__all__ = ["FOV_AXES", "Camera", "Orthographic", "Perspective", "ThinLens"]
-
-
-def __getattr__(name: str) -> Any:
-    """A lens is imported where a scene has one."""
-    if name == "ThinLens":
-        from torchpt.cameras.thinlens import ThinLens
-
-        return ThinLens
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+#: The kinds of cameras.
+KINDS: Kinds[Camera] = Kinds("torchpt.cameras.kinds", ("perspective", "thinlens", "orthographic"))

@@ -3,34 +3,59 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import ClassVar
+from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
+from torchpt.cameras.poses import POSES, pose_of
 from torchpt.math.vectors import normalize
+from torchpt.spec import Spec
 
 __all__ = ["Camera"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Camera(ABC):
-    """A camera on a film.
+    """A camera on a film. Fields of a kind are the values of its parameters: tensors of the lanes' dtype, or plain values.
 
     Attributes:
-        to_world: pose ``(4, 4)``; its scale is ignored, as only the axes' directions and the origin matter.
-        width: of the whole film in pixels.
-        height: of the whole film in pixels.
-        film: the same two as ``(2,)`` numbers of the lanes' dtype.
+        name: its ``type`` in a scene file.
+        parameters: what it declares; those that are traced are differentiable.
         lens: whether rays also depend on a place on a lens.
+        reaches: parameters that say how far from its origin a camera's rays may start.
+        sized_by: what errors say instead, where a pose has a scale.
+        to_world: pose ``(4, 4)``; its scale is ignored, as only the axes' directions and the origin matter.
+        resolution: width and height of the whole film in pixels.
+        film: the same two as ``(2,)`` numbers of the lanes' dtype.
     """
 
     to_world: Tensor
-    width: int
-    height: int
+    resolution: tuple[int, int]
     film: Tensor
 
+    name: ClassVar[str] = ""
+    parameters: ClassVar[Mapping[str, Spec]] = POSES
     lens: ClassVar[bool] = False
+    reaches: ClassVar[tuple[str, ...]] = ()
+    sized_by: ClassVar[str] = ""
+
+    @classmethod
+    def check(cls, values: dict[str, Any], given: frozenset[str]) -> None:
+        """Fill in the pose, from what the file states of it, and refuse values that do not go together.
+
+        Raises:
+            Refused: says which, and what is accepted.
+        """
+        values["to_world"] = pose_of(values, given, cls.sized_by)
+
+    @classmethod
+    def on(cls, to_world: Tensor, resolution: tuple[int, int], values: Mapping[str, Any]) -> Self:
+        """A camera of this kind on a film of ``resolution`` pixels, from the values of its parameters."""
+        own = {field.name: values[field.name] for field in fields(cls) if field.name in values}
+        film = to_world.new_tensor(resolution)
+        return cls(**{**own, "to_world": to_world, "resolution": resolution, "film": film})
 
     @abstractmethod
     def rays(self, x: Tensor, y: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -51,14 +76,18 @@ class Camera(ABC):
 
         From a point ``p`` the camera lies toward ``e - w p``, and a pixel's footprint there, across the line of sight, is
         ``spread`` times that vector's length on a side. Of rays from one place ``e`` is that place, ``w`` is 1, and
-        ``spread`` a pixel's side at distance 1 in the middle of the picture; of parallel rays ``e`` is the unit direction
-        against them, ``w`` is 0, and ``spread`` a pixel's side.
+        ``spread`` a pixel's side at distance 1 where the camera looks; of parallel rays ``e`` is the unit direction
+        against them, ``w`` is 0, and ``spread`` a pixel's side. Of a pixel that is no square, the root of its area.
         """
+
+    def intrinsics(self) -> Tensor | None:
+        """OpenCV's ``K (3, 3)`` in pixels, see :mod:`torchpt.cameras.opencv`; None where no such matrix says it."""
+        return None
 
     def kind(self) -> tuple[object, ...]:
         """What is not a tensor: the stages are compiled anew where it differs."""
-        values = (getattr(self, field.name) for field in fields(self) if field.name not in ("width", "height"))
-        return (type(self).__name__, *(value for value in values if not isinstance(value, Tensor)))
+        own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "resolution"}
+        return (self.name, *((key, value) for key, value in own.items() if not isinstance(value, Tensor)))
 
     def place(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Film positions in pixels as ``right`` and ``up`` of the film's middle, in half widths of the film."""

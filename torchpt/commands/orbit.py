@@ -104,12 +104,12 @@ def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
 
     from torchpt.math.transforms import look_at, rotate
 
-    camera = scene.description.camera
-    start = np.asarray(camera.pose(), np.float64)
-    aimed = camera.target is not None
+    told = scene.description.camera.values
+    start = np.asarray(scene.built.parameters["camera.to_world"], np.float64)
+    aimed = told["target"] is not None
     if aimed:
-        axis = np.asarray(camera.up or (0.0, 1.0, 0.0), np.float64)
-        centre = np.asarray(camera.target, np.float64)
+        axis = np.asarray(told["up"] or (0.0, 1.0, 0.0), np.float64)
+        centre = np.asarray(told["target"], np.float64)
     else:
         nearest = int(np.abs(start[:3, 1]).argmax())
         axis, centre = np.sign(start[nearest, 1]) * np.eye(3)[nearest], scene.middle()
@@ -118,9 +118,9 @@ def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
             yield start
             continue
         by = rotate({"axis": axis.tolist(), "angle": turn.degrees * frame / turn.frames})[:3, :3]
-        place = centre + by @ ((np.asarray(camera.origin) if aimed else start[:3, 3]) - centre)
+        place = centre + by @ ((np.asarray(told["origin"]) if aimed else start[:3, 3]) - centre)
         if aimed:
-            yield look_at(place.tolist(), camera.target, axis.tolist(), key="")
+            yield look_at(place.tolist(), centre.tolist(), axis.tolist(), key="")
             continue
         pose = start.copy()
         pose[:3, :3], pose[:3, 3] = by @ start[:3, :3], place

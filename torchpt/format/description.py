@@ -13,8 +13,9 @@ from torchpt import settings as run_settings
 from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, SceneError
 from torchpt.format import schema
-from torchpt.format.materials import MATERIALS, Material, check_material, custom_types, read_material
-from torchpt.format.schema import Camera, Shape
+from torchpt.format.cameras import read_camera
+from torchpt.format.materials import Kind, check_material, material_types, read_material
+from torchpt.format.schema import Shape
 from torchpt.format.textures import TEXTURES, Named, Texture
 from torchpt.format.yaml_file import plain, read_yaml
 from torchpt.lights import KINDS as LIGHTS
@@ -51,14 +52,14 @@ class Description:
 
     file: str | None
     base: Path
-    camera: Camera
+    camera: Described
     version: int | None = None
     film: dict[str, Any] = field(default_factory=dict)
     integrator: dict[str, Any] = field(default_factory=dict)
     sampler: dict[str, Any] = field(default_factory=dict)
     render: dict[str, Any] = field(default_factory=dict)
     textures: dict[str, Texture] = field(default_factory=dict)
-    materials: dict[str, Material] = field(default_factory=dict)
+    materials: dict[str, Described] = field(default_factory=dict)
     shapes: dict[str, Shape] = field(default_factory=dict)
     lights: dict[str, Described] = field(default_factory=dict)
 
@@ -124,7 +125,7 @@ def read_description(
     Warns:
         EnergyWarning: a material may reflect more light than it receives.
     """
-    types = {**MATERIALS, **custom_types(bsdfs)}
+    types = material_types(bsdfs)
     if isinstance(source, Mapping):
         return _describe(plain(source), types, None, Path.cwd())
     if not isinstance(source, str | os.PathLike):
@@ -154,15 +155,15 @@ def settings(description: Description, overrides: Mapping[str, Any] | None = Non
     return run_settings.merge(blocks, overrides or {}, description.file)
 
 
-def _describe(raw: dict[str, Any], types: Mapping[str, type[Material]], file: str | None, base: Path) -> Description:
+def _describe(raw: dict[str, Any], types: Mapping[str, Kind], file: str | None, base: Path) -> Description:
     check_keys(raw, _KEYS, "", "a scene", file)
     version = raw.get("version")
     if version is not None and (isinstance(version, bool) or version != 1):
         raise SceneError("version", version, "1", file)
     if raw.get("camera") is None:
         raise SceneError("camera", None, "a camera (every scene needs one)", file)
-    camera = schema.read_camera(raw["camera"], file)
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
+    camera = read_camera(raw["camera"], blocks["film"], file)
     run_settings.merge(blocks, {}, file)
     textures = _named(raw, "textures", file, lambda item, key: select("texture", TEXTURES, item, key, file))
     materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
@@ -196,9 +197,9 @@ def _named(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[
 def _shape(
     item: Any,
     key: str,
-    materials: Mapping[str, Material],
+    materials: Mapping[str, Described],
     textures: Mapping[str, Texture],
-    types: Mapping[str, type[Material]],
+    types: Mapping[str, Kind],
     file: str | None,
 ) -> Shape:
     if isinstance(item, dict) and isinstance(item.get("material"), dict):
@@ -218,7 +219,7 @@ def _shape(
             known = ", ".join(materials) or "none is defined"
             raise SceneError(where, material, f"the name of a material ({known}) or a material", file)
         material, where = materials[material], f"materials.{material}"
-    if shape.emission is not None and material is not None and material.emission is not None:
+    if shape.emission is not None and material is not None and material["emission"] is not None:
         expected = f"no emission where the material emits as well ({where}.emission)"
         raise SceneError(f"{key}.emission", shape.emission, expected, file)
     return shape

@@ -108,7 +108,7 @@ class CompiledStages(Stages):
         def stage(camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
             return stages.generate(self.plan, camera, filter, x, y, key, salts)
 
-        variant = (*camera.kind(), *filter.kind_of())
+        variant = (*camera.kind(), *filter.kind())
         return self._get("generate", variant, stage)(camera, filter, x, y, key, salts)
 
     def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:

@@ -14,7 +14,7 @@ from torchpt.integrators.surfaces import opacity_map
 from torchpt.lanes.tracing import tracing
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, World, rows
-from torchpt.samplers import Dimension, Draws, salts
+from torchpt.samplers import Dimension, Draws, Points, salts
 from torchpt.shapes import interact, offset_origin
 
 __all__ = ["PASSES", "Search", "beyond", "passing"]
@@ -50,11 +50,11 @@ class Search:
     Args:
         accel: finds the nearest hit.
         world: the scene's tensors.
-        sampler: type of the sampler.
+        sampler: where numbers come from.
         dtype: of the lanes.
     """
 
-    def __init__(self, accel: Accel, world: World, sampler: str, dtype: torch.dtype) -> None:
+    def __init__(self, accel: Accel, world: World, sampler: Points, dtype: torch.dtype) -> None:
         self._accel, self._world, self._sampler, self._dtype = accel, world, sampler, dtype
 
     def nearest(self, state: PathState, depth: int) -> Hit:

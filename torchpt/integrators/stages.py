@@ -22,7 +22,7 @@ from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import dot, largest, take
 from torchpt.math.warps import uniform_hemisphere, uniform_sphere
 from torchpt.records import BsdfSample, Hit, Interaction, LightSample, PathState, Shadow, World, rows
-from torchpt.samplers import Dimension, Draws
+from torchpt.samplers import Dimension, Draws, Points
 from torchpt.shapes import interact, offset_origin, reattach
 from torchpt.shapes.interaction import OFFSET
 
@@ -48,7 +48,7 @@ SHORTEN = 1e-4
 class Plan:
     """What a render asks of the stages; static."""
 
-    sampler: str
+    sampler: Points
     strategy: str
     rr_prob: float | None
     dtype: torch.dtype

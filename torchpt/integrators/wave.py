@@ -56,7 +56,7 @@ class Wave:
         place = torch.arange(first_pixel, first_pixel + pixels, device=device)
         x, y = place % width + x0, place // width + y0
         # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
-        pixel = (y * self.camera.width + x).repeat(samples)
+        pixel = (y * self.camera.resolution[0] + x).repeat(samples)
         sample = torch.arange(first_sample, first_sample + samples, device=device).repeat_interleave(pixels)
         key = self.sampler.key(pixel, sample)
         x, y = (a.to(self.stages.plan.dtype).repeat(samples) for a in (x, y))

@@ -8,35 +8,40 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from types import ModuleType
 
 import torch
 from torch import Tensor
 
 from torchpt.lanes.tracing import tracing
-from torchpt.native.operators import choose, operator
-from torchpt.samplers import hammersley, independent, sobol, stratified, zsobol
+from torchpt.samplers.base import Numbers, Points
 from torchpt.samplers.dimensions import Dimension, salt
-from torchpt.samplers.hashing import as_int32, mix, mix_int
+from torchpt.samplers.hashing import as_int32, mix_int
+from torchpt.spec import Kinds
 
-__all__ = ["KINDS", "Dimension", "Draws", "Numbers", "Sampler", "key_of", "salts"]
+__all__ = ["KINDS", "Dimension", "Draws", "Numbers", "Points", "Sampler", "points_of", "salts"]
 
-#: Sampler types by name: modules with ``draw_1d(key, salt)``, ``draw_2d(key, salt)`` and ``NEEDS_COUNT``.
-KINDS: dict[str, ModuleType] = {
-    "sobol": sobol,
-    "independent": independent,
-    "stratified": stratified,
-    "hammersley": hammersley,
-    "zsobol": zsobol,
-}
+#: The kinds of samplers.
+KINDS: Kinds[Points] = Kinds(
+    "torchpt.samplers.kinds", ("sobol", "independent", "stratified", "hammersley", "zsobol")
+)  # fmt: skip
+
+
+def points_of(kind: str | Points) -> Points:
+    """A kind by name, all of its parameters at their defaults; or what is one already."""
+    return _plain(kind) if isinstance(kind, str) else kind
+
+
+@lru_cache(maxsize=64)
+def _plain(kind: str) -> Points:
+    return KINDS[kind]()
 
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampler of one type under one seed.
+    """A sampler of one kind under one seed.
 
     Attributes:
-        kind: name of the type, from :data:`KINDS`.
+        kind: where the points lie; or the name of a kind.
         seed: any integer from 0 to 2^63 - 1.
         randomizations: R, how many independent sequences share the samples of a pixel: ``spp // R`` points each, and one
             more for the first ``spp % R``.
@@ -44,23 +49,28 @@ class Sampler:
         width: of the film in pixels, by which pixels are numbered; for kinds that ask where a pixel lies.
     """
 
-    kind: str
+    kind: str | Points
     seed: int
     randomizations: int = 1
     spp: int = 0
     width: int = 1
 
     def __post_init__(self) -> None:
-        if KINDS[self.kind].NEEDS_COUNT and self.spp < self.randomizations:
-            raise ValueError(f"{self.kind} points must know their number, at least one for each randomization")
+        if self.points.needs_count and self.spp < self.randomizations:
+            raise ValueError(f"{self.points.name} points must know their number, at least one for each randomization")
+
+    @property
+    def points(self) -> Points:
+        """Where the points lie."""
+        return points_of(self.kind)
 
     def key(self, pixel: Tensor, sample: Tensor) -> Tensor:
-        """:func:`key_of` for int64 pixel and sample indices ``(N,)``."""
+        """:meth:`Points.key` for int64 pixel and sample indices ``(N,)``."""
         group, point = sample % self.randomizations, sample // self.randomizations
-        return key_of(self.kind, self.numbers(pixel.device), pixel, group, point)
+        return self.points.key(self.numbers(pixel.device), pixel, group, point)
 
     def numbers(self, device: torch.device) -> Numbers:
-        """What :func:`key_of` needs of the sampler."""
+        """What :meth:`Points.key` needs of the sampler."""
         seeds = [
             mix_int(mix_int(mix_int(self.seed) ^ as_int32(self.seed >> 32)) + g) for g in range(self.randomizations)
         ]
@@ -73,78 +83,40 @@ class Sampler:
         )
 
 
-@dataclass(frozen=True)
-class Numbers:
-    """A sampler as tensors, so that a kernel made for one serves all of its kind."""
-
-    seeds: Tensor  # (R,) int32 of the randomizations
-    every: Tensor  # () int64 points of each randomization
-    more: Tensor  # () int64 how many of them have one more
-    bits: Tensor  # () int64 of the largest index of a point
-    width: Tensor  # () int64 of the film
-
-
-def key_of(kind: str, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
-    """``(2, N)`` int32: a pixel's seed and a point's index.
-
-    The seed is a bijection of the pixel index for each (seed, randomization), so no two pixels share a sequence.
-    ``stratified`` and ``hammersley`` have a third row, how many points there are; ``zsobol`` has :func:`zsobol.key`.
-
-    Args:
-        kind: type of the sampler.
-        numbers: of the sampler.
-        pixel: index on the film ``(N,)`` int64.
-        group: randomization ``(N,)`` int64.
-        point: index in its sequence ``(N,)`` int64.
-    """
-    seed = torch.index_select(numbers.seeds, 0, group)
-    if kind == "zsobol":
-        return zsobol.key(pixel, point, seed, numbers.bits, numbers.width)
-    key = [mix(mix(pixel.to(torch.int32)) ^ seed), point.to(torch.int32)]
-    if KINDS[kind].NEEDS_COUNT:
-        key.append((numbers.every + (group < numbers.more)).to(torch.int32))
-    return torch.stack(key)
-
-
 class Draws:
     """The numbers of one path vertex for a batch of lanes: ``draws.one(Dimension.ROULETTE)``, ``draws.two(...)``.
 
     Args:
-        kind: type of the sampler.
+        kind: where the points lie; or the name of a kind.
         key: ``(rows, N)`` int32 as given by :meth:`Sampler.key`.
         salts: ``(len(Dimension),)`` int32, the dimensions' names at this depth; a tensor, so that a compiled stage does not
             specialize on the depth.
     """
 
-    def __init__(self, kind: str, key: Tensor, salts: Tensor) -> None:
-        self._kind, self._key, self._salts = kind, key, salts
+    def __init__(self, kind: str | Points, key: Tensor, salts: Tensor) -> None:
+        self._points, self._key, self._salts = points_of(kind), key, salts
 
     def one(self, dimension: Dimension) -> Tensor:
         """``(N,)`` float32 in ``[0, 1)``."""
-        if self._key.device.type == "cpu" and not tracing():
-            return choose(_draw_on_cpu, _draw_operator)(self._kind, 1, self._key, self._salts, int(dimension))[0]
-        return KINDS[self._kind].draw_1d(self._key, self._salts[int(dimension)])
+        if self._by_kernel():
+            return self._drawn(1, dimension)[0]
+        return self._points.draw_1d(self._key, self._salts[int(dimension)])
 
     def two(self, dimension: Dimension) -> Tensor:
         """``(2, N)`` float32 in ``[0, 1)``."""
-        if self._key.device.type == "cpu" and not tracing():
-            return choose(_draw_on_cpu, _draw_operator)(self._kind, 2, self._key, self._salts, int(dimension))
-        return KINDS[self._kind].draw_2d(self._key, self._salts[int(dimension)])
+        if self._by_kernel():
+            return self._drawn(2, dimension)
+        return self._points.draw_2d(self._key, self._salts[int(dimension)])
 
+    def _by_kernel(self) -> bool:
+        """Whether numbers come from a CPU kernel: compiled stages have the tensor form inside."""
+        eager = self._key.device.type == "cpu" and not tracing() and not torch.compiler.is_compiling()
+        return eager and self._points.kernels() is not None
 
-def _draw_on_cpu(kind: str, rows: int, key: Tensor, salts: Tensor, dimension: int) -> Tensor:
-    """``(rows, N)`` numbers from the kernels."""
-    from torchpt.samplers import kernels
+    def _drawn(self, rows: int, dimension: Dimension) -> Tensor:
+        from torchpt.samplers import kernels
 
-    return kernels.draw(kind, rows, key, int(salts[dimension]))
-
-
-_draw_operator = operator("torchpt::draw", _draw_on_cpu)
-
-
-@_draw_operator.register_fake
-def _(kind: str, rows: int, key: Tensor, salts: Tensor, dimension: int) -> Tensor:
-    return torch.empty(rows, key.shape[1], dtype=torch.float32, device=key.device)
+        return kernels.draw(self._points, rows, self._key, int(self._salts[int(dimension)]))
 
 
 @lru_cache(maxsize=4096)

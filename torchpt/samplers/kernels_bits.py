@@ -1,4 +1,4 @@
-"""Integer arithmetic that the samplers' kernels share; the tensor forms are in ``hashing.py`` and ``sobol.py``."""
+"""Integer arithmetic that the samplers' kernels share; the tensor forms are in ``hashing.py`` and ``scrambling.py``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def mix(x: Any) -> Any:
 
 @jit(inline="always")
 def reverse(x: Any) -> Any:
-    """As ``sobol.reverse_bits``."""
+    """As ``scrambling.reverse_bits``."""
     x = U(((x >> U(1)) & U(0x55555555)) | ((x & U(0x55555555)) << U(1)))
     x = U(((x >> U(2)) & U(0x33333333)) | ((x & U(0x33333333)) << U(2)))
     x = U(((x >> U(4)) & U(0x0F0F0F0F)) | ((x & U(0x0F0F0F0F)) << U(4)))
@@ -37,7 +37,7 @@ def reverse(x: Any) -> Any:
 
 @jit(inline="always")
 def scramble(x: Any, seed: Any) -> Any:
-    """As ``sobol.scramble``."""
+    """As ``scrambling.scramble``."""
     x = U(x ^ U(x * _K0))
     x = U(x + seed)
     x = U(x * U((seed >> U(16)) | U(1)))
@@ -47,7 +47,7 @@ def scramble(x: Any, seed: Any) -> Any:
 
 @jit(inline="always")
 def second_dimension(x: Any) -> Any:
-    """As ``sobol.second_dimension``."""
+    """As ``scrambling.second_dimension``."""
     x = U(x ^ ((x >> U(16)) & U(0x0000FFFF)))
     x = U(x ^ ((x >> U(8)) & U(0x00FF00FF)))
     x = U(x ^ ((x >> U(4)) & U(0x0F0F0F0F)))

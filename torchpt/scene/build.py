@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchpt.bsdfs import KINDS as BSDFS
 from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.errors import AssetError, SceneError
 from torchpt.format.description import Description
-from torchpt.format.materials import MATERIALS, Diffuse, check_material, read_material, resolved
+from torchpt.format.materials import check_material, plain_material, read_material
 from torchpt.format.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
 from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
 from torchpt.meshes import FileCamera, FileMaterial, MeshPart, load_mesh, unit_cube
 from torchpt.meshes.displacement import displaced
 from torchpt.records import KINDS, SOURCES
+from torchpt.scene.materials import declare, resolved
 from torchpt.scene.parameters import Parameters
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.scene.sources import file_lights, labels_of, sources_of
@@ -65,11 +67,9 @@ def build_parts(description: Description) -> Built:
         if isinstance(shape, Instance):
             copies += _copies(description, name, shape, number, parts, parameters, opener)
     for name, material in description.materials.items():
-        _declare(resolved(material, f"materials.{name}", description.materials, opener), parameters)
+        declare(resolved(material, f"materials.{name}", description.materials, opener), parameters)
     sources = sorted([*sources_of(description, parameters), *found], key=lambda source: SOURCES.index(source.kind))
-    parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
-    for name, number in description.camera.numbers().items():
-        parameters[f"camera.{name}"] = np.asarray(number, np.float64)
+    parameters.declare_all("camera", description.camera.kind, description.camera.values)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)
     return Built(tuple(parts), parameters, centre, unit, tuple(sources), tuple(copies))
@@ -106,14 +106,10 @@ def _copies(
             slot = resolved(shape.material, f"{key}.material", description.materials, opener)
         if slot.emission is not None:
             raise SceneError(f"{key}.material", slot.name, "a material that does not emit: an instance cannot", file)
-        _declare(slot, parameters)
+        declare(slot, parameters)
         flip = shape.flip_normals != part.flip
         found.append(Copy(key, name, number, part.name, slot, flip, parameters[f"{key}.to_world"]))
     return found
-
-
-def _declare(slot: ResolvedMaterial, parameters: Parameters) -> None:
-    parameters.update({name: np.asarray(value, np.float64) for name, value in slot.numbers().items()})
 
 
 def _shape_parts(
@@ -228,7 +224,7 @@ def _slot(description: Description, shape: Shape, prefix: str, opener: Opener) -
     given, known = shape.material, description.materials
     if isinstance(given, str):
         return resolved(known[given], f"materials.{given}", known, opener)
-    return resolved(Diffuse() if given is None else given, f"{prefix}.material", known, opener)
+    return resolved(plain_material() if given is None else given, f"{prefix}.material", known, opener)
 
 
 def _own_slot(own: FileMaterial, prefix: str, key: str, source: str, opener: Opener) -> ResolvedMaterial:
@@ -238,7 +234,7 @@ def _own_slot(own: FileMaterial, prefix: str, key: str, source: str, opener: Ope
         AssetError: something that a material cannot have; it names the file and the material.
     """
     try:
-        material = read_material(own.material, key, MATERIALS, None)
+        material = read_material(own.material, key, BSDFS, None)
         check_material(material, key, {}, {}, None)
         return resolved(material, key, {}, opener.sharing(f"{prefix}.textures"))
     except SceneError as error:
@@ -262,7 +258,7 @@ def _part(
     quadric: str = "",
     label: str = "",
 ) -> Part:
-    _declare(slot, parameters)
+    declare(slot, parameters)
     emission, names = shape.emission, (f"shapes.{name}.emission",)
     emission_texture = slot.emission if emission is None and isinstance(slot.emission, Node) else None
     if emission_texture is not None:

@@ -118,7 +118,10 @@ def _view(source: Any) -> dict[str, Any]:
         matrix = np.array(source.camera_transform, np.float64)
         # A graph may scale its camera, which means nothing.
         matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-300)
-        pose = {"type": "perspective", "fov": float(camera.fov[0]), "fov_axis": "x"}
+        across, down = (float(length) for length in camera.focal)
+        pose: dict[str, Any] = {"type": "perspective", "fov": float(camera.fov[0]), "fov_axis": "x"}
+        if abs(down / across - 1.0) > 1e-9:
+            pose["pixel_aspect"] = down / across
         return {
             "camera": {**pose, "to_world": (matrix @ _TURN).tolist()},
             "film": {"width": width, "height": height},

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchpt import bsdfs
 from torchpt.accel import Accel
-from torchpt.format.schema import ThinLens
+from torchpt.film import FILTERS
 from torchpt.lights.choice import ByTree
 from torchpt.records import KINDS, Lights, World, tensors_of
 from torchpt.settings import Settings
@@ -77,7 +77,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     return {
         "scene": {
             "file": description.file,
-            "camera": type(description.camera).__name__.lower(),
+            "camera": description.camera.name,
             "primitives": {kind: n for kind, n in zip(KINDS, world.geometry.counts, strict=True) if n},
             **({"instances": len(built.copies)} if built.copies else {}),
             "parameters": len(built.parameters),
@@ -104,7 +104,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
     lights = world.lights
     absent = [f"{kind} primitives" for kind, n in zip(KINDS, world.geometry.counts, strict=True) if not n]
     present = {model.name for model in world.materials.models}
-    absent += [f"{name} bsdf" for name in dict.fromkeys(model.name for model in bsdfs.MODELS) if name not in present]
+    absent += [f"{name} bsdf" for name in bsdfs.KINDS if name not in present]
     if len(world.materials.models) == 1:
         absent.append("sorting by bsdf (one model)")
     if world.geometry.normals is None:
@@ -133,9 +133,9 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
         if lights.row_of_prim is None:
             absent.append("area lights")
         absent += [f"sampling of {kind} lights" for kind in KINDS if kind not in lights.kinds]
-    if settings.film.filter.type == "box":
-        absent.append("filter table (box)")
-    if not isinstance(description.camera, ThinLens):
+    if not FILTERS[settings.film.filter.type].tabulated:
+        absent.append(f"filter table ({settings.film.filter.type})")
+    if not description.camera.kind.lens:
         absent.append("places on a lens (all is in focus)")
     integrator = settings.integrator
     if getattr(integrator, "clamp", None) is None:

@@ -15,9 +15,9 @@ from torch import Tensor
 from torchpt import accel as search
 from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
-from torchpt.cameras import Camera, Orthographic, Perspective
+from torchpt.cameras import Camera, PinholeMatrices
+from torchpt.cameras.opencv import extrinsics
 from torchpt.errors import RenderError, SceneError
-from torchpt.format import schema
 from torchpt.format.description import Description, read_description, settings
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
@@ -26,7 +26,7 @@ from torchpt.scene.build import Built, build_parts
 from torchpt.scene.info import describe
 from torchpt.scene.space import FARTHEST, Space, middle_of
 from torchpt.settings import Film, Settings
-from torchpt.spec import Index, Moves, Pose, Refused, Scalar, Spec, Vertices
+from torchpt.spec import Moves, Pose, Refused, Scalar, Spec, Vertices, parameters_of
 
 __all__ = ["Scene", "device_of", "load"]
 
@@ -196,24 +196,40 @@ class Scene:
 
     def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
         """The camera on a film of a given size, in the lanes' coordinates."""
-        pose, kind = params["camera.to_world"], self.description.camera
-        number: dict[str, Any] = {name: params[f"camera.{name}"] for name in kind.numbers()}
-        number |= {name: number[name].double() / self._space.unit for name in schema.CAMERA_LENGTHS if name in number}
-        number = {name: value.to(dtype) for name, value in number.items()}
-        placed: dict[str, Any] = {
-            "to_world": torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype),
-            "width": film.width,
-            "height": film.height,
-            "film": torch.tensor((film.width, film.height), dtype=dtype, device=self.device),
-        }
-        if isinstance(kind, schema.Orthographic):
-            return Orthographic(**placed, extent=number["width"])
-        if isinstance(kind, schema.ThinLens):
-            from torchpt.cameras import ThinLens
+        camera, values = self.description.camera, dict(self.description.camera.values)
+        for key, spec in parameters_of(camera.kind).items():
+            number = params.get(f"camera.{key}")
+            if spec.traced and number is not None:
+                values[key] = (number.double() / self._space.unit if spec.length else number).to(dtype)
+        pose = params["camera.to_world"]
+        pose = torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype)
+        return camera.kind.on(pose, (film.width, film.height), values)
 
-            return ThinLens(**placed, **number, fov_axis=kind.fov_axis, blades=kind.blades)
-        assert isinstance(kind, schema.Perspective)
-        return Perspective(**placed, **number, fov_axis=kind.fov_axis)
+    def pinhole(
+        self,
+        params: Mapping[str, Tensor] | None = None,
+        film: Mapping[str, Any] | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> PinholeMatrices:
+        """The camera as OpenCV's matrices ``K`` in pixels, ``R`` and ``t``: see :mod:`torchpt.cameras.opencv`.
+
+        Args:
+            params: tensors in place of the scene's, by name; gradients flow to those of the camera.
+            film: film settings in place of the scene's own, e.g. ``{"width": 640, "height": 480}``; a crop changes nothing.
+            dtype: of the matrices.
+
+        Raises:
+            SceneError: parameters or film settings that are wrong, or a camera that is no pinhole's.
+        """
+        self.check(params)
+        merged, size = self.merged(params), settings(self.description, {"film": film or {}}).film
+        matrix = self.camera(size, merged, torch.float64).intrinsics()
+        if matrix is None:
+            raise SceneError(
+                "camera.type", self.description.camera.name, "a camera with an angle of view", self.description.file
+            )
+        turn, move = extrinsics(merged["camera.to_world"].double())
+        return PinholeMatrices(matrix.to(dtype), turn.to(dtype), move.to(dtype))
 
     def info(self, settings: Settings) -> dict[str, Any]:
         """What the scene holds, what was built for it and what was left out."""
@@ -255,11 +271,4 @@ def _undeclared(name: str, built: Built) -> Spec:
         return Vertices()
     if key == "to_world":
         return Pose(angles=any(part.kind == "sphere" and name == f"{part.name}.to_world" for part in built.parts))
-    if name.startswith("camera."):
-        low: dict[str, Any] = (
-            {"above": 0.0, "below": 180.0} if key == "fov" else {} if key == "aperture_radius" else {"above": 0.0}
-        )
-        return Scalar(moves=Moves.SURFACES, **low)
-    if ".material." in name or name.startswith("materials."):
-        return Index() if key in ("int_ior", "ext_ior", "ior") else Scalar()
     return Scalar() if key in ("emission", "texels") else Scalar(low=None)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpt.errors import SceneError
-from torchpt.format.schema import Camera, Orthographic, ThinLens
 from torchpt.scene.parts import Copy, Part, Source
+from torchpt.spec.declared import Described
 
 __all__ = ["FARTHEST", "Space", "centre_and_unit", "middle_of"]
 
@@ -72,7 +72,7 @@ def centre_and_unit(
     copies: Sequence[Copy],
     sources: Sequence[Source],
     parameters: Mapping[str, Array],
-    camera: Camera,
+    camera: Described,
     file: str | None,
 ) -> tuple[Array, float]:
     """Where the origin of the lanes' coordinates is put ``(3,)``, and their unit.
@@ -130,14 +130,11 @@ def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Ar
 
 
 def _reaches(
-    sources: Sequence[Source], parameters: Mapping[str, Array], camera: Camera, centre: Array
+    sources: Sequence[Source], parameters: Mapping[str, Array], camera: Described, centre: Array
 ) -> list[tuple[str, float]]:
     """Other lengths that lanes hold, by key."""
     found = [("camera", float(np.abs(parameters["camera.to_world"][:3, 3] - centre).max()))]
-    if isinstance(camera, ThinLens):
-        found.append(("camera.aperture_radius", camera.aperture_radius))
-    if isinstance(camera, Orthographic):
-        found.append(("camera.width", camera.width))
+    found += [(f"camera.{key}", float(camera[key])) for key in camera.kind.reaches]
     for source in sources:
         position = parameters.get(f"{source.name}.position")
         if position is not None:

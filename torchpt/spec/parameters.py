@@ -70,6 +70,8 @@ class Spec:
     place: ClassVar[bool] = False
     #: How many channels of a texture it takes.
     coloured: ClassVar[bool] = False
+    #: Whether a texture's numbers stand for no colours, so that 8-bit files are not decoded.
+    linear: ClassVar[bool] = True
 
     @property
     def accepted(self) -> str:
@@ -115,6 +117,11 @@ class _Numbers(Spec):
 
     traced: ClassVar[bool] = True
 
+    def __post_init__(self) -> None:
+        if isinstance(self.default, int | float) and not isinstance(self.default, bool):  # as a file's would be read
+            grey = float(self.default)
+            object.__setattr__(self, "default", (grey, grey, grey) if self.coloured else grey)
+
     @property
     def bounds(self) -> tuple[float, float]:
         """Least and greatest number that float32 holds among those accepted, open ends included."""
@@ -122,14 +129,16 @@ class _Numbers(Spec):
 
     @property
     def _range(self) -> str:
-        low, high = (None if self.above is not None else self.low), self.high
-        if self.above is not None and self.below is not None:
-            return f" above {self.above:g} and below {self.below:g}"
-        if self.above is not None:
-            return f" above {self.above:g}" + (f", at most {high:g}" if high is not None else "")
-        if low is None:
-            return "" if high is None else f" <= {high:g}"
-        return f" in {low:g}..{high:g}" if high is not None else f" >= {low:g}"
+        low, high = self.low, self.high
+        if self.above is None and self.below is None and low is not None and high is not None:
+            return f" in {low:g}..{high:g}"
+        least = f">= {low:g}" if low is not None and self.above is None else ""
+        ends = [
+            least if self.above is None else f"> {self.above:g}",
+            ("" if high is None else f"<= {high:g}") if self.below is None else f"< {self.below:g}",
+        ]
+        words = " and ".join(end for end in ends if end)
+        return f" {words}" if words else ""
 
     def _fits(self, number: float) -> bool:
         """Whether a number is in the range, as the float32 that it becomes."""
@@ -180,6 +189,7 @@ class Color(_Numbers):
     """A linear RGB colour: three numbers, or one for all."""
 
     coloured: ClassVar[bool] = True
+    linear: ClassVar[bool] = False
 
     @property
     def accepted(self) -> str:
@@ -232,7 +242,7 @@ class Index(Scalar):
     def expected(self) -> str:
         """See :class:`Spec`."""
         texture = ", a texture" if self.texture else ""
-        return f"{self.accepted}{texture}, or one of {', '.join(self.media)}"
+        return f"{self.accepted}{texture}, or one of {', '.join(self.media)}" if self.media else super().expected
 
     def read(self, value: Any) -> float:
         """See :class:`Spec`."""
@@ -348,8 +358,10 @@ class Pose(Spec):
 
     def check(self, value: Tensor) -> None:
         """See :class:`Spec`."""
+        import torch
+
         matrix = value.double().cpu().numpy()
-        if not np.isfinite(matrix.astype(np.float32)).all():
+        if not bool(torch.isfinite(value.float()).all()):
             raise Refused("numbers finite in float32", "a value that is not finite in float32")
         if not is_usable(matrix):
             raise Refused(f"a matrix that can be inverted, {WITHIN}", matrix.tolist())

@@ -147,7 +147,7 @@ class Worker:
         self._place[:] = np.array(
             (
                 chunk.first_pixel, chunk.pixels, group, (point + (1 << 31)) % (1 << 32) - (1 << 31),
-                sampler.randomizations, x, y, width, wave.camera.width,
+                sampler.randomizations, x, y, width, wave.camera.resolution[0],
             ),
             np.int64,
         ).astype(np.int32)  # fmt: skip

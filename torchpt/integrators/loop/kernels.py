@@ -24,8 +24,7 @@ from torchpt.lanes.packet import KINDS, packet_search
 from torchpt.lanes.program import Program, Tables, bound, holds, signature
 from torchpt.lanes.tracing import Tracer, lanes_for
 from torchpt.records import Hit, PathState, Shadow
-from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.samplers import Dimension, Draws, key_of
+from torchpt.samplers import Dimension, Draws
 
 if TYPE_CHECKING:
     from torchpt.integrators.wave import Wave
@@ -120,8 +119,8 @@ class Kernels:
             for path, tensor in self._leaves.items()
         }
         self._ids = {id(tensor): (path, tensor) for path, tensor in self._leaves.items()}
-        structure = (world, wave.camera.kind(), wave.filter.kind_of(), self.plan, wave.preview, self._leaves)
-        self._structure = (*map(signature, structure), wave.sampler.kind, packets, fused)
+        structure = (world, wave.camera.kind(), wave.filter.kind(), self.plan, wave.preview, self._leaves)
+        self._structure = (*map(signature, structure), packets, fused)
         self._before = before if before is not None and before._structure == self._structure else None
         self._laid_out: dict[Any, Tensor] = {}
         if self._before is not None:
@@ -380,7 +379,7 @@ class Kernels:
             turn = sample + at["group"]
             group = turn % at["randomizations"]
             point = torch.div(turn, at["randomizations"], rounding_mode="floor") + at["point"]
-            key = key_of(wave.sampler.kind, self.numbers, number, group, point)
+            key = wave.sampler.points.key(self.numbers, number, group, point)
             x, y = x.to(self.plan.dtype), y.to(self.plan.dtype)
             state = stages.generate(self.plan, wave.camera, wave.filter, x, y, key, salts)
             if wave.filter.signed:
@@ -617,8 +616,7 @@ def _none(state: PathState) -> Hit:
 
 
 def _key(wave: Wave) -> dict[str, tuple[tuple[int, ...], str]]:
-    rows = 3 if SAMPLERS[wave.sampler.kind].NEEDS_COUNT and wave.sampler.kind != "zsobol" else 2
-    return {"key": ((rows,), "i")}
+    return {"key": ((wave.sampler.points.rows,), "i")}
 
 
 def _state_rows(wave: Wave, packets: bool, fused: bool, has_opacity: bool) -> Rows:

@@ -1,0 +1,159 @@
+"""Write the tables of the docs from what kinds declare, between ``<!-- generated: NAME -->`` and ``<!-- end -->``.
+
+    python scripts/make_tables.py            # writes docs/*.md
+    python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
+
+A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), ``common.lights``: what all kinds of
+it have, or ``summary.lights``: a row a kind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from torchpt.spec import REQUIRED, Color, Index, Scalar, Spec, parameters_of
+
+DOCS = Path(__file__).parents[1] / "docs"
+MARKED = re.compile(r"(<!-- generated: ([\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+#: NAME -> where the table of kinds is.
+TABLES = {
+    "materials": ("torchpt.bsdfs", "KINDS"),
+    "lights": ("torchpt.lights", "KINDS"),
+    "cameras": ("torchpt.cameras", "KINDS"),
+    "filters": ("torchpt.film", "FILTERS"),
+    "integrators": ("torchpt.integrators", "KINDS"),
+    "shapes": ("torchpt.shapes", "KINDS"),
+    "textures": ("torchpt.textures", "KINDS"),
+}
+
+
+@cache
+def kinds(name: str) -> Mapping[str, Any]:
+    """A table of kinds."""
+    module, attribute = TABLES[name]
+    return getattr(import_module(module), attribute)
+
+
+def common(table: Mapping[str, Any]) -> dict[str, Spec]:
+    """What the base of a table's kinds declares for all of them."""
+    every = [table[name] for name in table]
+    roots = [base for base in every[0].__mro__ if all(issubclass(kind, base) for kind in every)]
+    return parameters_of(roots[0]) if len(every) > 1 else {}
+
+
+def shown(value: Any) -> str:
+    """A default as one would write it."""
+    if value is REQUIRED:
+        return "required"
+    if value is None:
+        return ""
+    if callable(value):
+        return "from the others"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return shown(value[0]) if len(set(value)) == 1 else f"[{', '.join(map(shown, value))}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def accepted(spec: Spec) -> str:
+    """What a parameter accepts, in few words."""
+    if isinstance(spec, Index):
+        words = "an index, or a medium's name"
+    elif isinstance(spec, Color | Scalar) and not spec.words:
+        words = spec.accepted.replace("[r, g, b] or one number, each finite", "a colour").replace(
+            "a finite number", "a number"
+        )
+        words = words.replace("colour and", "colour")
+    else:
+        words = spec.words or spec.accepted
+    if len(words) > LONGEST:
+        words = words[: words.rfind(",", 0, LONGEST)] + ", ..."
+    return words + (", or a texture" if spec.texture else "")
+
+
+#: Characters of a cell that lists what is accepted.
+LONGEST = 110
+
+
+def row(key: str, spec: Spec) -> str:
+    """One parameter."""
+    cells = (f"`{key}`", shown(spec.default), accepted(spec), spec.doc)
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+HEAD = "| key | default | accepted | what it is |\n|---|---|---|---|\n"
+
+
+def rows(specs: Mapping[str, Spec]) -> str:
+    """Parameters as a table."""
+    return HEAD + "".join(row(key, spec) + "\n" for key, spec in specs.items())
+
+
+def about(kind: Any) -> str:
+    """The first paragraph of a kind's docstring, as Markdown."""
+    return " ".join((kind.__doc__ or "").strip().split("\n\n")[0].split()).replace("``", "`")
+
+
+def summary(table: Mapping[str, Any]) -> str:
+    """A row a kind: its keys with their defaults."""
+    shared, lines = common(table), []
+    for name in table:
+        own = {key: spec for key, spec in parameters_of(table[name]).items() if key not in shared}
+        keys = [f"`{key}`{f' {shown(spec.default)}' if _plain(spec) else ''}" for key, spec in own.items()]
+        lines.append(f"| `{name}` | {', '.join(keys) or 'none'} | {about(table[name])} |\n".replace("||", "\\|\\|"))
+    return "| type | keys (default) | what it is |\n|---|---|---|\n" + "".join(lines)
+
+
+def _plain(spec: Spec) -> bool:
+    return spec.default is not REQUIRED and spec.default is not None and not callable(spec.default)
+
+
+def written(name: str) -> str:
+    """What stands between the marks of NAME."""
+    first, _, second = name.partition(".")
+    if first == "summary":
+        return summary(kinds(second))
+    if first == "common":
+        return rows(common(kinds(second)))
+    if second:
+        table = kinds(first)
+        return rows({key: spec for key, spec in parameters_of(table[second]).items() if key not in common(table)})
+    table, parts = kinds(first), []
+    for kind in table:
+        own = {key: spec for key, spec in parameters_of(table[kind]).items() if key not in common(table)}
+        parts.append(f"**`{kind}`**: {about(table[kind])}\n\n{rows(own) if own else ''}")
+    return "\n".join(parts)
+
+
+def page(text: str, make: Callable[[str], str] = written) -> str:
+    """A page with its tables as they should be."""
+    return MARKED.sub(lambda match: match[1] + make(match[2]) + match[3], text)
+
+
+def main() -> int:
+    """Write, or check."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    check = parser.parse_args().check
+    stale = []
+    for file in sorted(DOCS.glob("*.md")):
+        text = file.read_text(encoding="utf-8")
+        fresh = page(text)
+        if fresh != text:
+            stale.append(file.name)
+            if not check:
+                file.write_text(fresh, encoding="utf-8")
+    print(f"{'stale' if check else 'written'}: {', '.join(stale) or 'none'}")
+    return 1 if check and stale else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

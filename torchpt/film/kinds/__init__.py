@@ -1,0 +1,1 @@
+"""Reconstruction filters: one kind a file."""

@@ -1,0 +1,98 @@
+"""Sums of samples by pixel and randomization."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.math.threads import mean_all
+
+__all__ = ["RELMSE_FLOOR", "Film"]
+
+#: relMSE is the mean of ``(x - ref)^2 / (ref^2 + RELMSE_FLOOR)`` over pixels and channels.
+RELMSE_FLOOR = 1e-2
+
+
+class Film:
+    """Sums of radiance per pixel and randomization.
+
+    Args:
+        width: of the picture (after a crop) in pixels.
+        height: of the picture in pixels.
+        randomizations: independent sequences that share the samples, see :mod:`torchpt.samplers`.
+        device: where the lanes live.
+        channels: C, three for radiance.
+    """
+
+    def __init__(self, width: int, height: int, randomizations: int, device: torch.device, channels: int = 3) -> None:
+        self.width, self.height, self.randomizations = width, height, randomizations
+        pixels = width * height
+        self._first = torch.zeros(channels, pixels, dtype=torch.float64, device=device)
+        self._sums = torch.zeros(randomizations, channels, pixels, dtype=torch.float64, device=device)
+        self._counts = torch.zeros(randomizations, pixels, dtype=torch.int64, device=device)
+
+    def add(self, radiance: Tensor, first_pixel: int, first_sample: int) -> None:
+        """Add samples ``(C, S, n)`` of ``n`` consecutive pixels, ``S`` consecutive samples each."""
+        count, n = radiance.shape[1], radiance.shape[2]
+        pixels = slice(first_pixel, first_pixel + n)
+        if first_sample == 0:
+            self._first[:, pixels] = radiance[:, 0].double()
+        for s in range(count):
+            group = (first_sample + s) % self.randomizations
+            self._sums[group, :, pixels] += radiance[:, s]
+            self._counts[group, pixels] += 1
+
+    @property
+    def sums(self) -> Tensor:
+        """``(randomizations, C, pixels)`` float64."""
+        return self._sums
+
+    def counted(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> None:
+        """Say that consecutive samples were added to the sums of consecutive pixels."""
+        counts = self._counts.numpy()
+        for group in range(self.randomizations):
+            # Of the numbers from `first_sample` on those that are `group` modulo the randomizations.
+            number = len(range((group - first_sample) % self.randomizations, samples, self.randomizations))
+            counts[group, first_pixel : first_pixel + pixels] += number
+
+    def keep_first(self, values: np.ndarray, first_pixel: int) -> None:
+        """Keep the first samples ``(C, n)`` of consecutive pixels."""
+        self._first[:, first_pixel : first_pixel + values.shape[1]] = torch.from_numpy(values)
+
+    def mean(self) -> Tensor:
+        """The picture ``(H, W, C)`` in float64; pixels without samples are black."""
+        return self._picture(self._sums.sum(0) / self._counts.sum(0).clamp_min(1))
+
+    def first(self) -> Tensor:
+        """The first sample of each pixel ``(H, W, C)``: for what has no average."""
+        return self._picture(self._first)
+
+    def _picture(self, values: Tensor) -> Tensor:
+        return values.T.reshape(self.height, self.width, -1)
+
+    def variance(self) -> Tensor | None:
+        """Variance of :meth:`mean` ``(H, W, C)``, from the spread of the randomizations; None where one is all there is.
+
+        Randomizations with a sample more than the others weigh as much: the estimate is exact for equal counts.
+        """
+        filled = [k for k in range(self.randomizations) if int(self._counts[k].min()) > 0]
+        if len(filled) < 2:
+            return None
+        # One randomization at a time: a large film has room for no more.
+        mean = torch.zeros_like(self._first)
+        for k in filled:
+            mean += self._sums[k] / self._counts[k]
+        mean /= len(filled)
+        spread = torch.zeros_like(mean)
+        for k in filled:
+            spread += (self._sums[k] / self._counts[k] - mean).square_()
+        spread /= len(filled) - 1
+        return self._picture(spread / len(filled))
+
+    def relmse(self) -> float | None:
+        """The picture's estimate of its own relMSE."""
+        variance = self.variance()
+        if variance is None:
+            return None
+        return float(mean_all(variance / (self.mean() ** 2 + RELMSE_FLOOR)))

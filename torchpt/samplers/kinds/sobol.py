@@ -1,0 +1,43 @@
+"""Owen-scrambled Sobol' points, padded: each 1D or 2D set of dimensions is its own shuffled, scrambled (0, 2)-sequence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.samplers.base import Points
+from torchpt.samplers.hashing import mix, to_unit
+from torchpt.samplers.scrambling import X, Y, reverse_bits, scramble, second_dimension
+
+__all__ = ["Sobol"]
+
+
+@dataclass(frozen=True)
+class Sobol(Points):
+    """An Owen-scrambled (0, 2)-sequence for each pixel and set of dimensions: any number of samples, and more may follow."""
+
+    name = "sobol"
+
+    def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """See :class:`Points`."""
+        # Shuffled before it is scrambled: scrambled alone, all 1D sets would share their order and move together.
+        seed = mix(key[0] ^ salt)
+        index = reverse_bits(scramble(reverse_bits(key[1]), seed))
+        return to_unit(reverse_bits(scramble(index, mix(seed ^ X))))
+
+    def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """See :class:`Points`."""
+        seed = mix(key[0] ^ salt)
+        index = reverse_bits(scramble(reverse_bits(key[1]), seed))
+        x = scramble(index, mix(seed ^ X))
+        y = scramble(second_dimension(index), mix(seed ^ Y))
+        return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))
+
+    def kernels(self) -> Any:
+        """See :class:`Points`."""
+        from torchpt.samplers import kernels_sobol
+
+        return kernels_sobol
