@@ -19,7 +19,7 @@ from torchpt.errors import SceneError
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.spec.declared import Described
 
-__all__ = ["FARTHEST", "Space", "centre_and_unit"]
+__all__ = ["FARTHEST", "Space", "centre_and_unit", "middle_of"]
 
 #: A scene is moved to the origin where it lies further away than this many times its own size.
 RECENTRE = 8.0
@@ -97,6 +97,12 @@ def centre_and_unit(
     far, near = int(reaches.argmax()), int(sizes.argmin())
     lengths = [(names[far], float(reaches[far])), *_reaches(sources, parameters, camera, centre)]
     return centre, _unit(lengths, (names[near], float(sizes[near])), file)
+
+
+def middle_of(parts: Sequence[Part], copies: Sequence[Copy]) -> Array:
+    """The middle of the box around all that can be hit, ``(3,)``; the origin where nothing can."""
+    names, boxes, _ = _boxes(parts, copies)
+    return 0.5 * (boxes.min((0, 1)) + boxes.max((0, 1))) if names else np.zeros(3)
 
 
 def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Array, Array]:
