@@ -159,28 +159,23 @@ def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
     return found
 
 
-def sensor(mitsuba: Any, camera: Camera) -> dict[str, Any]:
+def sensor(mitsuba: Any, camera: Described) -> dict[str, Any]:
     """Mitsuba's dict of a camera, without film and sampler.
 
     Raises:
-        NoCounterpartError: an aperture with blades.
+        NoCounterpartError: an aperture with blades, pixels that are no squares, a lens that is shifted.
     """
-    pose = camera.pose()
-    if isinstance(camera, Orthographic):  # its film is [-1, 1] wide, and sized by the pose
-        pose = pose @ np.diag([0.5 * camera.width, 0.5 * camera.width, 1.0, 1.0])
-        found: dict[str, Any] = {"type": "orthographic"}
-    elif isinstance(camera, ThinLens):
-        if camera.blades or not camera.aperture_radius:
-            raise NoCounterpartError("camera: Mitsuba's lens is round, and has a size")
-        found = {
-            "type": "thinlens",
-            "aperture_radius": camera.aperture_radius,
-            "focus_distance": camera.focus_distance,
-        }
-    else:
-        found = {"type": "perspective"}
-    if isinstance(camera, Perspective | ThinLens):
-        found |= {"fov": camera.fov, "fov_axis": camera.fov_axis}
+    given = {key: value for key, value in camera.values.items() if value is not None}
+    pose = given["to_world"]
+    if camera.name == "orthographic":  # its film is [-1, 1] wide, and sized by the pose
+        pose = pose @ np.diag([0.5 * given["width"], 0.5 * given["width"], 1.0, 1.0])
+    if camera.kind.lens and (given["blades"] or not given["aperture_radius"]):
+        raise NoCounterpartError("camera: Mitsuba's lens is round, and has a size")
+    offsets = [key for key in given if key.startswith("principal_point")]
+    if "pixel_aspect" in given or (camera.kind.lens and offsets):
+        raise NoCounterpartError("camera: Mitsuba's pixels are squares, and its lens is in the middle")
+    keys = ("fov", "fov_axis", *offsets, "aperture_radius", "focus_distance")
+    found = {"type": camera.name, **{key: given[key] for key in keys if key in given}}
     return {**found, "to_world": _transform(mitsuba, pose), "near_clip": 1e-3, "far_clip": 1e7}
 
 
@@ -242,12 +237,13 @@ class _Nearest:
     def __init__(self) -> None:
         self.said: dict[str, str] = {}
 
-    def camera(self, camera: Camera) -> Camera:
+    def camera(self, camera: Described) -> Described:
         """A round aperture for one of blades."""
-        if not isinstance(camera, ThinLens) or not camera.blades:
+        blades = camera.values.get("blades")
+        if not blades:
             return camera
-        self.said["camera"] = f"an aperture of {camera.blades} blades is round"
-        return camera.model_copy(update={"blades": 0})
+        self.said["camera"] = f"an aperture of {blades} blades is round"
+        return replace(camera, values={**camera.values, "blades": 0})
 
     def shape(self, name: str, shape: Described, shapes: Mapping[str, Described]) -> Described:
         """A mesh for a cone, and for an instance."""

@@ -119,10 +119,10 @@ FEATURES: dict[str, Feature] = {
         module="torchpt.integrators.layers.normal",
     ),
     "lens": Feature(
-        ("cameras/thinlens.py",),
+        ("cameras/kinds/thinlens.py",),
         lambda scene: scene["camera"].update(type="thinlens", aperture_radius=0.05, focus_distance=4),
         ("camera.aperture", "camera.lens"),
-        module="torchpt.cameras.thinlens",
+        module="torchpt.cameras.kinds.thinlens",
     ),
     "preview": Feature(
         ("integrators/kinds/ibl.py", "integrators/split_sum.py"),

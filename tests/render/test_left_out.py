@@ -16,7 +16,7 @@ from trials import film_of
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.integrators.loop import kernels as loop_kernels
+from torchpt.integrators.loop import programs
 from torchpt.lanes.program import Program
 from torchpt.records import tensors_of
 
@@ -142,7 +142,7 @@ def test_kernels_hold_nothing_of_what_is_not_there(name, plain):
 def test_kernels_are_the_same_after_it_was_there_and_is_gone(name, plain):
     """Traced anew, not from the cache: the machine code's name is made of the IR."""
     kernels(with_feature(name))
-    loop_kernels._programs.clear()
+    programs.forget()
     again = _programs(with_feature(None))
     assert {key: program.code for key, program in again.items()} == {
         key: program.code for key, program in plain.items()

@@ -104,7 +104,7 @@ def test_what_goes_where_after_a_hit():
     with torch.no_grad():
         kernels = kernels_of(scene, wave)
         worker, recorder = Worker(kernels), waves(wave, 1024, 4)
-        assert not kernels.fused and kernels.around and kernels.emitters and kernels.models == 2
+        assert not kernels.fused and kernels.has_environment and kernels.has_emitters and kernels.models == 2
         _, state, hit, _, _ = next(found for found in recorder.bounces if found[4] == 2)
         n = len(state.lane)
         dead = torch.arange(n) % 10 == 0
@@ -115,10 +115,10 @@ def test_what_goes_where_after_a_hit():
             kernels, **{name: getattr(state, name) for name in ("lane", "t_max", "radiance", "key")},
             **{name: getattr(hit, name) for name in HIT}, shadow_radiance=light, clear=clear,
         )  # fmt: skip
-        worker._clear()
+        worker.calls.clear()
         lists = worker._lists[0]
-        worker._run(kernels.settle(True), n, here, here, lists=lists)
-        _, places = worker._found()
+        worker.calls.run(kernels.settle(True), n, here, here, lists=lists)
+        _, places = worker.calls.counted()
         wanted = torch.addcmul(state.radiance, light, clear)
         held = kernels.state.take(here, np.arange(n), ("radiance",))["radiance"]
         assert torch.allclose(held, wanted, rtol=1e-6, atol=0)
@@ -380,7 +380,7 @@ def test_searches_do_not_depend_on_the_packet(name):
         def found(state: Any) -> Hit:
             nothing = torch.zeros(n)
             here = arena(kernels, o=state.o, d=state.d, t_max=state.t_max, key=state.key, t=nothing)
-            worker._nearest(here, n, 2)
+            worker.search.nearest(here, n, 2)
             return Hit(*kernels.state.take(here, np.arange(n), tuple(HIT)).values())
 
         order = torch.randperm(n, generator=torch.Generator().manual_seed(4))

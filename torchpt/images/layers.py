@@ -1,4 +1,4 @@
-"""How named layers become EXR channels and how they are found again.
+"""How named layers become EXR channels and how a file's channels become layers again.
 
 ``image`` is the picture itself (``R G B``); the others carry their own name as a prefix (``albedo.R``). A layer of
 ``film.aovs`` names its own channels; any other is named after its number of components.
@@ -48,4 +48,4 @@ def group_channels(channels: tuple[str, ...] | list[str]) -> dict[str, list[int]
         elif not prefix:
             prefix = "image" if last in ("R", "G", "B", "A", "Y") else last
         groups.setdefault(prefix, []).append(index)
-    return {name: sorted(found, key=lambda i: _rank(channels[i])) for name, found in groups.items()}
+    return {name: sorted(indices, key=lambda i: _rank(channels[i])) for name, indices in groups.items()}

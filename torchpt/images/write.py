@@ -103,8 +103,8 @@ def check_writable(path: str | PathLike[str]) -> None:
 def _known(path: str | PathLike[str]) -> Path:
     destination = Path(fspath(path))
     if destination.suffix.lower() not in WRITABLE:
-        found = f"cannot write the kind {destination.suffix!r}" if destination.suffix else "needs an ending"
-        raise OutputError(path, f"{found}; accepted: {' '.join(WRITABLE)}")
+        problem = f"cannot write the kind {destination.suffix!r}" if destination.suffix else "needs an ending"
+        raise OutputError(path, f"{problem}; accepted: {' '.join(WRITABLE)}")
     try:
         return Path(os.path.realpath(destination))  # a link stays a link: its target is replaced
     except (OSError, ValueError) as problem:
