@@ -11,10 +11,11 @@ from torchpt.errors import AssetError, SceneError
 from torchpt.format.description import Description
 from torchpt.format.materials import MATERIALS, Diffuse, check_material, read_material, resolved
 from torchpt.format.schema import Cone, Cube, Cylinder, Disk, Displacement, Instance, Mesh, Rectangle, Shape, Sphere
+from torchpt.lights import order
 from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
 from torchpt.meshes import FileCamera, FileMaterial, MeshPart, load_mesh, unit_cube
 from torchpt.meshes.displacement import displaced
-from torchpt.records import KINDS, SOURCES
+from torchpt.records import KINDS
 from torchpt.scene.parameters import Parameters
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.scene.sources import file_lights, labels_of, sources_of
@@ -34,7 +35,7 @@ class Built:
         parameters: arrays by dotted name.
         centre: ``(3,)`` float64, subtracted from all positions.
         unit: what all lengths are divided by.
-        sources: lights that are no surfaces, in the order of ``records.SOURCES``.
+        sources: lights that are no surfaces, in the order of ``lights.order``.
         copies: instances of parts.
     """
 
@@ -66,7 +67,7 @@ def build_parts(description: Description) -> Built:
             copies += _copies(description, name, shape, number, parts, parameters, opener)
     for name, material in description.materials.items():
         _declare(resolved(material, f"materials.{name}", description.materials, opener), parameters)
-    sources = sorted([*sources_of(description, parameters), *found], key=lambda source: SOURCES.index(source.kind))
+    sources = sorted([*sources_of(description, parameters), *found], key=lambda source: order(source.kind))
     parameters["camera.to_world"] = np.asarray(description.camera.pose(), np.float64)
     for name, number in description.camera.numbers().items():
         parameters[f"camera.{name}"] = np.asarray(number, np.float64)

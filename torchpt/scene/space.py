@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchpt.errors import SceneError
 from torchpt.format.schema import Camera, Orthographic, ThinLens
+from torchpt.lights import KINDS as LIGHTS
 from torchpt.scene.parts import Copy, Part, Source
 
 __all__ = ["FARTHEST", "Space", "centre_and_unit"]
@@ -133,9 +134,9 @@ def _reaches(
     if isinstance(camera, Orthographic):
         found.append(("camera.width", camera.width))
     for source in sources:
-        position = parameters.get(f"{source.name}.position")
-        if position is not None:
-            found.append((f"{source.name}.position", float(np.abs(position - centre).max())))
+        for place in LIGHTS[source.kind].places:
+            name = f"{source.name}.{place}"
+            found.append((name, float(np.abs(parameters[name] - centre).max())))
     return found
 
 
