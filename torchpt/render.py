@@ -144,7 +144,9 @@ def _moves(scene: Scene, names: Iterable[str]) -> bool:
 
     def moves(name: str) -> bool:
         moved = scene.spec(name).moves
-        return moved is Moves.SURFACES or (moved is Moves.RAYS and name.rpartition(".")[0] in bending)
+        if moved is Moves.RAYS:  # by name, or by a texture that any of them may read
+            return any(name.startswith(f"{own}.") for own in bending) or bool(bending and "textures." in name)
+        return moved is Moves.SURFACES
 
     return any(map(moves, names))
 

@@ -170,5 +170,5 @@ def _blocked(module: str) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("module", sorted({f.module for f in FEATURES.values() if f.module is not None}))
 def test_the_same_picture_where_its_module_cannot_be_imported(module, unblocked):
-    """BSDF models, textures and lights other than maps are imported together, and are not asked here."""
+    """BSDF models and lights other than maps are imported together, and are not asked here."""
     assert _blocked(module) == [*unblocked, "missed"]

@@ -7,7 +7,7 @@ import torch
 from trials import SIGNIFICANCE, grid_cells, uniform_p
 
 from torchpt.samplers import KINDS, Dimension, Sampler, independent, salts
-from torchpt.samplers.hashing import logical_shift, mix, mix_int, to_unit
+from torchpt.math.hashing import logical_shift, mix, mix_int, to_unit
 
 CPU = torch.device("cpu")
 TESTS = 24  # comparisons in this file, each at SIGNIFICANCE / TESTS

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchpt.bsdfs.base import Bsdf
-from torchpt.textures import Node, Reading, VertexColors
+from torchpt.textures import Node
 
 __all__ = ["ResolvedMaterial", "Value"]
 
-Value = float | tuple[float, float, float] | Reading
+Value = float | tuple[float, float, float] | Node
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class ResolvedMaterial:
             found |= inner.numbers()
         return found
 
-    def readings(self) -> list[Reading]:
+    def readings(self) -> list[Node]:
         """Its textures, those of inner materials included."""
         mine = [*self.values.values(), self.opacity, self.emission, self.normal_map, self.bump_map]
-        found: list[Reading] = [value for value in mine if isinstance(value, Node | VertexColors)]
-        return [*found, *(reading for inner in self.inner for reading in inner.readings())]
+        own = [value for value in mine if isinstance(value, Node)]
+        return [*own, *(reading for inner in self.inner for reading in inner.readings())]

@@ -15,12 +15,13 @@ from torchpt.errors import AssetError, SceneError
 from torchpt.format import schema
 from torchpt.format.materials import MATERIALS, Material, check_material, custom_types, read_material
 from torchpt.format.schema import Camera, Shape
-from torchpt.format.textures import TEXTURES, Named, Texture
+from torchpt.format.textures import check_texture
 from torchpt.format.yaml_file import plain, read_yaml
 from torchpt.lights import KINDS as LIGHTS
 from torchpt.settings import BLOCKS, Settings
 from torchpt.spec.declared import Described, described
 from torchpt.spec.validate import check_keys, select
+from torchpt.textures import KINDS as TEXTURES
 
 __all__ = ["ASSETS", "Description", "read_description", "scene_names", "settings"]
 
@@ -57,7 +58,7 @@ class Description:
     integrator: dict[str, Any] = field(default_factory=dict)
     sampler: dict[str, Any] = field(default_factory=dict)
     render: dict[str, Any] = field(default_factory=dict)
-    textures: dict[str, Texture] = field(default_factory=dict)
+    textures: dict[str, Described] = field(default_factory=dict)
     materials: dict[str, Material] = field(default_factory=dict)
     shapes: dict[str, Shape] = field(default_factory=dict)
     lights: dict[str, Described] = field(default_factory=dict)
@@ -164,7 +165,7 @@ def _describe(raw: dict[str, Any], types: Mapping[str, type[Material]], file: st
     camera = schema.read_camera(raw["camera"], file)
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
     run_settings.merge(blocks, {}, file)
-    textures = _named(raw, "textures", file, lambda item, key: select("texture", TEXTURES, item, key, file))
+    textures = _named(raw, "textures", file, lambda item, key: described("texture", TEXTURES, item, key, file))
     materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
     for name, material in materials.items():
         check_material(material, f"materials.{name}", materials, textures, file)
@@ -197,7 +198,7 @@ def _shape(
     item: Any,
     key: str,
     materials: Mapping[str, Material],
-    textures: Mapping[str, Texture],
+    textures: Mapping[str, Described],
     types: Mapping[str, type[Material]],
     file: str | None,
 ) -> Shape:
@@ -207,11 +208,9 @@ def _shape(
         item = {**item, "material": inline}
     shape = select("shape", schema.SHAPES, item, key, file)
     displacement = getattr(shape, "displacement", None)
-    if displacement is not None and isinstance(displacement.texture.texture, Named):
-        name = displacement.texture.texture.texture
-        if name not in textures:
-            known = ", ".join(textures) or "none is defined"
-            raise SceneError(f"{key}.displacement.texture", name, f"the name of a texture ({known})", file)
+    if displacement is not None:
+        where = f"{key}.displacement.texture"
+        check_texture(displacement.texture, where, textures, file, coordinates=True, points=True)
     material, where = shape.material, f"{key}.material"
     if isinstance(material, str):
         if material not in materials:

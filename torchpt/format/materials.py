@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -17,10 +16,12 @@ from torchpt.bsdfs import Bsdf
 from torchpt.bsdfs.presets import INDICES, METALS, metal
 from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.errors import EnergyWarning, NotBuiltError, SceneError
-from torchpt.format.textures import Named, Texture, TextureInput, VertexColor, texture_input
+from torchpt.format.textures import TextureInput, check_texture, texture_input
+from torchpt.spec import Moves
+from torchpt.spec.declared import Described
 from torchpt.spec.fields import Check, Flag, bounded, color, number, scalar, vector, wrong
 from torchpt.spec.validate import Model, select
-from torchpt.textures import Node, Reading
+from torchpt.textures import Node
 
 __all__ = [
     "MATERIALS", "Blend", "BlinnPhong", "Conductor", "Custom", "Dielectric", "Diffuse", "Material", "Microfacet",
@@ -33,7 +34,7 @@ Number = float | TextureInput
 Color = Rgb | TextureInput
 Values = dict[str, Number | Color]
 #: What makes the texture of a slot, by its dotted key, one that can be read.
-Resolve = Callable[[TextureInput, str], Reading]
+Resolve = Callable[[TextureInput, str], Node]
 
 #: How deep blends may be nested: every level can double the models that a lane evaluates.
 MAX_BLENDS = 8
@@ -47,7 +48,7 @@ def _index(value: Any) -> Number:
     """An index of refraction: a number, the name of a medium, or a texture."""
     expected = f"a number in 0.001..1000, a texture, or one of {', '.join(INDICES)}"
     if isinstance(value, Mapping):
-        return texture_input(value, False, 1e-3, 1e3)
+        return texture_input(value, False, 1e-3, 1e3, moves=Moves.RAYS)
     if isinstance(value, str):
         found = INDICES.get(value.lower())
         if found is None:
@@ -625,8 +626,10 @@ def resolved(
         model = material.bsdf()
 
     def opened(value: Any, key: str) -> Any:
-        found = resolve(value, f"{name}.{key}") if resolve is not None and isinstance(value, TextureInput) else value
-        return replace(found, filtered=False) if key in _POINTS and isinstance(found, Node) else found
+        if resolve is None or not isinstance(value, TextureInput):
+            return value
+        node = resolve(value, f"{name}.{key}")
+        return node.at_points() if key in _POINTS else node
 
     return ResolvedMaterial(
         model=model,
@@ -660,7 +663,7 @@ def check_material(
     material: Material,
     key: str,
     materials: Mapping[str, Material],
-    textures: Mapping[str, Texture],
+    textures: Mapping[str, Described],
     file: str | None,
 ) -> None:
     """What can be said of a material only once all are known.
@@ -687,16 +690,9 @@ def check_material(
             if isinstance(item, Material):
                 check_material(item, f"{key}.{side}", materials, textures, file)
     for slot, found in material.slots():
-        if isinstance(found.texture, Named) and found.texture.texture not in textures:
-            known = ", ".join(textures) or "none is defined"
-            raise SceneError(f"{key}.{slot}.texture", found.texture.texture, f"the name of a texture ({known})", file)
-        texture = textures[found.texture.texture] if isinstance(found.texture, Named) else found.texture
         sheer = slot == "weight" and any(isinstance(item, Null) for item in _materials(material, materials))
-        if isinstance(texture, VertexColor) and (slot in _IMAGED or sheer):
-            raise SceneError(f"{key}.{slot}", "vertex_color", "an image, or a number", file)
-        if (slot in _POINTS or sheer) and getattr(found.texture, "filter", "") == "trilinear":
-            expected = f"nearest or bilinear, as {slot} is read at points"
-            raise SceneError(f"{key}.{slot}.filter", "trilinear", expected, file)
+        points, coordinates = slot in _POINTS or sheer, slot in _IMAGED or sheer
+        check_texture(found, f"{key}.{slot}", textures, file, coordinates=coordinates, points=points)
     if not isinstance(material, Blend):
         compensated = getattr(material, "energy_compensation", False)
         fixed = tuple(material.values()) if compensated else material.bsdf().tabulated

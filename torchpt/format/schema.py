@@ -179,10 +179,7 @@ def _heights(value: Any) -> TextureInput:
         value = {"texture": value}
     if not isinstance(value, Mapping):
         raise wrong("the name of a texture, or a texture")
-    found = texture_input(value, False, -_LARGEST, _LARGEST)
-    if getattr(found.texture, "filter", "") == "trilinear":
-        raise wrong("nearest or bilinear, as displacement is read at points", "trilinear", ("filter",))
-    return found
+    return texture_input(value, False, -_LARGEST, _LARGEST)
 
 
 _LARGEST = float(np.finfo(np.float32).max)

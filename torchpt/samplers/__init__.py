@@ -17,7 +17,7 @@ from torchpt.lanes.tracing import tracing
 from torchpt.native.operators import choose, operator
 from torchpt.samplers import hammersley, independent, sobol, stratified, zsobol
 from torchpt.samplers.dimensions import Dimension, salt
-from torchpt.samplers.hashing import as_int32, mix, mix_int
+from torchpt.math.hashing import as_int32, mix, mix_int
 
 __all__ = ["KINDS", "Dimension", "Draws", "Numbers", "Sampler", "key_of", "salts"]
 

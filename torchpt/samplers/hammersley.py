@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.samplers.hashing import as_int32, mix, to_unit
+from torchpt.math.hashing import as_int32, mix, to_unit
 from torchpt.samplers.shuffling import shuffle
 from torchpt.samplers.sobol import reverse_bits, scramble
 from torchpt.samplers.stratified import draw_1d, place

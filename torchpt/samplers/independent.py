@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.samplers.hashing import as_int32, mix, to_unit
+from torchpt.math.hashing import as_int32, mix, to_unit
 
 __all__ = ["NEEDS_COUNT", "draw_1d", "draw_2d"]
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.samplers.hashing import as_int32, logical_shift, mix, to_unit
+from torchpt.math.hashing import as_int32, logical_shift, mix, to_unit
 
 __all__ = ["NEEDS_COUNT", "draw_1d", "draw_2d", "reverse_bits", "scramble", "second_dimension"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.samplers.hashing import as_int32, mix, to_unit
+from torchpt.math.hashing import as_int32, mix, to_unit
 from torchpt.samplers.shuffling import shuffle
 
 __all__ = ["NEEDS_COUNT", "draw_1d", "draw_2d", "place"]

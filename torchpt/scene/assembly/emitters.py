@@ -15,14 +15,12 @@ from torchpt.errors import SceneError
 from torchpt.lights import KINDS as LIGHTS
 from torchpt.lights import choice_of
 from torchpt.lights.solid_angle import shapes_of, table_of
-from torchpt.math.threads import mean_all
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Geometry, Lights
 from torchpt.scene.assembly.curved import quadric_area
 from torchpt.scene.assembly.primitives import Primitives
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
-from torchpt.scene.texels import images_of
 
 if TYPE_CHECKING:
     from torchpt.lights.kinds.envmap import EnvironmentMap
@@ -42,9 +40,7 @@ def _mean_emission(part: Part, parameters: Mapping[str, Tensor]) -> float:
     """Mean luminance of the texture that a part shines by; 1 without."""
     if part.emission_texture is None:
         return 1.0
-    image = images_of([part.emission_texture], parameters)[part.emission_texture.texels].detach().double()
-    color = image[..., :3].mean((0, 1)) if image.shape[2] >= 3 else mean_all(image[..., 0]).expand(3)
-    return float(luminance((color * color.new_tensor(part.emission_texture.scale)).abs()))
+    return float(luminance(part.emission_texture.mean(parameters).abs()))
 
 
 @dataclass(frozen=True)
