@@ -6,8 +6,8 @@ import pytest
 import torch
 from trials import SIGNIFICANCE, grid_cells, uniform_p
 
-from torchpt.samplers import KINDS, Dimension, Sampler, independent, salts
 from torchpt.math.hashing import logical_shift, mix, mix_int, to_unit
+from torchpt.samplers import KINDS, Dimension, Sampler, independent, salts
 
 CPU = torch.device("cpu")
 TESTS = 24  # comparisons in this file, each at SIGNIFICANCE / TESTS

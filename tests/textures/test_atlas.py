@@ -167,7 +167,9 @@ def test_filtered_look_ups_lie_between_images_of_half_the_size(name: str, wrap: 
 
 @pytest.mark.parametrize("name", FILTERED)
 def test_the_last_size_is_the_mean(name: str):
-    found = filtered(ImageNode(name, None, "repeat", False, SAME, PLAIN, True), points(5), torch.full((5,), 1e6).double())
+    found = filtered(
+        ImageNode(name, None, "repeat", False, SAME, PLAIN, True), points(5), torch.full((5,), 1e6).double()
+    )
     assert torch.allclose(found, FILTERED[name].mean((0, 1)).expand(3)[:, None].expand(3, 5), atol=1e-14)
 
 
@@ -183,7 +185,9 @@ def test_up_to_one_texel_a_filtered_look_up_is_bilinear_to_the_bit():
 
 def test_nodes_that_do_not_filter_are_untouched_by_those_that_do():
     names = list(FILTERED)
-    nodes = [ImageNode(name, None, "mirror", False, SAME, PLAIN, filtered) for name in names for filtered in (False, True)]
+    nodes = [
+        ImageNode(name, None, "mirror", False, SAME, PLAIN, filtered) for name in names for filtered in (False, True)
+    ]
     atlas = atlas_of(nodes, FILTERED, torch.float64, CPU)
     uv = points(50)
     footprint = torch.rand(50, generator=torch.Generator().manual_seed(3)).double()

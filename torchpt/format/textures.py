@@ -37,7 +37,7 @@ def read_texture(raw: Any, key: str, file: str | None) -> Described | Named:
 
 
 def texture_of(raw: Mapping[str, Any], spec: Spec) -> TextureInput:
-    """What stands in place of a number or a colour: the reader that :func:`torchpt.spec.declared.described` takes as ``texture``.
+    """What stands in place of a number or a colour; :func:`torchpt.spec.declared.described` takes it as ``texture``.
 
     Args:
         raw: the mapping as written.

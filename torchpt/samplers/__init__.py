@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from torchpt.lanes.tracing import tracing
+from torchpt.math.hashing import as_int32, mix, mix_int
 from torchpt.native.operators import choose, operator
 from torchpt.samplers import hammersley, independent, sobol, stratified, zsobol
 from torchpt.samplers.dimensions import Dimension, salt
-from torchpt.math.hashing import as_int32, mix, mix_int
 
 __all__ = ["KINDS", "Dimension", "Draws", "Numbers", "Sampler", "key_of", "salts"]
 

@@ -241,6 +241,7 @@ class _Corners:
     y: Tensor
     width: Tensor
     height: Tensor
+    blend: Tensor  # 1, or 0 where the nearest texel is taken
     maps: Tensor
 
 
@@ -278,9 +279,9 @@ def slope(atlas: Atlas, node: Tensor, uv: Tensor, footprint: Tensor | None = Non
 def _slope(atlas: Atlas, node: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     c = _corners(atlas, node, uv, False)
     low, high = c.low[1] - c.low[0], c.high[1] - c.high[0]
-    across = (low + (high - low) * c.y) * c.width
+    across = (low + (high - low) * c.y) * (c.width * c.blend)
     left, right = c.high[0] - c.low[0], c.high[1] - c.low[1]
-    along = (left + (right - left) * c.x) * c.height
+    along = (left + (right - left) * c.x) * (c.height * c.blend)
     if atlas.scaled:
         across, along = across * c.maps[6], along * c.maps[6]
     if not atlas.moved:
@@ -323,7 +324,7 @@ def _corners(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> _Corners
             for row in (top, bottom)
             for column in (left, right)
         )
-    return _Corners((a, b), (c, d), x, y, wide, tall, maps)
+    return _Corners((a, b), (c, d), x, y, wide, tall, blend, maps)
 
 
 def _wrapped(wraps: tuple[str, ...], index: Tensor, size: Tensor, code: Tensor) -> Tensor:

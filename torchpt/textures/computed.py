@@ -20,18 +20,18 @@ from torchpt.textures.base import CHANNELS, SAME, Mapped, Matrix, Node, Opening,
 __all__ = ["Computed", "ComputedNode", "ComputedTable"]
 
 Values = Mapping[str, Tensor]
-#: A footprint larger than this is all of a texture.
-_WIDE = 1e30
+#: A footprint larger than this is all of a texture; its products stay far from the ends of float32.
+_WIDE = 1e12
 
 
 @dataclass(frozen=True)
 class Computed(Mapped):
     """A kind whose values are computed. An instance is a variant: what is static of it, as fields.
 
-    Its functions get coordinates ``(N,)`` after ``uv_transform``, and ``p``: its traced parameters by name. Numbers are ``(N,)``.
-    A colour is ``(3, N)`` where the slot wants a colour and ``(N,)`` where it wants a number, which is then that colour's
-    channel: so the functions treat every channel alike, and no channel by another. They use operations that round alike on
-    every lane (``tests/integrators/test_reproducible.py`` lists them) and that the lane compiler knows.
+    Its functions get coordinates ``(N,)`` after ``uv_transform``, and ``p``: its traced parameters by name. Numbers are
+    ``(N,)``. A colour is ``(3, N)`` where the slot wants a colour and ``(N,)``, one channel of it, where it wants a number: so
+    the functions treat all channels alike, and are linear in colours, as luminance is. They use operations that round alike
+    on every lane (``tests/integrators/test_reproducible.py`` lists them) and that the lane compiler knows.
     """
 
     @classmethod
@@ -123,7 +123,8 @@ class ComputedNode(Node):
         """See :class:`Node`."""
 
         def column(rows: list[Any]) -> Tensor:
-            return torch.tensor(rows, dtype=dtype, device=device).T.contiguous()
+            made = torch.tensor(rows, dtype=dtype, device=device)
+            return made.T.contiguous() if made.dim() > 1 else made
 
         rows = [node.values(parameters) for node in nodes]
         values = {key: torch.stack([row[key] for row in rows], -1).to(device=device, dtype=dtype) for key in rows[0]}

@@ -38,7 +38,7 @@ class Image(Mapped):
         "filter": Choice(
             "bilinear",
             names=("bilinear", "nearest", "trilinear"),
-            doc="how values between texels are found; trilinear: and it is read in smaller sizes where a pixel covers several texels",
+            doc="how values between texels are found; trilinear: in smaller sizes too, where a pixel covers several texels",
         ),
         "colorspace": Choice(
             "auto",

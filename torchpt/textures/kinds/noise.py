@@ -29,6 +29,7 @@ _LONG, _SHORT = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
 #: With these directions an octave lies within -0.661..0.661.
 _GAIN = 0.75
 _GOLDEN = 0x9E3779B9
+_COVERED = 64.0
 
 Values = Mapping[str, Tensor]
 
@@ -64,7 +65,7 @@ class Noise(Computed):
         return cls(values["octaves"])
 
     def constants(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Of each octave a key for its directions, and how far its grid is moved: else all would be 0 at one another's points."""
+        """Of each octave a key for its directions, and how far its grid is moved: else all would be 0 at the same points."""
         keys = [as_int32(mix_int(mix_int(values["seed"] + _GOLDEN) + k * _GOLDEN)) for k in range(self.octaves)]
         shifts = [(mix_int(key + axis) >> 8 & 0xFFFF) / 2**16 for key in keys[1:] for axis in (1, 2)]
         return {"keys": tuple(keys), "shifts": (0.0, 0.0, *shifts)}
@@ -72,37 +73,41 @@ class Noise(Computed):
     def value(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> Tensor:
         """See :class:`Computed`."""
         height, whole = torch.zeros_like(x), torch.zeros_like(x)
-        for weight, _, kept, cell in self._octaves(p, x, y, area):
+        for weight, _, kept, at, key in self._octaves(p, x, y, area):
             whole = whole + weight
-            height = torch.addcmul(height, weight if kept is None else weight * kept, _noise(*cell, False)[0])
+            height = torch.addcmul(height, weight if kept is None else weight * kept, _noise(at, key, False)[0])
         return p["color0"] + (p["color1"] - p["color0"]) * (0.5 + _GAIN * (height / whole))
 
     def slope(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> tuple[Tensor, Tensor]:
         """See :class:`Computed`."""
         across, along, whole = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x)
-        for weight, cells, kept, cell in self._octaves(p, x, y, area):
+        for weight, cells, kept, at, key in self._octaves(p, x, y, area):
             whole = whole + weight
             weight = weight * cells if kept is None else weight * cells * kept
-            dx, dy = _noise(*cell, True)
+            dx, dy = _noise(at, key, True)
             across, along = torch.addcmul(across, weight, dx), torch.addcmul(along, weight, dy)
         factor = (p["color1"] - p["color0"]) * (_GAIN / whole)
         return across * factor, along * factor
 
-    def _octaves(self, p: Values, x: Tensor, y: Tensor, area: Tensor | None) -> Iterator[tuple[Any, ...]]:
-        """Of each octave its weight, its cells in a unit, how much of it a footprint leaves, and where in it points lie."""
-        weight, cells = torch.ones_like(x), p["scale"]
+    def _octaves(
+        self, p: Values, x: Tensor, y: Tensor, area: Tensor | None
+    ) -> Iterator[tuple[Tensor, Tensor, Tensor | None, tuple[Tensor, Tensor], Tensor]]:
+        """Of each octave its weight, its cells in a unit, how much a footprint leaves, where in it points lie, and its key."""
+        weight, cells, shifts = torch.ones_like(x), p["scale"], p["shifts"]
+        if area is not None:  # in cells; of more than these nothing is left of any octave
+            area = (area * cells * cells).clamp_max(_COVERED)
         for k in range(self.octaves):
             if k:
                 weight, cells = weight * p["persistence"], cells * p["lacunarity"]
-            # The mean over a square of area a is this part of the noise, by least squares over squares of all sizes.
-            kept = None if area is None else (area * cells * cells * -math.log(2.0)).exp()
-            shifts = p["shifts"]
-            yield weight, cells, kept, (x * cells + shifts[2 * k], y * cells + shifts[2 * k + 1], p["keys"][k])
+                area = None if area is None else area * p["lacunarity"] * p["lacunarity"]
+            # The mean over a square of area a is 2^-a of the noise in its middle, by least squares, for any a.
+            kept = None if area is None else (area * -math.log(2.0)).exp()
+            yield weight, cells, kept, (x * cells + shifts[2 * k], y * cells + shifts[2 * k + 1]), p["keys"][k]
 
 
-def _noise(x: Tensor, y: Tensor, key: Tensor, slope: bool) -> tuple[Tensor, ...]:
-    """Gradient noise ``(N,)``, or its derivatives with respect to ``x`` and ``y``; ``key``: int32 of the lane's noise."""
-    x, y = x.clamp(-_FAR, _FAR), y.clamp(-_FAR, _FAR)
+def _noise(at: tuple[Tensor, Tensor], key: Tensor, slope: bool) -> tuple[Tensor, ...]:
+    """Gradient noise ``(N,)`` at two coordinates, or its derivatives by them; ``key``: int32 of the lane's noise."""
+    x, y = (w.clamp(-_FAR, _FAR) for w in at)
     i, j = x.detach().floor(), y.detach().floor()
     x, y = x - i, y - j
     i, j = i.to(torch.int32), j.to(torch.int32)
