@@ -42,12 +42,12 @@ from torchpt.scene import Scene
 from torchpt.scene.assembly import corners_of
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
-from torchpt.scene.texels import images_of
 from torchpt.settings import Film, Settings
 from torchpt.shapes import KINDS as SHAPES
 from torchpt.shapes import Shape
 from torchpt.spec.declared import Described, values_of
-from torchpt.textures import Node, VertexColors
+from torchpt.textures import Node
+from torchpt.textures.atlas import ImageNode
 
 __all__ = [
     "NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "lets_pass", "load_mitsuba", "nearest",
@@ -407,9 +407,11 @@ def _kind(part: Part) -> str:
 
 def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
     """Mitsuba's dict of a texture."""
+    if not isinstance(node, ImageNode):
+        raise NoCounterpartError("a texture that is no image is not converted")
     if node.filtered:
         raise NoCounterpartError(f"{node.texels}: Mitsuba does not filter textures over a pixel")
-    image = images_of([node], scene.params)[node.texels].detach()
+    image = node.image(scene.params).detach()
     if node.channel is None:
         image = image[..., :3] if image.shape[2] >= 3 else image[..., :1].expand(-1, -1, 3)
         image = image * torch.tensor(node.scale)
@@ -427,7 +429,7 @@ def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
 
 
 def _refuse(node: Node) -> dict[str, Any]:
-    raise NoCounterpartError(f"{node.texels}: a texture, and no scene to take it from")
+    raise NoCounterpartError("a texture, and no scene to take it from")
 
 
 Opened = Callable[[Node], dict[str, Any]]
@@ -463,8 +465,6 @@ def bsdf(slot: ResolvedMaterial, opened: Opened = _refuse) -> dict[str, Any]:
 
 def _value(value: Any, opened: Opened) -> Any:
     """A parameter as Mitsuba's dict has it."""
-    if isinstance(value, VertexColors):
-        raise NoCounterpartError("vertex colours are not converted")
     if isinstance(value, Node):
         return opened(value)
     return _rgb(value) if isinstance(value, tuple) else value

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torchpt.bsdfs import Bsdf, Parameters
     from torchpt.lights.choice import ByTree
     from torchpt.math.distributions import Discrete
-    from torchpt.textures import Atlas, MaterialTextures, OpacityMaps
+    from torchpt.textures import MaterialTextures, NodeMap, OpacityMaps, Table
 
 __all__ = [
     "KINDS",
@@ -203,11 +203,14 @@ class LaneMaterials:
 class LaneTextures:
     """The textures, and those that surfaces read whatever their model."""
 
-    atlas: Atlas | None = None  # None where no texture is read
+    tables: tuple[Table, ...] = ()  # what is read, by the code that reads it
     opacity: OpacityMaps | None = None  # None where there are none
-    emission: Tensor | None = (
-        None  # (P + I,) int64 node of the emission map, -1 where there is none; None where none is
-    )
+    emission: NodeMap | None = None  # None where there are none
+
+    @property
+    def filtered(self) -> bool:
+        """Whether any averages over a pixel's footprint."""
+        return any(table.filtered for table in self.tables)
 
 
 @dataclass(frozen=True)

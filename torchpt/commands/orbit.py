@@ -196,7 +196,7 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
     from torchpt.rendering import render_scene
 
     place, seed = scene.params["camera.to_world"], settings(scene.description, job.overrides).render.seed
-    totals = {"rays": 0, "nonfinite_samples": 0}
+    totals: dict[str, int] = {"rays": 0, "nonfinite_samples": 0}
     begun = time.perf_counter()
     with Bar(frames.folder.stem) as bar:
         for number, pose in enumerate(poses(scene, turn)):
@@ -207,7 +207,9 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
             once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
             wishes = settings(scene.description, once)
 
-            def on_progress(state: Any, number: int = number, before: int = totals["rays"]) -> bool:
+            before = totals["rays"]
+
+            def on_progress(state: Any, number: int = number, before: int = before) -> bool:
                 done, rays = number * state.total + state.done, before + state.rays
                 bar.update(done, turn.frames * state.total, rays, time.perf_counter() - begun)
                 return interrupt.signum is not None

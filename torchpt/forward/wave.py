@@ -118,7 +118,7 @@ def _dark(scene: Scene, world: World, own: bool) -> World:
 
 def _pixel_of(world: World, camera: Camera) -> Tensor | None:
     """What textures filtered by the pixel's footprint need of the camera; None where there are none."""
-    return camera.pixel() if world.textures.atlas is not None and world.textures.atlas.pyramids is not None else None
+    return camera.pixel() if world.textures.filtered else None
 
 
 def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: Tensor | None, own: bool) -> Stages:

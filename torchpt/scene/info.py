@@ -60,12 +60,10 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "lights": {} if lights is None else _lights(lights),
         "scene_bytes": memory,
     }
-    if world.textures.atlas is not None:
-        texels = world.textures.atlas.texels
-        made["textures"] = {
-            "reads": world.textures.atlas.places.shape[1],
-            "bytes": texels.numel() * texels.element_size(),
-        }
+    reads = sum(table.count for table in world.textures.tables)
+    if reads:
+        tensors = tensors_of(world.textures.tables)
+        made["textures"] = {"reads": reads, "bytes": sum(x.numel() * x.element_size() for x in tensors)}
     if built.centre.any():
         made["origin_moved_to"] = built.centre.tolist()
     if built.unit != 1.0:
@@ -143,8 +141,8 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
         absent.append("Russian roulette (paths end before rr_depth)")
     if not settings.film.aovs:
         absent.append("aov layers")
-    if world.textures.atlas is None:
-        absent.append("textures (no image is read)")
+    if not any(table.count for table in world.textures.tables):
+        absent.append("textures (no image is read, none is computed)")
     if world.geometry.colors is None:
         absent.append("vertex colours")
     if all(

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = [
-    "REQUIRED", "Angle", "Choice", "Color", "Direction", "Flag", "Index", "Map", "Moves", "Other", "Path", "Point",
+    "REQUIRED", "Angle", "Choice", "Color", "Direction", "Flag", "Index", "Map", "Moves", "Other", "Pair", "Path", "Point",
     "Pose", "Scalar", "Spec", "Texels", "Vertices", "Whole", "spec_of",
 ]  # fmt: skip
 
@@ -156,7 +156,8 @@ class _Numbers(Spec):
             raise Refused("numbers finite in float32", "a value that is not finite in float32")
         low, high = self.bounds
         # What is rounded on its way here is not refused for it.
-        bad = (value < low - 1e-6 * abs(low)) | (value > high + 1e-6 * abs(high))
+        slack = getattr(self, "slack", 0.0)
+        bad = (value < low - 1e-6 * abs(low) - slack) | (value > high + 1e-6 * abs(high) + slack)
         rounded = value.float()
         if self.above is not None:
             bad = bad | (rounded <= self.above)
@@ -371,7 +372,13 @@ class Pose(Spec):
 
 @dataclass(frozen=True)
 class Texels(_Numbers):
-    """An image ``(H, W, C)`` that a file holds: never written in a scene, but a tensor of it."""
+    """An image ``(H, W, C)`` that a file holds: never written in a scene, but a tensor of it.
+
+    Attributes:
+        slack: how far beyond the range is taken for rounding.
+    """
+
+    slack: float = field(default=0.0, kw_only=True)
 
     @property
     def accepted(self) -> str:
@@ -391,6 +398,26 @@ class Flag(Spec):
     def read(self, value: Any) -> bool:
         """See :class:`Spec`."""
         return reading.flag(value)
+
+
+@dataclass(frozen=True)
+class Pair(Spec):
+    """Two numbers, along u and along v.
+
+    Attributes:
+        single: whether one number stands for both.
+    """
+
+    single: bool = field(default=False, kw_only=True)
+
+    @property
+    def accepted(self) -> str:
+        """See :class:`Spec`."""
+        return "a number or [u, v]" if self.single else "two numbers [u, v]"
+
+    def read(self, value: Any) -> tuple[float, float]:
+        """See :class:`Spec`."""
+        return reading.pair(value, self.expected, single=self.single)
 
 
 @dataclass(frozen=True)

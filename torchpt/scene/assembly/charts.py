@@ -14,7 +14,6 @@ from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.math.vectors import normalize
 from torchpt.scene.assembly.corners import Corners
 from torchpt.scene.parts import Part
-from torchpt.textures import Node, VertexColors
 
 __all__ = ["charts_of"]
 
@@ -30,16 +29,16 @@ def charts_of(
 ) -> dict[str, Any]:
     """What of :class:`World` says where a point lies on its surface, each thing only where something reads it."""
     readings = [reading for material in materials.values() for reading in material.readings()]
-    # Filtered textures-ups ask how large a surface's texels are.
+    # Filtered look-ups ask how large a surface's texels are.
     bumpy = any(material.bump_map is not None for material in materials.values())
-    bumpy = bumpy or any(isinstance(reading, Node) and reading.filtered for reading in readings)
+    bumpy = bumpy or any(reading.filtered for reading in readings)
     framed = (
         bumpy
         or any(material.normal_map is not None for material in materials.values())
         or any(m.anisotropic for m in models)
     )
-    imaged = uv or any(isinstance(reading, Node) for reading in readings)
-    coloured = any(isinstance(reading, VertexColors) for reading in readings)
+    imaged = uv or any(reading.reads == "uv" for reading in readings)
+    coloured = any(reading.reads == "colors" for reading in readings)
     pairs = list(zip(parts, corners, strict=True))
     uvs = [_uvs(part, c) for part, c in pairs] if imaged or framed else []
     found: dict[str, Any] = dict.fromkeys(("tangents", "bitangents", "uvs", "axes", "mirrored", "colors"))

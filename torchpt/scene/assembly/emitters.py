@@ -14,13 +14,11 @@ from torchpt.accel.bounds import chosen, primitive_bounds
 from torchpt.lights import COLUMNS, SURFACES, Faces, Setting, choice_of, emitter
 from torchpt.lights import KINDS as LIGHTS
 from torchpt.lights.solid_angle import shapes_of, table_of
-from torchpt.math.threads import mean_all
 from torchpt.math.vectors import luminance
 from torchpt.records import KINDS, Geometry, Lights
 from torchpt.scene.assembly.primitives import Primitives
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
-from torchpt.scene.texels import images_of
 from torchpt.spec import Refused
 from torchpt.spec.validate import refused
 
@@ -39,9 +37,7 @@ def _mean_emission(part: Part, parameters: Mapping[str, Tensor]) -> float:
     """Mean luminance of the texture that a part shines by; 1 without."""
     if part.emission_texture is None:
         return 1.0
-    image = images_of([part.emission_texture], parameters)[part.emission_texture.texels].detach().double()
-    color = image[..., :3].mean((0, 1)) if image.shape[2] >= 3 else mean_all(image[..., 0]).expand(3)
-    return float(luminance((color * color.new_tensor(part.emission_texture.scale)).abs()))
+    return float(luminance(part.emission_texture.mean(parameters).abs()))
 
 
 @dataclass(frozen=True)
