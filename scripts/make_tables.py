@@ -66,7 +66,7 @@ def shown(value: Any) -> str:
 
 def row(key: str, spec: Spec) -> str:
     """One parameter."""
-    cells = (f"`{key}`", shown(spec.default), spec.expected, spec.doc)
+    cells = (f"`{key}`", shown(spec.default), spec.brief, spec.doc)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 

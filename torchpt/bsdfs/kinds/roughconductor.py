@@ -21,7 +21,9 @@ __all__ = ["RoughConductor"]
 
 @dataclass(frozen=True)
 class RoughConductor(Anisotropic, Metal):
-    """A rough mirror. A row with both roughnesses below ``1e-4`` is a smooth one: a delta lobe.
+    """A metal with GGX microfacets.
+
+    A row with both roughnesses below ``1e-4`` is a smooth one: a delta lobe.
 
     Facets shade one another; light that meets more than one of them is lost, unless it is given back as Turquin does
     (*Practical Multiple Scattering Compensation for Microfacet Models*, 2019, equation 16): each direction ``wo`` has its

@@ -25,7 +25,9 @@ __all__ = ["RoughDielectric"]
 
 @dataclass(frozen=True)
 class RoughDielectric(Anisotropic, Glass):
-    """Frosted glass. A row with both roughnesses below ``1e-4`` is polished glass, one with equal indices is nothing.
+    """A boundary between two clear media with GGX microfacets: frosted glass.
+
+    A row with both roughnesses below ``1e-4`` is polished glass, one with equal indices is nothing.
 
     Attributes:
         anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
