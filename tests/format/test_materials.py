@@ -639,7 +639,9 @@ OWN = {"mine": Tinted()}
 
 
 def test_a_model_of_the_callers_own() -> None:
-    assert slot(OWN, type="mine") == ResolvedMaterial(Tinted(), "materials.m", {**Tinted.parameters})
+    assert slot(OWN, type="mine") == ResolvedMaterial(
+        Tinted(), "materials.m", {"tint": (0.5, 0.25, 1.0), "amount": -2.0}
+    )
     found = slot(OWN, type="mine", tint=-3, amount=1e6, **COMMON)
     assert found.values == {"tint": (-3, -3, -3), "amount": 1e6} and found.emission == (1, 2, 3)
     assert found.model is OWN["mine"]
@@ -824,3 +826,22 @@ def test_indices_bend_rays_and_textures_of_them_too(tmp_path: Path) -> None:
     assert bending(type="dielectric") == {"materials.m.int_ior", "materials.m.ext_ior"}
     assert bending(type="roughdielectric", int_ior=squares) == {"materials.m.int_ior", "materials.m.ext_ior"}
     assert not bending(type="plastic") and not bending(type="thindielectric")
+
+
+@pytest.mark.parametrize("kind", ["roughconductor", "roughdielectric"])
+def test_energy_compensation_beside_textures(kind: str) -> None:
+    """Its table is made once a material, also where the rest is prepared on lanes."""
+
+    def picture(**keys: Any) -> Tensor:
+        lights, film = {"sky": {"type": "constant"}}, {"width": 8, "height": 8}
+        material = {"type": kind, "alpha": 0.5, "energy_compensation": True, **keys}
+        described = {**scene({"m": material}, material="m"), "lights": lights, "film": film}
+        return torchpt.render(torchpt.load(described, "cpu"), spp=4, seed=1, compile="off")
+
+    def even(*color: float) -> dict[str, Any]:
+        return {"type": "checkerboard", "color0": list(color), "color1": list(color)}
+
+    flat = picture(normal_map=even(0.5, 0.5, 1.0))
+    torch.testing.assert_close(flat.mean(), picture().mean(), rtol=0.02, atol=0)
+    tint = picture(specular_reflectance=even(0.25, 0.5, 0.75))
+    torch.testing.assert_close(tint, picture(specular_reflectance=[0.25, 0.5, 0.75]), rtol=1e-4, atol=1e-5)

@@ -83,6 +83,11 @@ class Spec:
         """The same, with a texture where one may stand."""
         return f"{self.words or self.accepted}{', or a texture' if self.texture else ''}"
 
+    @property
+    def brief(self) -> str:
+        """The same without lists of names, for tables."""
+        return self.expected
+
     def read(self, value: Any) -> Any:
         """A value as written, checked.
 
@@ -244,6 +249,13 @@ class Index(Scalar):
         """See :class:`Spec`."""
         texture = ", a texture" if self.texture else ""
         return f"{self.accepted}{texture}, or one of {', '.join(self.media)}" if self.media else super().expected
+
+    @property
+    def brief(self) -> str:
+        """See :class:`Spec`."""
+        return (
+            f"{self.accepted}{', the name of a medium' if self.media else ''}{', or a texture' if self.texture else ''}"
+        )
 
     def read(self, value: Any) -> float:
         """See :class:`Spec`."""
