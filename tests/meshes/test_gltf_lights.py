@@ -175,7 +175,7 @@ def test_they_are_parameters(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "expected"),
     [
-        ("bulb.intensity", [-1.0, 0, 0], ">= 0 \(clamp"),
+        ("bulb.intensity", [-1.0, 0, 0], r">= 0 \(clamp"),
         ("bulb.position", [float("nan"), 0, 0], "finite"),
         ("sun.direction", [0.0, 0, 0], "a direction other than"),
         ("lamp_1.cutoff_angle", 0.0, "an angle in degrees"),
