@@ -23,6 +23,7 @@ from torchpt import lights, spec
 from torchpt.accel.bounds import primitive_bounds
 from torchpt.errors import SceneError
 from torchpt.lights.bounds import bounds_of
+from torchpt.math.distributions import Discrete
 from torchpt.math.frames import Frame
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import Hit, LightSample
@@ -276,7 +277,9 @@ def test_power_is_that_of_brute_force(name):
     known = 10.0
     described["lights"]["known"] = {"type": "point", "position": [0, 0, 1], "intensity": known}
     scene = torchpt.load(described, device="cpu")
-    choice = scene.world(torch.float64, choice="power")[0].lights.choice  # pyright: ignore[reportOptionalMemberAccess]
+    world, _ = scene.world(torch.float64, choice="power")
+    assert world.lights is not None and isinstance(world.lights.choice, Discrete)
+    choice = world.lights.choice
     names = [source.name for source in scene.built.sources]
     own = names.index("lights.it") + len(choice.pmf) - len(names) if "lights.it" in names else 0
     share = (float(choice.pmf[own]) - 0.005) / 0.99  # a hundredth is even, see Discrete
