@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torchpt.format.schema import Camera, Orthographic, Perspective, ThinLens
 
 import torchpt
 from torchpt.bsdfs.resolved import ResolvedMaterial

@@ -22,9 +22,10 @@ from torchpt.errors import (
 if TYPE_CHECKING:
     from torchpt import ibl
     from torchpt.bsdfs import Bsdf
-    from torchpt.images import read_image, read_layers, write_image
+    from torchpt.images import metrics, read_image, read_layers, write_image
     from torchpt.rendering import render
     from torchpt.scene import Scene, load
+    from torchpt.scene.from_trimesh import from_trimesh
 
 __version__ = "0.1.0"
 __all__ = [
@@ -38,8 +39,10 @@ __all__ = [
     "Scene",
     "SceneError",
     "TorchptError",
+    "from_trimesh",
     "ibl",
     "load",
+    "metrics",
     "read_image",
     "read_layers",
     "render",
@@ -50,6 +53,7 @@ __all__ = [
 _LAZY = {
     "Bsdf": "torchpt.bsdfs",
     "Scene": "torchpt.scene",
+    "from_trimesh": "torchpt.scene.from_trimesh",
     "load": "torchpt.scene",
     "read_image": "torchpt.images",
     "read_layers": "torchpt.images",
@@ -57,12 +61,15 @@ _LAZY = {
     "write_image": "torchpt.images",
 }
 
+#: Public modules.
+_MODULES = {"ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics"}
+
 
 def __getattr__(name: str) -> Any:
     from importlib import import_module
 
-    if name == "ibl":
-        return import_module("torchpt.ibl")
+    if name in _MODULES:
+        return import_module(_MODULES[name])
     if name not in _LAZY:
         raise AttributeError(f"module 'torchpt' has no attribute {name!r}")
     value = getattr(import_module(_LAZY[name]), name)

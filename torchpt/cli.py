@@ -22,6 +22,7 @@ from torchpt import __version__
 from torchpt.commands import collector, keys
 from torchpt.commands.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.commands.interrupt import Interrupt, Interrupted
+from torchpt.commands.orbit import HELP as HELP_ORBIT
 from torchpt.commands.plain_words import compose_plainly
 from torchpt.errors import TorchptError
 
@@ -36,6 +37,7 @@ HELP = """\
 torchpt: a wavefront path tracer that is a PyTorch program
 
   torchpt render scene=cornell_box render.spp=64 out=cornell.exr    render a picture
+  torchpt orbit  scene=cornell_box frames=48 out=turn.gif           turn the camera about it: .gif, .mp4
   torchpt info   scene=cornell_box                                  what the scene holds, what was built, what left out
 
 torchpt COMMAND --help says more. Scenes that ship:
@@ -86,7 +88,7 @@ def main(argv: list[str] | None = None) -> int:
         try:
             arguments = parse(argv)
             if arguments.help:
-                print(_help(HELP_RENDER if arguments.command == "render" else HELP_INFO), end="")
+                print(_help({"render": HELP_RENDER, "orbit": HELP_ORBIT, "info": HELP_INFO}[arguments.command]), end="")
                 return 0
             if not arguments.scenes and not arguments.only_shows:
                 ship = ", ".join(keys.options("scene"))
@@ -114,6 +116,7 @@ class _Task:
     outs: list[str]
     paths: dict[str, str | None]
     json: bool
+    turn: dict[str, str]
 
     def __call__(self, cfg: DictConfig) -> int:
         """Do one job. Ends the process (of this job) where it does not end well."""
@@ -129,11 +132,14 @@ class _Task:
     def _ended(self, make_job: Callable[[], Job]) -> int:
         """Make and do a job; returns the exit code."""
         from torchpt.commands.info import info
+        from torchpt.commands.orbit import Turn, orbit
         from torchpt.commands.render import render
 
         with Interrupt() as interrupt:
             try:
                 job = make_job()
+                if self.command == "orbit":
+                    return orbit(job, Turn.read(self.turn), interrupt)
                 return info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
             except TorchptError as error:
                 return _refuse(str(error))
@@ -207,7 +213,7 @@ def _refuse_targets(value: Any, where: str) -> None:
 
 def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
     """Compose plain words here and hand all others over to Hydra; returns the exit code."""
-    task = _Task(arguments.command, arguments.scenes, arguments.outs, arguments.paths, arguments.json)
+    task = _Task(arguments.command, arguments.scenes, arguments.outs, arguments.paths, arguments.json, arguments.turn)
     if not arguments.options and not arguments.multirun:
         composed = compose_plainly(arguments.overrides, _configs())
         if composed is not None:

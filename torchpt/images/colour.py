@@ -2,6 +2,10 @@
 
 All functions take and return float tensors of any shape (colours in the last axis, RGB with the primaries of sRGB).
 Linear radiance enters unbounded; display values lie in 0..1.
+
+Colour libraries have the same functions (tests hold ours against kornia's). These lie on the way to every picture: their
+powers are taken piece by piece, so that a picture has the same bits on any number of threads, and importing one of those
+takes longer than a small render.
 """
 
 from __future__ import annotations

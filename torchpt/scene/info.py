@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
-
 from torchpt import bsdfs
 from torchpt.accel import Accel
 from torchpt.film import FILTERS
+from torchpt.lights import KINDS as LIGHTS
+from torchpt.lights import SURFACES, Environment
 from torchpt.lights.choice import ByTree
 from torchpt.records import KINDS, Lights, World, tensors_of
 from torchpt.settings import Settings
@@ -60,10 +60,6 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "lights": {} if lights is None else _lights(lights),
         "scene_bytes": memory,
     }
-    around = None if lights is None else lights.environment
-    if around is not None and not isinstance(around, Tensor):
-        compensated = around.compensated is not None
-        made["lights"]["envmap"] = {"texels": [around.width, around.height], "mis_compensation": compensated}
     if world.textures.atlas is not None:
         texels = world.textures.atlas.texels
         made["textures"] = {
@@ -96,6 +92,9 @@ def _lights(lights: Lights) -> dict[str, Any]:
         found["choice"] = {"tree": {"nodes": len(tree.nodes), "levels": tree.levels}}
     elif lights.choice is not None:
         found["choice"] = "a fixed chance for each"
+    last = LIGHTS.get(lights.kinds[-1])
+    if last is not None and issubclass(last, Environment) and (told := last.info(lights.environment)):
+        found[last.name] = told
     return found
 
 
@@ -132,7 +131,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
             absent.append("environment")
         if lights.row_of_prim is None:
             absent.append("area lights")
-        absent += [f"sampling of {kind} lights" for kind in KINDS if kind not in lights.kinds]
+        absent += [f"sampling of {kind} lights" for kind in SURFACES if kind not in lights.kinds]
     if not FILTERS[settings.film.filter.name].tabulated:
         absent.append(f"filter table ({settings.film.filter.name})")
     if not description.camera.kind.lens:

@@ -52,6 +52,12 @@ def mesh_of(triangles: Triangles, key: str, description: Description, opener: Op
     if triangles.path is not None:
         path = description.resolve(triangles.path, f"{key}.path")
         pieces, source = load_mesh(path, materials=materials), str(path)
+    elif isinstance(triangles.object, tuple):
+        pieces, source = list(triangles.object), "trimesh"
+    elif triangles.object is not None:
+        from torchpt.meshes.trimesh_parts import mesh_parts_of
+
+        pieces, source = mesh_parts_of(triangles.object), "trimesh"
     else:
         assert triangles.vertices is not None and triangles.faces is not None
         arrays = (triangles.vertices, triangles.faces, triangles.normals, triangles.uvs)

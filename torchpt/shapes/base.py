@@ -63,6 +63,7 @@ class Triangles:
         uvs: ``(V, 2)``, or None.
         flat: shade flat, whatever normals there are.
         displacement: ``texture``, ``scale`` and ``subdivisions`` of :class:`~torchpt.shapes.kinds.mesh.Displacement`, or None.
+        object: of trimesh, or parts of a mesh, in place of a file; None: no such thing.
     """
 
     path: tuple[str, ...] | None = None
@@ -72,6 +73,7 @@ class Triangles:
     uvs: Matrix | None = None
     flat: bool = False
     displacement: Described | None = None
+    object: Any = None
 
 
 def _material(value: Any) -> Any:

@@ -23,12 +23,27 @@ class Displacement:
     }
 
 
+def _object(value: Any) -> Any:
+    """An object of trimesh; or parts, which Python code read itself. Whoever builds the scene takes it apart."""
+    if isinstance(value, tuple | list) and value and all(hasattr(part, "faces") for part in value):
+        return tuple(value)
+    if type(value).__module__.split(".")[0] != "trimesh":
+        raise Refused("a trimesh.Trimesh or trimesh.Scene (an object of Python; files have a path)")
+    return value
+
+
 class Mesh(Shape):
-    """Triangles from a file, or from inline ``vertices`` and ``faces``."""
+    """Triangles from a file, from inline ``vertices`` and ``faces``, or from an object of trimesh."""
 
     name = "mesh"
     parameters: ClassVar = {
         "path": Path(None, doc="the file: OBJ, PLY, STL or glTF"),
+        "mesh": Other(
+            None,
+            reader=_object,
+            words="a trimesh.Trimesh or trimesh.Scene",
+            doc="an object of Python, read when the scene is loaded",
+        ),
         "vertices": Vertices(None, doc="points in its own space"),
         "faces": Other(
             None,
@@ -58,11 +73,14 @@ class Mesh(Shape):
         """See :class:`Shape`."""
         inline = {name: values[name] for name in ("vertices", "faces", "normals", "uvs")}
         vertices, faces = values["vertices"], values["faces"]
-        if values["path"] is not None:
-            for name, value in inline.items():
-                if value is not None:
-                    raise Refused("either path or an inline mesh, not both", value.tolist(), (name,))
-            return
+        if values["path"] is not None and values["mesh"] is not None:
+            raise Refused("either path or mesh, not both", "an object", ("mesh",))
+        for whole in ("path", "mesh"):
+            if values[whole] is not None:
+                for name, value in inline.items():
+                    if value is not None:
+                        raise Refused(f"either {whole} or an inline mesh, not both", value.tolist(), (name,))
+                return
         if vertices is None or faces is None:
             missing = "faces" if vertices is not None else "vertices" if faces is not None else "path"
             raise Refused("a path, or vertices and faces", None, (missing,))
@@ -81,4 +99,6 @@ class Mesh(Shape):
     def triangles(cls, values: Mapping[str, Any]) -> Triangles:
         """See :class:`Shape`."""
         arrays = (values[name] for name in ("path", "vertices", "faces", "normals", "uvs"))
-        return Triangles(*arrays, flat=values["face_normals"], displacement=values["displacement"])
+        return Triangles(
+            *arrays, flat=values["face_normals"], displacement=values["displacement"], object=values["mesh"]
+        )
