@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
@@ -14,7 +14,8 @@ from torchpt.errors import SceneError
 from torchpt.format.description import read_description, settings
 from torchpt.forward import BYTES_PER_LANE
 from torchpt.integrators import KINDS, LAYERS
-from torchpt.spec import parameters_of
+from torchpt.integrators.base import Integrator
+from torchpt.spec import Scalar, parameters_of
 
 #: What a convex body of this albedo shows in a furnace.
 ALBEDO = 0.75
@@ -59,7 +60,7 @@ class Row:
         furnace: what it shows of the ball.
         accepted: settings other than the default that mean something in the room.
         refused: keys with values just out of range.
-        gradient: the parameter of the room whose derivative is compared with a difference; None: it has none.
+        gradient: the parameter of the room whose derivative is compared with a difference; None: no material matters.
         smooth: settings under which no decision hangs on that parameter.
     """
 
@@ -132,10 +133,14 @@ def test_gradients(name):
     scene, key = load(ROOM), ROWS[name].gradient
     integrator = {"type": name, **ROWS[name].smooth}
     wish = {"integrator": integrator, "spp": 4, "seed": 3, "seed_grad": 3, "dtype": torch.float64, "compile": "off"}
-    if key is None:
-        leaf = scene.params["materials.clay.reflectance"].clone().requires_grad_()
+    leaf = scene.params["materials.clay.reflectance"].clone().requires_grad_()
+    if not KINDS[name].light:
         with pytest.raises(SceneError, match="where gradients are wanted"):
             torchpt.render(scene, params={"materials.clay.reflectance": leaf}, **wish)
+        return
+    if key is None:
+        torchpt.render(scene, params={"materials.clay.reflectance": leaf}, **wish).mean().backward()
+        assert leaf.grad is not None and not leaf.grad.any()
         return
     value = scene.params[key].double()
     leaf = value.clone().requires_grad_()
@@ -166,11 +171,19 @@ def test_settings_out_of_range_are_refused(name):
 def test_an_integrator_is_a_plain_frozen_record(name):
     integrator = KINDS[name]()
     assert integrator == KINDS[name](**integrator.values) and hash(integrator) == hash(KINDS[name]())
-    assert integrator.but() == integrator and name.capitalize() in repr(integrator)
+    assert integrator.but() == integrator and type(integrator).__name__ in repr(integrator)
     with pytest.raises(AttributeError, match="frozen"):
         integrator.clamp = 3.0
     with pytest.raises(TypeError, match="no_such_key"):
         KINDS[name](no_such_key=1)
+
+
+def test_lengths_are_counted_in_the_lanes_unit():
+    class Near(Integrator):
+        parameters: ClassVar = {"distance": Scalar(6.0, length=True), "share": Scalar(0.5)}
+
+    assert Near().counted_in(4.0) == Near(distance=1.5, share=0.5)
+    assert Near().counted_in(1.0) == Near()
 
 
 # -- layers

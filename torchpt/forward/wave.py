@@ -44,7 +44,8 @@ def make_wave(
     attached: bool = False,
 ) -> Wave:
     """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``."""
-    film, integrator, spp = settings.film, settings.integrator, settings.render.spp
+    film, spp = settings.film, settings.render.spp
+    integrator = settings.integrator.counted_in(scene.space.unit)
     uv = any(layer.uv for layer in surface_layers(settings).values())
     world, geometry = scene.world(dtype, params, uv, settings.light_choice)
     threads = None if settings.render.threads == "auto" else int(settings.render.threads)
