@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,9 +197,15 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
     from torchpt.render import render_scene
 
     place, seed = scene.params["camera.to_world"], settings(scene.description, job.overrides).render.seed
-    totals = {"rays": 0, "nonfinite_samples": 0}
+    totals: dict[str, int] = {"rays": 0, "nonfinite_samples": 0}
     begun = time.perf_counter()
     with Bar(frames.folder.stem) as bar:
+
+        def on_progress(number: int, rays: int, state: Any) -> bool:
+            done, seconds = number * state.total + state.done, time.perf_counter() - begun
+            bar.update(done, turn.frames * state.total, rays + state.rays, seconds)
+            return interrupt.signum is not None
+
         for number, pose in enumerate(poses(scene, turn)):
             if interrupt.signum is not None:
                 break
@@ -206,14 +213,8 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
                 continue
             once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
             wishes = settings(scene.description, once)
-
-            def on_progress(state: Any, number: int = number, before: int = totals["rays"]) -> bool:
-                done, rays = number * state.total + state.done, before + state.rays
-                bar.update(done, turn.frames * state.total, rays, time.perf_counter() - begun)
-                return interrupt.signum is not None
-
             scene.params["camera.to_world"] = torch.from_numpy(pose.copy()).to(place)
-            rendering = render_scene(scene, wishes, on_progress=on_progress)
+            rendering = render_scene(scene, wishes, on_progress=partial(on_progress, number, totals["rays"]))
             if not rendering.complete:
                 break
             frames.write(number, rendering.image, wishes.film)
