@@ -15,7 +15,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt.images.colour import display
-from torchpt.samplers import KINDS, Dimension, Sampler, salts
+from torchpt.samplers import Dimension, Sampler, points_of, salts
 
 #: Soft shadows of two balls on a floor, under one lamp.
 SHADOWS: dict[str, Any] = {
@@ -93,7 +93,7 @@ def points(out: Path) -> None:
     figure, axes = plt.subplots(1, 4, figsize=(11, 3), layout="constrained")
     for axis, kind in zip(axes, ("independent", "stratified", "hammersley", "sobol"), strict=True):
         key = Sampler(kind, 1, 1, count).key(torch.zeros(count, dtype=torch.int64), torch.arange(count))
-        x, y = KINDS[kind].draw_2d(key, salts(1, torch.device("cpu"))[int(Dimension.LIGHT)])
+        x, y = points_of(kind).draw_2d(key, salts(1, torch.device("cpu"))[int(Dimension.LIGHT)])
         axis.plot(x.numpy(), y.numpy(), "o", markersize=2.6, color="black")
         axis.set(title=kind, xlim=(0, 1), ylim=(0, 1), aspect="equal", xticks=[0, 1], yticks=[0, 1])
     figure.savefig(out / "sampler_points.png", dpi=80)

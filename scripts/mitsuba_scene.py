@@ -36,15 +36,17 @@ from torchpt.format.materials import (
     RoughDielectric,
     RoughPlastic,
 )
-from torchpt.format.schema import Camera, Cone, Cube, Instance, Mesh, Orthographic, Perspective, Shape, ThinLens
 from torchpt.format.textures import TextureInput
-from torchpt.math.vectors import cross, dot
+from torchpt.math.vectors import cross, dot, luminance
 from torchpt.scene import Scene
 from torchpt.scene.assembly import corners_of
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
 from torchpt.scene.texels import images_of
-from torchpt.settings import Film, Filter, PathIntegrator, Settings
+from torchpt.settings import Film, Settings
+from torchpt.shapes import KINDS as SHAPES
+from torchpt.shapes import Shape
+from torchpt.spec.declared import Described, values_of
 from torchpt.textures import Node, VertexColors
 
 __all__ = [
@@ -110,7 +112,7 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
         NoCounterpartError: a material or camera that Mitsuba cannot express.
     """
     integrator = settings.integrator
-    assert isinstance(integrator, PathIntegrator)
+    assert integrator.name == "path"
     if scene.built.copies:
         raise NoCounterpartError(f"{scene.built.copies[0].name}: instances are not converted")
     out: dict[str, Any] = {
@@ -156,37 +158,30 @@ def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
     return found
 
 
-def sensor(mitsuba: Any, camera: Camera) -> dict[str, Any]:
+def sensor(mitsuba: Any, camera: Described) -> dict[str, Any]:
     """Mitsuba's dict of a camera, without film and sampler.
 
     Raises:
-        NoCounterpartError: an aperture with blades.
+        NoCounterpartError: an aperture with blades, pixels that are no squares, a lens that is shifted.
     """
-    pose = camera.pose()
-    if isinstance(camera, Orthographic):  # its film is [-1, 1] wide, and sized by the pose
-        pose = pose @ np.diag([0.5 * camera.width, 0.5 * camera.width, 1.0, 1.0])
-        found: dict[str, Any] = {"type": "orthographic"}
-    elif isinstance(camera, ThinLens):
-        if camera.blades or not camera.aperture_radius:
-            raise NoCounterpartError("camera: Mitsuba's lens is round, and has a size")
-        found = {
-            "type": "thinlens",
-            "aperture_radius": camera.aperture_radius,
-            "focus_distance": camera.focus_distance,
-        }
-    else:
-        found = {"type": "perspective"}
-    if isinstance(camera, Perspective | ThinLens):
-        found |= {"fov": camera.fov, "fov_axis": camera.fov_axis}
+    given = {key: value for key, value in camera.values.items() if value is not None}
+    pose = given["to_world"]
+    if camera.name == "orthographic":  # its film is [-1, 1] wide, and sized by the pose
+        pose = pose @ np.diag([0.5 * given["width"], 0.5 * given["width"], 1.0, 1.0])
+    if camera.kind.lens and (given["blades"] or not given["aperture_radius"]):
+        raise NoCounterpartError("camera: Mitsuba's lens is round, and has a size")
+    offsets = [key for key in given if key.startswith("principal_point")]
+    if "pixel_aspect" in given or (camera.kind.lens and offsets):
+        raise NoCounterpartError("camera: Mitsuba's pixels are squares, and its lens is in the middle")
+    keys = ("fov", "fov_axis", *offsets, "aperture_radius", "focus_distance")
+    found = {"type": camera.name, **{key: given[key] for key in keys if key in given}}
     return {**found, "to_world": _transform(mitsuba, pose), "near_clip": 1e-3, "far_clip": 1e7}
 
 
 def comparable(name: str) -> Scene:
     """A scene of ``configs/scene`` without what Mitsuba cannot express, and without meshes that not every machine has."""
     scene = torchpt.load(name, device="cpu")
-    lacking = {
-        shape for shape, value in scene.description.shapes.items() if len(getattr(value, "path", None) or ()) > 1
-    }
+    lacking = {shape for shape, value in scene.description.shapes.items() if len(value.values.get("path") or ()) > 1}
     for part in scene.built.parts:
         try:
             _kind(part)
@@ -241,24 +236,27 @@ class _Nearest:
     def __init__(self) -> None:
         self.said: dict[str, str] = {}
 
-    def camera(self, camera: Camera) -> Camera:
+    def camera(self, camera: Described) -> Described:
         """A round aperture for one of blades."""
-        if not isinstance(camera, ThinLens) or not camera.blades:
+        blades = camera.values.get("blades")
+        if not blades:
             return camera
-        self.said["camera"] = f"an aperture of {camera.blades} blades is round"
-        return camera.model_copy(update={"blades": 0})
+        self.said["camera"] = f"an aperture of {blades} blades is round"
+        return replace(camera, values={**camera.values, "blades": 0})
 
-    def shape(self, name: str, shape: Shape, shapes: Mapping[str, Shape]) -> Shape:
+    def shape(self, name: str, shape: Described, shapes: Mapping[str, Described]) -> Described:
         """A mesh for a cone, and for an instance."""
-        if isinstance(shape, Cone):
+        if shape.name == "cone":
             self.said[name] = f"cone is a mesh of {SIDES} sides with smooth normals"
             shape = _cone(shape)
-        elif isinstance(shape, Instance) and isinstance(mesh := shapes.get(shape.of), Mesh | Cube):
-            self.said[name] = f"instance is a copy of {shape.of}"
-            own = {"transform": shape.transform, "flip_normals": shape.flip_normals, "emission": None}
-            shape = mesh.model_copy(update={**own, "material": shape.material or mesh.material})
-        if isinstance(shape.material, Material):
-            shape = shape.model_copy(update={"material": self.material(f"{name}.material", shape.material)})
+        elif shape.name == "instance" and (mesh := shapes.get(shape["of"])) is not None and mesh.kind.meshed:
+            self.said[name] = f"instance is a copy of {shape['of']}"
+            own = {"transform": shape["transform"], "flip_normals": shape["flip_normals"], "emission": None}
+            material = shape["material"] or mesh["material"]
+            shape = replace(mesh, values={**mesh.values, **own, "material": material})
+        if isinstance(shape["material"], Material):
+            material = self.material(f"{name}.material", shape["material"])
+            shape = replace(shape, values={**shape.values, "material": material})
         return shape
 
     def material(self, name: str, material: Material) -> Material:
@@ -322,7 +320,7 @@ def _numbers(name: str, value: Any) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-def _cone(cone: Cone) -> Mesh:
+def _cone(cone: Described) -> Described:
     """A mesh in place of a cone: its side with the cone's own normals, and its base."""
     angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
     none, one = np.zeros(SIDES), np.ones(SIDES)
@@ -332,17 +330,18 @@ def _cone(cone: Cone) -> Mesh:
     here = np.arange(SIDES)
     after = (here + 1) % SIDES
     points, normals, faces = [ring, tips], slanted, [np.stack((here, after, here + SIDES))]
-    if cone.capped:  # by corners that face down, around a centre
+    if cone["capped"]:  # by corners that face down, around a centre
         points, normals = [*points, ring, np.zeros((3, 1))], [*normals, -tips, -tips[:, :1]]
         faces.append(np.stack((after + 2 * SIDES, here + 2 * SIDES, np.full(SIDES, 3 * SIDES))))
-    own = cone.own()
+    own = cone.kind.own(cone.values)
     across = np.linalg.inv(own[:3, :3]).T @ np.concatenate(normals, 1)
-    mesh = Mesh(
-        vertices=(own[:3, :3] @ np.concatenate(points, 1) + own[:3, 3:]).T,
-        normals=(across / np.linalg.norm(across, axis=0)).T,
-        faces=np.concatenate(faces, 1).T,
-    )
-    return mesh.model_copy(update={key: getattr(cone, key) for key in Shape.model_fields})
+    mesh = {
+        "vertices": (own[:3, :3] @ np.concatenate(points, 1) + own[:3, 3:]).T,
+        "normals": (across / np.linalg.norm(across, axis=0)).T,
+        "faces": np.concatenate(faces, 1).T,
+    }
+    made = values_of(SHAPES["mesh"], mesh, "", None)
+    return replace(made, values=made.values | {key: cone[key] for key in Shape.parameters})
 
 
 def _film(film: Film) -> dict[str, Any]:
@@ -363,9 +362,10 @@ def _crop(film: Film) -> dict[str, int]:
     return dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), film.crop, strict=True))
 
 
-def _rfilter(filter: Filter) -> dict[str, Any]:
+def _rfilter(filter: Any) -> dict[str, Any]:
     # Mitsuba's gaussian has no radius of its own: it is four deviations, as ours is where none is given.
-    return {key: value for key, value in filter.model_dump().items() if key != "radius" or filter.type == "tent"}
+    own = {key: value for key, value in filter.values.items() if key != "radius" or filter.name == "tent"}
+    return {"type": filter.name, **own}
 
 
 def _transform(mitsuba: Any, matrix: np.ndarray) -> Any:
@@ -414,8 +414,7 @@ def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
         image = image[..., :3] if image.shape[2] >= 3 else image[..., :1].expand(-1, -1, 3)
         image = image * torch.tensor(node.scale)
     else:
-        weights = torch.tensor([0.212671, 0.715160, 0.072169])
-        channel = image[..., node.channel] if node.channel >= 0 else image[..., :3] @ weights
+        channel = image[..., node.channel] if node.channel >= 0 else luminance(image.movedim(-1, 0))
         image = channel[..., None] * node.scale[0]
     return {
         "type": "bitmap",

@@ -6,8 +6,6 @@ so ``import torchpt`` itself is quick.
 
 from __future__ import annotations
 
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from torchpt.errors import (
@@ -25,7 +23,7 @@ if TYPE_CHECKING:
     from torchpt import ibl
     from torchpt.bsdfs import Bsdf
     from torchpt.images import metrics, read_image, read_layers, write_image
-    from torchpt.render import render
+    from torchpt.rendering import render
     from torchpt.scene import Scene, load
     from torchpt.scene.from_trimesh import from_trimesh
 
@@ -59,7 +57,7 @@ _LAZY = {
     "load": "torchpt.scene",
     "read_image": "torchpt.images",
     "read_layers": "torchpt.images",
-    "render": "torchpt.render",
+    "render": "torchpt.rendering",
     "write_image": "torchpt.images",
 }
 
@@ -81,15 +79,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-class _Package(ModuleType):
-    """Keeps ``torchpt.render`` the function: importing the module of that name would bind the module over it."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name == "render" and isinstance(value, ModuleType):
-            value = value.render
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

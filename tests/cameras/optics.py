@@ -13,10 +13,26 @@ from torchpt.format.description import settings
 
 POSE = {"origin": [0.3, 1.1, 5], "target": [-0.2, 0.4, 0.1], "up": [0.1, 1, 0]}
 LENS = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.2, "fov": 35}
+#: What the tests of this folder look through; among them every kind, with every parameter that has a tensor.
 CAMERAS: dict[str, dict[str, Any]] = {
     "perspective": {"type": "perspective", "fov": 35},
+    "shifted": {
+        "type": "perspective",
+        "fov": 35,
+        "fov_axis": "larger",
+        "principal_point_offset_x": 0.1,
+        "principal_point_offset_y": -0.2,
+        "pixel_aspect": 1.3,
+    },
     "thinlens": LENS,
     "hexagon": {**LENS, "blades": 6},
+    "shifted lens": {
+        **LENS,
+        "fov_axis": "diagonal",
+        "principal_point_offset_x": -0.1,
+        "principal_point_offset_y": 0.1,
+        "pixel_aspect": 0.8,
+    },
     "orthographic": {"type": "orthographic", "width": 3.5},
 }
 

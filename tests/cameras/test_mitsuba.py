@@ -12,7 +12,7 @@ from optics import CAMERAS, POSE, numbers
 from trials import coarse, film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt.cameras import FOV_AXES
+from torchpt.cameras.pinhole import FOV_AXES
 from torchpt.format.description import settings
 
 pytestmark = pytest.mark.mitsuba
@@ -48,6 +48,7 @@ def bridge():
     "camera",
     [
         *({**CAMERAS[name], "fov_axis": axis} for name in ("perspective", "thinlens") for axis in FOV_AXES),
+        {**CAMERAS["perspective"], "principal_point_offset_x": 0.13, "principal_point_offset_y": -0.2},
         CAMERAS["orthographic"],
     ],
     ids=lambda camera: "-".join(str(value) for value in camera.values()),

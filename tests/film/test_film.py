@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchpt.film import RELMSE_FLOOR, Film, Filter
+from torchpt.film import RELMSE_FLOOR, Film, filter_of
 
 CPU = torch.device("cpu")
 
@@ -73,7 +73,7 @@ def test_one_randomization_knows_no_error_and_no_sample_is_black():
 
 def test_the_box_filter_fills_the_pixel():
     u = torch.tensor([0.0, 0.25, 0.5, 1 - 2**-24])
-    offset = Filter("box", 0.5, 0.5, CPU).offset(u)
+    offset = filter_of("box", CPU).offset(u)
     assert offset.tolist() == [-0.5, -0.25, 0.0, 0.5 - 2**-24]
 
 
@@ -83,7 +83,7 @@ def test_the_gaussian_has_the_moments_of_mitsubas(stddev, radius):
     x = np.linspace(-radius, radius, 2_000_001)
     weight = np.exp(-0.5 * (x / stddev) ** 2) - np.exp(-0.5 * (radius / stddev) ** 2)
     u = (torch.arange(1 << 20, dtype=torch.float64) + 0.5) / (1 << 20)
-    offset = Filter("gaussian", radius, stddev, CPU).offset(u.float()).double().numpy()
+    offset = filter_of("gaussian", CPU, stddev=stddev, radius=radius).offset(u.float()).double().numpy()
     assert np.abs(offset).max() <= radius
     assert (np.diff(offset) >= 0).all()
     assert abs(offset.mean()) < 1e-6
@@ -110,6 +110,6 @@ def test_the_gaussian_is_mitsubas(stddev):
     weight = np.array([theirs.eval(float(v)) for v in x])
     cumulative = np.concatenate(([0], np.cumsum(0.5 * (weight[1:] + weight[:-1]))))
     expected = np.diff(np.interp(edges, x, cumulative / cumulative[-1]))
-    offset = Filter("gaussian", radius, stddev, CPU).offset((torch.arange(1 << 18) + 0.5) / (1 << 18))
+    offset = filter_of("gaussian", CPU, stddev=stddev, radius=radius).offset((torch.arange(1 << 18) + 0.5) / (1 << 18))
     found = np.histogram(offset.numpy(), edges)[0] / (1 << 18)
     np.testing.assert_allclose(found, expected, atol=3e-4)

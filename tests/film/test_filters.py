@@ -11,9 +11,9 @@ import torch
 from trials import film_of, shoot, z_limit
 
 import torchpt
-from torchpt.film import Filter
+from torchpt.film import Filter, filter_of
 from torchpt.format.description import settings
-from torchpt.render import first_hit, render_scene
+from torchpt.rendering import first_hit, render_scene
 from torchpt.scene import Scene
 
 CPU = torch.device("cpu")
@@ -45,8 +45,8 @@ FILTERS: dict[str, tuple[dict[str, Any], float, Any]] = {
 }
 
 
-def made(keys: dict[str, Any], radius: float) -> Filter:
-    return Filter(keys["type"], radius, 0.5, CPU, keys.get("B", 1 / 3), keys.get("C", 1 / 3))
+def made(keys: dict[str, Any]) -> Filter:
+    return filter_of(keys["type"], CPU, **{key: value for key, value in keys.items() if key != "type"})
 
 
 def weights(filter: Filter) -> tuple[torch.Tensor, float]:
@@ -60,7 +60,7 @@ def weights(filter: Filter) -> tuple[torch.Tensor, float]:
 @pytest.mark.parametrize("name", FILTERS)
 def test_what_is_drawn_has_the_moments_and_shares_of_the_filter(name):
     keys, radius, profile = FILTERS[name]
-    filter = made(keys, radius)
+    filter = made(keys)
     x, order = filter.offset(U).double().sort()
     weight = weights(filter)[0][order]
     assert float(x.abs().max()) <= radius
@@ -79,7 +79,7 @@ def test_what_is_drawn_has_the_moments_and_shares_of_the_filter(name):
 @pytest.mark.parametrize("name", FILTERS)
 def test_weights_have_the_sign_of_the_filter_and_a_mean_of_one(name):
     keys, radius, profile = FILTERS[name]
-    filter = made(keys, radius)
+    filter = made(keys)
     negative = float((profile(np.linspace(-radius, radius, 100_001)) < 0).mean()) > 0
     assert filter.signed == negative
     if not negative:
@@ -96,8 +96,9 @@ def test_weights_have_the_sign_of_the_filter_and_a_mean_of_one(name):
     assert (np.sign(value[clear]) == np.sign(weight.numpy()[clear])).all()
     assert float(weight.double().mean()) == pytest.approx(1, abs=2e-2)
     # Over all numbers that a sampler can give, exactly: the lobe is a whole number of steps.
-    assert (1 - 4 * float(filter._lobe)) * centre == pytest.approx(1, abs=1e-7)
-    assert float(filter._lobe) * 2**24 == round(float(filter._lobe) * 2**24)
+    negative = float(filter.tensors()["negative"])
+    assert (1 - 2 * negative) * centre == pytest.approx(1, abs=1e-7)
+    assert negative * 2**24 == round(negative * 2**24)
 
 
 @pytest.mark.mitsuba

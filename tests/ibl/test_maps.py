@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 from torch import Tensor
-from torchpt.bsdfs.roughconductor import RoughConductor
 
 import torchpt
+from torchpt.bsdfs.kinds.roughconductor import RoughConductor
 from torchpt.ibl import convolve, equirect
 from torchpt.ibl.cube import look_up_cube
 from torchpt.ibl.pyramid import Pyramid

@@ -15,8 +15,8 @@ import yaml
 
 import torchpt
 from torchpt.errors import AssetError, EdgeWarning, SceneError
+from torchpt.format.cameras import read_camera
 from torchpt.format.description import settings
-from torchpt.format.schema import read_camera
 from torchpt.meshes import FileLight, load_mesh
 
 HALF = math.sqrt(0.5)
@@ -209,7 +209,7 @@ def test_info_names_lights_and_offers_cameras(tmp_path: Path) -> None:
     assert (block["fov"], block["fov_axis"]) == (40, "y")
     # At (0, 1, 2) looking along -z, turned to look along -x by the root; then the shape's transform.
     straight = {"origin": [5, 2, 3], "target": [4, 2, 3], "up": [0, 1, 0], "fov": 40, "fov_axis": "y"}
-    found, expected = (read_camera(x, None).pose() for x in (block, straight))
+    found, expected = (read_camera(x, {}, None)["to_world"] for x in (block, straight))
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 

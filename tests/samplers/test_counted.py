@@ -10,11 +10,12 @@ from trials import SIGNIFICANCE, film_of, grid_cells, shoot, uniform_p, z_limit
 import torchpt
 from torchpt.errors import NotBuiltError, SceneError
 from torchpt.format.description import read_description, settings
-from torchpt.samplers import KINDS, Dimension, Sampler, salts, zsobol
+from torchpt.samplers import KINDS, Dimension, Sampler, points_of, salts
+from torchpt.samplers.kinds import zsobol
 from torchpt.samplers.shuffling import shuffle
 
 CPU = torch.device("cpu")
-COUNTED = [kind for kind, module in KINDS.items() if module.NEEDS_COUNT]
+COUNTED = [name for name, kind in KINDS.items() if kind.needs_count]
 SETS = [(1, Dimension.BSDF), (1, Dimension.LIGHT), (2, Dimension.BSDF), (7, Dimension.LIGHT)]
 LINES = [(1, Dimension.ROULETTE), (1, Dimension.LOBE), (5, Dimension.ROULETTE)]
 
@@ -26,11 +27,11 @@ def keys(kind: str, pixels: int, count: int, seed: int = 0, randomizations: int 
 
 
 def one(kind: str, key: Tensor, name: tuple[int, Dimension]) -> Tensor:
-    return KINDS[kind].draw_1d(key, salts(name[0], CPU)[int(name[1])])
+    return points_of(kind).draw_1d(key, salts(name[0], CPU)[int(name[1])])
 
 
 def two(kind: str, key: Tensor, name: tuple[int, Dimension]) -> Tensor:
-    return KINDS[kind].draw_2d(key, salts(name[0], CPU)[int(name[1])])
+    return points_of(kind).draw_2d(key, salts(name[0], CPU)[int(name[1])])
 
 
 # --- Strata

@@ -6,10 +6,11 @@ import pytest
 import torch
 from trials import SIGNIFICANCE, grid_cells, uniform_p
 
-from torchpt.samplers import KINDS, Dimension, Sampler, independent, salts
+from torchpt.samplers import KINDS, Dimension, Sampler, points_of, salts
 from torchpt.samplers.hashing import logical_shift, mix, mix_int, to_unit
 
 CPU = torch.device("cpu")
+independent = points_of("independent")
 TESTS = 24  # comparisons in this file, each at SIGNIFICANCE / TESTS
 
 
@@ -65,8 +66,8 @@ def test_every_stream_has_a_name_of_its_own():
 def test_numbers_lie_in_zero_to_below_one(kind):
     pixel = torch.arange(1 << 10).repeat_interleave(1 << 9)
     key = Sampler(kind, 0, 1, 1 << 9, 32).key(pixel, torch.arange(1 << 9).repeat(1 << 10))
-    one = KINDS[kind].draw_1d(key, salts(3, CPU)[6])
-    two = KINDS[kind].draw_2d(key, salts(3, CPU)[5])
+    one = points_of(kind).draw_1d(key, salts(3, CPU)[6])
+    two = points_of(kind).draw_2d(key, salts(3, CPU)[5])
     for u in (one, two):
         assert u.dtype == torch.float32
         assert u.min() >= 0

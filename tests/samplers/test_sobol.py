@@ -9,9 +9,10 @@ import torch
 from trials import SIGNIFICANCE, film_of, grid_cells, shoot, uniform_p
 
 import torchpt
-from torchpt.samplers import Dimension, Sampler, salts, sobol
+from torchpt.samplers import Dimension, Sampler, points_of, salts, scrambling
 
 CPU = torch.device("cpu")
+sobol = points_of("sobol")
 
 
 def points(number: int, seed: int = 0, pixel: int = 0, depth: int = 1, dimension: Dimension = Dimension.BSDF):
@@ -61,20 +62,20 @@ def test_the_second_coordinate_is_sobols():
         for bit in range(32):
             y ^= direction[bit] if i >> bit & 1 else 0
         expected.append(y)
-    found = sobol.reverse_bits(sobol.second_dimension(index.to(torch.int32)))
+    found = scrambling.reverse_bits(scrambling.second_dimension(index.to(torch.int32)))
     assert [x & 0xFFFFFFFF for x in found.tolist()] == expected
 
 
 def test_reversing_bits_twice_is_the_identity():
     x = torch.randint(-(2**31), 2**31, (10_000,), generator=torch.Generator().manual_seed(0)).to(torch.int32)
-    assert torch.equal(sobol.reverse_bits(sobol.reverse_bits(x)), x)
-    assert sobol.reverse_bits(torch.tensor([1, 2, 6], dtype=torch.int32)).tolist() == [-(2**31), 2**30, 0x60000000]
+    assert torch.equal(scrambling.reverse_bits(scrambling.reverse_bits(x)), x)
+    assert scrambling.reverse_bits(torch.tensor([1, 2, 6], dtype=torch.int32)).tolist() == [-(2**31), 2**30, 0x60000000]
 
 
 def test_scrambling_is_a_bijection_that_keeps_prefixes():
     seed = torch.tensor(12345, dtype=torch.int32)
     x = torch.arange(1 << 16, dtype=torch.int32)
-    y = sobol.scramble(x, seed)
+    y = scrambling.scramble(x, seed)
     for bits in (1, 5, 11, 16):  # on bit-reversed numbers: a value's low bits depend on the low bits alone
         mask = (1 << bits) - 1
         assert len(torch.unique(torch.stack((x & mask, y & mask)), dim=1)[0]) == 1 << bits
@@ -83,7 +84,7 @@ def test_scrambling_is_a_bijection_that_keeps_prefixes():
 def test_each_bit_of_the_scramble_is_flipped_half_the_time():
     n = 1 << 14
     seeds = Sampler("independent", 1).key(torch.arange(n), torch.zeros(n, dtype=torch.int64))[0]
-    flips = sobol.scramble(torch.zeros(n, dtype=torch.int32), seeds)
+    flips = scrambling.scramble(torch.zeros(n, dtype=torch.int32), seeds)
     share = torch.stack([((flips >> bit) & 1).double().mean() for bit in range(32)])
     # 32 binomial shares; bits below are the value's leading ones. 4.2 sigma bounds all at 1e-3.
     assert (share - 0.5).abs().max() < 4.2 * 0.5 / n**0.5

@@ -194,7 +194,7 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
     import torch
 
     from torchpt.format.description import settings
-    from torchpt.render import render_scene
+    from torchpt.rendering import render_scene
 
     place, seed = scene.params["camera.to_world"], settings(scene.description, job.overrides).render.seed
     totals: dict[str, int] = {"rays": 0, "nonfinite_samples": 0}
@@ -296,19 +296,20 @@ class Frames:
 
 def _facts(scene: Scene, wishes: Any, turn: Turn) -> dict[str, Any]:
     """What frames depend on, by dotted name: the turn, the settings, and a digest of the scene."""
+    from torchpt.spec.declared import Described
+
     facts: dict[str, Any] = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
     stack: list[tuple[str, Any]] = [("", wishes)]
     while stack:
         name, value = stack.pop()
-        if isinstance(value, str | int | float | None):
-            facts[name] = plain(value)
-        elif isinstance(value, list | tuple):
-            facts[name] = str(value)
-        elif isinstance(value, type):
-            facts[name] = value.__name__
+        if isinstance(value, Described):
+            value = {"type": value.name, **value.values}
+        elif hasattr(value, "__dict__"):
+            value = vars(value)
+        if isinstance(value, Mapping):
+            stack += [(f"{name}.{key}" if name else str(key), inside) for key, inside in value.items()]
         else:
-            inside = value if isinstance(value, Mapping) else vars(value)
-            stack += [(f"{name}.{key}" if name else str(key), item) for key, item in inside.items()]
+            facts[name] = plain(value) if isinstance(value, int | float | None) else str(value)
     return {**{name: facts[name] for name in sorted(facts) if name not in _FREE}, "scene": _digest(scene)}
 
 

@@ -7,11 +7,25 @@ sum for each randomization of the sampler: their spread is the picture's own err
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch
+
 from torchpt.film.base import Filter
 from torchpt.film.sums import RELMSE_FLOOR, Film
 from torchpt.spec import Kinds
+from torchpt.spec.declared import values_of
 
-__all__ = ["FILTERS", "RELMSE_FLOOR", "Film", "Filter"]
+__all__ = ["FILTERS", "RELMSE_FLOOR", "Film", "Filter", "filter_of"]
 
 #: The kinds of reconstruction filters.
 FILTERS: Kinds[Filter] = Kinds("torchpt.film.kinds", ("gaussian", "box", "tent", "mitchell"))
+
+
+def filter_of(kind: str, device: torch.device, **given: Any) -> Filter:
+    """A filter by name; parameters that are not ``given`` have their defaults.
+
+    Raises:
+        SceneError: a parameter that it does not have, or a bad value.
+    """
+    return FILTERS[kind](values_of(FILTERS[kind], given, "film.filter", None).values, device)

@@ -98,11 +98,11 @@ def shade(
         return value.expand(shape).reshape(-1, 3).T
 
     def numbers(key: str, value: Tensor | float) -> Tensor:
-        found = torch.as_tensor(value, dtype=n.dtype, device=n.device)
+        given = torch.as_tensor(value, dtype=n.dtype, device=n.device)
         try:
-            return found.expand(shape[:-1]).reshape(-1)
+            return given.expand(shape[:-1]).reshape(-1)
         except RuntimeError:
-            raise SceneError(key, tuple(found.shape), f"a number, or the shape {tuple(shape[:-1])}") from None
+            raise SceneError(key, tuple(given.shape), f"a number, or the shape {tuple(shape[:-1])}") from None
 
     rough, metal = numbers("roughness", roughness), numbers("metallic", metallic)
     base = lanes(base_color)

@@ -18,15 +18,10 @@ from torch import Tensor
 from torchpt.errors import SceneError
 from torchpt.math.threads import in_pieces
 
-__all__ = ["TONEMAPS", "display", "linear_to_srgb", "luminance", "srgb_to_linear"]
+__all__ = ["TONEMAPS", "display", "linear_to_srgb", "srgb_to_linear"]
 
 # Above this every curve is white; below it no curve overflows float32 when it squares.
 _BRIGHTEST = 1e9
-
-
-def luminance(rgb: Tensor) -> Tensor:
-    """Relative luminance Y of linear RGB (ITU-R BT.709 weights): ``(..., 3)`` to ``(...)``."""
-    return 0.2126 * rgb[..., 0] + 0.7152 * rgb[..., 1] + 0.0722 * rgb[..., 2]
 
 
 def _power(x: Tensor, exponent: float) -> Tensor:

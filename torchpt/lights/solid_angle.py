@@ -27,7 +27,7 @@ from torchpt.lanes.tracing import tracing
 from torchpt.math.angles import azimuth
 from torchpt.math.vectors import cross, dot
 from torchpt.math.warps import uniform_triangle
-from torchpt.native.operators import choose, operator
+from torchpt.native.operators import operator
 
 __all__ = [
     "KINDS",
@@ -112,7 +112,7 @@ def sample(
         are 0 the point was drawn by area. Rows of other shapes keep ``u``.
     """
     if x.device.type == "cpu" and not tracing():
-        return choose(_sample_on_cpu, _sample_operator)(table, row, x, u)
+        return _sample_on_cpu(table, row, x, u)
     return tensor_sample(table, row, x, u, shapes)
 
 
@@ -122,7 +122,7 @@ def angles(table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] =
     From behind a light fills the same angle; it is the caller who knows which side emits.
     """
     if x.device.type == "cpu" and not tracing():
-        return choose(_angles_on_cpu, _angles_operator)(table, row, x)
+        return _angles_on_cpu(table, row, x)
     return tensor_angles(table, row, x, shapes)
 
 
@@ -142,30 +142,21 @@ def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
     return torch.where(angle > 0, solid, by_area)
 
 
+@operator(
+    "torchpt::solid_angle_sample",
+    lambda table, row, x, u: (x.new_empty(2, x.shape[1], dtype=u.dtype), x.new_empty(x.shape[1])),
+)
 def _sample_on_cpu(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     from torchpt.lights import kernels_solid
 
     return kernels_solid.sample(table, row, x, u)
 
 
+@operator("torchpt::solid_angles", lambda table, row, x: x.new_empty(x.shape[1]))
 def _angles_on_cpu(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
     from torchpt.lights import kernels_solid
 
     return kernels_solid.angles(table, row, x)
-
-
-_sample_operator = operator("torchpt::solid_angle_sample", _sample_on_cpu)
-_angles_operator = operator("torchpt::solid_angles", _angles_on_cpu)
-
-
-@_sample_operator.register_fake
-def _(table, row, x, u):
-    return torch.empty(2, x.shape[1], dtype=u.dtype, device=x.device), x.new_empty(x.shape[1])
-
-
-@_angles_operator.register_fake
-def _(table, row, x):
-    return x.new_empty(x.shape[1])
 
 
 @torch.no_grad()

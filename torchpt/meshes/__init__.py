@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from torchpt.errors import AssetError
-from torchpt.meshes.cube import unit_cube
 from torchpt.meshes.mesh_part import FileCamera, FileLight, FileMaterial, MeshPart, checked
 from torchpt.meshes.normals import smooth_normals
 
 __all__ = [
-    "FORMATS", "PARSERS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals", "unit_cube",
+    "FORMATS", "PARSERS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals",
 ]  # fmt: skip
 
 #: Endings that trimesh reads, and the packages beside it that each of them takes (all in the extra ``formats``).

@@ -8,9 +8,9 @@ The kernels of a kind are a module of their own, so that they are compiled only 
     serial(first, last, block, rows, k0, k1, k2, salt, o0, o1)        blocks ``first`` to ``last`` of lanes
     parallel(chunks, items, block, rows, k0, k1, k2, salt, o0, o1)    all of them, split over threads
 
-``rows`` numbers a lane from the key's rows ``k0``, ``k1`` and (the last one) ``k2`` into ``o0`` and ``o1``. Both are written out in
-each module: numba does not keep on disk what is made of other kernels by a function. Rows are separate one-dimensional
-arrays: indexed as rows of one array, the loops are not turned into vector code.
+``rows`` numbers a lane from the key's rows ``k0``, ``k1`` and (the last one) ``k2`` go into ``o0`` and ``o1``. Both are written
+out in each module: numba does not keep on disk what is made of other kernels by a function. Rows are separate
+one-dimensional arrays: indexed as rows of one array, the loops are not turned into vector code.
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ def _pivot(seed: Any, count: Any) -> Any:
 
 @jit(inline="always")
 def shuffle(index: Any, count: Any, seed: Any) -> Any:
+    """As ``shuffling.shuffle``."""
     pivot = _pivot(seed, count)
     index = U(U(index - pivot) + (count if pivot > index else U(0)))
     for _ in range(ROUNDS):
@@ -36,17 +37,20 @@ def shuffle(index: Any, count: Any, seed: Any) -> Any:
 
 @jit(inline="always")
 def place(stratum: Any, jitter: Any, count: Any) -> Any:
+    """As ``strata.place``."""
     level = np.floor((stratum + jitter) / count * _LEVELS)
     return np.float32(np.int32(min(level, _LEVELS - 1.0))) * SCALE
 
 
 @jit(inline="always")
 def real(x: Any) -> Any:
+    """A whole number below 2^31 as float64."""
     return np.float64(np.int32(x))
 
 
 @jit()
 def strata_1d(k0: Any, k1: Any, k2: Any, salt: Any, o0: Any, o1: Any) -> None:
+    """As ``strata.jittered``."""
     for i in range(len(k0)):
         seed = mix(U(k0[i] ^ salt))
         stratum = shuffle(k1[i], k2[i], seed)

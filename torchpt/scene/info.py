@@ -85,7 +85,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "shapes": shapes,
         "built": made,
         "left_out": _left_out(description, world, settings),
-        "settings": settings.model_dump(mode="json", warnings=False),
+        "settings": settings.plain(),
     }
 
 
@@ -133,14 +133,14 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
         if lights.row_of_prim is None:
             absent.append("area lights")
         absent += [f"sampling of {kind} lights" for kind in KINDS if kind not in lights.kinds]
-    if not FILTERS[settings.film.filter.type].tabulated:
-        absent.append(f"filter table ({settings.film.filter.type})")
+    if not FILTERS[settings.film.filter.name].tabulated:
+        absent.append(f"filter table ({settings.film.filter.name})")
     if not description.camera.kind.lens:
         absent.append("places on a lens (all is in focus)")
     integrator = settings.integrator
-    if getattr(integrator, "clamp", None) is None:
+    if integrator.clamp is None:
         absent.append("clamp")
-    if 0 <= getattr(integrator, "max_depth", 2) < getattr(integrator, "rr_depth", 3) + 1:
+    if 0 <= integrator.limits.max_depth <= integrator.limits.rr_depth:
         absent.append("Russian roulette (paths end before rr_depth)")
     if not settings.film.aovs:
         absent.append("aov layers")

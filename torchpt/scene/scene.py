@@ -26,7 +26,7 @@ from torchpt.scene.build import Built, build_parts
 from torchpt.scene.info import describe
 from torchpt.scene.space import FARTHEST, Space, middle_of
 from torchpt.settings import Film, Settings
-from torchpt.spec import Moves, Pose, Refused, Scalar, Spec, Vertices, parameters_of
+from torchpt.spec import Moves, Pose, Refused, Scalar, Spec, parameters_of
 
 __all__ = ["Scene", "device_of", "load"]
 
@@ -140,7 +140,7 @@ class Scene:
 
     def spec(self, name: str) -> Spec:
         """What a parameter is."""
-        return self._built.parameters.specs.get(name) or _undeclared(name, self._built)
+        return self._built.parameters.specs.get(name) or _undeclared(name)
 
     def _check(self, name: str, value: Tensor) -> None:
         """Refuse numbers that no scene file could hold."""
@@ -264,11 +264,7 @@ class Scene:
         self._accels.clear()
 
 
-def _undeclared(name: str, built: Built) -> Spec:
+def _undeclared(name: str) -> Spec:
     """What a parameter is whose kind does not declare it yet, by its name."""
     key = name.rpartition(".")[2]
-    if key == "vertices":
-        return Vertices()
-    if key == "to_world":
-        return Pose(angles=any(part.kind == "sphere" and name == f"{part.name}.to_world" for part in built.parts))
     return Scalar() if key in ("emission", "texels") else Scalar(low=None)

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = [
-    "REQUIRED", "Angle", "Choice", "Color", "Direction", "Flag", "Index", "Moves", "Other", "Path", "Point", "Pose", "Scalar",
-    "Spec", "Texels", "Vertices", "Whole", "spec_of",
+    "REQUIRED", "Angle", "Choice", "Color", "Direction", "Flag", "Index", "Map", "Moves", "Other", "Path", "Point",
+    "Pose", "Scalar", "Spec", "Texels", "Vertices", "Whole", "spec_of",
 ]  # fmt: skip
 
 
@@ -464,6 +464,21 @@ class Path(Spec):
     def read(self, value: Any) -> tuple[str, ...]:
         """See :class:`Spec`."""
         return reading.file_paths(value)
+
+
+@dataclass(frozen=True)
+class Map(Spec):
+    """A texture that gives numbers, or its name; read by whoever reads textures (:data:`torchpt.spec.declared.ReadTexture`)."""
+
+    texture: bool = field(default=True, kw_only=True)
+    words: str = field(default="the name of a texture", kw_only=True)
+
+    #: Numbers that it may give, as of a number that a texture may give.
+    bounds: ClassVar[tuple[float, float]] = (-LARGEST, LARGEST)
+
+    def read(self, value: Any) -> Any:
+        """See :class:`Spec`."""
+        raise Refused(self.expected)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ __all__ = ["Hammersley"]
 
 @dataclass(frozen=True)
 class Hammersley(Points):
-    """``(i/n, van der Corput)``, the first jittered, the second Owen-scrambled: direct light at a count that is fixed, any n."""
+    """``(i/n, van der Corput)``, the first jittered, the second Owen-scrambled: a net whatever the count, which is fixed."""
 
     name = "hammersley"
     needs_count = True

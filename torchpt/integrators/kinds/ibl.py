@@ -6,30 +6,40 @@ What the environment brings is not shadowed and no light is reflected twice: tha
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from torchpt.accel import Accel
 from torchpt.ibl import IblMaps, Sky, brdf_table, maps
 from torchpt.integrators import stages as pure
-from torchpt.integrators.compiled import Stages
-from torchpt.integrators.path import Tally, gather_light, partition
-from torchpt.integrators.search import Search
+from torchpt.integrators.base import LIGHT_CHOICE, SAMPLES
+from torchpt.integrators.first_surface import FirstSurface, FirstSurfaceIntegrator
 from torchpt.integrators.split_sum import under
 from torchpt.integrators.stages import Plan
 from torchpt.lights.choice import ByTree
 from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import dot
-from torchpt.records import Hit, Lights, PathState, Shadow, World, rows
-from torchpt.samplers import salts
+from torchpt.records import Hit, Lights, PathState, Shadow, World, tensors_of
 from torchpt.shapes import interact
 
-__all__ = ["Preview", "first_hit", "shaded", "without_environment"]
+__all__ = ["Ibl", "Preview", "without_environment"]
+
+
+class Ibl(FirstSurfaceIntegrator):
+    """A preview: the first surface under the environment by split sum (unshadowed), and under other lights."""
+
+    name = "ibl"
+    parameters: ClassVar = {**LIGHT_CHOICE, **SAMPLES}
+    strategy = "light"
+
+    def first(self, world: World) -> Preview:
+        """See :class:`Integrator`."""
+        return Preview.of(world)
 
 
 @dataclass(frozen=True)
-class Preview:
+class Preview(FirstSurface):
     """The environment ready for split-sum shading.
 
     Attributes:
@@ -57,52 +67,35 @@ class Preview:
         """Directions ``(3, N)`` of the world in the maps' own space."""
         return d if self.turn is None else torch.stack([dot(self.turn[k][:, None], d) for k in range(3)])
 
+    def again(self, world: World) -> Preview:
+        """See :class:`FirstSurface`."""
+        environment = None if world.lights is None else world.lights.environment
+        return Preview.of(world) if any(t.requires_grad for t in tensors_of(environment)) else self
 
-def first_hit(stages: Stages, preview: Preview, accel: Accel, state: PathState) -> tuple[Tensor, Tally]:
-    """Radiance ``(3, N)`` along camera rays ``state``, and what it took."""
-    plan, world = stages.plan, stages.world
-    search = Search(accel, world, plan.sampler, plan.dtype)
-    slide = plan.attached or plan.dtype == torch.float64
-    hit = search.nearest(state, 1)
-    tally = Tally(rays=len(state.lane))
-    ends, groups = partition(world, hit)
-    gather_light(stages, state, hit, ends, slide)
-    salt = salts(1, state.lane.device)
-    for model, index in groups:
-        radiance, shadow = shaded(
-            plan, world, preview, model, rows(state, index), rows(hit, index), salt, stages.pixel, slide
-        )
-        if shadow is not None:
-            tally.rays += len(shadow.t_max)
-            radiance = torch.addcmul(radiance, shadow.radiance, search.clear(shadow))
-        state.radiance.scatter_add_(1, index.expand(3, -1), radiance)
-    return state.radiance, tally
-
-
-def shaded(
-    plan: Plan,
-    world: World,
-    preview: Preview,
-    model: int,
-    state: PathState,
-    hit: Hit,
-    salts: Tensor,
-    pixel: Tensor | None,
-    slide: bool,
-) -> tuple[Tensor, Shadow | None]:
-    """What the environment brings to surfaces of one model ``(3, n)``, and the shadow rays to the other lights."""
-    local = replace(world, lights=without_environment(world.lights))
-    if hit.chance is not None:
-        state = replace(state, throughput=state.throughput * hit.chance)
-    at = interact(world, state.o, state.d, hit, slide)
-    surface, shadow = pure.shade(plan, local, model, state, at, salts, pixel)
-    radiance = torch.zeros_like(state.radiance)
-    if preview.sky is not None:
-        n, v = preview.turned(surface.frame.n), preview.turned(-state.d)
-        radiance = state.throughput * under(preview.sky, world.materials.models[model], surface.parameters, n, v)
-        if surface.shown is not None:
-            radiance = radiance * surface.shown
-    return radiance, shadow
+    def shade(
+        self,
+        plan: Plan,
+        world: World,
+        model: int,
+        state: PathState,
+        hit: Hit,
+        salts: Tensor,
+        pixel: Tensor | None,
+        slide: bool,
+    ) -> tuple[Tensor, Shadow | None]:
+        """See :class:`FirstSurface`."""
+        local = replace(world, lights=without_environment(world.lights))
+        if hit.chance is not None:
+            state = replace(state, throughput=state.throughput * hit.chance)
+        at = interact(world, state.o, state.d, hit, slide)
+        surface, shadow = pure.shade(plan, local, model, state, at, salts, pixel)
+        radiance = torch.zeros_like(state.radiance)
+        if self.sky is not None:
+            n, v = self.turned(surface.frame.n), self.turned(-state.d)
+            radiance = state.throughput * under(self.sky, world.materials.models[model], surface.parameters, n, v)
+            if surface.shown is not None:
+                radiance = radiance * surface.shown
+        return radiance, shadow
 
 
 def without_environment(lights: Lights | None) -> Lights | None:

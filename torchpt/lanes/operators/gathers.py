@@ -21,10 +21,10 @@ def _look_up(tracer: Tracer, table: Tensor, axis: int, index: int) -> np.ndarray
     number = tracer.table(table, axis)
     lead = (*table.shape[:axis], *table.shape[axis + 1 :])
     width = math.prod(lead)
-    found = np.empty(lead, object)
-    for k, at in enumerate(np.ndindex(*lead)):
-        found[at] = graph.node("gather", ty, graph.cast(index, "i"), extra=(number, width, k))
-    return found
+    entries = np.empty(lead, object)
+    for k, entry in enumerate(np.ndindex(*lead)):
+        entries[entry] = graph.node("gather", ty, graph.cast(index, "i"), extra=(number, width, k))
+    return entries
 
 
 @handles("index_select")
@@ -62,19 +62,19 @@ def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
     columns: Any = np.broadcast_arrays(*(tracer.get(index).nodes for index in indices[: len(axes)]))
     rest = tuple(table.shape[len(axes) :])
     width, number = math.prod(rest), tracer.table(table, None)
-    found = np.empty((*columns[0].shape, *rest), object)
-    for at in np.ndindex(*columns[0].shape):
+    nodes = np.empty((*columns[0].shape, *rest), object)
+    for entry in np.ndindex(*columns[0].shape):
         place = graph.constant("i", 0)
         for axis, column in enumerate(columns):
             place = graph.binary("mul", "i", place, graph.constant("i", table.shape[axis])) if axis else place
-            place = graph.binary("add", "i", place, graph.cast(column[at], "i"))
+            place = graph.binary("add", "i", place, graph.cast(column[entry], "i"))
         place = graph.binary("mul", "i", place, graph.constant("i", width))
         for k, inner in enumerate(
             np.ndindex(*rest)
         ):  # entries of the table laid flat, where each is brought into range
             one = graph.binary("add", "i", place, graph.constant("i", k))
-            found[(*at, *inner)] = graph.node("gather", ty, one, extra=(number, 1, 0))
-    tracer.put(out, found)
+            nodes[(*entry, *inner)] = graph.node("gather", ty, one, extra=(number, 1, 0))
+    tracer.put(out, nodes)
 
 
 def _index_one(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor) -> None:
@@ -92,10 +92,10 @@ def _take(tracer: Tracer, out: Tensor, table: Tensor, index: Tensor) -> None:
         raise Unsupported("a look-up in what depends on lanes")
     graph, ty, lanes = tracer.graph, DTYPES[table.dtype], tracer.get(index).nodes
     number = tracer.table(table, None)
-    found = np.empty(lanes.shape, object)
-    for at in np.ndindex(*lanes.shape):
-        found[at] = graph.node("gather", ty, graph.cast(lanes[at], "i"), extra=(number, 1, 0))
-    tracer.put(out, found)
+    nodes = np.empty(lanes.shape, object)
+    for entry in np.ndindex(*lanes.shape):
+        nodes[entry] = graph.node("gather", ty, graph.cast(lanes[entry], "i"), extra=(number, 1, 0))
+    tracer.put(out, nodes)
 
 
 @handles("gather")
@@ -107,14 +107,14 @@ def _gather(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor
         raise Unsupported("a look-up in other lanes")
     choices = np.moveaxis(value.nodes, axis, 0)
     rows = np.moveaxis(rows, axis, 0)
-    found = np.empty(rows.shape, object)
-    for at in np.ndindex(*rows.shape):
-        row = graph.cast(rows[at], "i")
-        node = choices[(0, *at[1:])]
+    nodes = np.empty(rows.shape, object)
+    for entry in np.ndindex(*rows.shape):
+        row = graph.cast(rows[entry], "i")
+        node = choices[(0, *entry[1:])]
         for k in range(1, len(choices)):
-            node = graph.select(graph.node("eq", "b", row, graph.constant("i", k)), choices[(k, *at[1:])], node)
-        found[at] = node
-    tracer.put(out, np.moveaxis(found, 0, axis))
+            node = graph.select(graph.node("eq", "b", row, graph.constant("i", k)), choices[(k, *entry[1:])], node)
+        nodes[entry] = node
+    tracer.put(out, np.moveaxis(nodes, 0, axis))
 
 
 @handles("bucketize")
@@ -140,12 +140,12 @@ def _searchsorted(
     graph, ty = tracer.graph, DTYPES[table.dtype]
     right = right or side == "right"
     number, lanes = tracer.table(table, None), tracer.get(values).nodes
-    found = np.empty(lanes.shape, object)
-    for at in np.ndindex(*lanes.shape):
-        if graph.type(lanes[at]) != ty and not (ty == "l" and graph.type(lanes[at]) in "il"):
+    nodes = np.empty(lanes.shape, object)
+    for entry in np.ndindex(*lanes.shape):
+        if graph.type(lanes[entry]) != ty and not (ty == "l" and graph.type(lanes[entry]) in "il"):
             raise Unsupported("a search for numbers of another type than the table's")
-        found[at] = graph.node("search", "l", lanes[at], extra=(number, ty, right))
-    tracer.put(out, found)
+        nodes[entry] = graph.node("search", "l", lanes[entry], extra=(number, ty, right))
+    tracer.put(out, nodes)
 
 
 def _matrix(tracer: Tracer, tensor: Tensor) -> np.ndarray:
@@ -161,15 +161,15 @@ def _product(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, start: Tensor | 
         raise Unsupported("a sum over lanes")
     x, y = _matrix(tracer, a), _matrix(tracer, b)
     lane = tracer.lane_axis(out.shape)
-    found = np.empty(tracer.inner(out.shape, lane), object)
-    begin: Any = None if start is None else np.broadcast_to(tracer.get(start).nodes, found.shape)
-    for i, j in np.ndindex(*found.shape):
+    nodes = np.empty(tracer.inner(out.shape, lane), object)
+    begin: Any = None if start is None else np.broadcast_to(tracer.get(start).nodes, nodes.shape)
+    for i, j in np.ndindex(*nodes.shape):
         total = None if begin is None else graph.cast(begin[i, j], ty)
         for k in range(x.shape[1]):
             term = graph.binary("mul", ty, graph.cast(x[i, k], ty), graph.cast(y[k, j], ty))
             total = term if total is None else graph.binary("add", ty, total, term)
-        found[i, j] = graph.constant(ty, 0) if total is None else total
-    tracer.put(out, found, lane)
+        nodes[i, j] = graph.constant(ty, 0) if total is None else total
+    tracer.put(out, nodes, lane)
 
 
 @handles("mm", "matmul")

@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from torchpt.lanes.graph import DTYPES, Unsupported
+from torchpt.lanes.operators.nodes import cast_all
 from torchpt.lanes.tracing import Tracer, handles
 
 __all__: list[str] = []
@@ -55,10 +56,10 @@ def _unbind(tracer: Tracer, out: Any, a: Tensor, axis: int = 0) -> None:
 
 @handles("split", "split_with_sizes", "chunk")
 def _split(tracer: Tracer, out: Any, a: Tensor, sizes: Any, axis: int = 0) -> None:
-    at = 0
+    start = 0
     for one in out:
-        _slice(tracer, one, a, axis, at, at + one.shape[axis])
-        at += one.shape[axis]
+        _slice(tracer, one, a, axis, start, start + one.shape[axis])
+        start += one.shape[axis]
 
 
 @handles("unsqueeze")
@@ -119,11 +120,7 @@ def _view(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any) -> None:
 
 def _cast(tracer: Tracer, tensor: Tensor, out: Tensor) -> np.ndarray:
     """The nodes of a part in the type of the whole."""
-    nodes, ty, graph = tracer.get(tensor).nodes, DTYPES[out.dtype], tracer.graph
-    found = np.empty(nodes.shape, object)
-    for at in np.ndindex(*nodes.shape):
-        found[at] = nodes[at] if ty == "l" and graph.type(nodes[at]) == "L" else graph.cast(nodes[at], ty)
-    return found
+    return cast_all(tracer, tracer.get(tensor).nodes, DTYPES[out.dtype])
 
 
 @handles("stack")

@@ -1,0 +1,34 @@
+"""Values that a parameter must refuse, made of what it declares."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from torchpt.spec import Choice, Flag, Spec, Whole
+
+__all__ = ["numbers_outside", "values_outside"]
+
+
+def numbers_outside(spec: Spec) -> list[float]:
+    """Numbers beyond each end of a traced number's range, and those that are none."""
+    found = [math.nan, math.inf, -math.inf]
+    for end, by, open_end in (("low", -1.0, "above"), ("high", 1.0, "below")):
+        bound, limit = getattr(spec, end, None), getattr(spec, open_end, None)
+        if limit is not None:
+            found += [limit, limit + by]
+        elif bound is not None:
+            found.append(bound + by * 1e-3 * max(1.0, abs(bound)))
+    return found
+
+
+def values_outside(spec: Spec) -> list[Any]:
+    """What a file may not give."""
+    if hasattr(spec, "low") and not isinstance(spec, Whole):
+        return [*numbers_outside(spec), True, "much", [1, 2]]
+    if isinstance(spec, Whole):
+        below = spec.low - 1 if spec.low - 1 not in spec.also else spec.low - 2
+        return [below, spec.high + 1, spec.low + 0.5, "many", True]
+    if isinstance(spec, Choice):
+        return ["no such word", 3]
+    return [3] if isinstance(spec, Flag) else ["no such thing", {"a": 1}]
