@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchpt.cameras import Camera
-from torchpt.film import FILTERS
 from torchpt.forward.kept import kept
 from torchpt.forward.schedule import randomizations_of
 from torchpt.integrators import LAYERS
@@ -20,7 +19,6 @@ from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.stages import Plan
 from torchpt.integrators.wave import Wave
 from torchpt.records import World
-from torchpt.samplers import KINDS as SAMPLERS
 from torchpt.samplers import Sampler
 from torchpt.scene import Scene
 from torchpt.settings import Settings
@@ -55,7 +53,7 @@ def make_wave(
     own = not params  # the world is the scene's own, and what is made of it may be kept
     if not integrator.lit:
         world = _dark(scene, world, own)
-    points = SAMPLERS[settings.sampler.name](**settings.sampler.values)
+    points = settings.sampler.kind(**settings.sampler.values)
     plan = integrator.plan(points, dtype, tape, attached)
     camera = scene.camera(film, scene.merged(params), dtype)
     return Wave(
@@ -63,7 +61,7 @@ def make_wave(
         integrator=integrator,
         accel=accel,
         camera=camera,
-        filter=FILTERS[film.filter.name](film.filter.values, scene.device),
+        filter=film.filter.kind(film.filter.values, scene.device),
         sampler=Sampler(points, settings.render.seed, randomizations_of(spp), spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.space.shift,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -53,8 +52,12 @@ def mesh_of(triangles: Triangles, key: str, description: Description, opener: Op
     if triangles.path is not None:
         path = description.resolve(triangles.path, f"{key}.path")
         pieces, source = load_mesh(path, materials=materials), str(path)
-    elif triangles.read is not None:
-        pieces, source = _read(triangles.read, materials), "trimesh"
+    elif isinstance(triangles.object, tuple):
+        pieces, source = list(triangles.object), "trimesh"
+    elif triangles.object is not None:
+        from torchpt.meshes.trimesh_parts import mesh_parts_of
+
+        pieces, source = mesh_parts_of(triangles.object, materials=materials), "trimesh"
     else:
         assert triangles.vertices is not None and triangles.faces is not None
         arrays = (triangles.vertices, triangles.faces, triangles.normals, triangles.uvs)
@@ -62,15 +65,6 @@ def mesh_of(triangles: Triangles, key: str, description: Description, opener: Op
     if triangles.displacement is not None:
         pieces = [_displaced(piece, triangles.displacement, key, opener, source) for piece in pieces]
     return Mesh(pieces, source, triangles.flat)
-
-
-def _read(source: Any, materials: bool) -> list[MeshPart]:
-    """The parts of an object of trimesh; or such parts as they are."""
-    if isinstance(source, list | tuple):
-        return list(source)
-    from torchpt.meshes.trimesh_parts import mesh_parts_of
-
-    return mesh_parts_of(source, materials=materials)
 
 
 def _displaced(piece: MeshPart, wish: Described, prefix: str, opener: Opener, source: str) -> MeshPart:

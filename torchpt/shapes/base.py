@@ -62,8 +62,8 @@ class Triangles:
         normals: ``(V, 3)``, or None.
         uvs: ``(V, 2)``, or None.
         flat: shade flat, whatever normals there are.
-        read: an object of trimesh, or parts of a mesh that has been read, in place of a path; None where there is none.
         displacement: ``texture``, ``scale`` and ``subdivisions`` of :class:`~torchpt.shapes.kinds.mesh.Displacement`, or None.
+        object: of trimesh, or parts of a mesh, in place of a file; None: no such thing.
     """
 
     path: tuple[str, ...] | None = None
@@ -73,7 +73,7 @@ class Triangles:
     uvs: Matrix | None = None
     flat: bool = False
     displacement: Described | None = None
-    read: Any = None
+    object: Any = None
 
 
 def _material(value: Any) -> Any:

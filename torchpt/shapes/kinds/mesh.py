@@ -1,8 +1,8 @@
-"""Meshes: triangles of a file, of an object of trimesh, or written out."""
+"""Meshes: triangles of a file, or written out."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,26 +24,25 @@ class Displacement:
 
 
 def _object(value: Any) -> Any:
-    """An object of Python, which whoever builds the scene reads; or parts of a mesh that has been read."""
-    several = value if isinstance(value, list | tuple) else [value]
-    if not several or any(
-        isinstance(one, str | bool | int | float | Mapping | Sequence | np.ndarray) for one in several
-    ):
-        raise Refused("a trimesh.Trimesh or trimesh.Scene (an object of Python; a file has a path)")
+    """An object of trimesh; or parts, which Python code read itself. Whoever builds the scene takes it apart."""
+    if isinstance(value, tuple | list) and value and all(hasattr(part, "faces") for part in value):
+        return tuple(value)
+    if all(kind.__module__.partition(".")[0] != "trimesh" for kind in type(value).__mro__):
+        raise Refused("a trimesh.Trimesh or trimesh.Scene (an object of Python; files have a path)")
     return value
 
 
 class Mesh(Shape):
-    """Triangles from a file, from an object of trimesh, or from inline ``vertices`` and ``faces``."""
+    """Triangles from a file, from inline ``vertices`` and ``faces``, or from an object of trimesh."""
 
     name = "mesh"
     parameters: ClassVar = {
-        "path": Path(None, doc="the file: OBJ, PLY, STL, glTF, or what trimesh reads"),
+        "path": Path(None, doc="the file: OBJ, PLY, STL, glTF, or one that trimesh reads"),
         "mesh": Other(
             None,
             reader=_object,
             words="a trimesh.Trimesh or trimesh.Scene",
-            doc="in place of a file, an object of Python: with its materials, and its lights",
+            doc="an object of Python, read when the scene is loaded",
         ),
         "vertices": Vertices(None, doc="points in its own space"),
         "faces": Other(
@@ -74,14 +73,14 @@ class Mesh(Shape):
         """See :class:`Shape`."""
         inline = {name: values[name] for name in ("vertices", "faces", "normals", "uvs")}
         vertices, faces = values["vertices"], values["faces"]
-        outside = [name for name in ("path", "mesh") if values[name] is not None]
-        if len(outside) == 2:
+        if values["path"] is not None and values["mesh"] is not None:
             raise Refused("either path or mesh, not both", "an object", ("mesh",))
-        if outside:
-            for name, value in inline.items():
-                if value is not None:
-                    raise Refused(f"either {outside[0]} or an inline mesh, not both", value.tolist(), (name,))
-            return
+        for whole in ("path", "mesh"):
+            if values[whole] is not None:
+                for name, value in inline.items():
+                    if value is not None:
+                        raise Refused(f"either {whole} or an inline mesh, not both", value.tolist(), (name,))
+                return
         if vertices is None or faces is None:
             missing = "faces" if vertices is not None else "vertices" if faces is not None else "path"
             raise Refused("a path, or vertices and faces", None, (missing,))
@@ -100,5 +99,6 @@ class Mesh(Shape):
     def triangles(cls, values: Mapping[str, Any]) -> Triangles:
         """See :class:`Shape`."""
         arrays = (values[name] for name in ("path", "vertices", "faces", "normals", "uvs"))
-        own = {"flat": values["face_normals"], "displacement": values["displacement"], "read": values["mesh"]}
-        return Triangles(*arrays, **own)
+        return Triangles(
+            *arrays, flat=values["face_normals"], displacement=values["displacement"], object=values["mesh"]
+        )
