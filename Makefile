@@ -57,9 +57,9 @@ $(VENV)/run.stamp: pyproject.toml constraints.txt | $(PY)
 	@touch $@
 
 $(VENV)/dev.stamp: $(VENV)/run.stamp
-	$(PIP) -e ".[dev]"
+	$(PIP) -e ".[dev,formats,video,compare]"
 	@touch $@
 
 $(VENV)/bench.stamp: $(VENV)/dev.stamp
-	$(PIP) -e ".[dev,bench]"
+	$(PIP) -e ".[dev,formats,video,compare,bench]"
 	@touch $@

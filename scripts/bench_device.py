@@ -8,7 +8,7 @@ import torch
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 
 
 def main(device: str) -> None:

@@ -371,7 +371,7 @@ def torchpt(name: str, arguments: argparse.Namespace) -> Turn:
     """Turns of torchpt's."""
     from mitsuba_scene import nearest
 
-    from torchpt.render import render_scene
+    from torchpt.rendering import render_scene
 
     scene = nearest(name)
     given = wishes(scene, arguments)

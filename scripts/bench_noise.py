@@ -22,7 +22,7 @@ from torch import Tensor
 import torchpt
 from torchpt.film import RELMSE_FLOOR
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 from torchpt.scene import Scene
 
 FLOOR = {"type": "rectangle", "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"scale": 4}]}

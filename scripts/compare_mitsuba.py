@@ -21,7 +21,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 from torchpt.scene import Scene
 
 BLOCK = 8

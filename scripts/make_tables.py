@@ -3,8 +3,8 @@
     python scripts/make_tables.py            # writes docs/*.md
     python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
 
-A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), or ``common.lights``: what all kinds of
-it have.
+A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), ``common.lights``: what all kinds of
+it have, or ``summary.lights``: a row a kind.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from torchpt.spec import REQUIRED, Spec, parameters_of
+from torchpt.spec import REQUIRED, Color, Index, Scalar, Spec, parameters_of
 
 DOCS = Path(__file__).parents[1] / "docs"
 MARKED = re.compile(r"(<!-- generated: ([\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -27,7 +27,6 @@ TABLES = {
     "materials": ("torchpt.bsdfs", "KINDS"),
     "lights": ("torchpt.lights", "KINDS"),
     "cameras": ("torchpt.cameras", "KINDS"),
-    "samplers": ("torchpt.samplers", "KINDS"),
     "filters": ("torchpt.film", "FILTERS"),
     "integrators": ("torchpt.integrators", "KINDS"),
     "shapes": ("torchpt.shapes", "KINDS"),
@@ -64,9 +63,29 @@ def shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def accepted(spec: Spec) -> str:
+    """What a parameter accepts, in few words."""
+    if isinstance(spec, Index):
+        words = "an index, or a medium's name"
+    elif isinstance(spec, Color | Scalar) and not spec.words:
+        words = spec.accepted.replace("[r, g, b] or one number, each finite", "a colour").replace(
+            "a finite number", "a number"
+        )
+        words = words.replace("colour and", "colour")
+    else:
+        words = spec.words or spec.accepted
+    if len(words) > LONGEST:
+        words = words[: words.rfind(",", 0, LONGEST)] + ", ..."
+    return words + (", or a texture" if spec.texture else "")
+
+
+#: Characters of a cell that lists what is accepted.
+LONGEST = 110
+
+
 def row(key: str, spec: Spec) -> str:
     """One parameter."""
-    cells = (f"`{key}`", shown(spec.default), spec.expected, spec.doc)
+    cells = (f"`{key}`", shown(spec.default), accepted(spec), spec.doc)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
@@ -78,9 +97,30 @@ def rows(specs: Mapping[str, Spec]) -> str:
     return HEAD + "".join(row(key, spec) + "\n" for key, spec in specs.items())
 
 
+def about(kind: Any) -> str:
+    """The first paragraph of a kind's docstring, as Markdown."""
+    return " ".join((kind.__doc__ or "").strip().split("\n\n")[0].split()).replace("``", "`")
+
+
+def summary(table: Mapping[str, Any]) -> str:
+    """A row a kind: its keys with their defaults."""
+    shared, lines = common(table), []
+    for name in table:
+        own = {key: spec for key, spec in parameters_of(table[name]).items() if key not in shared}
+        keys = [f"`{key}`{f' {shown(spec.default)}' if _plain(spec) else ''}" for key, spec in own.items()]
+        lines.append(f"| `{name}` | {', '.join(keys) or 'none'} | {about(table[name])} |\n".replace("||", "\\|\\|"))
+    return "| type | keys (default) | what it is |\n|---|---|---|\n" + "".join(lines)
+
+
+def _plain(spec: Spec) -> bool:
+    return spec.default is not REQUIRED and spec.default is not None and not callable(spec.default)
+
+
 def written(name: str) -> str:
     """What stands between the marks of NAME."""
     first, _, second = name.partition(".")
+    if first == "summary":
+        return summary(kinds(second))
     if first == "common":
         return rows(common(kinds(second)))
     if second:
@@ -89,8 +129,7 @@ def written(name: str) -> str:
     table, parts = kinds(first), []
     for kind in table:
         own = {key: spec for key, spec in parameters_of(table[kind]).items() if key not in common(table)}
-        summary = (table[kind].__doc__ or "").strip().split("\n\n")[0].replace("\n", " ")
-        parts.append(f"**`{kind}`**: {' '.join(summary.split())}\n\n{rows(own) if own else ''}")
+        parts.append(f"**`{kind}`**: {about(table[kind])}\n\n{rows(own) if own else ''}")
     return "\n".join(parts)
 
 

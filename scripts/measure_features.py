@@ -6,6 +6,7 @@ Prints a table in Markdown for ``docs/lanes.md``: ``python scripts/measure_featu
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from features import FEATURES, Feature, kernels, with_feature
 import torchpt
 from torchpt.format.description import settings
 from torchpt.integrators.loop.kernels import Kernels
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 
 REPEATS = 15
 
@@ -43,6 +44,7 @@ def _time(scene: torchpt.Scene) -> float:
 
 def main() -> None:
     """Print the table."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     made, scene = kernels(with_feature(None))
     plain, rows = _counts(made, None)[0], _counts(made, None)
     print("| feature | nodes of its files without it | with it | all nodes | rows of a path | tables | ns a sample |")

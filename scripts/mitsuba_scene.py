@@ -36,16 +36,17 @@ from torchpt.format.materials import (
     RoughDielectric,
     RoughPlastic,
 )
-from torchpt.format.schema import Cone, Cube, Instance, Mesh, Shape
 from torchpt.format.textures import TextureInput
-from torchpt.math.vectors import cross, dot
+from torchpt.math.vectors import cross, dot, luminance
 from torchpt.scene import Scene
 from torchpt.scene.assembly import corners_of
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
 from torchpt.scene.texels import images_of
-from torchpt.settings import Film, Filter, PathIntegrator, Settings
-from torchpt.spec.declared import Described
+from torchpt.settings import Film, Settings
+from torchpt.shapes import KINDS as SHAPES
+from torchpt.shapes import Shape
+from torchpt.spec.declared import Described, values_of
 from torchpt.textures import Node, VertexColors
 
 __all__ = [
@@ -111,7 +112,7 @@ def convert(mitsuba: Any, scene: Scene, settings: Settings, folder: Path) -> dic
         NoCounterpartError: a material or camera that Mitsuba cannot express.
     """
     integrator = settings.integrator
-    assert isinstance(integrator, PathIntegrator)
+    assert integrator.name == "path"
     if scene.built.copies:
         raise NoCounterpartError(f"{scene.built.copies[0].name}: instances are not converted")
     out: dict[str, Any] = {
@@ -180,9 +181,7 @@ def sensor(mitsuba: Any, camera: Described) -> dict[str, Any]:
 def comparable(name: str) -> Scene:
     """A scene of ``configs/scene`` without what Mitsuba cannot express, and without meshes that not every machine has."""
     scene = torchpt.load(name, device="cpu")
-    lacking = {
-        shape for shape, value in scene.description.shapes.items() if len(getattr(value, "path", None) or ()) > 1
-    }
+    lacking = {shape for shape, value in scene.description.shapes.items() if len(value.values.get("path") or ()) > 1}
     for part in scene.built.parts:
         try:
             _kind(part)
@@ -245,17 +244,19 @@ class _Nearest:
         self.said["camera"] = f"an aperture of {blades} blades is round"
         return replace(camera, values={**camera.values, "blades": 0})
 
-    def shape(self, name: str, shape: Shape, shapes: Mapping[str, Shape]) -> Shape:
+    def shape(self, name: str, shape: Described, shapes: Mapping[str, Described]) -> Described:
         """A mesh for a cone, and for an instance."""
-        if isinstance(shape, Cone):
+        if shape.name == "cone":
             self.said[name] = f"cone is a mesh of {SIDES} sides with smooth normals"
             shape = _cone(shape)
-        elif isinstance(shape, Instance) and isinstance(mesh := shapes.get(shape.of), Mesh | Cube):
-            self.said[name] = f"instance is a copy of {shape.of}"
-            own = {"transform": shape.transform, "flip_normals": shape.flip_normals, "emission": None}
-            shape = mesh.model_copy(update={**own, "material": shape.material or mesh.material})
-        if isinstance(shape.material, Material):
-            shape = shape.model_copy(update={"material": self.material(f"{name}.material", shape.material)})
+        elif shape.name == "instance" and (mesh := shapes.get(shape["of"])) is not None and mesh.kind.meshed:
+            self.said[name] = f"instance is a copy of {shape['of']}"
+            own = {"transform": shape["transform"], "flip_normals": shape["flip_normals"], "emission": None}
+            material = shape["material"] or mesh["material"]
+            shape = replace(mesh, values={**mesh.values, **own, "material": material})
+        if isinstance(shape["material"], Material):
+            material = self.material(f"{name}.material", shape["material"])
+            shape = replace(shape, values={**shape.values, "material": material})
         return shape
 
     def material(self, name: str, material: Material) -> Material:
@@ -319,7 +320,7 @@ def _numbers(name: str, value: Any) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-def _cone(cone: Cone) -> Mesh:
+def _cone(cone: Described) -> Described:
     """A mesh in place of a cone: its side with the cone's own normals, and its base."""
     angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
     none, one = np.zeros(SIDES), np.ones(SIDES)
@@ -329,17 +330,18 @@ def _cone(cone: Cone) -> Mesh:
     here = np.arange(SIDES)
     after = (here + 1) % SIDES
     points, normals, faces = [ring, tips], slanted, [np.stack((here, after, here + SIDES))]
-    if cone.capped:  # by corners that face down, around a centre
+    if cone["capped"]:  # by corners that face down, around a centre
         points, normals = [*points, ring, np.zeros((3, 1))], [*normals, -tips, -tips[:, :1]]
         faces.append(np.stack((after + 2 * SIDES, here + 2 * SIDES, np.full(SIDES, 3 * SIDES))))
-    own = cone.own()
+    own = cone.kind.own(cone.values)
     across = np.linalg.inv(own[:3, :3]).T @ np.concatenate(normals, 1)
-    mesh = Mesh(
-        vertices=(own[:3, :3] @ np.concatenate(points, 1) + own[:3, 3:]).T,
-        normals=(across / np.linalg.norm(across, axis=0)).T,
-        faces=np.concatenate(faces, 1).T,
-    )
-    return mesh.model_copy(update={key: getattr(cone, key) for key in Shape.model_fields})
+    mesh = {
+        "vertices": (own[:3, :3] @ np.concatenate(points, 1) + own[:3, 3:]).T,
+        "normals": (across / np.linalg.norm(across, axis=0)).T,
+        "faces": np.concatenate(faces, 1).T,
+    }
+    made = values_of(SHAPES["mesh"], mesh, "", None)
+    return replace(made, values=made.values | {key: cone[key] for key in Shape.parameters})
 
 
 def _film(film: Film) -> dict[str, Any]:
@@ -360,9 +362,10 @@ def _crop(film: Film) -> dict[str, int]:
     return dict(zip(("crop_offset_x", "crop_offset_y", "crop_width", "crop_height"), film.crop, strict=True))
 
 
-def _rfilter(filter: Filter) -> dict[str, Any]:
+def _rfilter(filter: Any) -> dict[str, Any]:
     # Mitsuba's gaussian has no radius of its own: it is four deviations, as ours is where none is given.
-    return {key: value for key, value in filter.model_dump().items() if key != "radius" or filter.type == "tent"}
+    own = {key: value for key, value in filter.values.items() if key != "radius" or filter.name == "tent"}
+    return {"type": filter.name, **own}
 
 
 def _transform(mitsuba: Any, matrix: np.ndarray) -> Any:
@@ -411,8 +414,7 @@ def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
         image = image[..., :3] if image.shape[2] >= 3 else image[..., :1].expand(-1, -1, 3)
         image = image * torch.tensor(node.scale)
     else:
-        weights = torch.tensor([0.212671, 0.715160, 0.072169])
-        channel = image[..., node.channel] if node.channel >= 0 else image[..., :3] @ weights
+        channel = image[..., node.channel] if node.channel >= 0 else luminance(image.movedim(-1, 0))
         image = channel[..., None] * node.scale[0]
     return {
         "type": "bitmap",

@@ -14,7 +14,7 @@ from trials import chi_square_p, z_limit
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 from torchpt.scene import Scene
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"

@@ -6,8 +6,6 @@ so ``import torchpt`` itself is quick.
 
 from __future__ import annotations
 
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from torchpt.errors import (
@@ -24,9 +22,10 @@ from torchpt.errors import (
 if TYPE_CHECKING:
     from torchpt import ibl
     from torchpt.bsdfs import Bsdf
-    from torchpt.images import read_image, read_layers, write_image
-    from torchpt.render import render
+    from torchpt.images import metrics, read_image, read_layers, write_image
+    from torchpt.rendering import render
     from torchpt.scene import Scene, load
+    from torchpt.scene.from_trimesh import from_trimesh
 
 __version__ = "0.1.0"
 __all__ = [
@@ -40,8 +39,10 @@ __all__ = [
     "Scene",
     "SceneError",
     "TorchptError",
+    "from_trimesh",
     "ibl",
     "load",
+    "metrics",
     "read_image",
     "read_layers",
     "render",
@@ -52,19 +53,23 @@ __all__ = [
 _LAZY = {
     "Bsdf": "torchpt.bsdfs",
     "Scene": "torchpt.scene",
+    "from_trimesh": "torchpt.scene.from_trimesh",
     "load": "torchpt.scene",
     "read_image": "torchpt.images",
     "read_layers": "torchpt.images",
-    "render": "torchpt.render",
+    "render": "torchpt.rendering",
     "write_image": "torchpt.images",
 }
+
+#: Public modules.
+_MODULES = {"ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics"}
 
 
 def __getattr__(name: str) -> Any:
     from importlib import import_module
 
-    if name == "ibl":
-        return import_module("torchpt.ibl")
+    if name in _MODULES:
+        return import_module(_MODULES[name])
     if name not in _LAZY:
         raise AttributeError(f"module 'torchpt' has no attribute {name!r}")
     value = getattr(import_module(_LAZY[name]), name)
@@ -74,15 +79,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-class _Package(ModuleType):
-    """Keeps ``torchpt.render`` the function: importing the module of that name would bind the module over it."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name == "render" and isinstance(value, ModuleType):
-            value = value.render
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

@@ -1,16 +1,26 @@
-"""How gradients are taken: an argument of ``render``, not another integrator."""
+"""How gradients are taken: an argument of ``render``, not another integrator; and what of a render they go through."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-__all__ = ["KINDS", "Chunk"]
+from torchpt.forward import BYTES_PER_LANE, chunks_of, lanes_for, limited_threads, make_wave, rebound
+from torchpt.forward.schedule import Span
+from torchpt.scene import Scene
+from torchpt.settings import Settings
+from torchpt.spec import Moves
+
+__all__ = ["KINDS", "Chunk", "attached", "casts", "chunks"]
+
+#: Vertices of a path that memory is planned for where its depth is without end.
+LONGEST = 64
 
 
 @dataclass(frozen=True)
@@ -75,3 +85,50 @@ def autograd(forward: Forward, chunks: Chunks, tensors: tuple[Tensor, ...], held
 
 
 KINDS = {"autograd": autograd}
+
+
+def attached(scene: Scene, names: Iterable[str]) -> bool:
+    """Whether any of the parameters moves surfaces or the camera, or bends rays that a delta lobe sends on."""
+    owners = [*scene.built.parts, *scene.built.copies]
+    bending = {name for owner in owners for material in owner.material.all() for name in material.bending()}
+
+    def moves(name: str) -> bool:
+        # A texture's numbers are called after it.
+        return scene.spec(name).moves is Moves.SURFACES or bool({name, name.rpartition(".")[0]} & bending)
+
+    return any(map(moves, names))
+
+
+def casts(scene: Scene, names: Iterable[str]) -> bool:
+    """Whether any of the parameters moves shadow edges."""
+    return any(scene.spec(name).moves is Moves.SHADOWS for name in names)
+
+
+def chunks(
+    scene: Scene,
+    settings: Settings,
+    params: Mapping[str, Tensor],
+    wanted: tuple[str, ...],
+    dtype: torch.dtype,
+    attached: bool,
+) -> Iterator[Chunk]:
+    """Chunks of pixels as differentiable functions of the tensors ``wanted``, for the backward pass."""
+    plain = {name: value.detach() for name, value in params.items()}
+    with torch.no_grad():
+        still = make_wave(scene, settings, plain, dtype, True, attached)
+    depth = still.integrator.limits.max_depth
+    lanes = lanes_for(settings, scene.device, BYTES_PER_LANE * max(depth if 0 <= depth < LONGEST else LONGEST, 1))
+    pixels = still.crop[2] * still.crop[3]
+    clamp = settings.integrator.clamp
+
+    def radiance(span: Span, *tensors: Tensor) -> Tensor:
+        given = {**plain, **dict(zip(wanted, tensors, strict=True))}
+        values, _ = rebound(still, scene, settings, given).radiance(*span)
+        values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
+        if clamp is not None:
+            values = values * (clamp / values.detach().abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
+        return values.sum(1) / settings.render.spp
+
+    with limited_threads(settings.render.threads):  # while whoever asked for the chunks differentiates them
+        for first, count, sample, samples, _ in chunks_of(settings, lanes, still.sampler.randomizations, pixels):
+            yield Chunk(first, count, partial(radiance, (first, count, sample, samples)))

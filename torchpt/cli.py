@@ -12,7 +12,6 @@ import os
 import re
 import sys
 import tempfile
-import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,9 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpt import __version__
-from torchpt.commands import collector
+from torchpt.commands import collector, keys
 from torchpt.commands.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.commands.interrupt import Interrupt, Interrupted
+from torchpt.commands.orbit import HELP as HELP_ORBIT
 from torchpt.commands.plain_words import compose_plainly
 from torchpt.errors import TorchptError
 
@@ -37,6 +37,7 @@ HELP = """\
 torchpt: a wavefront path tracer that is a PyTorch program
 
   torchpt render scene=cornell_box render.spp=64 out=cornell.exr    render a picture
+  torchpt orbit  scene=cornell_box frames=48 out=turn.gif           turn the camera about it: .gif, .mp4
   torchpt info   scene=cornell_box                                  what the scene holds, what was built, what left out
 
 torchpt COMMAND --help says more. Scenes that ship:
@@ -87,10 +88,11 @@ def main(argv: list[str] | None = None) -> int:
         try:
             arguments = parse(argv)
             if arguments.help:
-                print(_help(HELP_RENDER if arguments.command == "render" else HELP_INFO), end="")
+                print(_help({"render": HELP_RENDER, "orbit": HELP_ORBIT, "info": HELP_INFO}[arguments.command]), end="")
                 return 0
             if not arguments.scenes and not arguments.only_shows:
-                raise UsageError(f"scene: expected scene=NAME or scene=FILE.yaml; scenes that ship: {_scenes()}")
+                ship = ", ".join(keys.options("scene"))
+                raise UsageError(f"scene: expected scene=NAME or scene=FILE.yaml; scenes that ship: {ship}")
             return _compose_and_run(arguments, interrupt)
         except TorchptError as error:
             return _refuse(str(error))
@@ -114,6 +116,7 @@ class _Task:
     outs: list[str]
     paths: dict[str, str | None]
     json: bool
+    turn: dict[str, str]
 
     def __call__(self, cfg: DictConfig) -> int:
         """Do one job. Ends the process (of this job) where it does not end well."""
@@ -129,11 +132,14 @@ class _Task:
     def _ended(self, make_job: Callable[[], Job]) -> int:
         """Make and do a job; returns the exit code."""
         from torchpt.commands.info import info
+        from torchpt.commands.orbit import Turn, orbit
         from torchpt.commands.render import render
 
         with Interrupt() as interrupt:
             try:
                 job = make_job()
+                if self.command == "orbit":
+                    return orbit(job, Turn.read(self.turn), interrupt)
                 return info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
             except TorchptError as error:
                 return _refuse(str(error))
@@ -177,7 +183,7 @@ def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, An
     given: dict[str, dict[str, Any]] = {}
     for group, block in composed.items():
         if group not in GROUPS:
-            raise UsageError(_unknown(str(group)))
+            raise UsageError(keys.unknown(str(group)))
         if block is None:
             continue
         if not isinstance(block, dict):
@@ -207,7 +213,7 @@ def _refuse_targets(value: Any, where: str) -> None:
 
 def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
     """Compose plain words here and hand all others over to Hydra; returns the exit code."""
-    task = _Task(arguments.command, arguments.scenes, arguments.outs, arguments.paths, arguments.json)
+    task = _Task(arguments.command, arguments.scenes, arguments.outs, arguments.paths, arguments.json, arguments.turn)
     if not arguments.options and not arguments.multirun:
         composed = compose_plainly(arguments.overrides, _configs())
         if composed is not None:
@@ -228,7 +234,7 @@ def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
             except Exception as error:
                 if _came_from_job(error):
                     raise
-                raise UsageError(_one_line(error)) from error
+                raise UsageError(_one_line(error, arguments.overrides)) from error
             finally:
                 GlobalHydra.instance().clear()
     interrupt.check()
@@ -286,14 +292,14 @@ def _came_from_job(error: BaseException) -> bool:
     return False
 
 
-def _one_line(error: Exception) -> str:
+def _one_line(error: Exception, words: list[str]) -> str:
     """Hydra's and OmegaConf's errors, shortened to what was given and what is accepted."""
     text = str(error)
     if match := re.search(r"Could not override '([^']+)'", text):
-        return _unknown(match[1])
+        return keys.unknown(match[1], words)
     if match := re.search(r"Could not (?:find|load) '(.+?)/([^/']+)'", text):
         group, name = match[1], match[2]
-        options = re.findall(r"^\t([\w-]+)$", text, re.MULTILINE) or _options(group)
+        options = re.findall(r"^\t([\w-]+)$", text, re.MULTILINE) or keys.options(group)
         return f"{group}: expected one of {', '.join(options)}, got {name!r}"
     if match := re.search(r"Ambiguous value for argument '(\w.*?)=(.*)'", text):
         return f"{match[1]}: expected one value or a list [..,..], got {match[2]!r} (--multirun sweeps over several)"
@@ -309,48 +315,11 @@ def _first_line(error: object) -> str:
     return "; ".join(kept[:3])
 
 
-def _unknown(key: str) -> str:
-    """The line for a key that does not exist."""
-    import difflib
-
-    known = _known_keys()
-    group = key.split(".")[0]
-    if group in known:
-        return f"{key}: unknown key; known: {', '.join(f'{group}.{name}' for name in known[group])}"
-    every = [f"{group}.{name}" for group, names in known.items() for name in names]
-    same = [name for name in every if name.endswith(f".{key}")]
-    near = same or difflib.get_close_matches(key, [*every, *GROUPS, "scene", "out"], 1)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    return f"{key}: unknown key; known: scene, out, {', '.join(f'{name}.*' for name in GROUPS)}{hint}"
-
-
-def _known_keys() -> dict[str, list[str]]:
-    """Group to its keys, nested ones dotted, from the files in configs/."""
-    import yaml
-
-    known: dict[str, list[str]] = {}
-    for group in GROUPS:
-        block = yaml.safe_load((_configs() / group / "default.yaml").read_text())
-        nested = {key: value if isinstance(value, dict) else {"": None} for key, value in block.items()}
-        known[group] = [f"{key}.{name}" if name else key for key, names in nested.items() for name in names]
-    return known
-
-
-def _options(group: str) -> list[str]:
-    return sorted(path.stem for path in (_configs() / group).glob("*.yaml"))
-
-
 def _configs() -> Path:
     from torchpt.paths import configs
 
     return configs()
 
 
-def _scenes() -> str:
-    return ", ".join(_options("scene"))
-
-
 def _help(text: str) -> str:
-    keys = "\n  ".join(f"{group + '.':12}{' '.join(names)}" for group, names in _known_keys().items())
-    scenes = textwrap.fill(_scenes(), 110, initial_indent=" " * 11, subsequent_indent=" " * 11, break_on_hyphens=False)
-    return text.format(scenes=scenes, keys=keys)
+    return text.format(scenes=keys.scenes(), keys=keys.listed().replace("\n", "\n  "))

@@ -16,15 +16,12 @@ if TYPE_CHECKING:
 
     from torchpt.bsdfs import Bsdf, Parameters
     from torchpt.lights.choice import ByTree
-    from torchpt.lights.kinds.envmap import EnvironmentMap
     from torchpt.math.distributions import Discrete
     from torchpt.textures import Atlas, MaterialTextures, OpacityMaps
 
 __all__ = [
-    "DISTANT",
     "KINDS",
     "QUADRICS",
-    "SOURCES",
     "BsdfSample",
     "Copies",
     "Geometry",
@@ -38,6 +35,7 @@ __all__ = [
     "PathState",
     "Quadrics",
     "Shadow",
+    "SplitSumMaterial",
     "World",
     "joined",
     "rows",
@@ -46,10 +44,6 @@ __all__ = [
 
 #: Primitive kinds in the order in which a :class:`Geometry` stores them.
 KINDS = ("triangle", "rectangle", "disk", "sphere", "quadric")
-#: Lights that are no surfaces, in the order of their rows: those somewhere, then those infinitely far.
-SOURCES = ("point", "spot", "directional", "constant", "envmap")
-#: Those infinitely far.
-DISTANT = ("directional", "constant", "envmap")
 #: Surfaces of a quadric in its own space, in the order of their codes (:mod:`torchpt.shapes.quadrics`).
 QUADRICS = ("ellipsoid", "cylinder", "cone")
 
@@ -120,24 +114,24 @@ class Copies:
 
 @dataclass(frozen=True)
 class Lights:
-    """The emitters: a row for each emissive primitive, then one for each light of :data:`SOURCES`, in that order.
+    """The emitters: a row for each emissive primitive, then one for each other light, sorted as ``lights.order`` says.
 
-    Columns are a primitive's own; what the others put there is said in their files in :mod:`torchpt.lights`.
+    Columns are a primitive's own; what the others put there is said in their files in :mod:`torchpt.lights.kinds`.
     """
 
     choice: Discrete | ByTree | None  # over the rows; None where there is but one
-    kinds: tuple[str, ...]  # kinds among the rows, of KINDS and SOURCES in their order
+    kinds: tuple[str, ...]  # kinds among the rows, in their order: of KINDS, then lights
     kind: Tensor | None  # (K,) index into `kinds`; None where there is but one
     p0: Tensor  # (3, K)
     e1: Tensor  # (3, K)
     e2: Tensor  # (3, K)
     normal: Tensor  # (3, K) unit, the side that emits
     flip: Tensor  # (K,) -1 where a sphere emits inward
-    area: Tensor  # (K,); of a quadric its own space's area times |det|, see torchpt.lights.quadric
+    area: Tensor  # (K,); of a quadric its own space's area times |det|, see torchpt.lights.surfaces.quadric
     bound: Tensor  # (K,) see LaneGeometry.bound
     radiance: Tensor  # (3, K); of a point or spot its intensity, of a directional light its irradiance
     opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
-    environment: Tensor | EnvironmentMap | None  # what comes from outside: one radiance (3,), or a map
+    environment: Any  # what comes from outside, as the class of the last row made it; None where nothing does
     row_of_prim: Tensor | None  # (P + I,) int64, -1 where a primitive does not emit; None where none does
     quadric: (
         Tensor | None
@@ -264,6 +258,29 @@ class BsdfSample:
     pdf: Tensor  # (N,) in solid angle; 0 where the draw failed, inf where the lobe is a delta
     weight: Tensor  # (3, N) = eval / pdf
     eta: Tensor | None = None  # (N,) index of the side of wi over that of wo, 1 for reflection; None: never refracts
+
+
+@dataclass(frozen=True)
+class SplitSumMaterial:
+    """What split-sum shading knows of surfaces, see :mod:`torchpt.ibl`.
+
+    Attributes:
+        diffuse: colour of the diffuse part ``(3, N)``: base colour by ``1 - metallic``.
+        f0: reflectance of the mirror at normal incidence, ``(3, N)`` or ``(N,)``.
+        f90: at grazing incidence, likewise.
+        roughness: ``(N,)`` from 0 to 1.
+        over: F0 of the mirror over the diffuse part, whose light is missing there, as ``f0``; None where the two are added.
+        through: colour of what is not mirrored but passes ``(3, N)``; None where nothing does. It needs ``over``.
+        eta: index of refraction ``(N,)`` of what lies below; None: light passes straight on.
+    """
+
+    diffuse: Tensor
+    f0: Tensor
+    f90: Tensor
+    roughness: Tensor
+    over: Tensor | None
+    through: Tensor | None = None
+    eta: Tensor | None = None
 
 
 @dataclass(frozen=True)

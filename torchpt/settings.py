@@ -4,107 +4,50 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
-
-from pydantic import model_validator
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from torchpt.errors import SceneError
-from torchpt.samplers import KINDS
-from torchpt.spec import not_built
-from torchpt.spec.fields import Check, Flag, choice, integer, memory_size, number_field, wrong
-from torchpt.spec.validate import Model, check_keys, construct, dotted, refuse_foreign, refuse_not_built, select
+from torchpt.film import FILTERS
+from torchpt.integrators import KINDS as INTEGRATORS
+from torchpt.integrators import LAYERS
+from torchpt.integrators.base import Integrator
+from torchpt.samplers import KINDS as SAMPLERS
+from torchpt.spec import Choice, Other, Refused, Scalar, Valued, Whole, not_built, parameters_of, reading
+from torchpt.spec.declared import Described, described, refuse_foreign, values_of
+from torchpt.spec.validate import check_keys, dotted, refuse_not_built
 
-__all__ = [
-    "AOVS", "BLOCKS", "AovIntegrator", "BoxFilter", "DirectIntegrator", "Film", "Filter", "GaussianFilter",
-    "IblIntegrator", "Integrator", "MitchellFilter", "PathIntegrator", "Render", "Sampler", "Settings", "TentFilter", "merge",
-]  # fmt: skip
+__all__ = ["BLOCKS", "FILTERS", "INTEGRATORS", "SAMPLERS", "TYPED", "Film", "Render", "Settings", "merge"]
 
-AOVS = ("albedo", "normal", "depth", "position", "uv", "object_id", "variance")
 BLOCKS = ("film", "integrator", "sampler", "render")
 MAX_SIDE = 65_536
 MAX_PIXELS = 2**28
 
-Positive = Annotated[float, number_field("a number > 0", lambda x: x > 0)]
-Share = Annotated[float, number_field("a number in 0..1", lambda x: 0 <= x <= 1)]
-Clamp = Annotated[float | None, number_field("null or a number > 0", lambda x: x > 0, optional=True)]
-Survival = Annotated[
-    float | None, number_field("null or a number, 0 < rr_prob <= 1", lambda x: 0 < x <= 1, optional=True)
-]
 
-LightChoice = Annotated[str, choice("auto", "uniform", "power", "tree")]
-
-
-class BoxFilter(Model):
-    """The pixel's own square (radius 0.5 pixels)."""
-
-    type: Literal["box"] = "box"
-
-    @property
-    def radius(self) -> float:
-        """Half the width in pixels."""
-        return 0.5
+#: What has a type: the kinds it may be of, and the one it is of where nothing is said.
+TYPED: dict[str, tuple[Mapping[str, Any], str]] = {
+    "integrator": (INTEGRATORS, "path"),
+    "sampler": (SAMPLERS, "sobol"),
+    "filter": (FILTERS, "gaussian"),
+}
 
 
-class TentFilter(Model):
-    """A triangle that falls to zero at ``radius`` pixels, as Mitsuba's."""
-
-    type: Literal["tent"] = "tent"
-    radius: Positive = 1.0
-
-
-class MitchellFilter(Model):
-    """Mitchell and Netravali's cubic, two pixels wide, with Mitsuba's names; its lobes are negative where ``C`` > 0."""
-
-    type: Literal["mitchell"] = "mitchell"
-    B: Share = 1 / 3
-    C: Share = 1 / 3
-
-    @property
-    def radius(self) -> float:
-        """Half the width in pixels."""
-        return 2.0
-
-
-class GaussianFilter(Model):
-    """A truncated gaussian, as Mitsuba's: ``exp(-x^2 / 2 stddev^2)`` minus its value at ``radius``, in pixels."""
-
-    type: Literal["gaussian"] = "gaussian"
-    stddev: Positive = 0.5
-    radius: Positive = 2.0
-
-    @model_validator(mode="before")
-    @classmethod
-    def _default_radius(cls, raw: Any) -> Any:
-        stddev = raw.get("stddev", 0.5)
-        if raw.get("radius") is None and isinstance(stddev, int | float):
-            return {**raw, "radius": 4.0 * stddev}
-        return raw
-
-
-Filter = BoxFilter | TentFilter | GaussianFilter | MitchellFilter
-FILTERS: dict[str, type[Any]] = {
-    "gaussian": GaussianFilter, "box": BoxFilter, "tent": TentFilter, "mitchell": MitchellFilter,
-}  # fmt: skip
-
-
-def _crop(value: Any) -> tuple[int, int, int, int] | None:
-    if value is None:
-        return None
+def _crop(value: Any) -> tuple[int, int, int, int]:
     if not isinstance(value, list | tuple) or len(value) != 4 or not all(type(x) is int for x in value):
-        raise wrong("[x, y, width, height], whole numbers of pixels")
+        raise Refused("[x, y, width, height], whole numbers of pixels")
     x, y, width, height = value
     if x < 0 or y < 0 or width < 1 or height < 1:
-        raise wrong("[x, y, width, height] with x, y >= 0 and width, height >= 1")
+        raise Refused("[x, y, width, height] with x, y >= 0 and width, height >= 1")
     return x, y, width, height
 
 
 def _aovs(value: Any) -> tuple[str, ...]:
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list | tuple):
-        raise wrong(f"a list of {', '.join(AOVS)}")
+        raise Refused(f"a list of {', '.join(LAYERS)}")
     for index, name in enumerate(names):
-        if name not in AOVS or name in names[:index]:
-            raise wrong(f"a list of different ones of {', '.join(AOVS)}", name, (index,))
+        if not isinstance(name, str) or name not in LAYERS or name in names[:index]:
+            raise Refused(f"a list of different ones of {', '.join(LAYERS)}", name, (index,))
     return tuple(names)
 
 
@@ -112,196 +55,151 @@ def _gamma(value: Any) -> float | str:
     if value == "srgb":
         return "srgb"
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 100:
-        raise wrong("srgb or an exponent > 0 such as 0.4545")
+        raise Refused("srgb or an exponent > 0 such as 0.4545")
     return float(value)
 
 
-def _filter(value: Any) -> Any:
-    if isinstance(value, Filter):
-        return value
-    raise wrong("a filter")
+class Film(Valued):
+    """The picture: its size in pixels, its reconstruction filter, and how 8-bit files show it."""
 
+    parameters: ClassVar = {
+        "width": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
+        "height": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
+        "filter": Other(lambda _: _typed("filter", {}, "film.filter"), doc="a type, or a mapping"),
+        "crop": Other(
+            None,
+            reader=_crop,
+            words="[x, y, width, height]",
+            doc="the part that is rendered, in pixels",
+        ),
+        "aovs": Other(
+            (),
+            reader=_aovs,
+            words=f"a list of {', '.join(LAYERS)}",
+            doc="layers, kept by .exr",
+        ),
+        "exposure": Scalar(0.0, low=-64, high=64, words="a number of stops in -64..64", doc="of 8-bit files"),
+        "tonemap": Choice("none", names=("none", "filmic", "aces", "reinhard"), doc="of 8-bit files"),
+        "gamma": Other(
+            "srgb",
+            reader=_gamma,
+            words="srgb or an exponent > 0",
+            doc="of 8-bit files: out = in^gamma",
+        ),
+    }
 
-class Film(Model):
-    """The picture: its size in pixels, its reconstruction filter, and how 8-bit files show it.
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Valued`."""
+        wide, high, crop = values["width"], values["height"], values["crop"]
+        if wide * high > MAX_PIXELS:
+            raise Refused(f"a film of at most {MAX_PIXELS} pixels", [wide, high], ("width",))
+        if crop is not None and (crop[0] + crop[2] > wide or crop[1] + crop[3] > high):
+            raise Refused(f"a crop inside the film of {wide} x {high} pixels", list(crop), ("crop",))
 
-    Attributes:
-        crop: ``(x, y, width, height)`` in pixels, or None for the whole film.
-        aovs: extra layers.
-        exposure: stops, for the 8-bit formats.
-        gamma: ``srgb`` or the exponent itself (``out = in ** gamma``).
-    """
-
-    width: Annotated[int, integer(1, MAX_SIDE)] = 512
-    height: Annotated[int, integer(1, MAX_SIDE)] = 512
-    filter: Annotated[Filter, Check(_filter)] = GaussianFilter()
-    crop: Annotated[tuple[int, int, int, int] | None, Check(_crop)] = None
-    aovs: Annotated[tuple[str, ...], Check(_aovs)] = ()
-    exposure: Annotated[float, number_field("a number of stops in -64..64", lambda x: abs(x) <= 64)] = 0.0
-    tonemap: Annotated[str, choice("none", "filmic", "aces", "reinhard")] = "none"
-    gamma: Annotated[float | str, Check(_gamma)] = "srgb"
-
-    @model_validator(mode="after")
-    def _sizes(self) -> Film:
-        if self.width * self.height > MAX_PIXELS:
-            raise wrong(f"a film of at most {MAX_PIXELS} pixels", [self.width, self.height], ("width",))
-        if self.crop is not None:
-            x, y, width, height = self.crop
-            if x + width > self.width or y + height > self.height:
-                raise wrong(
-                    f"a crop inside the film of {self.width} x {self.height} pixels", list(self.crop), ("crop",)
-                )
-        return self
-
-
-class PathIntegrator(Model):
-    """Unidirectional path tracing.
-
-    Attributes:
-        max_depth: longest path in edges: 1 sees emission only, 2 adds direct light; -1 ends by roulette alone.
-        rr_depth: the depth from which Russian roulette may end a path.
-        rr_prob: a constant survival probability, or None (by throughput).
-        strategy: how light is found: mis, bsdf, light, uniform (hemisphere).
-        light_choice: which light is sampled: all alike (uniform), by power, by the light tree, or as many lights ask (auto).
-        clamp: largest contribution of a sample, or None.
-        strict: whether a sample that is not finite is an error.
-    """
-
-    type: Literal["path"] = "path"
-    max_depth: Annotated[int, integer(-1, 2**31 - 1)] = 16
-    rr_depth: Annotated[int, integer(1, 2**31 - 1)] = 5
-    rr_prob: Survival = None
-    strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
-    light_choice: LightChoice = "auto"
-    clamp: Clamp = None
-    strict: Flag = False
-
-    @model_validator(mode="after")
-    def _ends(self) -> PathIntegrator:
-        if self.max_depth == -1 and self.rr_prob == 1.0:
-            raise wrong("a survival probability below 1 where max_depth is -1 (paths would not end)", 1.0, ("rr_prob",))
-        return self
-
-
-class DirectIntegrator(Model):
-    """Emission and direct light only; the keys are those of :class:`PathIntegrator`."""
-
-    type: Literal["direct"] = "direct"
-    strategy: Annotated[str, choice("mis", "bsdf", "light", "uniform")] = "mis"
-    light_choice: LightChoice = "auto"
-    clamp: Clamp = None
-    strict: Flag = False
-
-
-class AovIntegrator(Model):
-    """The layers of ``film.aovs`` without any light transport."""
-
-    type: Literal["aov"] = "aov"
-
-
-class IblIntegrator(Model):
-    """A preview: the first surface under the environment by split sum, unshadowed, and other lights with their shadows."""
-
-    type: Literal["ibl"] = "ibl"
-    light_choice: LightChoice = "auto"
-    clamp: Clamp = None
-    strict: Flag = False
-
-
-Integrator = PathIntegrator | DirectIntegrator | AovIntegrator | IblIntegrator
-INTEGRATORS: dict[str, type[Any]] = {
-    "path": PathIntegrator,
-    "direct": DirectIntegrator,
-    "aov": AovIntegrator,
-    "ibl": IblIntegrator,
-}
-
-
-class Sampler(Model):
-    """Where sample points come from."""
-
-    type: Annotated[str, choice(*KINDS)] = "sobol"
-
-    @property
-    def needs_count(self) -> bool:
-        """Whether ``render.spp`` must be known before the first sample, so that nothing else may end a render."""
-        return KINDS[self.type].needs_count
-
-
-SAMPLERS: dict[str, type[Sampler]] = dict.fromkeys(KINDS, Sampler)
 
 _DEVICE = re.compile(r"(auto|cpu|cuda|cuda:[0-9]{1,3})\Z")
 
 
 def _device(value: Any) -> str:
     if not isinstance(value, str) or not _DEVICE.match(value):
-        raise wrong("auto, cpu, cuda or cuda:N")
+        raise Refused("auto, cpu, cuda or cuda:N")
     return value
 
 
-def _preview(value: Any) -> str | None:
-    if value is None or (isinstance(value, str) and value.strip() and value.isprintable()):
+def _preview(value: Any) -> str:
+    if isinstance(value, str) and value.strip() and value.isprintable():
         return value
-    raise wrong("null or a file path")
+    raise Refused("null or a file path")
 
 
-class Render(Model):
-    """How the work is done; none of it but ``spp`` and ``seed`` changes what the picture converges to.
+class Render(Valued):
+    """How the work is done; none of it but ``spp`` and ``seed`` changes what the picture converges to."""
+
+    parameters: ClassVar = {
+        "spp": Whole(64, low=1, doc="samples a pixel"),
+        "seed": Whole(0, high=2**63 - 1, doc="the same seed gives the same picture"),
+        "device": Other("auto", reader=_device, words="auto, cpu, cuda or cuda:N", doc="auto: CUDA where there is one"),
+        "accel": Choice("auto", names=("auto", "torch", "numba", "brute"), doc="the search structure"),
+        "compile": Choice(
+            "auto",
+            names=("auto", "on", "off"),
+            booleans={True: "on", False: "off"},
+            doc="auto: always on a CPU, on CUDA where it repays",
+        ),
+        "threads": Whole(
+            "auto",
+            low=1,
+            high=1024,
+            also=("auto",),
+            doc="auto: as many as torch uses",
+        ),
+        "max_memory": Other(
+            None,
+            reader=reading.memory_size,
+            words="null, bytes, or a size such as 4GB",
+            doc="of what is traced at once",
+        ),
+        "preview": Other(
+            None,
+            reader=_preview,
+            words="null or a file path",
+            doc="albedo and normal beside it first, then the picture so far after each pass",
+        ),
+    }
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All run settings, complete.
 
     Attributes:
-        max_memory: bytes, or None.
-        preview: a file that shows the picture so far, or None.
+        film: the picture.
+        integrator: what it estimates.
+        sampler: where sample points come from.
+        render: how the work is done.
     """
 
-    spp: Annotated[int, integer(1, 2**31 - 1)] = 64
-    seed: Annotated[int, integer(0, 2**63 - 1)] = 0
-    device: Annotated[str, Check(_device)] = "auto"
-    accel: Annotated[str, choice("auto", "torch", "numba", "brute")] = "auto"
-    compile: Annotated[str, choice("auto", "on", "off", booleans={True: "on", False: "off"})] = "auto"
-    threads: Annotated[int | str, integer(1, 1024, also=("auto",))] = "auto"
-    max_memory: Annotated[int | None, Check(memory_size)] = None
-    preview: Annotated[str | None, Check(_preview)] = None
-
-
-class Settings(Model):
-    """All run settings, complete."""
-
-    film: Film = Film()
-    integrator: Integrator = PathIntegrator()
-    sampler: Sampler = Sampler()
-    render: Render = Render()
+    film: Film
+    integrator: Integrator
+    sampler: Described
+    render: Render
 
     @property
     def light_choice(self) -> str:
         """How a light is chosen; where no light is sampled it does not matter."""
-        return getattr(self.integrator, "light_choice", "auto")
+        return self.integrator.light_choice
+
+    def plain(self) -> dict[str, Any]:
+        """As a scene file would state them."""
+        return {name: _plain(getattr(self, name)) for name in BLOCKS}
 
 
-_TYPED: dict[str, tuple[dict[str, type[Any]], str]] = {
-    "integrator": (INTEGRATORS, "path"),
-    "sampler": (SAMPLERS, "sobol"),
-    "filter": (FILTERS, "gaussian"),
-}
+def _plain(value: Any) -> Any:
+    if not isinstance(value, Valued | Described):
+        return value
+    kind = {"type": value.name} if hasattr(value, "name") else {}
+    return kind | {key: _plain(item) for key, item in value.values.items()}
 
 
 def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
     """The keys of a block that are really set (null means unset); a filter's or block's bare name is its type."""
     if raw is None:
         return {}
-    if isinstance(raw, str) and key.rpartition(".")[2] in _TYPED:
+    if isinstance(raw, str) and key.rpartition(".")[2] in TYPED:
         return {"type": raw}
     if not isinstance(raw, Mapping):
         raise SceneError(key, raw, "a mapping of settings", file)
     return {str(name): value for name, value in raw.items() if value is not None}
 
 
-def _overlay(kind: str, below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def _overlay(what: str, below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """``above`` over ``below``; keys of ``below`` that another type was meant to read do not follow."""
-    table, default = _TYPED[kind]
+    table, default = TYPED[what]
     before, after = below.get("type", default), above.get("type", below.get("type", default))
-    if before != after and after in table:
-        fields = table[after].model_fields
-        below = {name: value for name, value in below.items() if name in fields and name != "type"}
+    if before != after and isinstance(after, str) and after in table:
+        own = parameters_of(table[after])
+        below = {name: value for name, value in below.items() if name in own}
     return {**below, **above}
 
 
@@ -316,10 +214,7 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
     blocks: dict[str, Any] = {}
     for block in BLOCKS:
         below, above = _set(scene.get(block), block, file), _set(overrides.get(block), block, None)
-        if block in _TYPED:
-            raw = _overlay(block, below, above)
-        else:
-            raw = {**below, **above}
+        raw = _overlay(block, below, above) if block in TYPED else {**below, **above}
         if "filter" in raw:
             inner = [_set(part.get("filter"), "film.filter", name) for part, name in ((below, file), (above, None))]
             raw["filter"] = _overlay("filter", *inner)
@@ -330,20 +225,22 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
         except SceneError as error:
             blame = None if _given(overrides, error.key) else file
             raise type(error)(error.key, error.value, error.expected, blame) from None
-    if isinstance(blocks["integrator"], AovIntegrator) and "variance" in blocks["film"].aovs:
-        raise SceneError(
-            "film.aovs", list(blocks["film"].aovs), "no variance where integrator is aov (it carries no light)", file
-        )
-    return Settings.model_construct(**blocks)
+    settings = Settings(**blocks)
+    if not settings.integrator.light:
+        for name in settings.film.aovs:
+            if LAYERS[name].light:
+                expected = f"no {name} where integrator is {settings.integrator.name} (it carries no light)"
+                raise SceneError("film.aovs", list(settings.film.aovs), expected, file)
+    return settings
 
 
-def _open_end(raw: Mapping[str, Any], sampler: Sampler) -> None:
+def _open_end(raw: Mapping[str, Any], sampler: Described) -> None:
     """Raises where something else than ``spp`` is to end a render whose points depend on their number."""
     for name in ("time_limit", "target_error"):
-        if sampler.needs_count and raw.get(name) is not None:
-            free = ", ".join(name for name, kind in KINDS.items() if not kind.needs_count)
+        if sampler.kind.needs_count and raw.get(name) is not None:
+            free = ", ".join(kind for kind in SAMPLERS if not SAMPLERS[kind].needs_count)
             expected = (
-                f"null where sampler is {sampler.type}, whose points depend on how many there are (free of it: {free})"
+                f"null where sampler is {sampler.name}, whose points depend on how many there are (free of it: {free})"
             )
             raise SceneError(dotted("render", name), raw[name], expected)
 
@@ -358,17 +255,21 @@ def _given(overrides: Mapping[str, Any], key: str) -> bool:
     return True
 
 
-def _block(block: str, raw: dict[str, Any]) -> Model:
-    if block in _TYPED:
-        table, default = _TYPED[block]
-        if block == "integrator":
-            refuse_foreign(block, table, raw, default, None)
-        return select(block, table, raw, block, None, default)
+def _block(block: str, raw: dict[str, Any]) -> Any:
+    if block in TYPED:
+        refuse_foreign(block, TYPED[block][0], raw, TYPED[block][1], None)
+        made = _typed(block, raw, block)
+        return made.kind(**made.values) if block == "integrator" else made
     if block == "film":
         if "filter" in raw:
-            raw["filter"] = select("filter", FILTERS, raw["filter"], "film.filter", None, "gaussian")
-        return construct(Film, raw, block, None, "the film")
-    later, what = not_built.KEYS["render"], "the render settings"
-    check_keys({k: v for k, v in raw.items() if k not in later}, Render.model_fields, block, what, None)
-    rest = refuse_not_built(raw, later, block, ", ".join(Render.model_fields), None)
-    return construct(Render, rest, block, None, what)
+            raw["filter"] = _typed("filter", raw["filter"], "film.filter")
+        return Film(**values_of(Film, raw, block, None, "the film").values)
+    later, what, names = not_built.KEYS["render"], "the render settings", list(parameters_of(Render))
+    check_keys({k: v for k, v in raw.items() if k not in later}, names, block, what, None)
+    rest = refuse_not_built(raw, later, block, ", ".join(names), None)
+    return Render(**values_of(Render, rest, block, None, what).values)
+
+
+def _typed(what: str, raw: dict[str, Any], key: str) -> Described:
+    """A thing whose type picks its kind."""
+    return described(what, TYPED[what][0], raw, key, None, TYPED[what][1])

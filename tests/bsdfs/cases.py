@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchpt import bsdfs
 from torchpt.bsdfs import Bsdf, Parameters
+from torchpt.spec import REQUIRED, Color, Scalar, parameters_of
 
 RED = (0.8, 0.5, 0.1)
 WHITE = (1.0, 1.0, 1.0)
@@ -26,7 +27,7 @@ class Case:
     """One material.
 
     Attributes:
-        model: of ``bsdfs.MODELS``.
+        model: of ``bsdfs.variants()``.
         values: what ``prepare`` is given.
         eta: index of the inside over that of the outside, where it refracts.
         lossless: nothing is absorbed or lost between facets: a white furnace shows 1.
@@ -57,7 +58,7 @@ class Case:
     def rows(self, dtype: torch.dtype = torch.float32) -> Parameters:
         """The material as stacked rows of its model."""
         if dtype not in self._rows:
-            self._rows[dtype] = bsdfs.stacked([self.model.prepare(tensors(self.values, dtype))])
+            self._rows[dtype] = bsdfs.stacked([self.model.prepare(tensors(self.values, dtype))], self.model.factors)
         return self._rows[dtype]
 
     @cached_property
@@ -425,9 +426,41 @@ def _null(model: Bsdf) -> Iterator[Case]:
     yield Case(model, {}, smooth=True, lossless=True, label="nothing")
 
 
+def _numbers(model: Bsdf) -> dict[str, Scalar | Color]:
+    """Parameters of a model's own that a material without further keys gives it, or has to."""
+    specs = {key: spec for key, spec in parameters_of(model).items() if key not in Bsdf.parameters}
+    return {key: s for key, s in specs.items() if isinstance(s, Scalar | Color) and s.traced and s.default is not None}
+
+
+def _between(spec: Scalar | Color, share: float) -> Any:
+    """A value so far from the least to the greatest that a spec accepts."""
+    low, high = (0.0 if spec.low is None else spec.low), (1.0 if spec.high is None else spec.high)
+    number = low + share * (high - low)
+    return (number, 0.5 * (low + number), number) if spec.coloured else number
+
+
+def _by_specs(model: Bsdf) -> Iterator[Case]:
+    """What stands in for a row of :data:`BUILDERS`: a model's defaults, and places in the ranges that it declares."""
+    specs = _numbers(model)
+    yield Case(model, {k: _between(s, 0.5) if s.default is REQUIRED else s.default for k, s in specs.items()})
+    for share in (0.2, 0.7):
+        yield Case(model, {key: _between(spec, share) for key, spec in specs.items()})
+
+
+def _edges_by_specs(model: Bsdf) -> Iterator[Case]:
+    """Each parameter at either end of its range, the others half-way; all at one end."""
+    specs = _numbers(model)
+    middle = {key: _between(spec, 0.5) for key, spec in specs.items()}
+    for end in (0.0, 1.0):
+        yield Case(model, {key: _between(spec, end) for key, spec in specs.items()}, label=f"all at {end:g}")
+        for key, spec in specs.items():
+            yield Case(model, {**middle, key: _between(spec, end)})
+
+
 Builder = Callable[[Bsdf], Iterator[Case]]
 
-#: By a model's name: materials of its range, and materials at its edges.
+#: By a model's name: materials of its range, and materials at its edges. Of others see :func:`_by_specs`: a row can say
+#: more, such as that a white one loses nothing.
 BUILDERS: dict[str, tuple[Builder, Builder]] = {
     "diffuse": (_diffuse, _diffuse_edges),
     "phong": (_glossy, _glossy_edges),
@@ -448,13 +481,13 @@ BUILDERS: dict[str, tuple[Builder, Builder]] = {
 
 
 def cases_of(model: Bsdf) -> list[Case]:
-    """Materials over the range of a model; none where nobody has thought of any."""
-    return list(BUILDERS[model.name][0](model)) if model.name in BUILDERS else []
+    """Materials over the range of a model."""
+    return list(BUILDERS.get(model.name, (_by_specs, _edges_by_specs))[0](model))
 
 
 def edges_of(model: Bsdf) -> list[Case]:
     """Materials at the ends of the ranges, where numbers break."""
-    return list(BUILDERS[model.name][1](model)) if model.name in BUILDERS else []
+    return list(BUILDERS.get(model.name, (_by_specs, _edges_by_specs))[1](model))
 
 
 def leaves(values: Parameters) -> list[Tensor]:

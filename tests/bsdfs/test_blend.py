@@ -10,20 +10,16 @@ import torch
 from oracle import assert_same, both_sides, mitsuba_eval_pdf, random_pairs, rgb
 from torch import Tensor
 
-from torchpt.bsdfs import (
-    Blend,
-    Bsdf,
-    Conductor,
-    Dielectric,
-    Diffuse,
-    Null,
-    Parameters,
-    Phong,
-    Principled,
-    RoughConductor,
-    RoughDielectric,
-    gather,
-)
+from torchpt.bsdfs import Bsdf, Parameters, gather
+from torchpt.bsdfs.kinds.blend import Blend
+from torchpt.bsdfs.kinds.conductor import Conductor
+from torchpt.bsdfs.kinds.dielectric import Dielectric
+from torchpt.bsdfs.kinds.diffuse import Diffuse
+from torchpt.bsdfs.kinds.null import Null
+from torchpt.bsdfs.kinds.phong import Phong
+from torchpt.bsdfs.kinds.principled import Principled
+from torchpt.bsdfs.kinds.roughconductor import RoughConductor
+from torchpt.bsdfs.kinds.roughdielectric import RoughDielectric
 from torchpt.math import microfacet
 
 RED, BLUE = (0.8, 0.5, 0.1), (0.1, 0.2, 0.9)

@@ -10,7 +10,11 @@ import torch
 from oracle import ours_eval_pdf, random_pairs
 from torch import Tensor
 
-from torchpt.bsdfs import BlinnPhong, Bsdf, Microfacet, Nonmetal, Parameters, Phong, gather
+from torchpt.bsdfs import Bsdf, Parameters, gather
+from torchpt.bsdfs.kinds.blinn_phong import BlinnPhong
+from torchpt.bsdfs.kinds.microfacet import Microfacet
+from torchpt.bsdfs.kinds.nonmetal import Nonmetal
+from torchpt.bsdfs.kinds.phong import Phong
 
 RED, GREY = (0.8, 0.5, 0.1), (0.2, 0.3, 0.4)
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)

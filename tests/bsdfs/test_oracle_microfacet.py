@@ -11,19 +11,16 @@ import torch
 from oracle import assert_same, both_sides, mitsuba_bsdf, mitsuba_eval_pdf, ours_eval_pdf, random_pairs, rgb
 from torch import Tensor
 
-from torchpt.bsdfs import (
-    Bsdf,
-    Conductor,
-    Dielectric,
-    Null,
-    Plastic,
-    RoughConductor,
-    RoughDielectric,
-    RoughPlastic,
-    ThinDielectric,
-    gather,
-)
+from torchpt.bsdfs import Bsdf, gather
 from torchpt.bsdfs.base import Parameters
+from torchpt.bsdfs.kinds.conductor import Conductor
+from torchpt.bsdfs.kinds.dielectric import Dielectric
+from torchpt.bsdfs.kinds.null import Null
+from torchpt.bsdfs.kinds.plastic import Plastic
+from torchpt.bsdfs.kinds.roughconductor import RoughConductor
+from torchpt.bsdfs.kinds.roughdielectric import RoughDielectric
+from torchpt.bsdfs.kinds.roughplastic import RoughPlastic
+from torchpt.bsdfs.kinds.thindielectric import ThinDielectric
 from torchpt.math import microfacet
 from torchpt.math.vectors import dot, normalize
 

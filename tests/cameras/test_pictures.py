@@ -13,7 +13,7 @@ from trials import film_of, shoot
 import torchpt
 from torchpt.format.description import settings
 from torchpt.forward import BYTES_PER_LANE
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 
 AHEAD = {"origin": [0, 0, 0], "target": [0, 0, -1]}
 SIZE, BALL = 64, 0.03

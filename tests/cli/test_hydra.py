@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -9,8 +10,8 @@ import yaml
 
 from torchpt.cli import GROUPS, main
 from torchpt.paths import configs
-from torchpt.settings import FILTERS, INTEGRATORS, SAMPLERS, Film, Render
-from torchpt.spec import not_built
+from torchpt.settings import TYPED
+from torchpt.spec import not_built, parameters_of
 
 from .conftest import Renderer
 
@@ -25,29 +26,63 @@ def test_cfg_job_prints_the_composed_settings(folder: Path, capsys: pytest.Captu
     assert os.listdir(folder) == ["s.yaml"]
 
 
-def test_group_files_hide_nothing_and_name_every_key() -> None:
-    later = not_built.KEYS
-    known = {
-        "film": set(Film.model_fields),
-        "integrator": {name for model in INTEGRATORS.values() for name in model.model_fields},
-        "sampler": {name for model in SAMPLERS.values() for name in model.model_fields} | set(later.get("sampler", ())),
-        "render": set(Render.model_fields) | set(later.get("render", ())),
+def test_group_files_are_made_of_what_kinds_declare(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "scripts")
+    there = {
+        str(path.relative_to(configs())): path.read_text(encoding="utf-8")
+        for group in GROUPS
+        for path in (configs() / group).glob("*.yaml")
     }
-    for group, keys in known.items():
-        for path in (configs() / group).glob("*.yaml"):
-            block = yaml.safe_load(path.read_text())
-            assert set(block) == keys, path
-            filters = {name for model in FILTERS.values() for name in model.model_fields}
-            assert set(block.pop("filter", {}) or {}) in (set(), filters), path
-            values = {key: value for key, value in block.items() if value is not None}
-            assert values == ({} if path.stem == "default" else {"type": path.stem}), path
-    assert {path.stem for path in (configs() / "integrator").glob("*.yaml")} == {*INTEGRATORS, "default"}
-    assert {path.stem for path in (configs() / "sampler").glob("*.yaml")} == {*SAMPLERS, "default"}
+    assert there == import_module("make_configs").written(), "run scripts/make_configs.py"
 
 
-def test_every_file_in_configs_opens_with_its_command() -> None:
-    for path in configs().rglob("*.yaml"):
-        assert "torchpt render " in path.read_text().splitlines()[0], path
+def test_a_types_file_holds_its_own_keys_and_no_values() -> None:
+    """Said without the script: every key of a file is read by its type, and every key of its type is there."""
+    for group in ("integrator", "sampler"):
+        table, _ = TYPED[group]
+        later = set(not_built.KEYS.get(group, ()))
+        keys = {name: set(parameters_of(table[name])) | later for name in table}
+        for name, own in {**keys, "default": set().union(*keys.values())}.items():
+            block = yaml.safe_load((configs() / group / f"{name}.yaml").read_text())
+            assert block.pop("type") == (None if name == "default" else name)
+            assert set(block) == own and set(block.values()) <= {None}, (group, name)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["integrator=direct", "integrator.max_depth=8"], "expected only keys of integrator=direct"),
+        (["integrator=aov", "integrator.clamp=8"], "clamp belongs to direct, ibl, path"),
+        (["integrator.type=direct", "integrator.max_depth=8"], "max_depth belongs to path"),
+        (["-m", "integrator=path,direct", "integrator.max_depth=8"], "expected only keys of integrator=direct"),
+        (["integrator=direct", "integrator.depth=8"], "integrator.depth: unknown key; known: integrator.type"),
+    ],
+)
+def test_keys_of_another_type_are_refused(
+    folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str], words: list[str], says: str
+) -> None:
+    assert main(["render", "scene=s.yaml", *words]) == 2
+    said = capsys.readouterr().err
+    assert says in said and len(said.splitlines()) == 1
+    assert not renderer.settings
+
+
+@pytest.mark.parametrize(
+    ("words", "kinds"),
+    [
+        (["integrator=path", "integrator.max_depth=8"], ["path"]),
+        (["integrator.max_depth=8"], ["path"]),
+        (["integrator=direct"], ["direct"]),
+        (["integrator.type=direct", "integrator.strategy=light"], ["direct"]),
+        (["-m", "integrator=path,direct,ibl"], ["path", "direct", "ibl"]),
+        (["-m", "integrator.type=path,ibl", "integrator.clamp=3"], ["path", "ibl"]),
+    ],
+)
+def test_types_are_chosen_by_file_or_by_key(
+    folder: Path, renderer: Renderer, words: list[str], kinds: list[str]
+) -> None:
+    assert main(["render", "scene=s.yaml", *words]) == 0
+    assert [settings.integrator.name for settings in renderer.settings] == kinds
 
 
 def test_no_litter_even_in_a_folder_that_cannot_be_written(folder: Path, renderer: Renderer, tmp_path: Path) -> None:

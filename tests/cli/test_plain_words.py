@@ -27,7 +27,7 @@ PLAIN = [
     ["film.filter=gaussian", "film.width=3"],
     ["film.filter.radius=null", "integrator.clamp=null"],
     ["integrator=path", "sampler=independent", "render=default", "integrator.max_depth=3"],
-    ["integrator.max_depth=3", "integrator=direct", "integrator.type=path"],
+    ["integrator.strategy=light", "integrator=direct", "integrator.type=path"],
     ["integrator.strict=true", "sampler.adaptive=False", "render.resume=TRUE", "render.compile=on"],
     ["render.compile=off", "integrator.strict=yes", "integrator.clamp=Null", "render.device=none"],
     ["render.preview=a=b.png", "render.spp=1"],
@@ -39,6 +39,7 @@ NOT_PLAIN = [
     "film.width=${render.spp}", "film.width=???", "film.width=int(3)", "film.width={a: 1}", "film.filter=[box]",
     "film.crop=[[1]]", "film.crop=[1, 2]", "film.crop=[1,]", "film.width=1" + "0" * 400, "render.device=cuda:0",
     "film.width=ü", "film.width=1\n", "film.x.y=3", "film",
+    "integrator.bogus=3",
     "integrator=bogus", "integrator=[path]", "integrator@x=path", "spp=3", "scene_number=1", "hydra.run.dir=x", "defaults=3",
 ]  # fmt: skip
 
@@ -68,6 +69,13 @@ def test_the_job_is_hydras(words: list[str], monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize("word", NOT_PLAIN)
 def test_other_words_are_hydras(word: str) -> None:
     assert compose_plainly([word], configs()) is None
+
+
+@pytest.mark.parametrize(
+    "words", [["integrator=direct", "integrator.max_depth=3"], ["integrator.strict=true", "integrator=aov"]]
+)
+def test_keys_of_another_type_are_hydras(words: list[str]) -> None:
+    assert compose_plainly(words, configs()) is None
 
 
 def test_a_key_given_twice_is_hydras() -> None:

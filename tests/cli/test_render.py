@@ -49,15 +49,15 @@ def test_settings_reach_the_renderer(folder: Path, renderer: Renderer) -> None:
     assert main(["render", "scene=s.yaml", *words.split(), "film.aovs=[albedo,depth]", "out=a.exr"]) == 0
     settings = renderer.settings[0]
     assert (settings.film.width, settings.film.height) == (16, 6)  # given; the scene's wish
-    assert settings.film.filter.type == "box" and settings.film.aovs == ("albedo", "depth")
+    assert settings.film.filter.name == "box" and settings.film.aovs == ("albedo", "depth")
     assert settings.integrator.max_depth == 3 and settings.integrator.clamp == 10
-    assert settings.sampler.type == "independent" and settings.render.spp == 2 and settings.render.compile == "off"
+    assert settings.sampler.name == "independent" and settings.render.spp == 2 and settings.render.compile == "off"
 
 
 def test_an_explicit_null_unsets_the_scenes_wish(folder: Path, renderer: Renderer) -> None:
     assert main(["render", "scene=s.yaml", "integrator.clamp=null", "render.spp=null", "film.filter.type=box"]) == 0
     assert renderer.settings[0].integrator.clamp is None and renderer.settings[0].render.spp == 64
-    assert renderer.settings[0].film.filter.type == "box"
+    assert renderer.settings[0].film.filter.name == "box"
 
 
 @pytest.mark.parametrize("name", ODD)
@@ -193,7 +193,7 @@ def test_multirun_stops_at_a_signal(folder: Path, renderer: Renderer) -> None:
 def test_multirun_over_groups_without_out(folder: Path, renderer: Renderer) -> None:
     assert main(["render", "-m", "scene=s.yaml", "sampler=sobol,independent", "integrator=path,direct"]) == 0
     assert files(folder) == {f"s_{n}.png" for n in range(4)}
-    kinds = [(s.sampler.type, s.integrator.type) for s in renderer.settings]
+    kinds = [(s.sampler.name, s.integrator.name) for s in renderer.settings]
     assert kinds == [(s, i) for s in ("sobol", "independent") for i in ("path", "direct")]
 
 

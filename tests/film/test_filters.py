@@ -13,7 +13,7 @@ from trials import film_of, shoot, z_limit
 import torchpt
 from torchpt.film import Filter, filter_of
 from torchpt.format.description import settings
-from torchpt.render import first_hit, render_scene
+from torchpt.rendering import first_hit, render_scene
 from torchpt.scene import Scene
 
 CPU = torch.device("cpu")

@@ -13,9 +13,8 @@ from torchpt import paths
 from torchpt.errors import AssetError, NotBuiltError, SceneError
 from torchpt.format.cameras import read_camera
 from torchpt.format.description import read_description, scene_names, settings
-from torchpt.format.materials import Diffuse
-from torchpt.format.schema import Mesh, Sphere
 from torchpt.scene.build import build_parts
+from torchpt.spec.declared import Described
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
 TRIANGLE = {"type": "mesh", "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "faces": [[0, 1, 2]]}
@@ -209,24 +208,25 @@ def test_a_whole_scene() -> None:
     assert found.version == 1 and found.file is None
     assert list(found.shapes) == ["tri", "ball", "lamp"]
     ball, tri = found.shapes["ball"], found.shapes["tri"]
-    assert isinstance(ball, Sphere) and ball.radius == 2 and isinstance(ball.material, Diffuse)
-    assert isinstance(tri, Mesh) and tri.faces is not None and tri.faces.dtype == np.int64 and tri.material == "red"
-    assert found.shapes["lamp"].emission == (3, 3, 3)
-    assert found.shapes["lamp"].to_world()[1, 3] == 5
-    assert not found.materials["red"].two_sided
+    assert ball.name == "sphere" and ball["radius"] == 2 and isinstance(ball["material"], Described)
+    assert ball["material"].name == "diffuse"
+    assert tri.name == "mesh" and tri["faces"].dtype == np.int64 and tri["material"] == "red"
+    lamp = found.shapes["lamp"]
+    assert lamp["emission"] == (3, 3, 3)
+    assert lamp.kind.to_world(lamp.values)[1, 3] == 5
+    assert not found.materials["red"]["two_sided"]
     assert found.lights["sky"].values == {"radiance": (1, 2, 3)}
 
 
 def test_polygons_become_fans() -> None:
     square = read_description(mesh(vertices=[[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], faces=[[0, 1, 2, 3]]))
     part = square.shapes["s"]
-    assert isinstance(part, Mesh) and part.faces is not None
-    assert part.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+    assert part["faces"].tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
 def test_arrays_are_accepted() -> None:
     part = read_description(mesh(vertices=np.eye(3, dtype=np.float32), faces=np.array([[0, 1, 2]]))).shapes["s"]
-    assert isinstance(part, Mesh) and part.vertices is not None and part.vertices.dtype == np.float64
+    assert part["vertices"].dtype == np.float64
 
 
 @pytest.mark.mitsuba
@@ -245,8 +245,8 @@ def test_shipped_scenes_need_no_assets(name: str, monkeypatch: pytest.MonkeyPatc
     found = read_description(name)
     settings(found)
     for key, part in found.shapes.items():
-        if isinstance(part, Mesh) and part.path is not None:
-            assert found.resolve(part.path, f"shapes.{key}.path").is_file()
+        if part.values.get("path") is not None:
+            assert found.resolve(part["path"], f"shapes.{key}.path").is_file()
     first = (paths.configs() / "scene" / f"{name}.yaml").read_text().splitlines()[0]
     assert first.startswith(f"# torchpt render scene={name} ")
 

@@ -12,14 +12,32 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt import bsdfs
-from torchpt.bsdfs import Bsdf, Parameters
+import torchpt
+from torchpt.bsdfs import KINDS, Bsdf, Parameters
+from torchpt.bsdfs.kinds.blend import Blend
+from torchpt.bsdfs.kinds.blinn_phong import BlinnPhong
+from torchpt.bsdfs.kinds.conductor import Conductor
+from torchpt.bsdfs.kinds.dielectric import Dielectric
+from torchpt.bsdfs.kinds.diffuse import Diffuse
+from torchpt.bsdfs.kinds.microfacet import Microfacet
+from torchpt.bsdfs.kinds.nonmetal import Nonmetal
+from torchpt.bsdfs.kinds.null import Null
+from torchpt.bsdfs.kinds.phong import Phong
+from torchpt.bsdfs.kinds.plastic import Plastic
+from torchpt.bsdfs.kinds.principled import Principled
+from torchpt.bsdfs.kinds.roughconductor import RoughConductor
+from torchpt.bsdfs.kinds.roughdielectric import RoughDielectric
+from torchpt.bsdfs.kinds.roughplastic import RoughPlastic
+from torchpt.bsdfs.kinds.thindielectric import ThinDielectric
 from torchpt.bsdfs.presets import INDICES, METALS, metal
 from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.errors import EnergyWarning, NotBuiltError, SceneError
 from torchpt.format.description import Description, read_description
-from torchpt.format.materials import MATERIALS, MAX_BLENDS, Material, resolved
+from torchpt.format.materials import MAX_BLENDS
 from torchpt.records import BsdfSample
+from torchpt.scene.materials import resolved
+from torchpt.spec import Color, Flag, Index, Scalar, parameters_of
+from torchpt.spec.declared import Described
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
 AIR, BK7, PP = 1.000277, 1.5046, 1.49
@@ -53,100 +71,100 @@ def rgb(*values: float) -> tuple[float, ...]:
 
 GLASS = {"int_ior": BK7, "ext_ior": AIR}
 RESOLVED: dict[str, tuple[dict[str, Any], Bsdf, dict[str, Any]]] = {  # keys, model, its values
-    "diffuse": ({}, bsdfs.Diffuse(), {"reflectance": GREY}),
-    "diffuse, a colour": ({"reflectance": [0.1, 0.2, 0.3]}, bsdfs.Diffuse(), {"reflectance": (0.1, 0.2, 0.3)}),
-    "phong": ({}, bsdfs.Phong(), {"diffuse": GREY, "specular": rgb(0.2), "exponent": 30.0}),
+    "diffuse": ({}, Diffuse(), {"reflectance": GREY}),
+    "diffuse, a colour": ({"reflectance": [0.1, 0.2, 0.3]}, Diffuse(), {"reflectance": (0.1, 0.2, 0.3)}),
+    "phong": ({}, Phong(), {"diffuse": GREY, "specular": rgb(0.2), "exponent": 30.0}),
     "phong, all keys": (
         {"diffuse": 0.1, "specular": [0.2, 0.3, 0.4], "exponent": 7},
-        bsdfs.Phong(),
+        Phong(),
         {"diffuse": rgb(0.1), "specular": (0.2, 0.3, 0.4), "exponent": 7.0},
     ),
-    "blinn_phong": ({}, bsdfs.BlinnPhong(), {"diffuse": GREY, "specular": rgb(0.1), "exponent": 30.0}),
+    "blinn_phong": ({}, BlinnPhong(), {"diffuse": GREY, "specular": rgb(0.1), "exponent": 30.0}),
     "blinn_phong, all keys": (
         {"diffuse": 0.1, "specular": 0.2, "exponent": 0},
-        bsdfs.BlinnPhong(),
+        BlinnPhong(),
         {"diffuse": rgb(0.1), "specular": rgb(0.2), "exponent": 0.0},
     ),
-    "conductor": ({}, bsdfs.Conductor(schlick=True), {"reflectance": WHITE}),
-    "conductor, none": ({"material": "none"}, bsdfs.Conductor(schlick=True), {"reflectance": WHITE}),
+    "conductor": ({}, Conductor(schlick=True), {"reflectance": WHITE}),
+    "conductor, none": ({"material": "none"}, Conductor(schlick=True), {"reflectance": WHITE}),
     "conductor, metal": (
         {"material": "Au", "specular_reflectance": 0.9, "roughness": 0, "alpha": 0, "alpha_u": 0.0, "alpha_v": None},
-        bsdfs.Conductor(),
+        Conductor(),
         {"eta": METALS["Au"][0], "k": METALS["Au"][1], "specular_reflectance": rgb(0.9)},
     ),
     "conductor, eta and k": (
         {"eta": 0.2, "k": [3, 2, 1]},
-        bsdfs.Conductor(),
+        Conductor(),
         {"eta": rgb(0.2), "k": (3.0, 2.0, 1.0)},
     ),
     "conductor, reflectance": (
         {"reflectance": [1, 0.5, 0]},
-        bsdfs.Conductor(schlick=True),
+        Conductor(schlick=True),
         {"reflectance": (1.0, 0.5, 0.0)},
     ),
-    "roughconductor": ({}, bsdfs.RoughConductor(schlick=True), {"reflectance": WHITE, "alpha": 0.1}),
+    "roughconductor": ({}, RoughConductor(schlick=True), {"reflectance": WHITE, "alpha": 0.1}),
     "roughconductor, eta and k": (
         {"eta": [0.1, 0.2, 0.3], "k": 4, "roughness": 0.3, "specular_reflectance": 0.5, "energy_compensation": True},
-        bsdfs.RoughConductor(energy_compensation=True),
+        RoughConductor(energy_compensation=True),
         {"eta": (0.1, 0.2, 0.3), "k": rgb(4.0), "roughness": 0.3, "specular_reflectance": GREY},
     ),
     "roughconductor, anisotropic": (
         {"reflectance": 0.5, "alpha_u": 0.3, "alpha_v": 0.01, "energy_compensation": False},
-        bsdfs.RoughConductor(schlick=True, anisotropic=True),
+        RoughConductor(schlick=True, anisotropic=True),
         {"reflectance": GREY, "alpha_u": 0.3, "alpha_v": 0.01},
     ),
     "roughconductor, smooth": (
         {"material": "Cr", "alpha": 0},
-        bsdfs.RoughConductor(),
+        RoughConductor(),
         {"eta": METALS["Cr"][0], "k": METALS["Cr"][1], "alpha": 0.0},
     ),
-    "dielectric": ({}, bsdfs.Dielectric(), GLASS),
+    "dielectric": ({}, Dielectric(), GLASS),
     "dielectric, all keys": (
         {
             **{"int_ior": "Water", "ext_ior": 2, "alpha": 0, "roughness": 0},
             **{"specular_reflectance": 0.5, "specular_transmittance": [1, 1, 0]},
         },
-        bsdfs.Dielectric(),
+        Dielectric(),
         {
             **{"int_ior": 1.333, "ext_ior": 2.0},
             **{"specular_reflectance": GREY, "specular_transmittance": (1.0, 1.0, 0.0)},
         },
     ),
-    "thindielectric": ({}, bsdfs.ThinDielectric(), GLASS),
+    "thindielectric": ({}, ThinDielectric(), GLASS),
     "thindielectric, all keys": (
         {"int_ior": 1.5, "ext_ior": "vacuum", "specular_reflectance": 0, "specular_transmittance": 1}
         | {"alpha": 0, "roughness": 0},
-        bsdfs.ThinDielectric(),
+        ThinDielectric(),
         {"int_ior": 1.5, "ext_ior": 1.0, "specular_reflectance": rgb(0.0), "specular_transmittance": WHITE},
     ),
-    "roughdielectric": ({}, bsdfs.RoughDielectric(), {**GLASS, "alpha": 0.1}),
+    "roughdielectric": ({}, RoughDielectric(), {**GLASS, "alpha": 0.1}),
     "roughdielectric, all keys": (
         {"int_ior": "diamond", "ext_ior": 1, "roughness": 1, "energy_compensation": True, "specular_reflectance": 1},
-        bsdfs.RoughDielectric(energy_compensation=True),
+        RoughDielectric(energy_compensation=True),
         {"int_ior": 2.419, "ext_ior": 1.0, "roughness": 1.0, "specular_reflectance": WHITE},
     ),
     "roughdielectric, alpha": (
         {"alpha": 0.02, "specular_transmittance": 0.5},
-        bsdfs.RoughDielectric(),
+        RoughDielectric(),
         {**GLASS, "alpha": 0.02, "specular_transmittance": GREY},
     ),
     "roughdielectric, anisotropic": (
         {"alpha_u": 0.2, "alpha_v": 0.4},
-        bsdfs.RoughDielectric(anisotropic=True),
+        RoughDielectric(anisotropic=True),
         {**GLASS, "alpha_u": 0.2, "alpha_v": 0.4},
     ),
-    "plastic": ({}, bsdfs.Plastic(), {"diffuse_reflectance": GREY, "int_ior": PP, "ext_ior": AIR}),
+    "plastic": ({}, Plastic(), {"diffuse_reflectance": GREY, "int_ior": PP, "ext_ior": AIR}),
     "plastic, all keys": (
         {
             **{"diffuse_reflectance": [0.1, 0.2, 0.3], "int_ior": 1.9, "ext_ior": "acetone", "nonlinear": True},
             **{"specular_reflectance": 0.5, "alpha": 0, "roughness": 0},
         },
-        bsdfs.Plastic(nonlinear=True),
+        Plastic(nonlinear=True),
         {"diffuse_reflectance": (0.1, 0.2, 0.3), "int_ior": 1.9, "ext_ior": 1.36, "specular_reflectance": GREY},
     ),
     "roughplastic": (
         {},
-        bsdfs.RoughPlastic(),
+        RoughPlastic(),
         {"diffuse_reflectance": GREY, "int_ior": PP, "ext_ior": AIR, "alpha": 0.1},
     ),
     "roughplastic, all keys": (
@@ -154,7 +172,7 @@ RESOLVED: dict[str, tuple[dict[str, Any], Bsdf, dict[str, Any]]] = {  # keys, mo
             **{"diffuse_reflectance": 0.2, "int_ior": "bk7", "ext_ior": 1, "nonlinear": True},
             **{"specular_reflectance": 1, "roughness": 0.4},
         },
-        bsdfs.RoughPlastic(nonlinear=True),
+        RoughPlastic(nonlinear=True),
         {
             **{"diffuse_reflectance": rgb(0.2), "int_ior": BK7, "ext_ior": 1.0},
             **{"specular_reflectance": WHITE, "roughness": 0.4},
@@ -162,29 +180,29 @@ RESOLVED: dict[str, tuple[dict[str, Any], Bsdf, dict[str, Any]]] = {  # keys, mo
     ),
     "roughplastic, alpha": (
         {"alpha": 1},
-        bsdfs.RoughPlastic(),
+        RoughPlastic(),
         {"diffuse_reflectance": GREY, "int_ior": PP, "ext_ior": AIR, "alpha": 1.0},
     ),
-    "nonmetal": ({}, bsdfs.Nonmetal(), {"base_color": GREY, "specular": 0.04, "roughness": 0.5}),
+    "nonmetal": ({}, Nonmetal(), {"base_color": GREY, "specular": 0.04, "roughness": 0.5}),
     "nonmetal, all keys": (
         {"base_color": 1, "specular": 1, "roughness": 0},
-        bsdfs.Nonmetal(),
+        Nonmetal(),
         {"base_color": WHITE, "specular": 1.0, "roughness": 0.0},
     ),
-    "microfacet": ({}, bsdfs.Microfacet(), {"diffuse": GREY, "specular": WHITE, "roughness": 0.4, "ior": 1.85}),
+    "microfacet": ({}, Microfacet(), {"diffuse": GREY, "specular": WHITE, "roughness": 0.4, "ior": 1.85}),
     "microfacet, all keys": (
         {"diffuse": 0, "specular": 0.5, "roughness": 1, "ior": "amber"},
-        bsdfs.Microfacet(),
+        Microfacet(),
         {"diffuse": rgb(0.0), "specular": GREY, "roughness": 1.0, "ior": 1.55},
     ),
-    "principled": ({}, bsdfs.Principled(), {"base_color": GREY, "roughness": 0.5, "specular": 0.5}),
+    "principled": ({}, Principled(), {"base_color": GREY, "roughness": 0.5, "specular": 0.5}),
     "principled, all keys": (
         {
             **{"base_color": [0.1, 0.2, 0.3], "roughness": 0.1, "metallic": 0.2, "eta": 1.4, "spec_tint": 0.3},
             **{"anisotropic": 0.4, "sheen": 0.5, "sheen_tint": 0.6, "clearcoat": 0.7, "clearcoat_gloss": 0.8},
             **{"spec_trans": 0.9, "flatness": 1},
         },
-        bsdfs.Principled(transmissive=True, anisotropic=True),
+        Principled(transmissive=True, anisotropic=True),
         {
             **{"base_color": (0.1, 0.2, 0.3), "roughness": 0.1, "metallic": 0.2, "eta": 1.4, "spec_tint": 0.3},
             **{"anisotropic": 0.4, "sheen": 0.5, "sheen_tint": 0.6, "clearcoat": 0.7, "clearcoat_gloss": 0.8},
@@ -196,10 +214,10 @@ RESOLVED: dict[str, tuple[dict[str, Any], Bsdf, dict[str, Any]]] = {  # keys, mo
             **{"roughness": 0, "metallic": 0, "specular": 0, "spec_tint": 0, "anisotropic": 0, "sheen": 0},
             **{"sheen_tint": 1, "clearcoat": 0, "clearcoat_gloss": 1, "spec_trans": 0, "flatness": 0},
         },
-        bsdfs.Principled(),
+        Principled(),
         {"base_color": GREY, "roughness": 0.0, "specular": 0.0},
     ),
-    "null": ({}, bsdfs.Null(), {}),
+    "null": ({}, Null(), {}),
 }
 
 
@@ -215,7 +233,7 @@ def test_a_material_comes_to_its_model_and_values(name: str) -> None:
 def test_a_model_is_given_what_it_reads(name: str) -> None:
     found = slot(type=name.partition(",")[0], **RESOLVED[name][0])
     assert found.model.name == name.partition(",")[0]
-    assert found.values.keys() <= found.model.parameters.keys() | {"roughness"}
+    assert found.values.keys() <= own_keys(found.model)
     found.model.prepare(
         {
             key: torch.tensor([[channel] for channel in value] if isinstance(value, tuple) else [value])
@@ -224,19 +242,19 @@ def test_a_model_is_given_what_it_reads(name: str) -> None:
     )
 
 
+def own_keys(kind: Any) -> set[str]:
+    return parameters_of(kind).keys() - Bsdf.parameters.keys()
+
+
 def test_every_type_is_resolved_above_with_all_its_keys() -> None:
     said: dict[str, set[str]] = {}
     for name, (keys, _, _) in RESOLVED.items():
         said.setdefault(name.partition(",")[0], set()).update(keys)
-    assert said.keys() | {"blend"} == MATERIALS.keys()
-    missing: set[str] = set()
-    for name, keys in said.items():
-        own = MATERIALS[name].model_fields.keys() - Material.model_fields.keys() - {"type"}
-        missing |= {f"{name}.{key}" for key in own - keys}
+    missing = {f"{name}.{key}" for name, keys in said.items() for key in own_keys(KINDS[name]) - keys}
     assert not missing
 
 
-@pytest.mark.parametrize("name", sorted(MATERIALS.keys() - {"null", "blend"}))
+@pytest.mark.parametrize("name", [name for name in KINDS if name not in ("null", "blend")])
 def test_every_type_takes_the_common_keys(name: str) -> None:
     found = slot(type=name, **COMMON)
     assert (found.opacity, found.alpha_cutoff, found.emission, found.emission_strength) == (0.25, 0.5, (1, 2, 3), 4)
@@ -248,12 +266,12 @@ def test_every_type_takes_the_common_keys(name: str) -> None:
 
 
 def test_null_stands_for_what_is_not_said() -> None:
-    every = {key: None for key in (*MATERIALS["roughconductor"].model_fields, "normal_map", "bump_map")}
+    every = {key: None for key in parameters_of(KINDS["roughconductor"])}
     assert slot(**{**every, "type": "roughconductor"}) == slot(type="roughconductor")
 
 
 def test_the_type_null_may_be_written_bare() -> None:
-    assert slot(type=None).model == bsdfs.Null()
+    assert slot(type=None).model == Null()
 
 
 CIRCLE = {
@@ -461,12 +479,12 @@ def test_blends_of_names_and_of_materials_in_place() -> None:
         }
     ).materials
     found = resolved(materials["m"], "materials.m", materials)
-    red = ResolvedMaterial(bsdfs.Diffuse(), "materials.red", {"reflectance": (1, 0, 0)})
-    clear = ResolvedMaterial(bsdfs.Diffuse(), "materials.late.b", {"reflectance": GREY}, opacity=0.5)
-    mirror = ResolvedMaterial(bsdfs.Conductor(schlick=True), "materials.m.b", {"reflectance": WHITE})
-    late = ResolvedMaterial(bsdfs.Blend(red.model, clear.model), "materials.late", {"weight": 1.0}, inner=(red, clear))
+    red = ResolvedMaterial(Diffuse(), "materials.red", {"reflectance": (1, 0, 0)})
+    clear = ResolvedMaterial(Diffuse(), "materials.late.b", {"reflectance": GREY}, opacity=0.5)
+    mirror = ResolvedMaterial(Conductor(schlick=True), "materials.m.b", {"reflectance": WHITE})
+    late = ResolvedMaterial(Blend(red.model, clear.model), "materials.late", {"weight": 1.0}, inner=(red, clear))
     assert found == ResolvedMaterial(
-        model=bsdfs.Blend(late.model, mirror.model),
+        model=Blend(late.model, mirror.model),
         name="materials.m",
         values={"weight": 0.25},
         two_sided=False,
@@ -480,8 +498,8 @@ def test_blends_of_names_and_of_materials_in_place() -> None:
 
 def test_a_blend_in_a_shape() -> None:
     found = read({"d": DIFFUSE}, material={"type": "blend", "a": "d", "b": {"type": "phong"}, "weight": 0})
-    material = found.shapes["s"].material
-    assert isinstance(material, Material)
+    material = found.shapes["s"]["material"]
+    assert isinstance(material, Described)
     inner = resolved(material, "shapes.s.material", found.materials).inner
     assert [slot.name for slot in inner] == ["materials.d", "shapes.s.material.b"]
 
@@ -530,8 +548,8 @@ def test_shape_and_material_do_not_both_emit(glow: dict[str, Any]) -> None:
 
 def test_either_may_emit() -> None:
     found = read({"m": {**DIFFUSE, "emission": 2}, "n": DIFFUSE}, emission=1, material="n")
-    assert found.shapes["s"].emission == (1, 1, 1)
-    assert found.materials["m"].emission == (2, 2, 2) and found.materials["m"].emission_strength == 1
+    assert found.shapes["s"]["emission"] == (1, 1, 1)
+    assert found.materials["m"]["emission"] == (2, 2, 2) and found.materials["m"]["emission_strength"] == 1
 
 
 # --- presets ---
@@ -638,7 +656,7 @@ def test_their_own_model_in_a_blend_and_in_a_shape() -> None:
     blend = {"type": "blend", "a": {"type": "mine", "amount": 3}, "b": DIFFUSE, "weight": 0.5}
     found = slot(OWN, **blend).inner[0]
     assert found.name == "materials.m.a" and found.values["amount"] == 3 and found.model is OWN["mine"]
-    assert isinstance(read({}, OWN, material=blend).shapes["s"].material, Material)
+    assert isinstance(read({}, OWN, material=blend).shapes["s"]["material"], Described)
 
 
 OWN_BAD: dict[str, tuple[dict[str, Any], str, str]] = {
@@ -677,7 +695,13 @@ MODELS_BAD: dict[str, tuple[Any, str, str]] = {
     "a pair": ({"mine": with_parameters({"x": (1, 2)})}, "bsdfs.mine.parameters.x", "a finite number, or three"),
     "a common key": ({"mine": with_parameters({"opacity": 1})}, "bsdfs.mine.parameters.opacity", "another name"),
     "a later key": ({"mine": with_parameters({"bump_map": 1})}, "bsdfs.mine.parameters.bump_map", "another name"),
-    "a taken name": ({"mine": with_parameters({"values": 1})}, "bsdfs.mine.parameters.values", "another name"),
+    "a taken name": ({"mine": with_parameters({"copy": 1})}, "bsdfs.mine.parameters.copy", "another name"),
+    "a flag": ({"mine": with_parameters({"x": Flag(True)})}, "bsdfs.mine.parameters.x", "a number or a colour"),
+    "a default out of range": (
+        {"mine": with_parameters({"x": Scalar(2.0, high=1.0)})},
+        "bsdfs.mine.parameters.x",
+        "in 0..1, got 2",
+    ),
     "a dotted name": ({"mine": with_parameters({"a.b": 1})}, "bsdfs.mine.parameters", "letters, digits"),
 }
 
@@ -695,3 +719,108 @@ def test_the_example_in_the_docs_learns(capsys: pytest.CaptureFixture[str]) -> N
     exec(code.replace("    loss.backward()", "    print(loss.item())\n    loss.backward()"), {})
     losses = [float(line) for line in capsys.readouterr().out.splitlines()]
     assert len(losses) == 20 and losses[-1] < 0.1 * losses[0]
+
+
+# --- what they are among the parameters of a scene
+
+
+@dataclass(frozen=True)
+class Specified(Tinted):
+    parameters = {  # noqa: RUF012
+        "level": Scalar(0.25, high=0.5, texture=True, doc="a number with bounds"),
+        "tint": Color((1.0, 0.5, 0.25), high=1.0, doc="a colour with bounds"),
+        "index": Index(1.5, media=INDICES, doc="an index"),
+        "maybe": Scalar(None, doc="one that may be left out"),
+    }
+
+
+SPECIFIED = {"specified": Specified()}
+
+
+def loaded(material: dict[str, Any], models: dict[str, Any] | None = None) -> torchpt.Scene:
+    return torchpt.load(scene({"m": material}, material="m"), "cpu", bsdfs=models)
+
+
+def test_a_model_of_the_callers_own_may_have_specs() -> None:
+    found = slot(SPECIFIED, type="specified", index="water")
+    assert found.values == {"tint": (1.0, 0.5, 0.25), "amount": -2.0, "level": 0.25, "index": 1.333}
+    assert slot(SPECIFIED, type="specified", maybe=3).values["maybe"] == 3.0
+    error = refused({"m": {"type": "specified", "level": 0.6}}, SPECIFIED)
+    assert error.key == "materials.m.level" and "in 0..0.5, or a texture, got 0.6" in str(error)
+    error = refused({"m": {"type": "specified", "tint": {"type": "vertex_color"}}}, SPECIFIED)
+    assert error.key == "materials.m.tint" and "or a texture" not in error.expected
+
+
+PARAMETERS: dict[str, tuple[dict[str, Any], str, Any, str]] = {  # material, name, a value, what is said of it
+    "roughness": ({"type": "roughconductor", "roughness": 0.3}, "roughness", 7.0, "in 0..1"),
+    "reflectance": ({"type": "diffuse"}, "reflectance", [0.5, 1.5, 0.5], "in 0..1"),
+    "exponent": ({"type": "phong"}, "exponent", -1.0, "in 0..100000"),
+    "eta": ({"type": "conductor", "material": "Au"}, "eta", [1.0, -1.0, 1.0], ">= 0"),
+    "int_ior": ({"type": "dielectric"}, "int_ior", 0.0, "in 0.001..1000"),
+    "weight": ({"type": "blend", "a": DIFFUSE, "b": DIFFUSE, "weight": 0.5}, "weight", 1.5, "in 0..1"),
+    "an inner one": (
+        {"type": "blend", "a": DIFFUSE, "b": DIFFUSE, "weight": 0.5},
+        "a.reflectance",
+        [2.0] * 3,
+        "in 0..1",
+    ),
+    "opacity": ({"type": "diffuse", "opacity": 0.5}, "opacity", -0.5, "in 0..1"),
+    "emission": ({"type": "diffuse", "emission": 2}, "emission", [-1.0, 1.0, 1.0], ">= 0"),
+    "emission_strength": ({"type": "diffuse", "emission": 2}, "emission_strength", -1.0, ">= 0"),
+    "a user's": ({"type": "specified"}, "level", 0.6, "in 0..0.5"),
+    "a user's index": ({"type": "specified"}, "index", 0.0, "in 0.001..1000"),
+    "a user's without bounds": ({"type": "mine"}, "amount", math.nan, "finite"),
+    "a checkerboard": (
+        {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
+        "reflectance.color0",
+        [0.5, 0.5, 2.0],
+        "in 0..1",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_parameters_are_refused_as_a_file_refuses_them(name: str) -> None:
+    material, key, value, part = PARAMETERS[name]
+    found = loaded(material, {**OWN, **SPECIFIED})
+    with pytest.raises(SceneError) as caught:
+        torchpt.render(found, params={f"materials.m.{key}": torch.tensor(value)}, spp=1)
+    assert caught.value.key == f"params.materials.m.{key}" and part in str(caught.value)
+    torchpt.render(
+        found, params={f"materials.m.{key}": found.params[f"materials.m.{key}"]}, film={"width": 2, "height": 2}
+    )
+
+
+def test_texels_are_held_to_what_their_slots_accept(tmp_path: Path) -> None:
+    torchpt.write_image(tmp_path / "a.exr", torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(0)) * 0.5)
+    image = {"type": "image", "path": str(tmp_path / "a.exr")}
+    textures = {"shared": image, "heights": image}
+    material = {
+        "type": "principled",
+        "base_color": {"texture": "shared"},
+        "roughness": {**image, "scale": 2},
+        "bump_map": {"texture": "heights"},
+    }
+    found = torchpt.load({**scene({"m": material}, material="m"), "textures": textures}, "cpu")
+
+    def bounds(name: str) -> tuple[float | None, float | None]:
+        spec: Any = found.spec(name)
+        return spec.low, spec.high
+
+    assert bounds("textures.shared") == (0.0, 1.0) and bounds("materials.m.roughness") == (0.0, 0.5)
+    assert bounds("textures.heights") == (None, None)  # a bump map may go down as well as up
+    down = {"textures.heights": -found.params["textures.heights"]}
+    torchpt.render(found, params=down, spp=1, film={"width": 4, "height": 4})
+    with pytest.raises(SceneError, match="roughness: expected texels in 0..0.5"):
+        torchpt.render(found, params={"materials.m.roughness": found.params["materials.m.roughness"] + 0.5}, spp=1)
+
+
+def test_indices_bend_rays_and_textures_of_them_too(tmp_path: Path) -> None:
+    def bending(**keys: Any) -> set[str]:
+        found = loaded(keys)
+        return {name for part in found.built.parts for slot in part.material.all() for name in slot.bending()}
+
+    squares = {"type": "checkerboard", "color0": 1.3, "color1": 1.5}
+    assert bending(type="dielectric") == {"materials.m.int_ior", "materials.m.ext_ior"}
+    assert bending(type="roughdielectric", int_ior=squares) == {"materials.m.int_ior", "materials.m.ext_ior"}
+    assert not bending(type="plastic") and not bending(type="thindielectric")

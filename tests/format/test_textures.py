@@ -12,7 +12,7 @@ import torch
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 from torchpt.scene import texels
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0], "fov": 20}
@@ -165,7 +165,7 @@ def test_gradients_reach_texels_and_colours(png: str):
         film={"width": 8, "height": 8, "filter": {"type": "box"}},
         integrator={"type": "path", "max_depth": 2},
     )
-    texels = found.params["textures.t"].double().requires_grad_()
+    texels = found.params["textures.t"].double().clamp(0.01, 0.99).requires_grad_()  # so that a step stays within 0..1
     color = found.params["textures.c.color0"].double().requires_grad_()
 
     def loss(texels: torch.Tensor, color: torch.Tensor) -> torch.Tensor:

@@ -92,7 +92,7 @@ def test_error_names_the_file(tmp_path: Path) -> None:
     file.write_text(CAMERA + "shapes: {s: {type: sphere, radius: -1}}\n")
     with pytest.raises(SceneError) as caught:
         read_description(file)
-    assert str(caught.value) == f"{file}: shapes.s.radius: expected a number > 0, got -1"
+    assert str(caught.value) == f"{file}: shapes.s.radius: expected a finite number > 0, got -1"
 
 
 def test_a_thousand_shapes_and_a_large_inline_mesh_are_quick(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.bsdfs.roughconductor import RoughConductor
+from torchpt.bsdfs.kinds.roughconductor import RoughConductor
 from torchpt.ibl import convolve, equirect
 from torchpt.ibl.cube import look_up_cube
 from torchpt.ibl.pyramid import Pyramid

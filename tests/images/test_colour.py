@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchpt.errors import SceneError
-from torchpt.images.colour import TONEMAPS, display, linear_to_srgb, luminance, srgb_to_linear
+from torchpt.images.colour import TONEMAPS, display, linear_to_srgb, srgb_to_linear
 
 
 def test_srgb_at_known_values() -> None:
@@ -21,10 +21,6 @@ def test_srgb_keeps_all_bytes_and_gradients() -> None:
     x = torch.tensor([0.0, 1e-4, 0.5], requires_grad=True)
     linear_to_srgb(x).sum().backward()
     assert x.grad is not None and torch.isfinite(x.grad).all()
-
-
-def test_luminance() -> None:
-    assert torch.allclose(luminance(torch.eye(3)), torch.tensor([0.2126, 0.7152, 0.0722]))
 
 
 @pytest.mark.parametrize("name", list(TONEMAPS))

@@ -14,7 +14,7 @@ import torchpt
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
 from torchpt.images import write_image
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
 

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from torchpt.accel.brute import Brute
 from torchpt.lanes import engine
-from torchpt.lanes.kernel import HEAD, Sinks, Store, text
+from torchpt.lanes.kernel import HEAD, text
 from torchpt.lanes.packet import KINDS, packet_search
+from torchpt.lanes.sinks import Sinks, Store
 from torchpt.lanes.tracing import LANES, Tracer
 from torchpt.records import Geometry
 

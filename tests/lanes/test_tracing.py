@@ -16,8 +16,9 @@ from torch import Tensor, nn
 from torchpt.lanes import engine, function
 from torchpt.lanes.function import lanewise
 from torchpt.lanes.graph import Graph, Unsupported
-from torchpt.lanes.kernel import Sinks, Store, text
+from torchpt.lanes.kernel import text
 from torchpt.lanes.program import Program, bound, holds, laid_out, replayed
+from torchpt.lanes.sinks import Sinks, Store
 from torchpt.lanes.tracing import LANES, Tracer, tracing
 from torchpt.math import vectors
 

@@ -11,7 +11,7 @@ from significance import z_limit
 import torchpt
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 
 UP = {"rotate": {"axis": [1, 0, 0], "angle": -90}}
 DOWN = {"rotate": {"axis": [1, 0, 0], "angle": 90}}

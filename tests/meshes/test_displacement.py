@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from cubes import unit_cube
 
 import torchpt
-from torchpt.meshes import MeshPart, unit_cube
+from torchpt.meshes import MeshPart
 from torchpt.meshes.displacement import displaced, subdivided
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0]}

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cubes import unit_cube
 
 from torchpt.errors import AssetError
-from torchpt.meshes import MeshPart, load_mesh, smooth_normals, unit_cube
+from torchpt.meshes import MeshPart, load_mesh, smooth_normals
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
 HEADER = "ply\nformat {}\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face {}\n"

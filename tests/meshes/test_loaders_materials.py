@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from torchpt.bsdfs import KINDS
 from torchpt.errors import AssetError
-from torchpt.format.materials import MATERIALS, check_material, read_material
+from torchpt.format.materials import check_material, read_material
 from torchpt.images import EncodedImage
 from torchpt.meshes import MeshPart, load_mesh
 
 
 def accepted(material: dict[str, Any]) -> None:
     """A scene file may say the same."""
-    check_material(read_material(material, "m", MATERIALS, None), "m", {}, {}, None)
+    check_material(read_material(material, "m", KINDS, None), "m", {}, {}, None)
 
 
 # --- MTL

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torchpt
-from torchpt import forward
+from torchpt.forward import kept
 from torchpt.integrators.loop.kernels import Kernels
 
 __all__ = ["FEATURES", "PLAIN", "Feature", "kernels", "with_feature"]
@@ -74,12 +74,17 @@ def _light(scene: dict[str, Any], **keys: Any) -> None:
 #: By name.
 FEATURES: dict[str, Feature] = {
     "second material": Feature(
-        ("bsdfs/roughconductor.py",),
+        ("bsdfs/kinds/roughconductor.py",),
         lambda scene: _material(scene, **{"type": "roughconductor", "material": "Au", "alpha": 0.2}),
         ("world.materials.parameters.1",),
+        module="torchpt.bsdfs.kinds.roughconductor",
     ),
     "refraction": Feature(
-        ("bsdfs/dielectric.py",), lambda scene: _material(scene, type="dielectric"), ("world.materials.parameters.1",), ("eta",)
+        ("bsdfs/kinds/dielectric.py", "bsdfs/glass.py"),
+        lambda scene: _material(scene, type="dielectric"),
+        ("world.materials.parameters.1",),
+        ("eta",),
+        module="torchpt.bsdfs.kinds.dielectric",
     ),
     "texture": Feature(
         ("textures/atlas.py",),
@@ -109,7 +114,9 @@ FEATURES: dict[str, Feature] = {
         ("lights/kinds/point.py",), lambda scene: _light(scene, type="point", position=[1, 2, 1], intensity=5)
     ),
     "layer": Feature(
-        ("integrators/aov.py",), lambda scene: scene["film"].update(aovs=["normal"]), module="torchpt.integrators.aov"
+        ("integrators/aov.py", "integrators/layers/normal.py"),
+        lambda scene: scene["film"].update(aovs=["normal"]),
+        module="torchpt.integrators.layers.normal",
     ),
     "lens": Feature(
         ("cameras/kinds/thinlens.py",),
@@ -118,10 +125,10 @@ FEATURES: dict[str, Feature] = {
         module="torchpt.cameras.kinds.thinlens",
     ),
     "preview": Feature(
-        ("integrators/ibl.py", "integrators/split_sum.py"),
+        ("integrators/kinds/ibl.py", "integrators/split_sum.py"),
         lambda scene: scene.update(integrator={"type": "ibl"}, lights={"more": {"type": "constant", "radiance": 0.3}}),
-        ("preview",),
-        module="torchpt.integrators.ibl",
+        ("first",),
+        module="torchpt.integrators.kinds.ibl",
     ),
     "roulette": Feature(("integrators/roulette.py",), lambda scene: scene["integrator"].update(rr_depth=2)),
 }  # fmt: skip
@@ -139,4 +146,6 @@ def kernels(described: Mapping[str, Any]) -> tuple[Kernels, torchpt.Scene]:
     """A scene's kernels, all that a render of it asks for made."""
     scene = torchpt.load(described, "cpu")
     torchpt.render(scene, spp=8, compile="on")
-    return forward._kernels[scene], scene
+    made = kept(scene).kernels
+    assert made is not None
+    return made, scene

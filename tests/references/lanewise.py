@@ -134,7 +134,7 @@ def compare(scene: torchpt.Scene, wishes: Mapping[str, Any], pixels: int, sample
     wave, _ = prepared(scene, wishes)
     with torch.no_grad():
         chosen = kernels_of(scene, wave)
-        if wave.preview is not None:
+        if wave.first is not None:
             _first_hits(found, wave, chosen, pixels, samples)
             return found
         recorder = waves(wave, pixels, samples)
@@ -167,10 +167,10 @@ def _listed(index: Tensor) -> Memory:
 def _generate(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:
     eager = wave.rays(0, pixels, 0, samples)
     worker, here = Worker(kernels), arena(kernels)
-    worker._start(Chunk(0, pixels, 0, samples))
-    worker._clear()
-    worker._name_salts(0)
-    worker._run(kernels.generate(), pixels * samples, here, here)
+    worker.start(Chunk(0, pixels, 0, samples))
+    worker.calls.clear()
+    worker.calls.name_salts(0)
+    worker.calls.run(kernels.generate(), pixels * samples, here, here)
     taken = kernels.state.take(here, np.arange(pixels * samples), _STATE)
     for name, value in taken.items():
         if name == "eta":
@@ -193,17 +193,17 @@ def run_bounce(
     if not kernels.listed:
         state, hit = rows(state, index), rows(hit, index)
     here, there = arena(kernels, **_fields(state, hit)), arena(kernels)
-    worker._clear()
-    worker._name_salts(depth)
+    worker.calls.clear()
+    worker.calls.name_salts(depth)
     worker.slots.words[:] = 0
     lists = [Memory(1) for _ in range(kernels.models + 2)]
     places = _listed(index) if kernels.listed else None
-    worker._run(kernels.bounce(model, roulette), len(index), here, there, places, lists=lists)
+    worker.calls.run(kernels.bounce(model, roulette), len(index), here, there, places, lists=lists)
     names = tuple(kernels.state._fields)
     lanes = (state.lane[index] if kernels.listed else state.lane).numpy()
     if not kernels.fused:
         return kernels.state.take(there, np.arange(len(index)), names), torch.ones(len(index), dtype=torch.bool), None  # type: ignore[return-value]
-    live, counts = worker._found()
+    live, counts = worker.calls.counted()
     taken = kernels.state.take(there, np.arange(live), names)
     _routes(worker, taken, lists, counts)
     place = np.full(int(lanes.max()) + 1, -1)
@@ -223,9 +223,9 @@ def _routes(worker: Worker, taken: dict[str, Tensor], lists: list[Memory], count
     hit = Hit(*(taken[name] for name in HIT))
     ends, groups = partition(kernels.world, hit)
     wanted: dict[int, Tensor] = {model: index for model, index in groups} if kernels.listed else {}
-    if kernels.emitters:
+    if kernels.has_emitters:
         wanted[kernels.emissive] = ends.emissive
-    if kernels.around:
+    if kernels.has_environment:
         wanted[kernels.missed] = ends.missed[taken["t_max"][ends.missed] > 0]
     for number in range(kernels.models + 2):
         count = counts[number] if number < len(counts) else 0
@@ -267,14 +267,14 @@ def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recor
     for state, hit, index in recorder.emits:
         light = Stages.emit(recorder, state, hit, index, False)
         here = arena(kernels, **_fields(state, hit))
-        worker._run(kernels.emit(), len(index), here, here, _listed(index))
+        worker.calls.run(kernels.emit(), len(index), here, here, _listed(index))
         taken = kernels.state.take(here, index.numpy(), ("radiance",))["radiance"]
         found.add(f"{kind} emit", "radiance", state.radiance[:, index] + light, taken)
     for state, hit, index in recorder.escapes:
         index = index[state.t_max[index] > 0]
         light = Stages.escape(recorder, state, hit, index)
         here = arena(kernels, **_fields(state, hit))
-        worker._run(kernels.escape(), len(index), here, here, _listed(index))
+        worker.calls.run(kernels.escape(), len(index), here, here, _listed(index))
         lanes = state.lane[index].numpy()
         taken = torch.from_numpy(worker.slots.floats[:, lanes].copy())
         found.add(f"{kind} escape", "radiance", state.radiance[:, index] + light, taken)
@@ -311,7 +311,7 @@ def _compare_fused(
     ended: Tensor,
 ) -> None:
     alive = after.t_max > 0
-    goes = (hit.prim >= 0) | (alive & kernels.around)
+    goes = (hit.prim >= 0) | (alive & kernels.has_environment)
     both, neither, differ = goes & on, ~goes & ~on, goes != on
     if values["lane"] is not None:
         for key in (*_STATE, *HIT):
@@ -335,7 +335,7 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
     for depth, state in enumerate(recorder.states, 1):
         hit = search.nearest(state, depth)
         here = arena(kernels, **_fields(state, Hit(*(torch.zeros_like(hit.t) for _ in range(4)))))
-        worker._nearest(here, len(state.lane), depth)
+        worker.search.nearest(here, len(state.lane), depth)
         taken = kernels.state.take(here, np.arange(len(state.lane)), tuple(HIT))
         for key in HIT:
             found.add("nearest", key, getattr(hit, key), taken[key], _floor(key))
@@ -350,7 +350,7 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
         here = arena(
             kernels, shadow_o=shadow.o, shadow_d=shadow.d, shadow_t=shadow.t_max, clear=one, key=state.key[:, index]
         )
-        worker._light(here, n)
+        worker.search.light(here, n)
         taken = kernels.state.take(here, np.arange(n), ("clear", "blocked"))
         arrived = taken["clear"] if "clear" in taken else (taken["blocked"] == 0).float()
         lit = shadow.t_max > 0
@@ -364,7 +364,7 @@ def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, s
     took = worker.trace(Chunk(0, pixels, 0, samples))
     assert took.rays == tally.rays
     slots = torch.from_numpy(worker.slots.floats[:, : pixels * samples].copy())
-    found.add("preview", "radiance", eager.reshape(3, -1), slots)
+    found.add("first", "radiance", eager.reshape(3, -1), slots)
 
 
 def _none(state: PathState) -> Hit:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from torchpt.bsdfs import KINDS
+
 __all__ = ["MATERIALS", "showcase"]
 
-#: Materials by name, at least one for each variant in ``bsdfs.MODELS``.
+#: Materials by name, at least one for each variant in ``bsdfs.variants()``.
 MATERIALS: dict[str, dict[str, Any]] = {
     "diffuse": {"type": "diffuse", "reflectance": [0.6, 0.3, 0.2]},
     "phong": {"type": "phong", "diffuse": [0.3, 0.4, 0.5], "specular": 0.3, "exponent": 40},
@@ -81,6 +83,8 @@ MATERIALS: dict[str, dict[str, Any]] = {
     },
     "ember": {"type": "roughconductor", "alpha": 0.3, "material": "Cu", "emission": [0.5, 0.2, 0.1]},
 }
+_TYPES = {material["type"] for material in MATERIALS.values()}
+MATERIALS |= {kind: {"type": kind} for kind in KINDS if kind not in _TYPES}
 
 
 def showcase(*names: str) -> dict[str, Any]:

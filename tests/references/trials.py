@@ -12,7 +12,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 from torchpt.scene import Scene
 
 __all__ = [

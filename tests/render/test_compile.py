@@ -9,12 +9,12 @@ import torch
 from trials import film_of
 
 import torchpt
-from torchpt import forward
 from torchpt.format.description import settings
+from torchpt.forward import kept
 from torchpt.integrators import compiled
 from torchpt.integrators.loop import kernels
 from torchpt.integrators.loop.schedule import Loop
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
 
@@ -49,8 +49,8 @@ def test_auto_and_on_take_the_loop(passes, mode, looped):
     found = run(scene, 8, mode)
     assert sum(passes) == (8 if looped else 0)
     assert found.eager == ()
-    assert (scene in forward._kernels) == looped
-    assert scene not in forward._compiled or not forward._compiled[scene]  # graphs are for CUDA
+    assert (kept(scene).kernels is not None) == looped
+    assert not kept(scene).stages  # graphs are for CUDA
 
 
 def test_the_summary_tells_the_time_that_compiling_took(monkeypatch):
@@ -64,7 +64,9 @@ def test_the_summary_tells_the_time_that_compiling_took(monkeypatch):
     clock = iter(range(1000))
     monkeypatch.setattr(kernels.time, "perf_counter", lambda: float(next(clock)))
     ticks = run(scene, 1, "auto").compile_seconds
-    assert ticks >= len(forward._kernels[scene]._made) > 0
+    made = kept(scene).kernels
+    assert made is not None
+    assert ticks >= len(made._made) > 0
 
 
 def test_float64_stays_eager(passes):
@@ -110,7 +112,7 @@ def test_under_a_tape_the_picture_is_compiled_and_the_gradient_eager(passes):
 
 def graphs(scene: torchpt.Scene) -> dict[str, int]:
     counts: dict[str, int] = {}
-    for stages in forward._compiled[scene].values():
+    for stages in kept(scene).stages.values():
         counts |= stages.graphs
     return counts
 

@@ -16,7 +16,7 @@ from trials import film_of
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.integrators.loop import kernels as loop_kernels
+from torchpt.integrators.loop import programs
 from torchpt.lanes.program import Program
 from torchpt.records import tensors_of
 
@@ -86,6 +86,22 @@ def test_info_says_what_was_left_out():
     assert made == {"diffuse": 2, "roughconductor (anisotropic)": 1, "dielectric": 1}  # floor and lamp have their own
 
 
+_IMPORTED = """
+import sys
+sys.path[:0] = {paths!r}
+import torchpt
+from features import with_feature
+scene = torchpt.load(with_feature(None), "cpu")
+print(*[name for name in sys.modules if name.startswith("torchpt.bsdfs.kinds.")])
+"""
+
+
+def test_a_model_is_imported_where_a_scene_has_it():
+    code = _IMPORTED.format(paths=[path for path in sys.path if path.endswith("references")])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.split() == ["torchpt.bsdfs.kinds.diffuse"], done.stderr
+
+
 # -- kernels of the compiled loop
 
 
@@ -126,7 +142,7 @@ def test_kernels_hold_nothing_of_what_is_not_there(name, plain):
 def test_kernels_are_the_same_after_it_was_there_and_is_gone(name, plain):
     """Traced anew, not from the cache: the machine code's name is made of the IR."""
     kernels(with_feature(name))
-    loop_kernels._programs.clear()
+    programs.forget()
     again = _programs(with_feature(None))
     assert {key: program.code for key, program in again.items()} == {
         key: program.code for key, program in plain.items()
@@ -170,5 +186,5 @@ def _blocked(module: str) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("module", sorted({f.module for f in FEATURES.values() if f.module is not None}))
 def test_the_same_picture_where_its_module_cannot_be_imported(module, unblocked):
-    """BSDF models, textures and lights other than maps are imported together, and are not asked here."""
+    """Textures are imported together, and are not asked here."""
     assert _blocked(module) == [*unblocked, "missed"]

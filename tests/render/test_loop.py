@@ -17,20 +17,22 @@ from significance import t_limit
 from trials import coarse, film_of
 
 import torchpt
-from torchpt.bsdfs import MODELS
+from torchpt.bsdfs import KINDS
 from torchpt.film import Film
 from torchpt.format.description import settings
 from torchpt.forward import kernels_of
-from torchpt.integrators.aov import CHANNELS
+from torchpt.integrators import LAYERS
 from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.loop.rows import HIT
 from torchpt.integrators.loop.schedule import Loop
 from torchpt.integrators.stages import STRATEGIES
 from torchpt.records import Hit, rows
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 from torchpt.samplers import KINDS as SAMPLERS
 
 SCENES = sorted(path.stem for path in Path("configs/scene").glob("*.yaml")) or ["cornell_box"]
+#: Layers of first surfaces.
+SEEN = [name for name in LAYERS if not LAYERS[name].light]
 DIFFUSE = ("cornell_box", "cornell_bunny", "cornell_statue_bunny_diffuse", "games101")
 
 
@@ -83,7 +85,7 @@ def test_kernels_of_every_material(names):
 
 
 def test_every_model_is_among_the_materials():
-    assert {MATERIALS[name]["type"] for name in MATERIALS} >= {str(name).split()[0] for name in MODELS} - {"blend"}
+    assert {MATERIALS[name]["type"] for name in MATERIALS} >= KINDS.keys() - {"blend"}
 
 
 @pytest.mark.slow
@@ -102,7 +104,7 @@ def test_what_goes_where_after_a_hit():
     with torch.no_grad():
         kernels = kernels_of(scene, wave)
         worker, recorder = Worker(kernels), waves(wave, 1024, 4)
-        assert not kernels.fused and kernels.around and kernels.emitters and kernels.models == 2
+        assert not kernels.fused and kernels.has_environment and kernels.has_emitters and kernels.models == 2
         _, state, hit, _, _ = next(found for found in recorder.bounces if found[4] == 2)
         n = len(state.lane)
         dead = torch.arange(n) % 10 == 0
@@ -113,10 +115,10 @@ def test_what_goes_where_after_a_hit():
             kernels, **{name: getattr(state, name) for name in ("lane", "t_max", "radiance", "key")},
             **{name: getattr(hit, name) for name in HIT}, shadow_radiance=light, clear=clear,
         )  # fmt: skip
-        worker._clear()
+        worker.calls.clear()
         lists = worker._lists[0]
-        worker._run(kernels.settle(True), n, here, here, lists=lists)
-        _, places = worker._found()
+        worker.calls.run(kernels.settle(True), n, here, here, lists=lists)
+        _, places = worker.calls.counted()
         wanted = torch.addcmul(state.radiance, light, clear)
         held = kernels.state.take(here, np.arange(n), ("radiance",))["radiance"]
         assert torch.allclose(held, wanted, rtol=1e-6, atol=0)
@@ -295,14 +297,14 @@ def test_depths_and_roulette(limits):
 @pytest.mark.parametrize("name", quick(("cornell_box",), ["cornell_box", "showcase"]))
 def test_layers(name, integrator):
     scene = loaded(showcase("lattice", "glass", "tiles", "patches") if name == "showcase" else name)
-    wish = {"integrator": {"type": integrator}, "film": {"aovs": list(CHANNELS), "filter": "mitchell"}}
+    wish = {"integrator": {"type": integrator}, "film": {"aovs": SEEN, "filter": "mitchell"}}
     assert paired(scene, wish, 16, 4) <= 1.0
 
 
 def test_first_surfaces_agree_pixel_by_pixel():
     """No path to go astray: but for edges that rays graze, layers are equal to rounding."""
     scene = loaded(showcase("lattice", "glass", "tiles", "patches"))
-    wish = {"integrator": {"type": "aov"}, "film": {**film_of(40, 30), "aovs": list(CHANNELS)}}
+    wish = {"integrator": {"type": "aov"}, "film": {**film_of(40, 30), "aovs": SEEN}}
     on, off = (layers_of(rendered(scene, mode, 1, 2, wish)) for mode in ("on", "off"))
     for name in on:
         near = torch.isclose(
@@ -378,7 +380,7 @@ def test_searches_do_not_depend_on_the_packet(name):
         def found(state: Any) -> Hit:
             nothing = torch.zeros(n)
             here = arena(kernels, o=state.o, d=state.d, t_max=state.t_max, key=state.key, t=nothing)
-            worker._nearest(here, n, 2)
+            worker.search.nearest(here, n, 2)
             return Hit(*kernels.state.take(here, np.arange(n), tuple(HIT)).values())
 
         order = torch.randperm(n, generator=torch.Generator().manual_seed(4))

@@ -22,7 +22,7 @@ from torchpt.forward import BYTES_PER_LANE
 from torchpt.integrators.loop import schedule
 from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.path import Tally
-from torchpt.render import Progress, Rendering, render_scene
+from torchpt.rendering import Progress, Rendering, render_scene
 
 FILM = {**film_of(37, 23), "filter": "mitchell", "aovs": ["albedo", "normal", "variance"]}
 
@@ -240,7 +240,7 @@ def test_a_worker_is_used_again_as_if_new():
     with torch.no_grad():
         kernels = kernels_of(scene, wave)
     worker, fresh = Worker(kernels), Worker(kernels)
-    for memory in (*worker._arenas, *worker._passed, worker.slots, *worker._lists[0], *worker._lists[1]):
+    for memory in (*worker._arenas, *worker.search.passed, worker.slots, *worker._lists[0], *worker._lists[1]):
         memory.words[:] = np.float32(np.nan).view(np.int32) if memory.words.shape[0] > 1 else 5
     worker.trace(Chunk(0, 1600, 0, 3))
     a, b = worker.trace(Chunk(64, 99, 1, 3)), fresh.trace(Chunk(64, 99, 1, 3))

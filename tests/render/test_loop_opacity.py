@@ -11,7 +11,7 @@ from trials import film_of
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 
 MESH = str(Path(__file__).parents[2] / "scenes" / "standin.ply")
 

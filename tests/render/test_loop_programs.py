@@ -16,15 +16,17 @@ from torch import Tensor, nn
 from trials import film_of
 
 import torchpt
-from torchpt import forward
 from torchpt.bsdfs import Parameters
 from torchpt.format.description import settings
+from torchpt.forward import say_once
+from torchpt.integrators.compiled import Stages
+from torchpt.integrators.loop import programs
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.lanes import engine
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.warps import cosine_hemisphere
 from torchpt.records import BsdfSample
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 
 
 def rendered(scene: torchpt.Scene, params: Any = None, **wishes: Any) -> Rendering:
@@ -37,13 +39,13 @@ def rendered(scene: torchpt.Scene, params: Any = None, **wishes: Any) -> Renderi
 @pytest.fixture
 def work(monkeypatch) -> Iterator[Any]:
     """Counts kernels compiled and stages traced since it was last asked."""
-    traced, kept = [0], Kernels._traced
+    traced, kept = [0], programs._traced
 
-    def counting(self: Kernels, *args: Any) -> Any:
+    def counting(*args: Any) -> Any:
         traced[0] += 1
-        return kept(self, *args)
+        return kept(*args)
 
-    monkeypatch.setattr(Kernels, "_traced", counting)
+    monkeypatch.setattr(programs, "_traced", counting)
     before = [engine.counts()[0], 0]
 
     def since() -> tuple[int, int]:
@@ -159,13 +161,13 @@ def test_larger_pictures_and_maps(work, tmp_path):
 
 AGAIN = """
 import sys, torchpt
-from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.loop import programs
 from torchpt.lanes import engine
-traced, kept = [0], Kernels._traced
-def counting(self, *args):
+traced, kept = [0], programs._traced
+def counting(*args):
     traced[0] += 1
-    return kept(self, *args)
-Kernels._traced = counting
+    return kept(*args)
+programs._traced = counting
 scene = torchpt.load("cornell_box", "cpu")
 wish = dict(film={"width": 16, "height": 16, "aovs": ["albedo"]}, threads=1)
 image = torchpt.render(scene, spp=4, **wish)
@@ -245,11 +247,11 @@ def close(a: Rendering, b: Rendering) -> bool:
 
 
 def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
-    monkeypatch.setattr(forward, "_said", set())
+    say_once.cache_clear()
     scene = torchpt.load(room("odd"), "cpu", bsdfs={"odd": Odd()})
     eager = rendered(scene, render={"compile": "off", "spp": 4})
     asked: list[int] = []
-    kept = forward.Stages.bounce
+    kept = Stages.bounce
 
     def noted(self: Any, model: int, *args: Any) -> Any:
         asked.append(model)
@@ -328,7 +330,7 @@ class Lambert(torchpt.Bsdf):
 
 
 def test_a_stage_that_turns_out_not_to_compile_renders_all_eagerly(monkeypatch, capsys):
-    monkeypatch.setattr(forward, "_said", set())
+    say_once.cache_clear()
     scene = torchpt.load("cornell_box", "cpu")
     eager = rendered(scene, render={"compile": "off"})
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import torchpt
-from torchpt import forward
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
-from torchpt.render import render_scene
+from torchpt.forward import limited_threads
+from torchpt.rendering import render_scene
 from torchpt.scene.sources import labels_of
 
 LAMP = {
@@ -118,14 +118,14 @@ def test_overlapping_renders_put_the_thread_count_back():
     inside, go_on = threading.Event(), threading.Event()
 
     def first() -> None:
-        with forward.limited_threads(1):
+        with limited_threads(1):
             inside.set()
             go_on.wait(10)
 
     worker = threading.Thread(target=first)
     worker.start()
     inside.wait(10)
-    with forward.limited_threads("auto"):
+    with limited_threads("auto"):
         go_on.set()
         worker.join()
     assert torch.get_num_threads() == before

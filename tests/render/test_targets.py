@@ -11,7 +11,7 @@ import torchpt
 from torchpt.format.description import settings
 from torchpt.integrators.loop import kernels
 from torchpt.lanes import engine
-from torchpt.render import render_scene
+from torchpt.rendering import render_scene
 
 pytestmark = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="these are x86 machines")
 

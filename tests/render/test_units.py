@@ -11,7 +11,7 @@ import torch
 import torchpt
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
-from torchpt.render import Rendering, render_scene
+from torchpt.rendering import Rendering, render_scene
 
 DOWN = {"rotate": {"axis": [1, 0, 0], "angle": 90}}
 SHEAR = {"matrix": [[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from cubes import unit_cube
 
-from torchpt.meshes import load_mesh, unit_cube
+from torchpt.meshes import load_mesh
 from torchpt.shapes.normals import smooth_normals
 
 BUNNY = Path(os.environ.get("TORCHPT_ASSETS", "")) / "bunny.ply"

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchpt.accel.base import Accel, Array, Hits, closer
 from torchpt.accel.tables import extent, inverses, prepare, tolerances
 from torchpt.errors import SceneError
-from torchpt.native.operators import choose, operator
+from torchpt.native.operators import hits_like, operator
 from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
@@ -68,14 +68,10 @@ class Brute(Accel):
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return choose(_intersect, _intersect_operator)(
-            o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, self.threads
-        )
+        return _intersect(o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, self.threads)
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return choose(_occluded, _occluded_operator)(
-            o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, self.threads
-        )
+        return _occluded(o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, self.threads)
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
@@ -109,6 +105,7 @@ class Brute(Accel):
         }
 
 
+@operator("torchpt::brute_intersect", lambda o, d, t_max, *scene: hits_like(t_max))
 def _intersect(
     o: Tensor,
     d: Tensor,
@@ -138,15 +135,7 @@ def _intersect(
     return t, prim, u, v
 
 
-_intersect_operator = operator("torchpt::brute_intersect", _intersect)
-
-
-@_intersect_operator.register_fake
-def _(o, d, t_max, table, spheres, quadrics, counts, extent, threads):
-    like = torch.empty_like
-    return like(t_max), like(t_max, dtype=torch.int32), like(t_max), like(t_max)
-
-
+@operator("torchpt::brute_occluded", lambda o, d, t_max, *scene: torch.empty_like(t_max, dtype=torch.bool))
 def _occluded(
     o: Tensor,
     d: Tensor,
@@ -166,14 +155,6 @@ def _occluded(
     blocks = -(-t_max.shape[0] // kernels.BLOCK)
     launch(kernels.occluded, kernels.occluded_parallel, blocks, threads, _GRAIN, (*args, blocked.numpy()))
     return blocked
-
-
-_occluded_operator = operator("torchpt::brute_occluded", _occluded)
-
-
-@_occluded_operator.register_fake
-def _(o, d, t_max, table, spheres, quadrics, counts, extent, threads):
-    return torch.empty_like(t_max, dtype=torch.bool)
 
 
 def _arguments(

@@ -89,40 +89,44 @@ def _ball(ball, w, i):
 
 
 @jit(forceinline=True)
-def _keep(hit, t, prim, w, i):
-    w[_T + i] = t if hit else w[_T + i]
-    w[_PRIM + i] = prim if hit else w[_PRIM + i]
+def _keep(hit, t, prim, w, i, any_hit):
+    """Takes a hit that is nearer than what there is; of any hit the ray is dead then."""
+    if any_hit:
+        w[_T + i] = _DEAD if hit else w[_T + i]
+    else:
+        w[_T + i] = t if hit else w[_T + i]
+        w[_PRIM + i] = prim if hit else w[_PRIM + i]
 
 
-@jit(fastmath=_FAST)
-def _triangle(row, prim, w):
+@jit(fastmath=_FAST, forceinline=True)
+def _triangle(row, prim, w, any_hit):
     r = _unpack(row)
     for i in range(BLOCK):
         t, u, v, slack = _plane(r, w, i)
-        _keep(_in_triangle(u, v, slack) & (t > _ZERO) & (t < w[_T + i]), t, prim, w, i)
+        _keep(_in_triangle(u, v, slack) & (t > _ZERO) & (t < w[_T + i]), t, prim, w, i, any_hit)
 
 
-@jit(fastmath=_FAST)
-def _rectangle(row, prim, w):
+@jit(fastmath=_FAST, forceinline=True)
+def _rectangle(row, prim, w, any_hit):
     r = _unpack(row)
     for i in range(BLOCK):
         t, u, v, slack = _plane(r, w, i)
-        _keep(_in_rectangle(u, v, slack) & (t > _ZERO) & (t < w[_T + i]), t, prim, w, i)
+        _keep(_in_rectangle(u, v, slack) & (t > _ZERO) & (t < w[_T + i]), t, prim, w, i, any_hit)
 
 
-@jit(fastmath=_FAST)
-def _disk(row, prim, w):
+@jit(fastmath=_FAST, forceinline=True)
+def _disk(row, prim, w, any_hit):
     r = _unpack(row)
     for i in range(BLOCK):
         t, u, v, _ = _plane(r, w, i)
-        _keep((u * u + v * v <= _ONE) & (t > _ZERO) & (t < w[_T + i]), t, prim, w, i)
+        _keep((u * u + v * v <= _ONE) & (t > _ZERO) & (t < w[_T + i]), t, prim, w, i, any_hit)
 
 
-@jit()
-def _sphere(ball, prim, w):
+@jit(forceinline=True)
+def _sphere(ball, prim, w, any_hit):
     for i in range(BLOCK):
         t = _ball(ball, w, i)
-        _keep((t > _ZERO) & (t < w[_T + i]), t, prim, w, i)
+        _keep((t > _ZERO) & (t < w[_T + i]), t, prim, w, i, any_hit)
 
 
 @jit()
@@ -132,51 +136,12 @@ def _bent(quadrics, k, w, i):
     return quadric_hit(quadrics, k, ox, oy, oz, dx, dy, dz)
 
 
-@jit()
-def _quadric(quadrics, k, prim, w):
+@jit(forceinline=True)
+def _quadric(quadrics, k, prim, w, any_hit):
     for i in range(BLOCK):
         if w[_T + i] > _ZERO:
             t, _, _ = _bent(quadrics, k, w, i)
-            _keep((t > _ZERO) & (t < w[_T + i]), t, prim, w, i)
-
-
-@jit(fastmath=_FAST)
-def _shade_triangle(row, w):
-    r = _unpack(row)
-    for i in range(BLOCK):
-        t, u, v, slack = _plane(r, w, i)
-        w[_T + i] = _DEAD if _in_triangle(u, v, slack) & (t > _ZERO) & (t < w[_T + i]) else w[_T + i]
-
-
-@jit(fastmath=_FAST)
-def _shade_rectangle(row, w):
-    r = _unpack(row)
-    for i in range(BLOCK):
-        t, u, v, slack = _plane(r, w, i)
-        w[_T + i] = _DEAD if _in_rectangle(u, v, slack) & (t > _ZERO) & (t < w[_T + i]) else w[_T + i]
-
-
-@jit(fastmath=_FAST)
-def _shade_disk(row, w):
-    r = _unpack(row)
-    for i in range(BLOCK):
-        t, u, v, _ = _plane(r, w, i)
-        w[_T + i] = _DEAD if (u * u + v * v <= _ONE) & (t > _ZERO) & (t < w[_T + i]) else w[_T + i]
-
-
-@jit()
-def _shade_sphere(ball, w):
-    for i in range(BLOCK):
-        t = _ball(ball, w, i)
-        w[_T + i] = _DEAD if (t > _ZERO) & (t < w[_T + i]) else w[_T + i]
-
-
-@jit()
-def _shade_quadric(quadrics, k, w):
-    for i in range(BLOCK):
-        if w[_T + i] > _ZERO:
-            t, _, _ = _bent(quadrics, k, w, i)
-            w[_T + i] = _DEAD if (t > _ZERO) & (t < w[_T + i]) else w[_T + i]
+            _keep((t > _ZERO) & (t < w[_T + i]), t, prim, w, i, any_hit)
 
 
 @jit()
@@ -235,15 +200,15 @@ def intersect(first, last, o, d, t_max, table, balls, quadrics, triangles, recta
         _load(block, o, d, t_max, extent, w)
         if not _all_dead(w):
             for p in range(triangles):
-                _triangle(table[p], np.float32(p), w)
+                _triangle(table[p], np.float32(p), w, False)
             for p in range(triangles, triangles + rectangles):
-                _rectangle(table[p], np.float32(p), w)
+                _rectangle(table[p], np.float32(p), w, False)
             for p in range(triangles + rectangles, table.shape[0]):
-                _disk(table[p], np.float32(p), w)
+                _disk(table[p], np.float32(p), w, False)
             for p in range(balls.shape[0]):
-                _sphere(balls[p], np.float32(p + table.shape[0]), w)
+                _sphere(balls[p], np.float32(p + table.shape[0]), w, False)
             for p in range(quadrics.shape[0]):
-                _quadric(quadrics, p, np.float32(p + table.shape[0] + balls.shape[0]), w)
+                _quadric(quadrics, p, np.float32(p + table.shape[0] + balls.shape[0]), w, False)
         _store(block, table, triangles, rectangles, w, t, prim, u, v)
         if quadrics.shape[0] > 0:
             _store_quadrics(block, quadrics, table.shape[0] + balls.shape[0], w, prim, u, v)
@@ -264,17 +229,17 @@ def _shade(table, balls, quadrics, triangles, rectangles, w):
     """Marks the blocked rays of a block as dead; stops once none is left."""
     for p in range(table.shape[0]):
         if p < triangles:
-            _shade_triangle(table[p], w)
+            _triangle(table[p], _DEAD, w, True)
         elif p < triangles + rectangles:
-            _shade_rectangle(table[p], w)
+            _rectangle(table[p], _DEAD, w, True)
         else:
-            _shade_disk(table[p], w)
+            _disk(table[p], _DEAD, w, True)
         if p % 8 == 7 and _all_dead(w):
             return
     for p in range(balls.shape[0]):
-        _shade_sphere(balls[p], w)
+        _sphere(balls[p], _DEAD, w, True)
     for p in range(quadrics.shape[0]):
-        _shade_quadric(quadrics, p, w)
+        _quadric(quadrics, p, _DEAD, w, True)
 
 
 @jit()

@@ -13,7 +13,7 @@ from torchpt.accel.base import Accel, Hits
 from torchpt.accel.bounds import primitive_bounds, surface
 from torchpt.accel.radix import Tree, build_tree
 from torchpt.accel.tables import inverses, prepare
-from torchpt.native.operators import choose, operator
+from torchpt.native.operators import hits_like, operator
 from torchpt.records import Geometry
 
 __all__ = ["Lbvh"]
@@ -44,10 +44,10 @@ class Lbvh(Accel):
         return [self.corners, self.rows, self.quadrics, self.tree.children, self.tree.boxes, self.tree.order]
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return choose(_intersect, _intersect_operator)(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
+        return _intersect(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return choose(_occluded, _occluded_operator)(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
+        return _occluded(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`."""
@@ -73,28 +73,16 @@ def sah_cost(tree: Tree) -> float:
     return float(1 + area.sum() / surface(low, high).clamp(min=torch.finfo(torch.float64).tiny))
 
 
+@operator("torchpt::lbvh_intersect", lambda o, d, t_max, *scene: hits_like(t_max))
 def _intersect(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return traverse.intersect(o, d, t_max, tensors, counts, depth)
 
 
-_intersect_operator = operator("torchpt::lbvh_intersect", _intersect)
-
-
-@_intersect_operator.register_fake
-def _(o, d, t_max, tensors, counts, depth):
-    like = torch.empty_like
-    return like(t_max), like(t_max, dtype=torch.int32), like(t_max), like(t_max)
-
-
+@operator(
+    "torchpt::lbvh_occluded",
+    lambda o, d, t_max, *scene: torch.empty_like(t_max, dtype=torch.bool),
+)
 def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> Tensor:
     return traverse.occluded(o, d, t_max, tensors, counts, depth)
-
-
-_occluded_operator = operator("torchpt::lbvh_occluded", _occluded)
-
-
-@_occluded_operator.register_fake
-def _(o, d, t_max, tensors, counts, depth):
-    return torch.empty_like(t_max, dtype=torch.bool)

@@ -16,7 +16,7 @@ from torchpt.accel.blocks import Others, aligned, lines_of, mesh_tree, room_of, 
 from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.topology import Topology
 from torchpt.native.jit import compiled, launch
-from torchpt.native.operators import choose, operator
+from torchpt.native.operators import hits_like, operator
 from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
@@ -68,10 +68,10 @@ class Wide(Accel):
         return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return choose(_intersect, _intersect_operator)(o, d, t_max, self.tensors, self.threads)
+        return _intersect(o, d, t_max, self.tensors, self.threads)
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return choose(_occluded, _occluded_operator)(o, d, t_max, self.tensors, self.threads)
+        return _occluded(o, d, t_max, self.tensors, self.threads)
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
@@ -108,6 +108,7 @@ def _arrays(tensors: list[Tensor]) -> tuple[np.ndarray, ...]:
     return tree, tree.view(np.int32), *rest
 
 
+@operator("torchpt::wide_intersect", lambda o, d, t_max, *scene: hits_like(t_max))
 def _intersect(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], threads: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -119,26 +120,10 @@ def _intersect(
     return t, prim, u, v
 
 
-_intersect_operator = operator("torchpt::wide_intersect", _intersect)
-
-
-@_intersect_operator.register_fake
-def _(o, d, t_max, tensors, threads):
-    like = torch.empty_like
-    return like(t_max), like(t_max, dtype=torch.int32), like(t_max), like(t_max)
-
-
+@operator("torchpt::wide_occluded", lambda o, d, t_max, *scene: torch.empty_like(t_max, dtype=torch.bool))
 def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], threads: int) -> Tensor:
     out = torch.empty_like(t_max, dtype=torch.int32)
     rays = (x.contiguous().numpy() for x in (o, d, t_max))
     args = (*rays, *_arrays(tensors), _ALL_OPAQUE, out.numpy())
     launch(kernels.blocked, kernels.blocked_parallel, t_max.shape[0], threads, _GRAIN, args)
     return out != 0
-
-
-_occluded_operator = operator("torchpt::wide_occluded", _occluded)
-
-
-@_occluded_operator.register_fake
-def _(o, d, t_max, tensors, threads):
-    return torch.empty_like(t_max, dtype=torch.bool)

@@ -9,36 +9,39 @@ Radiance is carried, so what is refracted scales by ``1 / eta^2`` (Veach, *Robus
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from torchpt.bsdfs.specs import Heights, Normals, fraction
 from torchpt.math.vectors import take
-from torchpt.records import BsdfSample
+from torchpt.records import BsdfSample, SplitSumMaterial
+from torchpt.spec import Color, Flag, Refused, Scalar, Spec, parameters_of
 
-__all__ = ["Bsdf", "Parameters", "Table", "gather", "stacked"]
+__all__ = ["Bsdf", "Parameters", "Table", "Values", "gather", "made", "matte", "stacked"]
 
 #: By name: a tensor, ``(3, N)`` or ``(N,)``; a :class:`Table`; such a mapping again; None where it asks for nothing.
 Parameters = dict[str, Any]
 
-#: Parameters that scale a lobe: where they are absent they count as 1.
-FACTORS = ("specular_reflectance", "specular_transmittance")
-
-Default = float | tuple[float, float, float]
+#: By name, as a scene file has them: numbers, colours as three, textures, words.
+Values = Mapping[str, Any]
 
 
 class Bsdf:
     """A material model: pure tensor functions on plain values. One instance is one group of lanes.
 
-    A subclass defines :meth:`sample` and either :meth:`eval_pdf`, or :meth:`eval` and :meth:`pdf`.
+    A subclass defines :meth:`sample` and either :meth:`eval_pdf`, or :meth:`eval` and :meth:`pdf`. Its ``parameters`` are
+    added to those that every material has, which stand here.
 
     Attributes:
         name: its ``type`` in a scene file.
-        parameters: names and defaults of what a material of this type is given: a number, or three for a colour.
+        parameters: what a material of this type takes: specs, or plain defaults (a number, or three for a colour).
+        factors: those that scale a lobe: where a material lacks one that others of its model have, it counts as 1.
         tabulated: parameters that :meth:`tabulate` needs, so that no texture can give them.
+        sheer: whether nothing is there: rays pass, which is no bounce.
         lobed: whether ``sample`` reads ``lobe``; the others are spared that number.
         delta: whether ``sample`` may give ``pdf = inf``.
         smooth: whether it gives nothing else: then no light is sampled for it.
@@ -51,8 +54,23 @@ class Bsdf:
     """
 
     name: ClassVar[str] = ""
-    parameters: ClassVar[Mapping[str, Default]] = {}
-    tabulated: ClassVar[tuple[str, ...]] = ()
+    parameters: ClassVar[Mapping[str, Spec | float | tuple[float, float, float]]] = {
+        "two_sided": Flag(
+            True, doc="whether the back of an opaque material reflects as the front does; else it is black"
+        ),
+        "opacity": fraction(
+            1.0, "fraction of the light that meets the surface; the rest passes as if it were not there"
+        ),
+        "alpha_cutoff": Scalar(None, high=1.0, doc="an opacity below it counts as 0, else as 1"),
+        "emission": Color(None, texture=True, doc="radiance leaving the front side: an area light"),
+        "emission_strength": Scalar(1.0, doc="factor of `emission`"),
+        "normal_map": Normals(doc="shading normals in the surface's own frame, `2 c - 1` of the colours c"),
+        "normal_strength": Scalar(1.0, doc="factor of how far the map's normals lean"),
+        "bump_map": Heights(doc="heights along the normal, in the scene's units, whose slope tilts the shading normal"),
+    }
+    factors: tuple[str, ...] = ("specular_reflectance", "specular_transmittance")
+    tabulated: tuple[str, ...] = ()
+    sheer: ClassVar[bool] = False
     lobed: ClassVar[bool] = False
     conserves: ClassVar[bool] = True
     reciprocal: ClassVar[bool] = True
@@ -62,10 +80,59 @@ class Bsdf:
     refracts: bool = False
     anisotropic: bool = False
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(cls, part: bool = False, **kwargs: Any) -> None:
+        """``part``: of models, and none by itself."""
         super().__init_subclass__(**kwargs)
-        if cls.eval_pdf is Bsdf.eval_pdf and (cls.eval is Bsdf.eval or cls.pdf is Bsdf.pdf):
+        if not part and cls.eval_pdf is Bsdf.eval_pdf and (cls.eval is Bsdf.eval or cls.pdf is Bsdf.pdf):
             raise TypeError(f"{cls.__name__} has to define eval_pdf, or eval and pdf")
+
+    @classmethod
+    def check(cls, values: Values, given: frozenset[str]) -> None:
+        """Refuse values that do not go together.
+
+        Args:
+            values: of all parameters, defaults filled in.
+            given: names of those that the file states.
+
+        Raises:
+            Refused: says which, and what is accepted.
+        """
+        if values["alpha_cutoff"] is not None and "opacity" not in given:
+            raise Refused("an opacity beside alpha_cutoff", values["alpha_cutoff"], ("alpha_cutoff",))
+        if values["normal_map"] is not None and values["bump_map"] is not None:
+            raise Refused("either normal_map or bump_map, not both", values["bump_map"], ("bump_map",))
+        for key, whole in (("normal_strength", "normal_map"), ("emission_strength", "emission")):
+            if key in given and values[whole] is None:
+                raise Refused(f"{'an' if whole[0] in 'aeiou' else 'a'} {whole} beside {key}", values[key], (key,))
+
+    @classmethod
+    def of(cls, values: Values) -> tuple[Bsdf, dict[str, Any]]:
+        """The model in the variant that a material needs, and what it is given: see :meth:`given`.
+
+        Args:
+            values: of all parameters; in place of other materials their models.
+        """
+        return cls(), cls.given(values)
+
+    @classmethod
+    def given(cls, values: Values) -> dict[str, Any]:
+        """What the model is given of a material's values: its own numbers, colours and textures, None excepted."""
+        specs = parameters_of(cls)
+        return {
+            key: value
+            for key, value in values.items()
+            if value is not None and key not in Bsdf.parameters and (key not in specs or specs[key].traced)
+        }
+
+    @classmethod
+    def energy(cls, values: Values) -> str:
+        """Why a material reflects more than it receives, or ""; what textures give is not known yet."""
+        return ""
+
+    @classmethod
+    def variants(cls) -> tuple[Bsdf, ...]:
+        """The model in every variant that scenes can ask for: tests run over them."""
+        return (cls(),)
 
     def tabulate(self, values: Parameters) -> Parameters:
         """What :meth:`prepare` needs beside ``values`` and can be had once a material: integrals over directions."""
@@ -106,6 +173,14 @@ class Bsdf:
         """Colour ``(3, N)`` for the albedo layer."""
         raise NotImplementedError
 
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """What split-sum shading, the preview, takes the material for; by default diffuse, of the colour :meth:`albedo`."""
+        return matte(self.albedo(parameters))
+
+    def preview(self, parameters: Parameters, shade: Callable[[SplitSumMaterial], Tensor]) -> Tensor:
+        """Radiance ``(3, N)`` in the preview, where ``shade`` gives that of one material."""
+        return shade(self.split_sum(parameters))
+
     def weights(self) -> Iterator[Tensor]:
         """Trainable tensors of its own, those of modules it holds: gradients flow to them."""
         held = [value for value in vars(self).values() if isinstance(value, torch.nn.Module)]
@@ -115,6 +190,17 @@ class Bsdf:
     def __str__(self) -> str:
         variants = [key.replace("_", " ") for key, value in vars(self).items() if value is True]
         return f"{self.name} ({', '.join(variants)})" if variants else self.name
+
+
+def made(kind: Any, values: Values) -> tuple[Bsdf, dict[str, Any]]:
+    """A kind's model and what it is given, see :meth:`Bsdf.of`; a caller's own kind is the one instance that they made."""
+    return kind.of(values) if isinstance(kind, type) else (kind, kind.given(values))
+
+
+def matte(color: Tensor) -> SplitSumMaterial:
+    """A diffuse surface ``(3, N)`` without a mirror."""
+    none = torch.zeros_like(color[0])
+    return SplitSumMaterial(color, none, none, torch.ones_like(none), None)
 
 
 @dataclass(frozen=True)
@@ -155,7 +241,7 @@ def gather(rows: Parameters, row: Tensor) -> Parameters:
     return {name: at(value) for name, value in rows.items()}
 
 
-def stacked(prepared: Sequence[Parameters]) -> Parameters:
+def stacked(prepared: Sequence[Parameters], factors: Sequence[str] = Bsdf.factors) -> Parameters:
     """One mapping of rows from those of several materials of one model. Of what is None in some, they get 0, of a factor 1."""
     out: Parameters = {}
     for name in dict.fromkeys(name for values in prepared for name in values):
@@ -164,10 +250,10 @@ def stacked(prepared: Sequence[Parameters]) -> Parameters:
         if like is None:
             out[name] = None
         elif isinstance(like, dict):
-            out[name] = stacked([value or {} for value in column])
+            out[name] = stacked([value or {} for value in column], factors)
         elif isinstance(like, Table):
             out[name] = Table(torch.cat([torch.zeros_like(like.values) if t is None else t.values for t in column]))
         else:
-            nothing = torch.ones_like(like) if name in FACTORS else torch.zeros_like(like)
+            nothing = torch.ones_like(like) if name in factors else torch.zeros_like(like)
             out[name] = torch.cat([nothing if t is None else t for t in column], -1)
     return out

@@ -29,6 +29,10 @@ class Glossy(Bsdf):
         """Diffuse and specular factors ``(3, N)``."""
         raise NotImplementedError
 
+    def roughness(self, parameters: Parameters) -> Tensor:
+        """Roughness ``(N,)`` of the facets; 0 where they are a mirror."""
+        return torch.where(parameters["smooth"], 0.0, parameters["alpha"].sqrt())
+
     def prepare(self, values: Parameters) -> Parameters:
         """Roughness becomes ``alpha`` and ``k``; below the least alpha the facets are a mirror."""
         values = dict(values)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpt.bsdfs.base import Bsdf, Parameters
 from torchpt.records import BsdfSample
 
-__all__ = ["above", "cosine_power", "drop_of_power", "mean", "share", "weighed", "with_delta"]
+__all__ = ["above", "cosine_power", "drop_of_power", "mean", "reflectance_at_normal", "share", "weighed", "with_delta"]
 
 
 def above(*directions: Tensor) -> Tensor:
@@ -38,6 +38,12 @@ def drop_of_power(u: Tensor, exponent: Tensor) -> Tensor:
 def mean(rgb: Tensor) -> Tensor:
     """Of the three channels: ``(3, N) -> (N,)``."""
     return (rgb[0] + rgb[1] + rgb[2]) * (1.0 / 3.0)
+
+
+def reflectance_at_normal(eta: Tensor) -> Tensor:
+    """Of a dielectric of relative index ``eta (N,)``."""
+    root = (eta - 1.0) / (eta + 1.0)
+    return root * root
 
 
 def share(a: Tensor, b: Tensor) -> Tensor:

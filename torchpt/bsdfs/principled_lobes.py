@@ -7,26 +7,63 @@ Subsurface Scattering*, 2015 (below: 2015).
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchpt.math.fresnel import Interface
 from torchpt.math.microfacet import ggx, masking, stretched_length
 from torchpt.math.vectors import luminance
 
 __all__ = [
+    "Facet",
+    "Main",
+    "Probabilities",
     "clearcoat_alpha",
     "clearcoat_masking",
     "fake_subsurface",
     "gtr1",
     "lerp",
-    "reflectance_at_normal",
+    "or_zero",
     "retro_diffuse",
     "sample_gtr1",
     "schlick_weight",
     "tint",
+    "up",
+    "upward",
     "wide_ggx",
 ]
+
+
+class Facet(NamedTuple):
+    """What happens at one facet; ``wo`` has been turned to the upper side."""
+
+    interface: Interface  # with the far side's index over that of wo's side
+    cos: Tensor  # (N,) of wo and the facet's normal, >= 0
+    schlick: Tensor  # (N,) Schlick's weight there
+    reflected: Tensor  # (3, N)
+    refracted: Tensor | None  # (3, N), without the radiance factor; None where nothing refracts
+
+
+class Probabilities(NamedTuple):
+    """Of drawing each lobe, each ``(N,)`` and detached. Only how the last two share their sum depends on the facet."""
+
+    diffuse: Tensor
+    clearcoat: Tensor | None
+    reflect: Tensor
+    refract: Tensor | None
+
+
+class Main(NamedTuple):
+    """The main lobes between ``wo`` and ``wi`` as if all were reflected, and all refracted; each ``(N,)``."""
+
+    m: Tensor  # (3, N) half vector
+    cos: Tensor  # of wo and m, >= 0
+    reflection: Tensor  # f cos(theta_i)
+    reflection_pdf: Tensor
+    refraction: Tensor  # the last two are those of reflection, and idle, where nothing refracts
+    refraction_pdf: Tensor
 
 
 def lerp(a: Tensor | float, b: Tensor | float, t: Tensor) -> Tensor:
@@ -39,12 +76,6 @@ def schlick_weight(cos: Tensor) -> Tensor:
     x = (1.0 - cos).clamp(0.0, 1.0)
     x2 = x * x
     return x2 * x2 * x
-
-
-def reflectance_at_normal(eta: Tensor) -> Tensor:
-    """Of a dielectric of relative index ``eta``."""
-    root = (eta - 1.0) / (eta + 1.0)
-    return root * root
 
 
 def tint(base_color: Tensor) -> Tensor:
@@ -114,3 +145,22 @@ def wide_ggx(m: Tensor, alpha_u: Tensor, alpha_v: Tensor) -> Tensor:
     """
     unit = torch.maximum(alpha_u, alpha_v).clamp_min(1.0)
     return unit * unit * ggx(torch.stack((m[0], m[1], m[2] * unit)), alpha_u / unit, alpha_v / unit)
+
+
+def up(like: Tensor) -> Tensor:
+    """The normal in every lane: what stands in where there is no half vector."""
+    zero = torch.zeros_like(like[0])
+    return torch.stack((zero, zero, torch.ones_like(zero)))
+
+
+def or_zero(value: Tensor | None, like: Tensor) -> Tensor:
+    """A feature's amount, 0 where it is absent."""
+    return torch.zeros_like(like) if value is None else value
+
+
+def upward(wo: Tensor, wi: Tensor, eta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The pair turned so that ``wo`` is above, the far side's index over the near one's, and 1 where nothing was turned."""
+    side = torch.copysign(torch.ones_like(wo[2]), wo[2])
+    front = (side > 0).to(side.dtype)
+    wo, wi = (torch.stack((w[0], w[1], w[2] * side)) for w in (wo, wi))
+    return wo, wi, torch.where(side > 0, eta, 1.0 / eta), front

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchpt.bsdfs.base import Bsdf
+from torchpt.spec import Moves, parameters_of
 from torchpt.textures import Node, Reading, VertexColors
 
 __all__ = ["ResolvedMaterial", "Value"]
@@ -48,22 +49,27 @@ class ResolvedMaterial:
         """Itself and the materials that it blends."""
         return [self, *(slot for inner in self.inner for slot in inner.all())]
 
-    def numbers(self) -> dict[str, float | tuple[float, float, float]]:
-        """Its parameters by dotted name, those of inner materials included, textures excepted."""
-        mine: dict[str, Value] = dict(self.values)
-        if self.opacity != 1.0:
-            mine["opacity"] = self.opacity
-        if self.emission is not None:
-            mine |= {"emission": self.emission, "emission_strength": self.emission_strength}
-        if self.normal_strength != 1.0:
-            mine["normal_strength"] = self.normal_strength
-        found = {f"{self.name}.{key}": value for key, value in mine.items() if isinstance(value, float | tuple)}
-        for inner in self.inner:
-            found |= inner.numbers()
-        return found
+    def own(self) -> dict[str, Value | None]:
+        """What it has by parameter name, that of inner materials excepted: numbers that say nothing are None."""
+        return {
+            **self.values,
+            "opacity": None if self.opacity == 1.0 else self.opacity,
+            "emission": self.emission,
+            "emission_strength": None if self.emission is None else self.emission_strength,
+            "normal_map": self.normal_map,
+            "normal_strength": None if self.normal_strength == 1.0 else self.normal_strength,
+            "bump_map": self.bump_map,
+        }
 
     def readings(self) -> list[Reading]:
         """Its textures, those of inner materials included."""
-        mine = [*self.values.values(), self.opacity, self.emission, self.normal_map, self.bump_map]
-        found: list[Reading] = [value for value in mine if isinstance(value, Node | VertexColors)]
+        found: list[Reading] = [value for value in self.own().values() if isinstance(value, Node | VertexColors)]
         return [*found, *(reading for inner in self.inner for reading in inner.readings())]
+
+    def bending(self) -> set[str]:
+        """Names of the parameters that turn the rays of its deltas: numbers, and the texels of textures."""
+        if not (self.model.refracts and self.model.delta):
+            return set()
+        specs = parameters_of(self.model)
+        bent = {key: value for key, value in self.values.items() if specs[key].moves is Moves.RAYS}
+        return {value.texels if isinstance(value, Node) else f"{self.name}.{key}" for key, value in bent.items()}

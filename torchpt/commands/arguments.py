@@ -14,9 +14,12 @@ from torchpt.errors import TorchptError
 
 __all__ = ["COMMANDS", "GROUPS", "Arguments", "UsageError", "parse"]
 
-COMMANDS = ("render", "info")
+COMMANDS = ("render", "orbit", "info")
 GROUPS = ("film", "integrator", "sampler", "render")
 PATH_KEYS = ("render.preview", "render.checkpoint")
+#: Keys of `torchpt orbit` alone.
+TURN_KEYS = ("frames", "degrees", "fps", "keep")
+_TURN = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)
 _TAKEN = re.compile(r"\+{0,2}(scene|out|render\.preview|render\.checkpoint)=(.*)\Z", re.DOTALL)
 
 # option -> (its other name, whether a value follows)
@@ -46,6 +49,7 @@ class Arguments:
         scenes: names or paths; several only with ``multirun``.
         outs: pictures to write, as given; empty where nothing was said.
         paths: values of the keys in `PATH_KEYS`.
+        turn: values of the keys in `TURN_KEYS`, as written.
         overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``.
         options: what Hydra gets besides, such as ``--multirun`` or ``--cfg job``.
         multirun: whether this is a sweep.
@@ -57,6 +61,7 @@ class Arguments:
     scenes: list[str] = field(default_factory=list)
     outs: list[str] = field(default_factory=list)
     paths: dict[str, str | None] = field(default_factory=dict)
+    turn: dict[str, str] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
     options: list[str] = field(default_factory=list)
     multirun: bool = False
@@ -84,7 +89,7 @@ def parse(argv: list[str]) -> Arguments:
         if word.startswith("-"):
             _option(arguments, word, words)
             continue
-        match = _TAKEN.match(word)
+        match = _TAKEN.match(word) or (_TURN.match(word) if arguments.command == "orbit" else None)
         if match is None:
             _override(arguments, word)
             continue
@@ -100,12 +105,15 @@ def parse(argv: list[str]) -> Arguments:
     if arguments.multirun and arguments.only_shows:
         raise UsageError("--multirun: cannot be combined with --cfg or --hydra-help")
     if arguments.json and arguments.command != "info":
-        raise UsageError("--json: only `torchpt info` takes it; the last line of `torchpt render` is JSON anyway")
+        raise UsageError(
+            f"--json: only `torchpt info` takes it; the last line of `torchpt {arguments.command}` is JSON anyway"
+        )
     if arguments.command == "info" and "out" in taken:
         raise UsageError("out: `torchpt info` writes no picture")
     arguments.scenes = _scenes(taken.get("scene"), arguments.multirun)
     arguments.outs = _names("out", taken.get("out"))
     arguments.paths = {key: None if taken[key] == "null" else taken[key] for key in PATH_KEYS if key in taken}
+    arguments.turn = {key: taken[key] for key in TURN_KEYS if key in taken}
     sweep = f"+scene_number={','.join(map(str, range(len(arguments.scenes))))}"
     arguments.overrides = [sweep if word == "scene" else word for word in arguments.overrides]
     if len(arguments.scenes) < 2:

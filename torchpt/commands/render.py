@@ -53,7 +53,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
         Interrupted: a signal came while there was no picture to keep.
     """
     from torchpt.images import check_writable
-    from torchpt.render import first_hit, render_scene
+    from torchpt.rendering import first_hit, render_scene
     from torchpt.scene.scene import Scene, device_of
 
     collector.resume()

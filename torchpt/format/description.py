@@ -12,14 +12,14 @@ from torchpt import paths
 from torchpt import settings as run_settings
 from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, SceneError
-from torchpt.format import schema
 from torchpt.format.cameras import read_camera
-from torchpt.format.materials import MATERIALS, Material, check_material, custom_types, read_material
-from torchpt.format.schema import Shape
-from torchpt.format.textures import TEXTURES, Named, Texture
+from torchpt.format.materials import Kind, check_material, material_types, read_material
+from torchpt.format.textures import TEXTURES, Image, Named, Texture, TextureInput, texture_input
 from torchpt.format.yaml_file import plain, read_yaml
 from torchpt.lights import KINDS as LIGHTS
 from torchpt.settings import BLOCKS, Settings
+from torchpt.shapes import KINDS as SHAPES
+from torchpt.spec import Map, Refused, Spec
 from torchpt.spec.declared import Described, described
 from torchpt.spec.validate import check_keys, select
 
@@ -59,8 +59,8 @@ class Description:
     sampler: dict[str, Any] = field(default_factory=dict)
     render: dict[str, Any] = field(default_factory=dict)
     textures: dict[str, Texture] = field(default_factory=dict)
-    materials: dict[str, Material] = field(default_factory=dict)
-    shapes: dict[str, Shape] = field(default_factory=dict)
+    materials: dict[str, Described] = field(default_factory=dict)
+    shapes: dict[str, Described] = field(default_factory=dict)
     lights: dict[str, Described] = field(default_factory=dict)
 
     def resolve(self, path: str | tuple[str, ...], key: str) -> Path:
@@ -125,7 +125,7 @@ def read_description(
     Warns:
         EnergyWarning: a material may reflect more light than it receives.
     """
-    types = {**MATERIALS, **custom_types(bsdfs)}
+    types = material_types(bsdfs)
     if isinstance(source, Mapping):
         return _describe(plain(source), types, None, Path.cwd())
     if not isinstance(source, str | os.PathLike):
@@ -155,7 +155,7 @@ def settings(description: Description, overrides: Mapping[str, Any] | None = Non
     return run_settings.merge(blocks, overrides or {}, description.file)
 
 
-def _describe(raw: dict[str, Any], types: Mapping[str, type[Material]], file: str | None, base: Path) -> Description:
+def _describe(raw: dict[str, Any], types: Mapping[str, Kind], file: str | None, base: Path) -> Description:
     check_keys(raw, _KEYS, "", "a scene", file)
     version = raw.get("version")
     if version is not None and (isinstance(version, bool) or version != 1):
@@ -197,29 +197,37 @@ def _named(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[
 def _shape(
     item: Any,
     key: str,
-    materials: Mapping[str, Material],
+    materials: Mapping[str, Described],
     textures: Mapping[str, Texture],
-    types: Mapping[str, type[Material]],
+    types: Mapping[str, Kind],
     file: str | None,
-) -> Shape:
+) -> Described:
     if isinstance(item, dict) and isinstance(item.get("material"), dict):
         inline = read_material(item["material"], f"{key}.material", types, file)
         check_material(inline, f"{key}.material", materials, textures, file)
         item = {**item, "material": inline}
-    shape = select("shape", schema.SHAPES, item, key, file)
-    displacement = getattr(shape, "displacement", None)
-    if displacement is not None and isinstance(displacement.texture.texture, Named):
-        name = displacement.texture.texture.texture
+    shape = described("shape", SHAPES, item, key, file, texture=_heights)
+    displacement = shape.values.get("displacement")
+    if displacement is not None and isinstance(displacement["texture"].texture, Named):
+        name = displacement["texture"].texture.texture
         if name not in textures:
             known = ", ".join(textures) or "none is defined"
             raise SceneError(f"{key}.displacement.texture", name, f"the name of a texture ({known})", file)
-    material, where = shape.material, f"{key}.material"
+    material, emission, where = shape["material"], shape["emission"], f"{key}.material"
     if isinstance(material, str):
         if material not in materials:
             known = ", ".join(materials) or "none is defined"
             raise SceneError(where, material, f"the name of a material ({known}) or a material", file)
         material, where = materials[material], f"materials.{material}"
-    if shape.emission is not None and material is not None and material.emission is not None:
+    if emission is not None and material is not None and material["emission"] is not None:
         expected = f"no emission where the material emits as well ({where}.emission)"
-        raise SceneError(f"{key}.emission", shape.emission, expected, file)
+        raise SceneError(f"{key}.emission", emission, expected, file)
     return shape
+
+
+def _heights(value: Mapping[str, Any], spec: Spec) -> TextureInput:
+    """The texture of a shape's displacement."""
+    slot = texture_input(value, spec.coloured, *Map.bounds)
+    if isinstance(slot.texture, Image) and slot.texture.filter == "trilinear":
+        raise Refused("nearest or bilinear, as displacement is read at points", "trilinear", ("filter",))
+    return slot

@@ -92,10 +92,10 @@ def prefiltered(
         sizes = [(width // 2, width) for width in widths]
     if len(sizes) != levels - 1:
         raise SceneError("sizes", list(sizes), f"{levels - 1} pairs (rows, columns), one a level after the first")
-    convolved, found = _Convolution(map), [map]
+    convolved, maps = _Convolution(map), [map]
     for roughness, (height, width) in zip(roughnesses(levels)[1:], sizes, strict=True):
-        found.append(convolved(height, width, _facets(roughness * roughness, samples)))
-    return found
+        maps.append(convolved(height, width, _facets(roughness * roughness, samples)))
+    return maps
 
 
 def roughnesses(levels: int) -> list[float]:
@@ -187,8 +187,8 @@ class _Rule:
         share = row - i
         first = p.first[a, b] + i.to(torch.int64) * width
         dtypes = (texels.dtype, torch.int32, torch.int32, texels.dtype, texels.dtype)
-        found = (u * width, width, first, lobe.weight * (1.0 - share), lobe.weight * share)
-        return tuple(t.to(texels.device, dtype) for t, dtype in zip(found, dtypes, strict=True))
+        place = (u * width, width, first, lobe.weight * (1.0 - share), lobe.weight * share)
+        return tuple(t.to(texels.device, dtype) for t, dtype in zip(place, dtypes, strict=True))
 
     def _bag(self, place: tuple[Tensor, ...], column: Tensor) -> tuple[Tensor, Tensor]:
         x, width, first, low, high = place

@@ -17,6 +17,7 @@ from torchpt.ibl.convolve import irradiance_map, prefiltered
 from torchpt.ibl.equirect import coordinates, corners
 from torchpt.ibl.table import brdf_table
 from torchpt.math.vectors import dot, take
+from torchpt.records import SplitSumMaterial
 
 __all__ = ["F0", "IblMaps", "Sky", "SplitSumMaterial", "fresnel", "maps", "shade"]
 
@@ -97,11 +98,11 @@ def shade(
         return value.expand(shape).reshape(-1, 3).T
 
     def numbers(key: str, value: Tensor | float) -> Tensor:
-        found = torch.as_tensor(value, dtype=n.dtype, device=n.device)
+        given = torch.as_tensor(value, dtype=n.dtype, device=n.device)
         try:
-            return found.expand(shape[:-1]).reshape(-1)
+            return given.expand(shape[:-1]).reshape(-1)
         except RuntimeError:
-            raise SceneError(key, tuple(found.shape), f"a number, or the shape {tuple(shape[:-1])}") from None
+            raise SceneError(key, tuple(given.shape), f"a number, or the shape {tuple(shape[:-1])}") from None
 
     rough, metal = numbers("roughness", roughness), numbers("metallic", metallic)
     base = lanes(base_color)
@@ -111,25 +112,6 @@ def shade(
     surface = SplitSumMaterial(base * (1.0 - metal), color, torch.ones_like(rough), rough, color)
     out = Sky.of(maps).reflected(lanes(n), lanes(v), surface)
     return out.T.reshape(shape)
-
-
-@dataclass(frozen=True)
-class SplitSumMaterial:
-    """What split-sum shading knows of surfaces.
-
-    Attributes:
-        diffuse: colour of the diffuse part ``(3, N)``: base colour by ``1 - metallic``.
-        f0: reflectance of the mirror at normal incidence, ``(3, N)`` or ``(N,)``.
-        f90: at grazing incidence, likewise.
-        roughness: ``(N,)`` from 0 to 1.
-        over: F0 of the mirror over the diffuse part, whose light is missing there, as ``f0``; None where the two are added.
-    """
-
-    diffuse: Tensor
-    f0: Tensor
-    f90: Tensor
-    roughness: Tensor
-    over: Tensor | None
 
 
 def fresnel(cosine: Tensor, f0: Tensor, surface: SplitSumMaterial) -> Tensor:

@@ -2,6 +2,10 @@
 
 All functions take and return float tensors of any shape (colours in the last axis, RGB with the primaries of sRGB).
 Linear radiance enters unbounded; display values lie in 0..1.
+
+Colour libraries have the same functions (tests hold ours against kornia's). These lie on the way to every picture: their
+powers are taken piece by piece, so that a picture has the same bits on any number of threads, and importing one of those
+takes longer than a small render.
 """
 
 from __future__ import annotations
@@ -14,15 +18,10 @@ from torch import Tensor
 from torchpt.errors import SceneError
 from torchpt.math.threads import in_pieces
 
-__all__ = ["TONEMAPS", "display", "linear_to_srgb", "luminance", "srgb_to_linear"]
+__all__ = ["TONEMAPS", "display", "linear_to_srgb", "srgb_to_linear"]
 
 # Above this every curve is white; below it no curve overflows float32 when it squares.
 _BRIGHTEST = 1e9
-
-
-def luminance(rgb: Tensor) -> Tensor:
-    """Relative luminance Y of linear RGB (ITU-R BT.709 weights): ``(..., 3)`` to ``(...)``."""
-    return 0.2126 * rgb[..., 0] + 0.7152 * rgb[..., 1] + 0.0722 * rgb[..., 2]
 
 
 def _power(x: Tensor, exponent: float) -> Tensor:

@@ -1,35 +1,30 @@
-"""How named layers become EXR channels and how they are found again.
+"""How named layers become EXR channels and how a file's channels become layers again.
 
-``image`` is the picture itself (``R G B``); the others carry their own name as a prefix (``albedo.R``). A layer that
-this table does not know is named after its number of components.
+``image`` is the picture itself (``R G B``); the others carry their own name as a prefix (``albedo.R``). A layer of
+``film.aovs`` names its own channels; any other is named after its number of components.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
+from torchpt.spec import Kinds
+
 __all__ = ["channel_names", "group_channels"]
 
-# layer -> its channels
-KNOWN = {
-    "image": ("R", "G", "B"),
-    "albedo": ("albedo.R", "albedo.G", "albedo.B"),
-    "normal": ("normal.X", "normal.Y", "normal.Z"),
-    "depth": ("Z",),
-    "position": ("position.X", "position.Y", "position.Z"),
-    "uv": ("uv.U", "uv.V"),
-    "object_id": ("object_id",),
-    "variance": ("variance.R", "variance.G", "variance.B"),
-}
+#: The layers of ``film.aovs``, by their folder's name: nothing of that room is imported before such a layer is written.
+LAYERS: Kinds[Any] = Kinds("torchpt.integrators.layers")
 _SUFFIXES = {2: "XY", 3: "RGB", 4: "RGBA"}
 _ORDER = "RGBXYZUVA"
 
 
 def channel_names(layer: str, components: int) -> tuple[str, ...]:
     """The EXR channels of a layer with so many components."""
-    known = KNOWN.get(layer)
-    if known is not None and len(known) == components:
-        return known
     if layer == "image":
-        return {1: ("Y",), 4: ("R", "G", "B", "A")}.get(components) or tuple(f"image.{i}" for i in range(components))
+        known = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+        return known.get(components) or tuple(f"image.{i}" for i in range(components))
+    if layer in LAYERS and len(LAYERS[layer].channels) == components:
+        return LAYERS[layer].channels
     if components == 1:
         return (layer,)
     suffixes = _SUFFIXES.get(components) or [str(i) for i in range(components)]
@@ -53,4 +48,4 @@ def group_channels(channels: tuple[str, ...] | list[str]) -> dict[str, list[int]
         elif not prefix:
             prefix = "image" if last in ("R", "G", "B", "A", "Y") else last
         groups.setdefault(prefix, []).append(index)
-    return {name: sorted(found, key=lambda i: _rank(channels[i])) for name, found in groups.items()}
+    return {name: sorted(indices, key=lambda i: _rank(channels[i])) for name, indices in groups.items()}

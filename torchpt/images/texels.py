@@ -41,9 +41,9 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
         AssetError: a file that is missing, of no known kind, malformed, truncated, too large, CMYK, of more than 4
             channels, or with a value that is not finite.
     """
-    found = source if isinstance(source, EncodedImage) else existing(source)
-    pixels = pixels_of(found, max_pixels)
-    label = found.label if isinstance(found, EncodedImage) else str(found)
+    file = source if isinstance(source, EncodedImage) else existing(source)
+    pixels = pixels_of(file, max_pixels)
+    label = file.label if isinstance(file, EncodedImage) else str(file)
     values = picture_of(pixels)
     if values.shape[-1] > 4:
         raise AssetError(label, f"has {values.shape[-1]} channels, expected 1 to 4")
@@ -67,10 +67,10 @@ def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
         return False
     if data[25:26] in (b"\x04", b"\x06"):
         return True
-    at = 8
-    while at + 8 <= len(data) and data[at + 4 : at + 8] not in (b"IDAT", b"tRNS"):
-        at += 12 + int.from_bytes(data[at : at + 4], "big")
-    return data[at + 4 : at + 8] == b"tRNS"
+    chunk = 8
+    while chunk + 8 <= len(data) and data[chunk + 4 : chunk + 8] not in (b"IDAT", b"tRNS"):
+        chunk += 12 + int.from_bytes(data[chunk : chunk + 4], "big")
+    return data[chunk + 4 : chunk + 8] == b"tRNS"
 
 
 def picture_of(pixels: Pixels) -> NDArray:

@@ -23,7 +23,7 @@ from torchpt.errors import OutputError
 from torchpt.images.colour import display
 from torchpt.images.layers import channel_names
 
-__all__ = ["WRITABLE", "check_writable", "write_image"]
+__all__ = ["WRITABLE", "check_writable", "place_of", "reason_of", "temporary_beside", "write_image"]
 
 WRITABLE = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".ppm")
 
@@ -55,9 +55,9 @@ def write_image(
         OutputError: an ending that is not written, or a place that cannot be written.
         ValueError: an image or layer of another shape.
     """
-    destination = _known(path)
+    destination = place_of(path)
     pixels = _pixels("image", image)
-    temporary = _temporary(destination)
+    temporary = temporary_beside(destination)
     if temporary.suffix == ".exr":
         named = {"image": pixels} | {name: _pixels(name, layer) for name, layer in (layers or {}).items()}
         for name, layer in named.items():
@@ -75,47 +75,58 @@ def write_image(
         encode()
         os.replace(temporary, destination)
     except (OSError, ValueError) as problem:
-        raise OutputError(path, _reason(problem, destination)) from problem
+        raise OutputError(path, reason_of(problem, destination)) from problem
     finally:
         with suppress(OSError):  # it is only there after a failure
             temporary.unlink()
 
 
-def check_writable(path: str | PathLike[str]) -> None:
+def check_writable(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) -> Path:
     """Find out before a long render whether its picture can be written; leaves nothing behind.
+
+    Args:
+        path: where to.
+        endings: the formats that count.
+
+    Returns:
+        The file itself, links resolved.
 
     Raises:
         OutputError: an ending that is not written, a folder that is missing or cannot be written, a folder in the way.
     """
-    destination = _known(path)
+    destination = place_of(path, endings)
     try:
         if destination.is_dir():
             raise OutputError(path, "is a folder")
-        temporary = _temporary(destination)
+        temporary = temporary_beside(destination)
         temporary.touch(exist_ok=False)
         temporary.unlink()
         destination.exists()  # raises for a name too long
         os.stat(destination.parent)
     except (OSError, ValueError) as problem:
-        raise OutputError(path, _reason(problem, destination)) from problem
+        raise OutputError(path, reason_of(problem, destination)) from problem
+    return destination
 
 
-def _known(path: str | PathLike[str]) -> Path:
+def place_of(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) -> Path:
+    """The file that is meant, links resolved; an ending that is not among those accepted is an OutputError."""
     destination = Path(fspath(path))
-    if destination.suffix.lower() not in WRITABLE:
-        found = f"cannot write the kind {destination.suffix!r}" if destination.suffix else "needs an ending"
-        raise OutputError(path, f"{found}; accepted: {' '.join(WRITABLE)}")
+    if destination.suffix.lower() not in endings:
+        problem = f"cannot write the kind {destination.suffix!r}" if destination.suffix else "needs an ending"
+        raise OutputError(path, f"{problem}; accepted: {' '.join(endings)}")
     try:
         return Path(os.path.realpath(destination))  # a link stays a link: its target is replaced
     except (OSError, ValueError) as problem:
-        raise OutputError(path, _reason(problem, destination)) from problem
+        raise OutputError(path, reason_of(problem, destination)) from problem
 
 
-def _temporary(destination: Path) -> Path:
+def temporary_beside(destination: Path) -> Path:
+    """A name that nothing has yet, where a file is made before it is moved to its place."""
     return destination.parent / f".torchpt-{secrets.token_hex(8)}{destination.suffix.lower()}"
 
 
-def _reason(problem: Exception, destination: Path) -> str:
+def reason_of(problem: Exception, destination: Path) -> str:
+    """Why a file could not be written, for an OutputError."""
     if not destination.parent.exists():
         return f"cannot be written: there is no folder {destination.parent}"
     return f"cannot be written ({getattr(problem, 'strerror', None) or problem})"

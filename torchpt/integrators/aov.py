@@ -1,23 +1,27 @@
-"""Arbitrary output variables: what the first surface is, without light transport."""
+"""Layers of the first surface, without light transport (arbitrary output variables)."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from torchpt.integrators import LAYERS
+from torchpt.integrators.layer import Seen, SurfaceLayer
 from torchpt.integrators.path import partition
 from torchpt.integrators.search import Search
-from torchpt.integrators.surfaces import parameters_at, shading_normal, texture_point_at
+from torchpt.integrators.surfaces import texture_point_at
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, rows
-from torchpt.shapes import interact, surface_uv
+from torchpt.shapes import interact
 
-__all__ = ["CHANNELS", "NAMES", "first_hit", "values"]
+__all__ = ["first_hit", "surface_layer", "values", "weighted"]
 
-#: Layers and how many channels each has. A miss is 0 in all of them.
-CHANNELS = {"albedo": 3, "normal": 3, "depth": 1, "position": 3, "uv": 2, "object_id": 1}
-#: Layers that name things: a pixel shows what its first sample met, since names have no average.
-NAMES = ("object_id",)
+
+def surface_layer(name: str) -> type[SurfaceLayer]:
+    """The layer of a name, which is one of the first surface."""
+    layer = LAYERS[name]
+    assert issubclass(layer, SurfaceLayer)
+    return layer
 
 
 def first_hit(
@@ -29,17 +33,17 @@ def first_hit(
     dtype: torch.dtype,
     pixel: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """The layers ``names``, each ``(C, N)``, for camera rays ``state``.
+    """The layers ``names``, each ``(C, N)``, for camera rays ``state``; a miss is 0 in all of them.
 
-    ``albedo`` is the material's reflectance, ``normal`` the shading normal in the world, ``depth`` the distance from the
-    camera, ``object_id`` the order of the shape in the scene, from 1. ``pixel``: see ``surfaces.texture_point_at``.
+    ``pixel``: see ``surfaces.texture_point_at``.
     """
     hit = search.nearest(state, 1)
-    layers = {name: torch.zeros(CHANNELS[name], len(hit.t), dtype=dtype, device=centre.device) for name in names}
+    n, device = len(hit.t), centre.device
+    layers = {name: torch.zeros(len(LAYERS[name].channels), n, dtype=dtype, device=device) for name in names}
     _, groups = partition(world, hit)
     for model, index in groups:
-        found = rows(hit, index)
-        here = values(names, world, model, take(state.o, index), take(state.d, index), found, centre, dtype, pixel)
+        o, d = take(state.o, index), take(state.d, index)
+        here = values(names, world, model, o, d, rows(hit, index), centre, dtype, pixel)
         for name, value in here.items():
             layers[name].scatter_(1, index.expand(len(value), -1), value)
     return layers
@@ -58,19 +62,10 @@ def values(
 ) -> dict[str, Tensor]:
     """The layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of one model; see :func:`first_hit`."""
     at = interact(world, o, d, hit)
-    point = texture_point_at(world, model, at, pixel)
-    found: dict[str, Tensor] = {}
-    if "albedo" in names:
-        parameters = parameters_at(world, model, take(world.materials.row, at.slot), at, point)
-        found["albedo"] = world.materials.models[model].albedo(parameters)
-    if "normal" in names:
-        found["normal"] = shading_normal(world, model, d, at, point)
-    if "uv" in names:
-        found["uv"] = surface_uv(world, at)
-    if "depth" in names:
-        found["depth"] = hit.t[None]
-    if "position" in names:
-        found["position"] = at.p + centre.to(dtype)[:, None]
-    if "object_id" in names:
-        found["object_id"] = take(world.geometry.object_id, at.slot).to(dtype)[None]
-    return found
+    seen = Seen(world, model, d, hit, at, texture_point_at(world, model, at, pixel), centre, dtype)
+    return {name: surface_layer(name).values(seen) for name in names}
+
+
+def weighted(layers: dict[str, Tensor], weight: Tensor) -> dict[str, Tensor]:
+    """Layers times the weights ``(N,)`` of their samples, where they are averaged."""
+    return {name: value * weight if surface_layer(name).averaged else value for name, value in layers.items()}

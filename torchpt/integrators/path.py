@@ -14,40 +14,28 @@ from torch import Tensor
 
 from torchpt import lights
 from torchpt.accel import Accel
+from torchpt.integrators.base import Integrator, Limits, Tally
 from torchpt.integrators.compiled import Stages
-from torchpt.integrators.roulette import DEEP, DEEP_CAP
 from torchpt.integrators.search import Search
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, joined
 from torchpt.samplers import salts
 
-__all__ = ["ENDLESS", "Limits", "Tally", "gather_light", "partition", "trace"]
+__all__ = ["ENDLESS", "Limits", "PathIntegrator", "Tally", "gather_light", "partition", "trace"]
 
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
 #: paths that lose nothing none comes so far (``DEEP_CAP``): only those are cut that roulette was told to leave alone.
 ENDLESS = 1 << 15
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Where paths end."""
+class PathIntegrator(Integrator):
+    """Integrators that follow paths to their :attr:`limits`, vertex by vertex, in the stage ``bounce``."""
 
-    max_depth: int  # -1: only roulette ends them
-    rr_depth: int  # roulette from this vertex on
+    looped = True
 
-    def roulette(self, depth: int) -> float:
-        """The most that roulette lets paths survive with at a vertex; 0 where it does not play."""
-        if depth < self.rr_depth:
-            return 0.0
-        return DEEP_CAP if self.max_depth < 0 and depth > DEEP else 1.0
-
-
-@dataclass
-class Tally:
-    """What a wave did."""
-
-    rays: int = 0
-    truncated: int = 0  # paths still alive at ENDLESS
+    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: None) -> tuple[Tensor, Tally]:
+        """See :class:`Integrator`."""
+        return trace(stages, self.limits, accel, state)
 
 
 def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tuple[Tensor, Tally]:

@@ -17,14 +17,14 @@ from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import Dimension, Draws, Points, salts
 from torchpt.shapes import interact, offset_origin
 
-__all__ = ["PASSES", "Search", "beyond", "passing"]
+__all__ = ["PASSES", "Search", "beyond", "opacity_at"]
 
 #: Beyond the depth of any path: names the numbers for the second, third, ... surface that a ray passes.
 PASSES = 1 << 13
 
 
-def passing(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
-    """Opacity ``(N,)`` of what rays ``o, d`` hit; ``miss`` where they hit nothing."""
+def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
+    """Opacity ``(N,)`` of the surfaces that rays ``o, d`` hit, textures included; ``miss`` where they hit nothing."""
     assert world.materials.opacity is not None
     missed = hit.prim < 0
     slot = world.geometry.slot(hit.prim).clamp_min(0)
@@ -60,28 +60,25 @@ class Search:
     def nearest(self, state: PathState, depth: int) -> Hit:
         """Where the rays of ``state`` meet a surface, at path vertex ``depth``."""
         hit = self._trace(state.o, state.d, state.t_max)
-        return hit if self._world.materials.opacity is None else self._met(state, hit, depth)
+        return hit if self._world.materials.opacity is None else self._stopped(state, hit, depth)
 
     def clear(self, shadow: Shadow) -> Tensor:
         """How much of the light gets through ``(N,)``: 0 or 1 where all surfaces are opaque."""
         if self._world.materials.opacity is None:
             return (~self._accel.occluded(shadow.o, shadow.d, shadow.t_max)).to(self._dtype)
-        return self._filtered(shadow)
+        return self._transmittance(shadow)
 
     def _trace(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
         t, prim, u, v = self._accel.intersect(o, d, t_max)
         return Hit(t.to(self._dtype), prim.to(torch.int64), u.to(self._dtype), v.to(self._dtype))
 
-    def _opacity(self, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:
-        return passing(self._world, o, d, hit, miss)
-
     @torch.no_grad()
     def _beyond(self, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
         return beyond(self._world, o, d, hit)
 
-    def _met(self, state: PathState, hit: Hit, depth: int) -> Hit:
-        """The hits that hold: a surface is met with the chance of its opacity, else the ray goes on behind it."""
-        opacity = self._opacity(state.o, state.d, hit, 1.0)
+    def _stopped(self, state: PathState, hit: Hit, depth: int) -> Hit:
+        """Where rays are stopped: each surface stops one with the chance of its opacity, else the ray goes on behind it."""
+        opacity = opacity_at(self._world, state.o, state.d, hit, 1.0)
         chance = torch.ones_like(hit.t) if opacity.requires_grad else None
         t, prim, u, v = hit.t, hit.prim, hit.u, hit.v
         step, lanes = 0, (opacity.detach() < 1).nonzero().squeeze(1)
@@ -93,30 +90,30 @@ class Search:
                 share = torch.where(met, opacity, 1.0 - opacity)
                 chance = chance.index_copy(0, lanes, take(chance, lanes) * (share / share.detach()))
             lanes = take(lanes, (~met).nonzero().squeeze(1))
-            at = Hit(take(t, lanes), take(prim, lanes), take(u, lanes), take(v, lanes))
+            passed = Hit(take(t, lanes), take(prim, lanes), take(u, lanes), take(v, lanes))
             o, d = take(state.o.detach(), lanes), take(state.d.detach(), lanes)
-            o = self._beyond(o, d, at)
+            o = self._beyond(o, d, passed)
             behind = self._trace(o, d, take(state.t_max, lanes))
             # Distances are counted from where the ray began; the step over the surface is below their rounding.
-            t, prim = t.index_copy(0, lanes, behind.t + at.t), prim.index_copy(0, lanes, behind.prim)
+            t, prim = t.index_copy(0, lanes, behind.t + passed.t), prim.index_copy(0, lanes, behind.prim)
             u, v = u.index_copy(0, lanes, behind.u), v.index_copy(0, lanes, behind.v)
-            opacity = self._opacity(o, d, behind, 1.0)
+            opacity = opacity_at(self._world, o, d, behind, 1.0)
             again = (opacity.detach() < 1).nonzero().squeeze(1)
             lanes, opacity, step = take(lanes, again), take(opacity, again), step + 1
         return Hit(t, prim, u, v, chance)
 
-    def _filtered(self, shadow: Shadow) -> Tensor:
+    def _transmittance(self, shadow: Shadow) -> Tensor:
         """The product of ``1 - opacity`` over all surfaces between the ends of the rays."""
         clear = torch.ones_like(shadow.t_max)
         o, d, t_max = shadow.o.detach(), shadow.d.detach(), shadow.t_max
         lanes = torch.arange(len(t_max), device=t_max.device)
         while len(lanes):
             hit = self._trace(o, d, t_max)
-            opacity = self._opacity(o, d, hit, 0.0)
+            opacity = opacity_at(self._world, o, d, hit, 0.0)
             clear = clear.index_copy(0, lanes, take(clear, lanes) * (1.0 - opacity))
             on = ((hit.prim >= 0) & (opacity.detach() < 1)).nonzero().squeeze(1)
-            at, o, d = rows(hit, on), take(o, on), take(d, on)
-            lanes, t_max = take(lanes, on), (take(t_max, on) - at.t).clamp_min(0.0)
+            passed, o, d = rows(hit, on), take(o, on), take(d, on)
+            lanes, t_max = take(lanes, on), (take(t_max, on) - passed.t).clamp_min(0.0)
             if len(lanes):
-                o = self._beyond(o, d, at)
+                o = self._beyond(o, d, passed)
         return clear

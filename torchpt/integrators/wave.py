@@ -11,14 +11,14 @@ from torch import Tensor
 from torchpt.accel import Accel
 from torchpt.cameras import Camera
 from torchpt.film import Filter
+from torchpt.integrators.base import Integrator, Limits, Tally
 from torchpt.integrators.compiled import Stages
-from torchpt.integrators.path import Limits, Tally, trace
 from torchpt.integrators.search import Search
 from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, salts
 
 if TYPE_CHECKING:
-    from torchpt.integrators.ibl import Preview
+    from torchpt.integrators.first_surface import FirstSurface
 
 __all__ = ["Wave"]
 
@@ -29,25 +29,30 @@ class Wave:
 
     Attributes:
         stages: the stages bound to the scene, eager or compiled.
-        limits: where paths end; None where no light is carried.
+        integrator: what makes radiance of camera rays.
         accel: the search.
         camera: on the whole film.
         filter: reconstruction filter.
         sampler: random numbers.
         crop: ``(x, y, width, height)`` of the picture on the film.
         centre: ``(3,)`` float64, see Space.shift.
-        preview: the environment of a split-sum preview; None where paths are traced.
+        first: what happens at first surfaces; None where paths go on.
     """
 
     stages: Stages
-    limits: Limits | None
+    integrator: Integrator
     accel: Accel
     camera: Camera
     filter: Filter
     sampler: Sampler
     crop: tuple[int, int, int, int]
     centre: Tensor
-    preview: Preview | None = None
+    first: FirstSurface | None = None
+
+    @property
+    def limits(self) -> Limits | None:
+        """Where paths end; None where no light is carried."""
+        return self.integrator.limits if self.integrator.light else None
 
     def rays(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> PathState:
         """Camera rays of consecutive pixels of the picture, row by row; lanes run over pixels, then over samples."""
@@ -64,14 +69,8 @@ class Wave:
 
     def radiance(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> tuple[Tensor, Tally]:
         """Radiance ``(3, samples, pixels)`` and what it took."""
-        assert self.limits is not None
         state = self.rays(first_pixel, pixels, first_sample, samples)
-        if self.preview is None:
-            radiance, tally = trace(self.stages, self.limits, self.accel, state)
-        else:
-            from torchpt.integrators import ibl
-
-            radiance, tally = ibl.first_hit(self.stages, self.preview, self.accel, state)
+        radiance, tally = self.integrator.radiance(self.stages, self.accel, state, self.first)
         if self.filter.signed:
             radiance = radiance * self._weight(state)
         return radiance.view(3, samples, pixels), tally
@@ -92,6 +91,5 @@ class Wave:
         search = Search(self.accel, world, plan.sampler, plan.dtype)
         found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel)
         if self.filter.signed:
-            weight = self._weight(state)
-            found = {name: value if name in aov.NAMES else value * weight for name, value in found.items()}
+            found = aov.weighted(found, self._weight(state))
         return {name: value.view(len(value), samples, pixels) for name, value in found.items()}

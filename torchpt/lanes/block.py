@@ -129,10 +129,10 @@ class Block:
         better = "ogt" if op == "max" else "olt"
         if b.startswith("splat"):  # no NaN: the other one is kept where it is
             return self.select(ty, self.compare(better, ty, b, a), b, a)
-        found = self.select(ty, self.compare(better, ty, a, b), a, b)
+        chosen = self.select(ty, self.compare(better, ty, a, b), a, b)
         if a.startswith("splat"):
-            return found
-        return self.select(ty, self.compare("uno", ty, a, a), a, found)
+            return chosen
+        return self.select(ty, self.compare("uno", ty, a, a), a, chosen)
 
     # -- memory
 

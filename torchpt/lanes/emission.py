@@ -43,8 +43,8 @@ def emit(block: Block, graph: Graph, node: int, names: dict[int, str]) -> str:
     handler = _HANDLERS.get(op)
     if handler is None:
         raise Unsupported(f"the operation {op} on numbers of type {ty}")
-    found = handler(block, ty, *a) if extra is None else handler(block, ty, *a, extra)
-    return _byte(block, found) if ty == "u" and op in _CARRIES else found
+    value = handler(block, ty, *a) if extra is None else handler(block, ty, *a, extra)
+    return _byte(block, value) if ty == "u" and op in _CARRIES else value
 
 
 #: Operations on bytes, which are held in 32 bits, that may leave more than eight.
@@ -70,8 +70,8 @@ def _cast(block: Block, source: str, target: str, a: str) -> str:
         return block.convert("fpext" if target == "d" else "fptrunc", source, target, a)
     if source in FLOATS:
         # Frozen: of NaN and of numbers out of range it is some number, which look-ups bring into range.
-        found = block.op(f"freeze {block.vector(target)} {block.convert('fptosi', source, target, a)}")
-        return _byte(block, found) if target == "u" else found
+        number = block.op(f"freeze {block.vector(target)} {block.convert('fptosi', source, target, a)}")
+        return _byte(block, number) if target == "u" else number
     if target in FLOATS:
         return block.convert("sitofp", source, target, a)
     if target == "L":
@@ -103,8 +103,8 @@ def _shift(op: str) -> Callable[..., str]:
     def handler(block: Block, ty: str, a: str, b: str) -> str:
         most = block.constant(ty, 63 if ty == "L" else 31)
         far = block.compare("ugt", ty, b, most)
-        found = block.op(f"{op} {block.vector(ty)} {a}, {block.select(ty, far, most, b)}")
-        return found if op == "ashr" else block.select(ty, far, block.constant(ty, 0), found)
+        shifted = block.op(f"{op} {block.vector(ty)} {a}, {block.select(ty, far, most, b)}")
+        return shifted if op == "ashr" else block.select(ty, far, block.constant(ty, 0), shifted)
 
     return handler
 
@@ -129,8 +129,8 @@ def _sign(block: Block, ty: str, a: str) -> str:
         return a
     zero = block.constant(ty, 0)
     up, down = ("ogt", "olt") if ty in FLOATS else ("sgt", "slt")
-    found = block.select(ty, block.compare(up, ty, a, zero), block.constant(ty, 1), zero)
-    return block.select(ty, block.compare(down, ty, a, zero), block.constant(ty, -1), found)
+    sign = block.select(ty, block.compare(up, ty, a, zero), block.constant(ty, 1), zero)
+    return block.select(ty, block.compare(down, ty, a, zero), block.constant(ty, -1), sign)
 
 
 def _quotient(block: Block, ty: str, a: str, b: str, rounding: str) -> str:
@@ -274,8 +274,8 @@ def _part(block: Block, ty: str, a: str, extra: int) -> str:
 
 def _iota(block: Block, ty: str) -> str:
     numbers = ", ".join(f"i32 {k}" for k in range(WIDTH))
-    found = block.op(f"add <{WIDTH} x i32> %i32s, <{numbers}>")
-    return block.convert("sext", "i", "L", found) if ty == "L" else _cast(block, "i", ty, found)
+    places = block.op(f"add <{WIDTH} x i32> %i32s, <{numbers}>")
+    return block.convert("sext", "i", "L", places) if ty == "L" else _cast(block, "i", ty, places)
 
 
 def _place(block: Block, ty: str) -> str:

@@ -92,8 +92,8 @@ def compiled(ir: str, target: Target | None = None) -> Function:
     with _lock:
         target = target or host()
         key = _key(ir, target)
-        found = _functions.get(key)
-        if found is None:
+        function = _functions.get(key)
+        if function is None:
             code = read(f"{key[:40]}.o")
             if code is None:
                 code = _object(ir, target)
@@ -101,19 +101,19 @@ def compiled(ir: str, target: Target | None = None) -> Function:
                 write(f"{key[:40]}.o", code)
             else:
                 _state["loaded"] += 1
-            found = _functions[key] = _loaded(code, target, key)
-        return found
+            function = _functions[key] = _loaded(code, target, key)
+        return function
 
 
 def kept(key: str) -> Function | None:
     """A function of this machine by its key, from this process or from disk; None where there is none."""
     with _lock:
-        found = _functions.get(key)
-        code = read(f"{key[:40]}.o") if found is None else None
+        function = _functions.get(key)
+        code = read(f"{key[:40]}.o") if function is None else None
         if code is not None:
             _state["loaded"] += 1
-            found = _functions[key] = _loaded(code, host(), key)
-        return found
+            function = _functions[key] = _loaded(code, host(), key)
+        return function
 
 
 def identity() -> str:

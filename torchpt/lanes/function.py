@@ -9,11 +9,12 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchpt.lanes import engine, gathers, pointwise, views  # noqa: F401  (they register what they lower)
+from torchpt.lanes import engine, operators  # noqa: F401  (the operators register how they are lowered)
 from torchpt.lanes.engine import Target
 from torchpt.lanes.graph import DTYPES
-from torchpt.lanes.kernel import HEAD, Sinks, Store, text
+from torchpt.lanes.kernel import HEAD, text
 from torchpt.lanes.program import bound
+from torchpt.lanes.sinks import Sinks, Store
 from torchpt.lanes.tracing import Tracer, lanes_for
 
 __all__ = ["lanewise"]

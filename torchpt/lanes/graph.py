@@ -60,12 +60,12 @@ class Graph:
     def node(self, op: str, ty: str, *arguments: int, extra: Any = None) -> int:
         """The number of a node, made where it is new."""
         key = op, ty, arguments, extra
-        found = self._known.get(key)
-        if found is None:
-            found = self._known[key] = len(self.nodes)
+        number = self._known.get(key)
+        if number is None:
+            number = self._known[key] = len(self.nodes)
             self.nodes.append(key)
             self.origins.append(self.origin)
-        return found
+        return number
 
     def type(self, node: int) -> str:
         """Its type."""
@@ -140,10 +140,10 @@ class Graph:
 
     def needed(self, roots: list[int]) -> list[int]:
         """All nodes that roots depend on, arguments first."""
-        found, stack = set(), list(roots)
+        needed, stack = set(), list(roots)
         while stack:
             node = stack.pop()
-            if node not in found:
-                found.add(node)
+            if node not in needed:
+                needed.add(node)
                 stack += self.nodes[node][2]
-        return sorted(found)
+        return sorted(needed)

@@ -111,15 +111,15 @@ class _Search(Block):
         ]
         if kind == "sphere":
             self._near_ball(kind)
-        found, hit = self._ball(kind) if kind == "sphere" else self._planar(kind)
+        distance, hit = self._ball(kind) if kind == "sphere" else self._planar(kind)
         tests = [
-            self.compare("ogt", "f", found, self.constant("f", 0.0)),
-            self.compare("olt", "f", found, f"%{kind}_t"),
+            self.compare("ogt", "f", distance, self.constant("f", 0.0)),
+            self.compare("olt", "f", distance, f"%{kind}_t"),
         ]
         for test in tests:
             hit = test if hit is None else self.op(f"and {_B} {hit}, {test}")
         # A ray that meets anything at all is done: no distance is below the one it has then.
-        better = self.constant("f", -1.0) if self.any_hit else found
+        better = self.constant("f", -1.0) if self.any_hit else distance
         number_ = self.splat("i", self.op(f"trunc i64 %{kind}_id to i32"))
         tail = "e" if kind == "sphere" else "1"
         self.lines += [

@@ -1,4 +1,4 @@
-"""The tables of a kernel: the prologue run for a scene, and its results laid out as kernels read them."""
+"""What a stage was compiled to, and the tables of a scene as its machine code reads them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from torchpt.lanes.graph import Unsupported
-from torchpt.lanes.tracing import Guard, Source, Step, Table
+from torchpt.lanes.prologue import Guard, Source, Step, Table, replayed
 
-__all__ = ["Program", "Tables", "bound", "holds", "laid_out", "replayed", "signature"]
+__all__ = ["Program", "Tables", "bound", "holds", "laid_out", "signature"]
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class Program:
 
     def leaves(self) -> set[str]:
         """Paths of the leaves that enter its tables."""
-        found: set[str] = set()
+        paths: set[str] = set()
 
         def visit(value: Any) -> None:
             if isinstance(value, Source):
                 if value.kind == "leaf":
-                    found.add(str(value.name))
+                    paths.add(str(value.name))
             elif isinstance(value, list | tuple):
                 for x in value:
                     visit(x)
@@ -65,7 +65,7 @@ class Program:
         for step in self.steps:
             visit((step.args, tuple(step.kwargs.values())))
         visit([table.source for table in self.tables])
-        return found
+        return paths
 
 
 @dataclass(frozen=True)
@@ -79,29 +79,6 @@ class Tables:
 
     address: int
     keep: tuple[Any, ...]
-
-
-def replayed(steps: Sequence[Step], held: Sequence[Tensor], leaves: Mapping[str, Tensor]) -> Any:
-    """Runs a prologue; returns ``tensor(source)``."""
-    results: list[Any] = []
-
-    def tensor(source: Source) -> Tensor:
-        if source.kind == "leaf":
-            return leaves[str(source.name)]
-        if source.kind == "held":
-            return held[int(source.name)]
-        found = results[int(source.name)]
-        return found if source.item < 0 else found[source.item]
-
-    def filled(value: Any) -> Any:
-        if isinstance(value, Source):
-            return tensor(value)
-        return type(value)(filled(x) for x in value) if isinstance(value, list | tuple) else value
-
-    with torch.no_grad():
-        for step in steps:
-            results.append(step.function(*filled(step.args), **{k: filled(v) for k, v in step.kwargs.items()}))
-    return tensor
 
 
 def laid_out(tensor: Tensor, axis: int | None) -> Tensor:
@@ -146,14 +123,14 @@ def bound(
     keep: list[Tensor] = []
     for table in tables:
         key = (table.source.name, table.axis) if table.source.kind == "leaf" else None
-        found = known.get(key) if key is not None else None
+        numbers = known.get(key) if key is not None else None
         plain = tensor(table.source)
-        if found is None:
-            found = laid_out(plain, table.axis)
+        if numbers is None:
+            numbers = laid_out(plain, table.axis)
             if key is not None:
-                known[key] = found
-        keep.append(found)
-        words += [found.data_ptr(), plain.numel() if table.axis is None else plain.shape[table.axis]]
+                known[key] = numbers
+        keep.append(numbers)
+        words += [numbers.data_ptr(), plain.numel() if table.axis is None else plain.shape[table.axis]]
     block = (ctypes.c_int64 * max(len(words), 1))(*words)
     return Tables(ctypes.addressof(block), (block, keep))
 
@@ -187,7 +164,7 @@ def signature(record: Any) -> Any:
 
 
 def _contents(value: Any, seen: set[int]) -> Any:
-    """What a trace may have found in an object of the user's own: its plain numbers, and which tensors it holds.
+    """What a trace may have read of an object of the user's own: its plain numbers, and which tensors it holds.
 
     Tensors enter by identity: what is in them is memory, and those that a program reads live as long as it does.
     """

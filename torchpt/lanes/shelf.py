@@ -21,7 +21,7 @@ from torch import Tensor
 from torchpt.lanes import engine
 from torchpt.lanes.graph import DTYPES
 from torchpt.lanes.program import Program
-from torchpt.lanes.tracing import Guard, Source, Step, Table
+from torchpt.lanes.prologue import Guard, Source, Step, Table
 
 __all__ = ["key_of", "load", "store"]
 

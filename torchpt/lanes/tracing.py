@@ -19,14 +19,11 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchpt.lanes.graph import DTYPES, Graph, Unsupported
+from torchpt.lanes.prologue import Guard, Source, Step, Table
 
 __all__ = [
     "HANDLERS",
     "LANES",
-    "Guard",
-    "Source",
-    "Step",
-    "Table",
     "Tracer",
     "Value",
     "handles",
@@ -73,52 +70,6 @@ def lanes_for(tables: Iterable[Tensor]) -> int:
 def tracing() -> bool:
     """Whether a stage is being traced in this process: then tensor forms are wanted, not calls of kernels."""
     return bool(_active)
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where a tensor that holds no lanes comes from.
-
-    Attributes:
-        kind: ``leaf`` (of the records that the stage was given), ``step`` (of the prologue) or ``held`` (an object of the
-            program's own, a network's weights among them).
-        name: of a leaf its path, else a number.
-        item: which result of a step that gives several; -1 where it gives one.
-    """
-
-    kind: str
-    name: str | int
-    item: int = -1
-
-
-@dataclass(frozen=True)
-class Step:
-    """One operator on tables: ``function(*args, **kwargs)`` with a :class:`Source` in place of each tensor."""
-
-    function: Any
-    args: tuple[Any, ...]
-    kwargs: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Table:
-    """A tensor as a kernel reads it.
-
-    Attributes:
-        source: where it comes from.
-        axis: which axis is indexed: its entries come first in memory, the numbers of one entry side by side. None: as it is.
-    """
-
-    source: Source
-    axis: int | None
-
-
-@dataclass(frozen=True)
-class Guard:
-    """A number that was read from a table while tracing, and holds for this trace alone."""
-
-    source: Source
-    value: Any
 
 
 @dataclass(frozen=True)
@@ -181,8 +132,8 @@ class Tracer(TorchDispatchMode):
         """Declare ``like (..., lanes)`` an input; ``make(k)`` gives the node of its k-th number."""
         lead = like.shape[:-1]
         nodes = np.empty((*lead, 1), object)
-        for k, at in enumerate(np.ndindex(*lead)):
-            nodes[(*at, 0)] = make(k)
+        for k, entry in enumerate(np.ndindex(*lead)):
+            nodes[(*entry, 0)] = make(k)
         self._keep.append(like)
         self._values[id(like)] = Value(nodes, len(lead))
         return like
@@ -193,8 +144,8 @@ class Tracer(TorchDispatchMode):
         nodes = np.empty(tuple(like.shape), object)
         slot = len(self.uniforms)
         self.uniforms.append((ty, like.numel()))
-        for k, at in enumerate(np.ndindex(*like.shape)):
-            nodes[at] = self.graph.node("uniform", ty, extra=(slot, k))
+        for k, entry in enumerate(np.ndindex(*like.shape)):
+            nodes[entry] = self.graph.node("uniform", ty, extra=(slot, k))
         self._keep.append(like)
         self._values[id(like)] = Value(nodes, None)
         return like
@@ -220,10 +171,10 @@ class Tracer(TorchDispatchMode):
 
     def lane_axis(self, shape: Iterable[int]) -> int | None:
         """Which axis holds the lanes; None where none does."""
-        found = [axis for axis, size in enumerate(shape) if size and size % self.lanes == 0]
-        if len(found) > 1:
+        axes = [axis for axis, size in enumerate(shape) if size and size % self.lanes == 0]
+        if len(axes) > 1:
             raise Unsupported(f"a tensor of shape {tuple(shape)} with lanes on two axes")
-        return found[0] if found else None
+        return axes[0] if axes else None
 
     def inner(self, shape: Iterable[int], lane: int | None) -> tuple[int, ...]:
         """The shape of the nodes of a tensor: the lanes' axis divided by the number of lanes."""
@@ -256,8 +207,8 @@ class Tracer(TorchDispatchMode):
             raise Unsupported(f"a table of shape {tuple(tensor.shape)} read whole in every lane")
         table, ty = self.table(tensor, None), DTYPES[tensor.dtype]
         nodes = np.empty(tuple(tensor.shape), object)
-        for k, at in enumerate(np.ndindex(*tensor.shape)):
-            nodes[at] = self.graph.node("element", ty, extra=(table, k))
+        for k, entry in enumerate(np.ndindex(*tensor.shape)):
+            nodes[entry] = self.graph.node("element", ty, extra=(table, k))
         return Value(nodes, None)
 
     def _spread(self, tensor: Tensor, lane: int) -> Value:
@@ -273,11 +224,11 @@ class Tracer(TorchDispatchMode):
 
     def source(self, tensor: Tensor) -> Source:
         """Where a tensor without lanes comes from."""
-        found = self._sources.get(id(tensor))
-        if found is None:
-            found = self._sources[id(tensor)] = Source("held", len(self.held))
+        source = self._sources.get(id(tensor))
+        if source is None:
+            source = self._sources[id(tensor)] = Source("held", len(self.held))
             self.held.append(tensor)
-        return found
+        return source
 
     def table(self, tensor: Tensor, axis: int | None) -> int:
         """The number of a table."""
@@ -389,13 +340,13 @@ def _safe(name: str, args: Any) -> Any:
 
 def _files() -> tuple[str, ...]:
     """The package's files on the stack, innermost first; the lane compiler's own left out."""
-    found: list[str] = []
+    files: list[str] = []
     frame: Any = sys._getframe(2)
     while frame is not None:
         name = frame.f_code.co_filename
         if name.startswith(_PACKAGE):
             name = name[len(_PACKAGE) :]
-            if not name.startswith("lanes") and name not in found:
-                found.append(name)
+            if not name.startswith("lanes") and name not in files:
+                files.append(name)
         frame = frame.f_back
-    return tuple(found)
+    return tuple(files)

@@ -27,10 +27,9 @@ from torchpt.lanes.tracing import tracing
 from torchpt.math.angles import azimuth
 from torchpt.math.vectors import cross, dot
 from torchpt.math.warps import uniform_triangle
-from torchpt.native.operators import choose, operator
+from torchpt.native.operators import operator
 
 __all__ = [
-    "KINDS",
     "LEAST",
     "MOST",
     "NEAR",
@@ -47,8 +46,6 @@ __all__ = [
     "tensor_sample",
 ]
 
-#: Primitive kinds that are sampled here.
-KINDS = ("triangle", "rectangle")
 #: Codes of shapes: a triangle, a rectangle, a parallelogram that is no rectangle, anything else.
 TRIANGLE, RECTANGLE, SKEW, OTHER = 0, 1, 2, 3
 #: Solid angles, in steradians, beyond which lights are sampled by area.
@@ -59,11 +56,11 @@ NEAR = 2.0
 SQUARE = 1e-6
 
 
-def table_of(kinds: Sequence[str], p0: Tensor, e1: Tensor, e2: Tensor, near: float = NEAR) -> Tensor | None:
+def table_of(codes: Sequence[int], p0: Tensor, e1: Tensor, e2: Tensor, near: float = NEAR) -> Tensor | None:
     """What :func:`sample` reads of lights.
 
     Args:
-        kinds: of the rows.
+        codes: of the rows' shapes: :data:`TRIANGLE`, :data:`RECTANGLE` (which may be sheared) or :data:`OTHER`.
         p0: ``(3, K)``.
         e1: ``(3, K)``.
         e2: ``(3, K)``.
@@ -71,13 +68,12 @@ def table_of(kinds: Sequence[str], p0: Tensor, e1: Tensor, e2: Tensor, near: flo
 
     Returns:
         ``(K, 14)`` float64: the shape's code, the squared distance from which on it is sampled by area, the centre which
-        that is from, ``p0``, ``e1``, ``e2``. None where none of the kinds is sampled by its solid angle.
+        that is from, ``p0``, ``e1``, ``e2``. None where none of them is sampled by its solid angle.
     """
-    if not set(KINDS) & set(kinds):
+    if set(codes) <= {OTHER}:
         return None
     p, a, b = (x.detach().double() for x in (p0, e1, e2))
-    numbers = {"triangle": TRIANGLE, "rectangle": RECTANGLE}
-    code = torch.tensor([numbers.get(kind, OTHER) for kind in kinds], device=p.device)
+    code = torch.tensor(codes, device=p.device)
     skew = dot(a, b).abs() > SQUARE * (dot(a, a) * dot(b, b)).sqrt()
     code = torch.where(skew & (code == RECTANGLE), SKEW, code)
     share = torch.where(code == TRIANGLE, 1.0 / 3.0, 0.5).double()
@@ -112,7 +108,7 @@ def sample(
         are 0 the point was drawn by area. Rows of other shapes keep ``u``.
     """
     if x.device.type == "cpu" and not tracing():
-        return choose(_sample_on_cpu, _sample_operator)(table, row, x, u)
+        return _sample_on_cpu(table, row, x, u)
     return tensor_sample(table, row, x, u, shapes)
 
 
@@ -122,7 +118,7 @@ def angles(table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] =
     From behind a light fills the same angle; it is the caller who knows which side emits.
     """
     if x.device.type == "cpu" and not tracing():
-        return choose(_angles_on_cpu, _angles_operator)(table, row, x)
+        return _angles_on_cpu(table, row, x)
     return tensor_angles(table, row, x, shapes)
 
 
@@ -142,30 +138,21 @@ def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
     return torch.where(angle > 0, solid, by_area)
 
 
+@operator(
+    "torchpt::solid_angle_sample",
+    lambda table, row, x, u: (x.new_empty(2, x.shape[1], dtype=u.dtype), x.new_empty(x.shape[1])),
+)
 def _sample_on_cpu(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
     from torchpt.lights import kernels_solid
 
     return kernels_solid.sample(table, row, x, u)
 
 
+@operator("torchpt::solid_angles", lambda table, row, x: x.new_empty(x.shape[1]))
 def _angles_on_cpu(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
     from torchpt.lights import kernels_solid
 
     return kernels_solid.angles(table, row, x)
-
-
-_sample_operator = operator("torchpt::solid_angle_sample", _sample_on_cpu)
-_angles_operator = operator("torchpt::solid_angles", _angles_on_cpu)
-
-
-@_sample_operator.register_fake
-def _(table, row, x, u):
-    return torch.empty(2, x.shape[1], dtype=u.dtype, device=x.device), x.new_empty(x.shape[1])
-
-
-@_angles_operator.register_fake
-def _(table, row, x):
-    return x.new_empty(x.shape[1])
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchpt.lanes.tracing import tracing
-from torchpt.native.operators import choose, operator
+from torchpt.native.operators import operator
 
 __all__ = ["LightTree", "build", "fine", "probability", "sample"]
 
@@ -111,7 +111,7 @@ def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Ten
     """
     x, n = x.detach(), None if n is None else n.detach()
     if x.device.type == "cpu" and not tracing():
-        return choose(_sample_on_cpu, _sample_operator)(*_parts(tree), x, n, u)
+        return _sample_on_cpu(*_parts(tree), x, n, u)
     row, p, rest = _walk(tree, x, n, u, None)
     assert rest is not None
     return row, p, rest
@@ -121,7 +121,7 @@ def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None) -> Te
     """``(N,)`` with which :func:`sample` draws ``row (N,)`` at ``x, n``."""
     x, n = x.detach(), None if n is None else n.detach()
     if x.device.type == "cpu" and not tracing():
-        return choose(_probability_on_cpu, _probability_operator)(*_parts(tree), row, x, n)
+        return _probability_on_cpu(*_parts(tree), row, x, n)
     return _walk(tree, x, n, None, row)[1]
 
 
@@ -129,6 +129,14 @@ def _parts(tree: LightTree) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     return tree.nodes, tree.child, tree.full, tree.trail, tree.depth
 
 
+@operator(
+    "torchpt::light_tree_sample",
+    lambda nodes, child, full, trail, depth, x, n, u: (
+        torch.empty_like(u, dtype=torch.int64),
+        torch.empty_like(u, dtype=x.dtype),
+        torch.empty_like(u),
+    ),
+)
 def _sample_on_cpu(
     nodes: Tensor, child: Tensor, full: Tensor, trail: Tensor, depth: Tensor, x: Tensor, n: Tensor | None, u: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -137,30 +145,16 @@ def _sample_on_cpu(
     return kernels_tree.sample((nodes, child, full, trail, depth), x, n, u)
 
 
+@operator(
+    "torchpt::light_tree_probability",
+    lambda nodes, child, full, trail, depth, row, x, n: torch.empty_like(row, dtype=x.dtype),
+)
 def _probability_on_cpu(
     nodes: Tensor, child: Tensor, full: Tensor, trail: Tensor, depth: Tensor, row: Tensor, x: Tensor, n: Tensor | None
 ) -> Tensor:
     from torchpt.lights import kernels_tree
 
     return kernels_tree.probability((nodes, child, full, trail, depth), row, x, n)
-
-
-_sample_operator = operator("torchpt::light_tree_sample", _sample_on_cpu)
-_probability_operator = operator("torchpt::light_tree_probability", _probability_on_cpu)
-
-
-@_sample_operator.register_fake
-def _(
-    nodes: Tensor, child: Tensor, full: Tensor, trail: Tensor, depth: Tensor, x: Tensor, n: Tensor | None, u: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    return torch.empty_like(u, dtype=torch.int64), torch.empty_like(u, dtype=x.dtype), torch.empty_like(u)
-
-
-@_probability_operator.register_fake
-def _(
-    nodes: Tensor, child: Tensor, full: Tensor, trail: Tensor, depth: Tensor, row: Tensor, x: Tensor, n: Tensor | None
-) -> Tensor:
-    return torch.empty_like(row, dtype=x.dtype)
 
 
 # The tensor form: what other devices run, and the kernels' reference.

@@ -56,7 +56,7 @@ def safe_reciprocal(a: Tensor) -> Tensor:
 
 
 def luminance(rgb: Tensor) -> Tensor:
-    """Rec. 709 luminance of linear RGB ``(3, ...) -> (...)``."""
+    """Luminance of linear RGB ``(3, ...) -> (...)``: Y of CIE XYZ by the primaries of Rec. 709, as in pbrt and Mitsuba."""
     return 0.212671 * rgb[0] + 0.715160 * rgb[1] + 0.072169 * rgb[2]
 
 

@@ -1,4 +1,7 @@
-"""Mesh files to plain arrays: OBJ with MTL, PLY, STL, glTF. One table of formats; a scene imports those that it reads."""
+"""Mesh files to plain arrays: OBJ with MTL, PLY, STL, glTF by our own readers, others through trimesh.
+
+One table of formats; a scene imports those that it reads.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,27 @@ from pathlib import Path
 import numpy as np
 
 from torchpt.errors import AssetError
-from torchpt.meshes.cube import unit_cube
 from torchpt.meshes.mesh_part import FileCamera, FileLight, FileMaterial, MeshPart, checked
 from torchpt.meshes.normals import smooth_normals
 
-__all__ = ["FORMATS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals", "unit_cube"]
+__all__ = [
+    "FORMATS", "PARSERS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "load_mesh", "smooth_normals",
+]  # fmt: skip
 
+#: Endings that trimesh reads, and the packages beside it that each of them takes (all in the extra ``formats``).
+PARSERS: dict[str, tuple[str, ...]] = {
+    ".off": (),
+    ".3mf": ("lxml", "networkx"),
+    ".dae": ("collada",),
+    ".zae": ("collada",),
+    ".xaml": ("lxml",),
+    ".3dxml": ("lxml", "networkx"),
+}
 #: File ending -> module here, whose ``load_<module>(path, data, materials)`` gives the parts.
-FORMATS = {".obj": "obj", ".ply": "ply", ".stl": "stl", ".glb": "gltf", ".gltf": "gltf"}
+FORMATS = {
+    **{".obj": "obj", ".ply": "ply", ".stl": "stl", ".glb": "gltf", ".gltf": "gltf"},
+    **dict.fromkeys(PARSERS, "others"),
+}
 
 
 def load_mesh(path: Path, *, materials: bool = True) -> list[MeshPart]:

@@ -67,9 +67,9 @@ def _stamp() -> tuple[float, int]:
 
     Numba keeps a kernel until the kernel's own file changes, and would not see that what is inlined into it has.
     """
-    here = Path(__file__).parent
-    found = [path.stat() for path in (*here.rglob("*.py"), *here.parent.glob("*/kernels*.py"))]
-    return max(file.st_mtime for file in found), sum(file.st_size for file in found)
+    native = Path(__file__).parent
+    files = [path.stat() for path in (*native.rglob("*.py"), *native.parent.glob("*/kernels*.py"))]
+    return max(file.st_mtime for file in files), sum(file.st_size for file in files)
 
 
 def part(**options: Any) -> Callable[[Callable], Any]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
-
 from torchpt import bsdfs
 from torchpt.accel import Accel
 from torchpt.film import FILTERS
+from torchpt.lights import KINDS as LIGHTS
+from torchpt.lights import SURFACES, Environment
 from torchpt.lights.choice import ByTree
 from torchpt.records import KINDS, Lights, World, tensors_of
 from torchpt.settings import Settings
@@ -60,10 +60,6 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "lights": {} if lights is None else _lights(lights),
         "scene_bytes": memory,
     }
-    around = None if lights is None else lights.environment
-    if around is not None and not isinstance(around, Tensor):
-        compensated = around.compensated is not None
-        made["lights"]["envmap"] = {"texels": [around.width, around.height], "mis_compensation": compensated}
     if world.textures.atlas is not None:
         texels = world.textures.atlas.texels
         made["textures"] = {
@@ -85,7 +81,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "shapes": shapes,
         "built": made,
         "left_out": _left_out(description, world, settings),
-        "settings": settings.model_dump(mode="json", warnings=False),
+        "settings": settings.plain(),
     }
 
 
@@ -96,6 +92,9 @@ def _lights(lights: Lights) -> dict[str, Any]:
         found["choice"] = {"tree": {"nodes": len(tree.nodes), "levels": tree.levels}}
     elif lights.choice is not None:
         found["choice"] = "a fixed chance for each"
+    last = LIGHTS.get(lights.kinds[-1])
+    if last is not None and issubclass(last, Environment) and (told := last.info(lights.environment)):
+        found[last.name] = told
     return found
 
 
@@ -104,7 +103,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
     lights = world.lights
     absent = [f"{kind} primitives" for kind, n in zip(KINDS, world.geometry.counts, strict=True) if not n]
     present = {model.name for model in world.materials.models}
-    absent += [f"{name} bsdf" for name in dict.fromkeys(model.name for model in bsdfs.MODELS) if name not in present]
+    absent += [f"{name} bsdf" for name in bsdfs.KINDS if name not in present]
     if len(world.materials.models) == 1:
         absent.append("sorting by bsdf (one model)")
     if world.geometry.normals is None:
@@ -132,15 +131,15 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
             absent.append("environment")
         if lights.row_of_prim is None:
             absent.append("area lights")
-        absent += [f"sampling of {kind} lights" for kind in KINDS if kind not in lights.kinds]
-    if not FILTERS[settings.film.filter.type].tabulated:
-        absent.append(f"filter table ({settings.film.filter.type})")
+        absent += [f"sampling of {kind} lights" for kind in SURFACES if kind not in lights.kinds]
+    if not FILTERS[settings.film.filter.name].tabulated:
+        absent.append(f"filter table ({settings.film.filter.name})")
     if not description.camera.kind.lens:
         absent.append("places on a lens (all is in focus)")
     integrator = settings.integrator
-    if getattr(integrator, "clamp", None) is None:
+    if integrator.clamp is None:
         absent.append("clamp")
-    if 0 <= getattr(integrator, "max_depth", 2) < getattr(integrator, "rr_depth", 3) + 1:
+    if 0 <= integrator.limits.max_depth <= integrator.limits.rr_depth:
         absent.append("Russian roulette (paths end before rr_depth)")
     if not settings.film.aovs:
         absent.append("aov layers")

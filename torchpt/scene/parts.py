@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -94,8 +96,10 @@ class Source:
 
     Attributes:
         name: dotted prefix of its parameters, e.g. ``lights.sky``.
-        kind: one of ``records.SOURCES``.
+        kind: one of ``lights.KINDS``.
+        values: of its parameters as it was loaded, those that are no tensors included.
     """
 
     name: str
     kind: str
+    values: Mapping[str, Any] = field(default_factory=dict)

@@ -24,9 +24,10 @@ from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
 from torchpt.scene.info import describe
-from torchpt.scene.space import FARTHEST, Space
+from torchpt.scene.sources import check_sources
+from torchpt.scene.space import FARTHEST, Space, middle_of
 from torchpt.settings import Film, Settings
-from torchpt.spec import Index, Moves, Pose, Refused, Scalar, Spec, Vertices, parameters_of
+from torchpt.spec import Moves, Pose, Refused, Scalar, Spec, parameters_of
 
 __all__ = ["Scene", "device_of", "load"]
 
@@ -114,6 +115,10 @@ class Scene:
         """The lanes' own coordinates."""
         return self._space
 
+    def middle(self) -> np.ndarray:
+        """The middle of the box around all that can be hit, ``(3,)`` float64; the origin where nothing can."""
+        return middle_of(self._built.parts, self._built.copies)
+
     def check(self, params: Mapping[str, Tensor] | None) -> None:
         """Refuse parameters that this scene cannot be rendered with.
 
@@ -129,6 +134,7 @@ class Scene:
                 found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
                 raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}")
             self._check(name, value.detach())
+        check_sources(self._built.sources, params or {}, self.merged(params))
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """All parameters, those of ``params`` (once checked) in place of the scene's."""
@@ -136,7 +142,7 @@ class Scene:
 
     def spec(self, name: str) -> Spec:
         """What a parameter is."""
-        return self._built.parameters.specs.get(name) or _undeclared(name, self._built)
+        return self._built.parameters.specs.get(name) or _undeclared(name)
 
     def _check(self, name: str, value: Tensor) -> None:
         """Refuse numbers that no scene file could hold."""
@@ -243,27 +249,24 @@ class Scene:
         """Forget what was made of parameters that have since been replaced or changed in place."""
         state = {name: (value, value._version) for name, value in self.params.items()}
         # The tensors themselves are kept and compared: an id may be another tensor's by now.
-        same = state.keys() == self._state.keys() and all(
-            value is self._state[name][0] and version == self._state[name][1]
+        changed = [
+            name
             for name, (value, version) in state.items()
-        )
-        if not same:
-            for name, (value, version) in state.items():
-                old = self._state.get(name)
-                if self.spec(name).place and old is not None and (old[0] is not value or old[1] != version):
-                    self._check(name, value.detach())
-            self._state = state
-            self._worlds.clear()
-            self._accels.clear()
+            if name not in self._state or value is not self._state[name][0] or version != self._state[name][1]
+        ]
+        if not changed and len(state) == len(self._state):
+            return
+        for name in changed:
+            if self.spec(name).place and name in self._state:
+                self._check(name, state[name][0].detach())
+        self._state = state
+        if changed and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it
+            return
+        self._worlds.clear()
+        self._accels.clear()
 
 
-def _undeclared(name: str, built: Built) -> Spec:
+def _undeclared(name: str) -> Spec:
     """What a parameter is whose kind does not declare it yet, by its name."""
     key = name.rpartition(".")[2]
-    if key == "vertices":
-        return Vertices()
-    if key == "to_world":
-        return Pose(angles=any(part.kind == "sphere" and name == f"{part.name}.to_world" for part in built.parts))
-    if ".material." in name or name.startswith("materials."):
-        return Index() if key in ("int_ior", "ext_ior", "ior") else Scalar()
     return Scalar() if key in ("emission", "texels") else Scalar(low=None)

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpt.errors import SceneError
+from torchpt.lights import KINDS as LIGHTS
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.spec.declared import Described
 
-__all__ = ["FARTHEST", "Space", "centre_and_unit"]
+__all__ = ["FARTHEST", "Space", "centre_and_unit", "middle_of"]
 
 #: A scene is moved to the origin where it lies further away than this many times its own size.
 RECENTRE = 8.0
@@ -99,6 +100,12 @@ def centre_and_unit(
     return centre, _unit(lengths, (names[near], float(sizes[near])), file)
 
 
+def middle_of(parts: Sequence[Part], copies: Sequence[Copy]) -> Array:
+    """The middle of the box around all that can be hit, ``(3,)``; the origin where nothing can."""
+    names, boxes, _ = _boxes(parts, copies)
+    return 0.5 * (boxes.min((0, 1)) + boxes.max((0, 1))) if names else np.zeros(3)
+
+
 def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Array, Array]:
     """Names ``N``, corners ``(N, 8, 3)`` of boxes in the scene, and largest extents ``(N,)`` of all that can be hit."""
     cube = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -130,9 +137,9 @@ def _reaches(
     found = [("camera", float(np.abs(parameters["camera.to_world"][:3, 3] - centre).max()))]
     found += [(f"camera.{key}", float(camera[key])) for key in camera.kind.reaches]
     for source in sources:
-        position = parameters.get(f"{source.name}.position")
-        if position is not None:
-            found.append((f"{source.name}.position", float(np.abs(position - centre).max())))
+        for place in LIGHTS[source.kind].places:
+            name = f"{source.name}.{place}"
+            found.append((name, float(np.abs(parameters[name] - centre).max())))
     return found
 
 

@@ -18,7 +18,7 @@ from torchpt.images.decode import MAX_PIXELS
 from torchpt.math.transforms import uv_matrix
 from torchpt.textures import Node, Reading, VertexColors, atlas_of, look_up
 
-__all__ = ["Opener", "images_of", "radiance_of"]
+__all__ = ["Opener", "images_of"]
 
 _ONE = (1.0, 1.0, 1.0)
 #: What a checkerboard's two colours are called among the parameters, after its own name.
@@ -201,27 +201,6 @@ class Opener:
         where = f" in the texels of {label}" if label else ""
         expected = f"numbers in {slot.low:g}..{slot.high:g}" if slot.high < 1e30 else f"numbers >= {slot.low:g}"
         raise SceneError(key, [low, high], f"{expected}{where}", self.file)
-
-
-def radiance_of(source: Path, key: str, file: str | None) -> np.ndarray:
-    """A picture as radiance ``(H, W, 3)`` float32: grey ones in all channels, 8-bit ones decoded from sRGB, no alpha.
-
-    Args:
-        source: the picture.
-        key: dotted key for the error.
-        file: scene file for the error.
-
-    Raises:
-        SceneError: a negative value.
-        AssetError: an image that is malformed.
-    """
-    found = read_texels(source)
-    values = found.values[..., :3] if found.values.shape[2] >= 3 else found.values[..., :1].repeat(3, 2)
-    if found.eight_bit:
-        values = srgb_to_linear(torch.from_numpy(np.ascontiguousarray(values))).numpy()
-    if values.min() < 0:
-        raise SceneError(key, float(values.min()), f"numbers >= 0 in the texels of {source}", file)
-    return np.ascontiguousarray(values)
 
 
 def images_of(nodes: list[Node], parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -1,11 +1,18 @@
-"""Shapes: from what the search found to a surface point, its normals, and points sampled on it.
+"""Shapes: what they declare, and from what the search found to a surface point, its normals, and points sampled on it.
 
-Planar primitives (triangle, rectangle, disk) share one affine form; spheres are their own.
+One kind a file in ``kinds/``. Planar primitives (triangle, rectangle, disk) share one affine form; spheres are their own.
 """
 
 from __future__ import annotations
 
+from torchpt.shapes.base import Shape
 from torchpt.shapes.interaction import interact, offset_origin, reattach
 from torchpt.shapes.uv import surface_uv, vertex_colors
+from torchpt.spec import Kinds
 
-__all__ = ["interact", "offset_origin", "reattach", "surface_uv", "vertex_colors"]
+#: The kinds of shapes.
+KINDS: Kinds[Shape] = Kinds(
+    "torchpt.shapes.kinds", ("mesh", "sphere", "rectangle", "disk", "cube", "cylinder", "cone", "instance")
+)
+
+__all__ = ["KINDS", "Shape", "interact", "offset_origin", "reattach", "surface_uv", "vertex_colors"]

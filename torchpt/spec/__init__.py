@@ -7,7 +7,7 @@ files and the tables of the docs are made of these.
 
 from __future__ import annotations
 
-from torchpt.spec.kinds import Kinds, parameters_of
+from torchpt.spec.kinds import Block, Kinds, parameters_of
 from torchpt.spec.parameters import (
     REQUIRED,
     Angle,
@@ -16,6 +16,7 @@ from torchpt.spec.parameters import (
     Direction,
     Flag,
     Index,
+    Map,
     Moves,
     Other,
     Path,
@@ -29,16 +30,19 @@ from torchpt.spec.parameters import (
     spec_of,
 )
 from torchpt.spec.reading import Refused
+from torchpt.spec.valued import Valued
 
 __all__ = [
     "REQUIRED",
     "Angle",
+    "Block",
     "Choice",
     "Color",
     "Direction",
     "Flag",
     "Index",
     "Kinds",
+    "Map",
     "Moves",
     "Other",
     "Path",
@@ -48,6 +52,7 @@ __all__ = [
     "Scalar",
     "Spec",
     "Texels",
+    "Valued",
     "Vertices",
     "Whole",
     "parameters_of",

@@ -5,13 +5,14 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Annotated, Any
 
 from pydantic import create_model
 
 from torchpt.errors import NotBuiltError, SceneError
-from torchpt.spec import REQUIRED, Refused, Spec, not_built, parameters_of
+from torchpt.spec import REQUIRED, Block, Map, Refused, Spec, not_built, parameters_of
+from torchpt.spec.reading import within
 from torchpt.spec.validate import Check, Model, check_keys, construct, dotted, refuse_not_built, refused
 
 __all__ = ["Described", "described", "refuse_foreign", "values_of"]
@@ -173,10 +174,25 @@ def _default(spec: Spec) -> Any:
 
 
 def _reader(spec: Spec, texture: ReadTexture | None) -> Callable[[Any], Any]:
+    if isinstance(spec, Block):
+        return partial(_block, spec, texture)
     if not spec.texture or texture is None:
         return spec.read
 
     def read(value: Any) -> Any:
+        if isinstance(value, str) and isinstance(spec, Map):
+            value = {"texture": value}
         return texture(value, spec) if isinstance(value, Mapping) else spec.read(value)
 
     return read
+
+
+def _block(spec: Block, texture: ReadTexture | None, value: Any) -> Described | None:
+    if value is None:
+        return None
+    if not isinstance(value, Mapping):
+        raise Refused(spec.expected)
+    try:
+        return values_of(spec.kind, value, "", None, spec.kind.__name__.lower(), texture)
+    except SceneError as error:
+        raise within(error) from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
@@ -12,7 +13,7 @@ from typing import Any, Generic, TypeVar
 
 from torchpt.spec.parameters import Spec, spec_of
 
-__all__ = ["Kinds", "parameters_of"]
+__all__ = ["Block", "Kinds", "parameters_of"]
 
 K = TypeVar("K")
 
@@ -82,3 +83,19 @@ def parameters_of(kind: Any) -> dict[str, Spec]:
         if isinstance(layer, Mapping):
             found |= {name: spec_of(value) for name, value in layer.items()}
     return found
+
+
+@dataclass(frozen=True)
+class Block(Spec):
+    """A mapping with parameters of its own.
+
+    Attributes:
+        kind: what declares them.
+    """
+
+    kind: Any = field(default=None, kw_only=True)
+
+    @property
+    def accepted(self) -> str:
+        """See :class:`Spec`."""
+        return f"a mapping with the keys {', '.join(parameters_of(self.kind))}"

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = [
-    "REQUIRED", "Angle", "Choice", "Color", "Direction", "Flag", "Index", "Moves", "Other", "Path", "Point", "Pose", "Scalar",
-    "Spec", "Texels", "Vertices", "Whole", "spec_of",
+    "REQUIRED", "Angle", "Choice", "Color", "Direction", "Flag", "Index", "Map", "Moves", "Other", "Path", "Point",
+    "Pose", "Scalar", "Spec", "Texels", "Vertices", "Whole", "spec_of",
 ]  # fmt: skip
 
 
@@ -70,6 +70,8 @@ class Spec:
     place: ClassVar[bool] = False
     #: How many channels of a texture it takes.
     coloured: ClassVar[bool] = False
+    #: Whether a texture's numbers stand for no colours, so that 8-bit files are not decoded.
+    linear: ClassVar[bool] = True
 
     @property
     def accepted(self) -> str:
@@ -114,6 +116,11 @@ class _Numbers(Spec):
     below: float | None = field(default=None, kw_only=True)
 
     traced: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if isinstance(self.default, int | float) and not isinstance(self.default, bool):  # as a file's would be read
+            grey = float(self.default)
+            object.__setattr__(self, "default", (grey, grey, grey) if self.coloured else grey)
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -182,6 +189,7 @@ class Color(_Numbers):
     """A linear RGB colour: three numbers, or one for all."""
 
     coloured: ClassVar[bool] = True
+    linear: ClassVar[bool] = False
 
     @property
     def accepted(self) -> str:
@@ -234,7 +242,7 @@ class Index(Scalar):
     def expected(self) -> str:
         """See :class:`Spec`."""
         texture = ", a texture" if self.texture else ""
-        return f"{self.accepted}{texture}, or one of {', '.join(self.media)}"
+        return f"{self.accepted}{texture}, or one of {', '.join(self.media)}" if self.media else super().expected
 
     def read(self, value: Any) -> float:
         """See :class:`Spec`."""
@@ -456,6 +464,21 @@ class Path(Spec):
     def read(self, value: Any) -> tuple[str, ...]:
         """See :class:`Spec`."""
         return reading.file_paths(value)
+
+
+@dataclass(frozen=True)
+class Map(Spec):
+    """A texture that gives numbers, or its name; read by whoever reads textures (:data:`torchpt.spec.declared.ReadTexture`)."""
+
+    texture: bool = field(default=True, kw_only=True)
+    words: str = field(default="the name of a texture", kw_only=True)
+
+    #: Numbers that it may give, as of a number that a texture may give.
+    bounds: ClassVar[tuple[float, float]] = (-LARGEST, LARGEST)
+
+    def read(self, value: Any) -> Any:
+        """See :class:`Spec`."""
+        raise Refused(self.expected)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import take
+from torchpt.math.vectors import luminance, take
 
 __all__ = [
     "WRAPS",
@@ -242,7 +242,7 @@ def _planes(image: Tensor, channel: int | None) -> Tensor:
         return image[..., channel][None]
     if not coloured:
         return image[..., 0][None]
-    return (0.212671 * image[..., 0] + 0.715160 * image[..., 1] + 0.072169 * image[..., 2])[None]
+    return luminance(image.movedim(-1, 0))[None]
 
 
 @dataclass(frozen=True)

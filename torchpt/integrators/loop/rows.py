@@ -8,16 +8,30 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.graph import DTYPES
-from torchpt.lanes.kernel import CAPACITY
 from torchpt.lanes.tracing import Tracer
 
-__all__ = ["HIT", "PASS", "SHADOW", "Memory", "Rows"]
+__all__ = ["HIT", "PASS", "SHADOW", "Fields", "Memory", "Rows"]
+
+#: Shape without lanes and node type of each field.
+Fields = dict[str, tuple[tuple[int, ...], str]]
 
 #: Fields of a hit, of a shadow ray, and of a ray that goes on behind a surface that it passed.
-HIT = {"t": ((), "f"), "prim": ((), "l"), "u": ((), "f"), "v": ((), "f")}
-SHADOW = {"shadow_o": ((3,), "f"), "shadow_d": ((3,), "f"), "shadow_t": ((), "f"), "shadow_radiance": ((3,), "f")}
-PASS = {"pass_o": ((3,), "f"), "pass_d": ((3,), "f"), "pass_t": ((), "f"), "before": ((), "f"), "home": ((), "l")}
+HIT: Fields = {"t": ((), "f"), "prim": ((), "l"), "u": ((), "f"), "v": ((), "f")}
+SHADOW: Fields = {
+    "shadow_o": ((3,), "f"),
+    "shadow_d": ((3,), "f"),
+    "shadow_t": ((), "f"),
+    "shadow_radiance": ((3,), "f"),
+}
+PASS: Fields = {
+    "pass_o": ((3,), "f"),
+    "pass_d": ((3,), "f"),
+    "pass_t": ((), "f"),
+    "before": ((), "f"),
+    "home": ((), "l"),
+}
 
 _DTYPES = {ty: dtype for dtype, ty in DTYPES.items()}
 
@@ -35,13 +49,13 @@ class Rows:
     """Rows of an arena by the names of the fields that they hold.
 
     Args:
-        fields: shape without lanes and node type of each.
+        fields: of the arena.
 
     Attributes:
         count: how many rows there are.
     """
 
-    def __init__(self, fields: dict[str, tuple[tuple[int, ...], str]]) -> None:
+    def __init__(self, fields: Fields) -> None:
         self._fields = fields
         self._first: dict[str, int] = {}
         self.count = 0
@@ -58,7 +72,7 @@ class Rows:
 
     def read(self, tracer: Tracer, *names: str) -> dict[str, Tensor]:
         """Fields as inputs of a trace; those that there are not are left out."""
-        found: dict[str, Tensor] = {}
+        inputs: dict[str, Tensor] = {}
         for name in names:
             if name not in self._fields:
                 continue
@@ -71,20 +85,20 @@ class Rows:
             def node(k: int, first: int = first, ty: str = ty) -> int:
                 return tracer.graph.node("arena", ty, extra=first + k)
 
-            found[name] = tracer.lane(like, node)
-        return found
+            inputs[name] = tracer.lane(like, node)
+        return inputs
 
     def take(self, memory: Memory, lanes: np.ndarray, names: tuple[str, ...]) -> dict[str, Tensor]:
         """Fields of some lanes as tensors; those that there are not are left out."""
-        found = {}
+        values = {}
         for name in names:
             if name in self._fields:
                 shape, ty = self._fields[name]
                 held = memory.floats if ty == "f" else memory.words
                 first = self._first[name]
                 value = torch.from_numpy(held[first : first + math.prod(shape), lanes]).to(_DTYPES[ty])
-                found[name] = value.view(*shape, len(lanes))
-        return found
+                values[name] = value.view(*shape, len(lanes))
+        return values
 
     def put(self, memory: Memory, start: int, values: dict[str, Tensor | None]) -> None:
         """Fields of consecutive lanes from tensors; those that there are not are left out."""
@@ -98,15 +112,15 @@ class Rows:
 
     def nodes(self, tracer: Tracer, **fields: Tensor) -> list[tuple[int, int]]:
         """Rows and nodes of results by field; numbers that all lanes share are spread."""
-        found = []
+        pairs = []
         for name, value in fields.items():
             shape, ty = self._fields[name]
             nodes = tracer.nodes(value)
             if len(nodes) != math.prod(shape):
                 raise ValueError(f"{name}: {len(nodes)} numbers for {math.prod(shape)} rows")
             held = ty if ty != "l" else None
-            found += [
+            pairs += [
                 (self._first[name] + k, node if held is None else tracer.graph.cast(node, held))
                 for k, node in enumerate(nodes)
             ]
-        return found
+        return pairs

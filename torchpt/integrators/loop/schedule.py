@@ -12,11 +12,14 @@ import numpy as np
 
 from torchpt.errors import RenderError
 from torchpt.film import Film
-from torchpt.integrators.loop.chunk import LANES, Chunk, Halted, Worker
+from torchpt.integrators import LAYERS
+from torchpt.integrators.loop.calls import Halted
+from torchpt.integrators.loop.chunk import LANES, Chunk, Worker
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.path import Tally
+from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.block import WIDTH
-from torchpt.lanes.kernel import CAPACITY, HEAD
+from torchpt.lanes.kernel import HEAD
 
 __all__ = ["Loop", "Share"]
 
@@ -24,7 +27,7 @@ __all__ = ["Loop", "Share"]
 TASKS = 6
 #: Fewest lanes that repay a task.
 FEWEST = 1024
-#: Seconds between two textures at signals.
+#: Seconds after which the thread that asked for the render looks whether it is to end.
 PATIENCE = 0.05
 
 
@@ -88,7 +91,7 @@ class Loop:
             Whether all were taken.
         """
         blocks = list(self._blocks(count))
-        # Tasks never run in this thread: it textures after signals.
+        # Tasks never run in this thread: it looks after signals.
         pool = ThreadPoolExecutor(min(self.threads, len(blocks)), thread_name_prefix="torchpt")
         try:
             waiting: set[Future[Share]] = {pool.submit(self._task, start, size, first, count) for start, size in blocks}
@@ -150,17 +153,15 @@ class Loop:
             raise self._not_finite(used, chunk)
 
     def _layers(self, worker: Worker, chunk: Chunk, share: Share) -> None:
-        from torchpt.integrators.aov import CHANNELS
-
         names = tuple(self.layers)
         share.tally.rays += worker.layers(chunk, names)
         assert worker.shown is not None
-        at = 0
+        first = 0
         for name in names:
-            channels = CHANNELS[name]
-            values = worker.shown.floats[at : at + channels]
+            channels = len(LAYERS[name].channels)
+            values = worker.shown.floats[first : first + channels]
             self._deposit(worker, values, chunk, self.layers[name], channels, None)
-            at += channels
+            first += channels
 
     def _deposit(
         self, worker: Worker, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None
@@ -175,16 +176,16 @@ class Loop:
         words[HEAD.index("tables")] = made.tables.address
         if kernel.uniforms:
             words[len(HEAD)] = limit.ctypes.data
-        at = len(HEAD) + len(kernel.uniforms)
+        rest = len(HEAD) + len(kernel.uniforms)  # input and output tensors: addresses and lengths of rows
         sums, n = film.sums, chunk.pixels
         pixels = sums.shape[2]
         for k in range(chunk.samples):
             group = (chunk.first_sample + k) % film.randomizations
             source = values.ctypes.data + 4 * k * n
             total = sums.data_ptr() + 8 * (group * channels * pixels + chunk.first_pixel)
-            words[at : at + 6] = (source, CAPACITY, total, pixels, total, pixels)
+            words[rest : rest + 6] = (source, CAPACITY, total, pixels, total, pixels)
             if clamp is not None:
-                words[at + 6], words[at + 7] = source, CAPACITY
+                words[rest + 6], words[rest + 7] = source, CAPACITY
             kernel.call(ctypes.addressof(words), n)
         film.counted(chunk.first_pixel, n, chunk.first_sample, chunk.samples)
         if chunk.first_sample == 0:

@@ -1,4 +1,4 @@
-"""Quadrics: what lanes need of them, and their areas."""
+"""Quadrics: what lanes need of them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import affine, cross, dot
+from torchpt.math.vectors import cross, dot
 from torchpt.records import QUADRICS, Quadrics
 from torchpt.scene.parts import Part
-from torchpt.shapes import quadrics
 
-__all__ = ["quadric_area", "quadrics_of"]
+__all__ = ["quadrics_of"]
 
 
 def quadrics_of(parts: Sequence[Part], frames: Tensor, dtype: torch.dtype) -> Quadrics:
@@ -26,19 +25,3 @@ def quadrics_of(parts: Sequence[Part], frames: Tensor, dtype: torch.dtype) -> Qu
     reach = (p0.abs() + e1.abs() + e2.abs() + e3.abs()).detach().to(dtype)
     code = torch.tensor([QUADRICS.index(part.quadric) for part in parts], dtype=torch.int64, device=p0.device)
     return Quadrics(code, e3.to(dtype), n1, n2, n3, reach)
-
-
-def quadric_area(code: Tensor, frames: Tensor) -> tuple[Tensor, Tensor]:
-    """Areas ``(Q,)`` float64 of quadrics: their own space's times ``|det|``, and (by quadrature, detached) the world's."""
-    e1, e2, e3 = frames[3:6], frames[6:9], frames[9:12]
-    own = torch.tensor(quadrics.AREAS, dtype=torch.float64, device=e1.device)[code]
-    det = dot(e1, cross(e2, e3)).abs()
-    faces = [n.detach() for n in (cross(e2, e3), cross(e3, e1), cross(e1, e2))]
-    grid = (torch.arange(16, dtype=torch.float64, device=e1.device) + 0.5) / 16
-    spots = torch.cartesian_prod(grid, grid)
-    total = torch.zeros_like(own)
-    for spot in spots:
-        n = quadrics.normal(code, quadrics.sample(code, spot[:, None].expand(2, len(own))))
-        grown = affine(faces[0] * n[0], faces[1], n[1], faces[2], n[2])
-        total += (dot(grown, grown) / dot(n, n)).sqrt()
-    return own * det, own * total / len(spots)

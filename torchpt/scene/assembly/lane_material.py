@@ -5,14 +5,14 @@ Differentiable in the parameters, and done once a material. A blend with ``null`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs import Blend, Bsdf, Null, Parameters
+from torchpt.bsdfs import Bsdf, Parameters
 from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.textures import Node, Reading, VertexColors
 
@@ -55,10 +55,10 @@ def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], 
     }
     if material.inner:
         a, b = (lane_material(inner, parameters, dtype) for inner in material.inner)
-        found = _blended(values.get("weight"), readings.get("weight"), a, b)
+        found = _blended(type(material.model), values.get("weight"), readings.get("weight"), a, b)
     else:
         device = next(iter(parameters.values())).device
-        nothing = torch.zeros(1, dtype=dtype, device=device) if isinstance(material.model, Null) else None
+        nothing = torch.zeros(1, dtype=dtype, device=device) if material.model.sheer else None
         found = LaneMaterial(material.model, values, nothing, readings)
     opacity, opacity_texture = found.opacity, found.opacity_texture
     if isinstance(material.opacity, Node):
@@ -71,23 +71,25 @@ def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], 
     return LaneMaterial(found.model, found.values, opacity, found.readings, opacity_texture)
 
 
-def _blended(weight: Tensor | None, reading: Reading | None, a: LaneMaterial, b: LaneMaterial) -> LaneMaterial:
+def _blended(
+    kind: Callable[[Bsdf, Bsdf], Bsdf], weight: Tensor | None, reading: Reading | None, a: LaneMaterial, b: LaneMaterial
+) -> LaneMaterial:
     """The blend of two materials, ``weight (1,)`` of the second: what is met of each, and how often either is."""
     opacity = None
     if weight is None:  # a texture, beside which nothing but null lets rays pass
         assert reading is not None
-        if isinstance(reading, Node) and isinstance(a.model, Null):
+        if isinstance(reading, Node) and a.model.sheer:
             return LaneMaterial(b.model, b.values, None, b.readings, OpacityTexture(reading))
-        if isinstance(reading, Node) and isinstance(b.model, Null):
+        if isinstance(reading, Node) and b.model.sheer:
             return LaneMaterial(a.model, a.values, None, a.readings, OpacityTexture(reading, 1.0, -1.0))
     elif a.opacity is not None or b.opacity is not None:
         first = (1.0 - weight) * (1.0 if a.opacity is None else a.opacity)
         second = weight * (1.0 if b.opacity is None else b.opacity)
         opacity = first + second
         weight = second / torch.where(opacity > 0, opacity, 1.0)
-    if isinstance(a.model, Null):
+    if a.model.sheer:
         return LaneMaterial(b.model, b.values, opacity, b.readings)
-    if isinstance(b.model, Null):
+    if b.model.sheer:
         return LaneMaterial(a.model, a.values, opacity, a.readings)
     values: Parameters = {"a": a.values, "b": b.values}
     readings = {side: s.readings for side, s in (("a", a), ("b", b)) if s.readings}
@@ -95,4 +97,4 @@ def _blended(weight: Tensor | None, reading: Reading | None, a: LaneMaterial, b:
         readings["weight"] = reading  # type: ignore[assignment]
     else:
         values["weight"] = weight
-    return LaneMaterial(Blend(a.model, b.model), values, opacity, readings)
+    return LaneMaterial(kind(a.model, b.model), values, opacity, readings)

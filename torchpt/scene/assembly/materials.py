@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs import Bsdf, Diffuse, Parameters, stacked
+from torchpt.bsdfs import KINDS, Bsdf, Parameters, stacked
 from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.errors import SceneError
 from torchpt.scene.assembly.lane_material import LaneMaterial
@@ -69,7 +69,7 @@ def groups_of(
     for name, material in made.items():
         members.setdefault(_kind(materials[name], material), []).append(name)
     if not members:
-        members[Diffuse(), None] = []
+        members[KINDS["diffuse"](), None] = []
     if len(members) > MOST_MODELS:
         expected = f"at most {MOST_MODELS} models, blends and textured ones counted by what they are made of"
         raise SceneError("materials", len(members), expected)
@@ -77,10 +77,10 @@ def groups_of(
     for number, ((model, form), names) in enumerate(members.items()):
         place |= {name: (number, row) for row, name in enumerate(names)}
         if form is None:
-            stacks.append(stacked([model.prepare(made[name].values) for name in names]))
+            stacks.append(stacked([model.prepare(made[name].values) for name in names], model.factors))
             textures.append(None)
         else:
-            stacks.append(stacked([_tabulated(model, made[name].values) for name in names]))
+            stacks.append(stacked([_tabulated(model, made[name].values) for name in names], model.factors))
             read = _textures([materials[name] for name in names], [made[name] for name in names], nodes, device)
             strong = [f"{name}.normal_strength" for name in names]
             if any(name in parameters for name in strong):

@@ -44,7 +44,7 @@ def assemble(
     Args:
         parts: ordered by kind as ``records.KINDS``.
         parameters: every tensor by dotted name.
-        sources: lights that are no made, ordered by kind as ``records.SOURCES``.
+        sources: lights that are no surfaces, ordered as ``lights.order`` says.
         space: the lanes' coordinates.
         dtype: of the lanes.
         copies: instances of parts.

@@ -1,0 +1,138 @@
+"""Every command that help, the docs and the first line of each config file advertise is run, on a film of a few pixels."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from torchpt import cli
+from torchpt.cli import main
+from torchpt.paths import configs
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+#: Settings by which a render takes no time, in place of what a command says.
+SMALL = {"film.width": "8", "film.height": "6", "render.spp": "2", "render.compile": "off"}
+#: Scenes that load and render in no time; of the others the commands are slow.
+QUICK = ("my/scene.yaml", "cornell_box", "cornell_spheres", "games101", "env_teapot")
+SCENE = """\
+camera: {origin: [0, 0, -4], target: [0, 0, 0]}
+shapes: {ball: {type: sphere, emission: 1}}
+"""
+
+
+def texts() -> Iterator[tuple[str, str]]:
+    """Where a command may stand, and the text."""
+    for name in ("HELP", "HELP_RENDER", "HELP_INFO"):
+        yield f"cli.{name}", getattr(cli, name)
+    for page in PAGES:
+        yield str(page.relative_to(ROOT)), page.read_text(encoding="utf-8")
+    for path in sorted(configs().rglob("*.yaml")):
+        yield f"configs/{path.relative_to(configs())}", path.read_text(encoding="utf-8").splitlines()[0]
+
+
+def spans(where: str, text: str) -> Iterator[str]:
+    """What a text shows as commands: lines of blocks, and what stands between backticks, perhaps over two lines."""
+    if where.endswith(".md"):
+        blocks = re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+        text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+        yield from (line for block in blocks for line in block.splitlines())
+        yield from (" ".join(span.split()) for span in re.findall(r"`([^`]+)`", text))
+        return
+    quoted = re.findall(r"`([^`]+)`", text)
+    for line in quoted if where.endswith(".yaml") and quoted else text.splitlines():
+        yield re.split(r" {3,}(?=\S+ )(?!scene)", line.strip().removeprefix("# "))[0]
+
+
+def commands(program: str) -> list[tuple[str, str]]:
+    """Commands of a program by where they stand; usage with capital letters for what is to be filled in is none."""
+    found: dict[str, str] = {}
+    for where, text in texts():
+        for span in spans(where, text):
+            whole = program != "torchpt" or "=" in span or "--" in span  # else it is named, not shown
+            if span.startswith(f"{program} ") and whole and not re.search(r"\b(NAME|COMMAND|FILE)\b", span):
+                found.setdefault(span.partition(" #")[0].strip(), where)
+    return [(where, command) for command, where in found.items()]
+
+
+def shrunk(words: list[str]) -> list[str]:
+    """The words of a command for a film of a few pixels; sweeps keep how many values they have."""
+    left, made = dict(SMALL), []
+    for word in words:
+        key, equals, value = word.partition("=")
+        if equals and key in left:
+            small = left.pop(key)
+            word = f"{key}={','.join([small] * len(value.split(',')))}"
+        made.append(word)
+    return made + [f"{key}={value}" for key, value in left.items()]
+
+
+def quick(command: str) -> bool:
+    return "--cfg" in command or any(f"scene={name}" in command.split() for name in QUICK)
+
+
+TORCHPT = commands("torchpt")
+
+
+def test_there_are_commands_from_everywhere() -> None:
+    where = {place for place, _ in TORCHPT}
+    assert {"cli.HELP", "README.md", "docs/ibl.md", "configs/config.yaml", "configs/integrator/direct.yaml"} <= where
+    assert len(TORCHPT) > 40 and {command.split()[1] for _, command in TORCHPT} == {"render", "info"}
+
+
+def test_every_file_in_configs_opens_with_its_command() -> None:
+    for path in configs().rglob("*.yaml"):
+        (command, *_) = spans(path.name, path.read_text(encoding="utf-8").splitlines()[0])
+        assert command.startswith("torchpt render scene="), path
+        if path.parent.name == "scene":
+            assert f"scene={path.stem} " in command
+        elif path.stem not in ("default", "config"):
+            assert f" {path.parent.name}={path.stem}" in command
+
+
+@pytest.mark.parametrize(
+    ("where", "command"),
+    [pytest.param(*item, marks=() if quick(item[1]) else pytest.mark.slow) for item in TORCHPT],
+    ids=lambda value: value,
+)
+def test_advertised_commands_run(
+    where: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my").mkdir()
+    (tmp_path / "my" / "scene.yaml").write_text(SCENE)
+    words = shlex.split(command)[1:]
+    renders = words[0] == "render" and "--cfg" not in words
+    assert main(shrunk(words) if renders else words) == 0, where
+    captured = capfd.readouterr()
+    assert captured.out
+    if renders:
+        files = [path for path in tmp_path.iterdir() if path.is_file()]
+        assert files and all(path.stat().st_size for path in files)
+
+
+SCRIPTS = commands("python")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("where", "command"), SCRIPTS, ids=lambda value: value)
+def test_advertised_scripts_take_their_arguments(where: str, command: str) -> None:
+    """They take minutes: what is run is their help, with the arguments as advertised."""
+    words = shlex.split(command)[1:]
+    assert (ROOT / words[0]).is_file(), where
+    done = subprocess.run([sys.executable, *words, "--help"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    if "No module named" in done.stderr:
+        pytest.skip(done.stderr.splitlines()[-1])
+    assert done.returncode == 0 and "usage" in done.stdout, done.stderr
+
+
+def test_advertised_targets_of_make_are_there() -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    named = {command.split()[1] for _, command in commands("make")}
+    assert {"render", "test"} <= named <= targets

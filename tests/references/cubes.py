@@ -1,0 +1,15 @@
+"""The unit cube as a part of a mesh."""
+
+from __future__ import annotations
+
+from torchpt.meshes import MeshPart
+from torchpt.shapes import KINDS
+
+__all__ = ["unit_cube"]
+
+
+def unit_cube() -> MeshPart:
+    """The triangles of the shape ``cube``."""
+    cube = KINDS["cube"].triangles({})
+    assert cube is not None and cube.vertices is not None and cube.faces is not None
+    return MeshPart("", cube.vertices, cube.faces, cube.normals, cube.uvs)

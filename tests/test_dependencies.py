@@ -1,0 +1,97 @@
+"""Every package that pyproject.toml asks for is used by something, and everything that is imported is asked for."""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from torchpt.meshes import PARSERS
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
+#: Extras of users; the others are the developers'.
+FEATURES = ("formats", "video", "compare")
+#: Distribution -> what it is imported as, where that is another name.
+MODULES = {"pillow": "PIL", "pyyaml": "yaml", "hydra-core": "hydra", "pycollada": "collada"}
+#: Tools of developers that nothing imports -> the words that use them.
+TOOLS = {
+    "pytest-xdist": ("Makefile", "-n 2"),
+    "ruff": ("Makefile", "-m ruff check"),
+    "pyright": ("Makefile", "-m pyright"),
+    "import-linter": ("Makefile", "lint-imports"),
+    "hatchling": ("pyproject.toml", 'build-backend = "hatchling.build"'),
+    "editables": ("Makefile", '-e ".['),  # hatchling's editable installs
+}
+
+
+def modules(requirements: list[str]) -> set[str]:
+    names = [Requirement(text).name for text in requirements]
+    return {MODULES.get(name, name.replace("-", "_")) for name in names}
+
+
+def imports(folder: str) -> Iterator[tuple[str, bool]]:
+    """Top-level packages that the files of a folder import or look for, and whether they do so as they are imported."""
+    for path in (ROOT / folder).rglob("*.py"):
+        tree = ast.parse(path.read_text(), str(path))
+        at_once = {id(node) for node in tree.body}
+        for node in ast.walk(tree):
+            names: list[str] = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+                names = [node.module]
+            elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+                called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+                if called in ("find_spec", "importorskip", "import_module") and isinstance(node.args[0].value, str):
+                    names = [node.args[0].value]
+            yield from ((name.partition(".")[0], id(node) in at_once) for name in names)
+
+
+USED = set(imports("torchpt"))
+THROUGH_TRIMESH = {name for names in PARSERS.values() for name in names}
+
+
+def test_every_dependency_is_imported_by_the_package() -> None:
+    assert modules(PROJECT["dependencies"]) - {name for name, _ in USED} == set()
+
+
+@pytest.mark.parametrize("extra", FEATURES)
+def test_every_extra_is_imported_by_a_feature_when_it_is_asked_for(extra: str) -> None:
+    wanted = modules(EXTRAS[extra])
+    assert wanted - {name for name, _ in USED} - THROUGH_TRIMESH == set()
+    assert wanted & {name for name, at_once in USED if at_once} == set()
+
+
+def test_what_developers_install_is_used() -> None:
+    assert set(EXTRAS) == {*FEATURES, "bench", "dev"}
+    used = {name for folder in ("scripts", "tests") for name, _ in imports(folder)}
+    assert modules(EXTRAS["bench"]) - used == set()
+    dev = {Requirement(text).name for text in EXTRAS["dev"]}
+    assert modules([name for name in dev if name not in TOOLS]) - used == set()
+    for name, (file, words) in TOOLS.items():
+        assert name in dev and words in (ROOT / file).read_text()
+
+
+def test_everything_imported_is_asked_for() -> None:
+    own = {"torchpt", "hydra_plugins"}  # the latter is only looked for
+    everything = modules(PROJECT["dependencies"]) | own | {"omegaconf", "pydantic_core", "flip_evaluator"}
+    optional = set().union(*(modules(EXTRAS[extra]) for extra in FEATURES))
+    at_once = {name for name, now in USED if now} - set(sys.stdlib_module_names)
+    later = {name for name, _ in USED} - set(sys.stdlib_module_names)
+    assert at_once - everything == set()
+    assert later - everything - optional == set()
+
+
+def test_what_is_asked_for_is_pinned() -> None:
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
+    pins = {name.lower().replace("_", "-"): version for name, _, version in (line.partition("==") for line in lines)}
+    for text in [*PROJECT["dependencies"], *(text for extra in EXTRAS.values() for text in extra)]:
+        requirement = Requirement(text)
+        assert requirement.specifier.contains(pins[requirement.name.lower().replace("_", "-")]), text

@@ -1,0 +1,1 @@
+"""Materials: one model a file."""

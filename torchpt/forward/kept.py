@@ -1,0 +1,44 @@
+"""What renders of a scene leave for the next one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
+from torchpt.integrators.base import Integrator
+from torchpt.integrators.compiled import CompiledStages
+from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.stages import Plan
+from torchpt.records import World
+from torchpt.scene import Scene
+
+if TYPE_CHECKING:
+    from torchpt.integrators.first_surface import FirstSurface
+
+__all__ = ["Kept", "kept"]
+
+
+@dataclass
+class Kept:
+    """Of one scene.
+
+    Attributes:
+        kernels: of its latest render by the compiled loop.
+        stages: compiled by torch, by what was asked of them.
+        first: the integrator and the world that this was made of, and what happens at first surfaces.
+        dark: a world, and the same without lights.
+    """
+
+    kernels: Kernels | None = None
+    stages: dict[Plan, CompiledStages] = field(default_factory=dict)
+    first: tuple[Integrator, World, FirstSurface] | None = None
+    dark: tuple[World, World] | None = None
+
+
+_scenes: WeakKeyDictionary[Scene, Kept] = WeakKeyDictionary()
+
+
+def kept(scene: Scene) -> Kept:
+    """What is kept for a scene, as long as the scene is."""
+    return _scenes.setdefault(scene, Kept())

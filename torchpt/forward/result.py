@@ -1,0 +1,92 @@
+"""A picture and how it came about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+__all__ = ["Progress", "Rendering"]
+
+
+@dataclass
+class Rendering:
+    """A picture and how it came about.
+
+    Attributes:
+        image: ``(H, W, 3)`` linear RGB.
+        layers: what ``film.aovs`` asked for, each ``(H, W, C)``.
+        spp: samples a pixel that the picture holds.
+        seconds: wall time.
+        build_seconds: of it, for the world and its search structure.
+        compile_seconds: of it, for compiling.
+        paths: camera samples traced.
+        rays: rays traced, shadow rays included.
+        nonfinite_samples: samples that were NaN or infinite, and counted as black.
+        truncated_paths: paths ended by the cap on endless depth.
+        clamped: fraction of the light that ``integrator.clamp`` took away; None where it is off.
+        relmse: the picture's estimate of its own relMSE; None for a single randomization.
+        complete: whether all samples asked for were taken.
+        eager: stages that ran as tensor operations although kernels were wanted, and why.
+    """
+
+    image: Tensor
+    layers: dict[str, Tensor] = field(default_factory=dict)
+    spp: int = 0
+    seconds: float = 0.0
+    build_seconds: float = 0.0
+    compile_seconds: float = 0.0
+    paths: int = 0
+    rays: int = 0
+    nonfinite_samples: int = 0
+    truncated_paths: int = 0
+    clamped: float | None = None
+    relmse: float | None = None
+    complete: bool = True
+    eager: tuple[str, ...] = ()
+
+    def summary(self) -> dict[str, Any]:
+        """The facts as plain values, ready for JSON."""
+        facts: dict[str, Any] = {
+            "spp": self.spp,
+            "build_seconds": round(self.build_seconds, 4),
+            "compile_seconds": round(self.compile_seconds, 4),
+            "seconds": round(self.seconds, 4),
+            "paths_per_second": round(self.paths / max(self.seconds, 1e-9)),
+            "rays": self.rays,
+            "nonfinite_samples": self.nonfinite_samples,
+            "mean": [float(x) for x in self.image.double().mean((0, 1))],
+            "relmse": self.relmse,
+        }
+        if self.truncated_paths:
+            facts["truncated_paths"] = self.truncated_paths
+        if self.clamped is not None:
+            facts["clamped"] = self.clamped
+        if not self.complete:
+            facts["complete"] = False
+        if self.eager:
+            facts["eager"] = list(self.eager)
+        return facts
+
+
+@dataclass
+class Progress:
+    """The state of a render between two chunks.
+
+    Attributes:
+        done: camera samples taken.
+        total: camera samples asked for.
+        rays: rays traced.
+        seconds: since the start.
+        pass_finished: whether every pixel now has the same number of samples.
+        snapshot: makes the picture so far.
+    """
+
+    done: int
+    total: int
+    rays: int
+    seconds: float
+    pass_finished: bool
+    snapshot: Callable[[], Rendering]

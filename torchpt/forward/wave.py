@@ -1,0 +1,188 @@
+"""What all waves of a render share, and how they run: as tensor operations, compiled by torch, or as the compiled loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchpt.cameras import Camera
+from torchpt.forward.kept import kept
+from torchpt.forward.schedule import randomizations_of
+from torchpt.integrators import LAYERS
+from torchpt.integrators.base import Integrator
+from torchpt.integrators.compiled import CompiledStages, Stages
+from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.stages import Plan
+from torchpt.integrators.wave import Wave
+from torchpt.records import World
+from torchpt.samplers import Sampler
+from torchpt.scene import Scene
+from torchpt.settings import Settings
+from torchpt.spec import Moves
+
+if TYPE_CHECKING:
+    from torchpt.integrators.first_surface import FirstSurface
+    from torchpt.integrators.layer import SurfaceLayer
+
+__all__ = ["kernels_of", "loop_facts", "looped", "make_wave", "rebound", "surface_layers"]
+
+#: From this many camera paths a BSDF model on ``compile: auto`` compiles: a cold start takes a minute each, and saves a
+#: quarter of the rest.
+COMPILE_REPAYS = 200_000_000
+
+
+def make_wave(
+    scene: Scene,
+    settings: Settings,
+    params: Mapping[str, Tensor] | None,
+    dtype: torch.dtype,
+    tape: bool = False,
+    attached: bool = False,
+) -> Wave:
+    """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``."""
+    film, integrator, spp = settings.film, settings.integrator, settings.render.spp
+    uv = any(layer.uv for layer in surface_layers(settings).values())
+    world, geometry = scene.world(dtype, params, uv, settings.light_choice)
+    threads = None if settings.render.threads == "auto" else int(settings.render.threads)
+    moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in params or {})
+    accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
+    own = not params  # the world is the scene's own, and what is made of it may be kept
+    if not integrator.lit:
+        world = _dark(scene, world, own)
+    points = settings.sampler.kind(**settings.sampler.values)
+    plan = integrator.plan(points, dtype, tape, attached)
+    camera = scene.camera(film, scene.merged(params), dtype)
+    return Wave(
+        stages=_stages(scene, settings, plan, world, _pixel_of(world, camera), own),
+        integrator=integrator,
+        accel=accel,
+        camera=camera,
+        filter=film.filter.kind(film.filter.values, scene.device),
+        sampler=Sampler(points, settings.render.seed, randomizations_of(spp), spp, film.width),
+        crop=film.crop or (0, 0, film.width, film.height),
+        centre=scene.space.shift,
+        first=_first(scene, integrator, world, own),
+    )
+
+
+def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Wave:
+    """An eager wave whose world and camera follow ``params`` under a tape, of one of the same parameters detached.
+
+    The search structure stays.
+    """
+    world, _ = scene.world(wave.stages.plan.dtype, params, choice=settings.light_choice)
+    if not wave.integrator.lit:
+        world = replace(world, lights=None)
+    camera = scene.camera(settings.film, scene.merged(params), wave.stages.plan.dtype)
+    stages = Stages(wave.stages.plan, world, _pixel_of(world, camera))
+    return replace(wave, stages=stages, camera=camera, first=None if wave.first is None else wave.first.again(world))
+
+
+def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:
+    """The layers of first surfaces that are wanted, by name."""
+    names = settings.film.aovs or settings.integrator.layers
+    if not names:
+        return {}
+    from torchpt.integrators.layer import SurfaceLayer
+
+    layers = {name: LAYERS[name] for name in names}
+    return {name: layer for name, layer in layers.items() if issubclass(layer, SurfaceLayer)}
+
+
+def _first(scene: Scene, integrator: Integrator, world: World, own: bool) -> FirstSurface | None:
+    """What happens at first surfaces; kept with the scene, unless the world is not the scene's ``own``."""
+    if not own or torch.is_grad_enabled():
+        return integrator.first(world)
+    keeper = kept(scene)
+    if keeper.first is not None and keeper.first[0] == integrator and keeper.first[1] is world:
+        return keeper.first[2]
+    first = integrator.first(world)
+    if first is not None:
+        keeper.first = integrator, world, first
+    return first
+
+
+def _dark(scene: Scene, world: World, own: bool) -> World:
+    """The world without lights; one of the scene's ``own`` is kept with it."""
+    if not own:
+        return replace(world, lights=None)
+    keeper = kept(scene)
+    if keeper.dark is None or keeper.dark[0] is not world:
+        keeper.dark = world, replace(world, lights=None)
+    return keeper.dark[1]
+
+
+def _pixel_of(world: World, camera: Camera) -> Tensor | None:
+    """What textures filtered by the pixel's footprint need of the camera; None where there are none."""
+    return camera.pixel() if world.textures.atlas is not None and world.textures.atlas.pyramids is not None else None
+
+
+def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: Tensor | None, own: bool) -> Stages:
+    """Eager stages; on CUDA compiled ones, which are kept with the scene unless the world is not the scene's ``own``."""
+    mode = settings.render.compile
+    if mode == "auto":
+        _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+        work = width * height * settings.render.spp
+        mode = (
+            "on"
+            if own
+            and work >= COMPILE_REPAYS * len(world.materials.models)  # each has graphs of its own
+            and plan.dtype == torch.float32
+            and not scene.own_models  # code of the user's own may hold what cannot be compiled
+            else "off"
+        )
+    if scene.device.type == "cpu" or mode == "off" or plan.tape or torch.is_grad_enabled():
+        return Stages(plan, world, pixel)
+    if not own:
+        return CompiledStages(plan, world, pixel)
+    made = kept(scene).stages
+    if plan not in made or made[plan].world is not world:
+        made[plan] = CompiledStages(plan, world)
+    return made[plan].through(pixel)
+
+
+def looped(wave: Wave, settings: Settings, device: torch.device) -> bool:
+    """Whether a render takes the compiled loop: on a CPU, in float32, and without a tape."""
+    plan = wave.stages.plan
+    if not wave.integrator.looped or device.type != "cpu" or settings.render.compile == "off":
+        return False
+    return plan.dtype == torch.float32 and not plan.tape
+
+
+def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
+    """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
+    packets = wave.accel.name == "brute" and not wave.stages.world.geometry.counts[4]
+    fused = packets and wave.stages.world.materials.opacity is None and wave.first is None
+    kernels = Kernels(wave, packets, fused, before)
+    own = [
+        k
+        for k, model in enumerate(wave.stages.world.materials.models)
+        if any(model is mine for mine in scene.own_models)
+    ]
+    eager = kernels.probe(own) if wave.integrator.light else {}
+    if eager and kernels.fused:  # what runs as tensor operations hands its rays to the search structure
+        kernels = Kernels(wave, packets, False)
+    kernels.eager = eager
+    return kernels
+
+
+def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
+    """How a render of the scene would run: as the compiled loop, and how that searches, or as tensor operations."""
+    with torch.no_grad():
+        wave = make_wave(scene, settings, None, torch.float32)
+        if not looped(wave, settings, scene.device):
+            return {"stages": "compiled by torch" if wave.stages.compiled else "eager, by tensor operations"}
+        kernels = kernels_of(scene, wave)
+    search = "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else wave.accel.name
+    names = [str(model) for model in wave.stages.world.materials.models]
+    eager = {names[number]: reason for number, reason in kernels.eager.items()}
+    return {
+        "stages": "compiled to loops over lanes",
+        "search": search,
+        "rows_a_path": kernels.state.count,
+        **({"eager": eager} if eager else {}),
+    }

@@ -1,0 +1,105 @@
+"""Write moving pictures: whole or not at all, as pictures are. GIF by Pillow, MP4 by ffmpeg through imageio."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from importlib.util import find_spec
+from io import BytesIO
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.errors import OutputError
+from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
+
+__all__ = ["MOVIES", "check_movie", "write_movie"]
+
+Frame = NDArray[np.uint8]
+
+#: What players take for a mistake and slow down: a frame of a GIF that is shown for less than 2 hundredths of a second.
+_FASTEST = {".gif": 50.0, ".mp4": 240.0}
+#: H.264 in the colours of ITU-R BT.709, which players assume; its header first, so that a page can start to play.
+_H264 = [
+    *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709", "-color_primaries", "bt709"),
+    *("-color_trc", "iec61966-2-1", "-color_range", "tv", "-movflags", "+faststart"),
+]
+
+
+def check_movie(path: str | PathLike[str], fps: float) -> None:
+    """Find out before a long render whether a moving picture can be written.
+
+    Raises:
+        OutputError: an ending that is not written, more frames a second than it can show, a package that is not installed,
+            or a place that cannot be written.
+    """
+    place = check_writable(path, tuple(MOVIES))
+    kind = place.suffix.lower()
+    if fps > _FASTEST[kind]:
+        raise OutputError(path, f"{kind} shows at most {_FASTEST[kind]:g} frames a second, fps={fps:g} are asked for")
+    if kind == ".mp4" and not (find_spec("imageio") and find_spec("imageio_ffmpeg")):
+        how = "pip install 'torchpt-renderer[video]' (.gif needs nothing)"
+        raise OutputError(path, f"writing .mp4 needs the packages imageio and imageio-ffmpeg: {how}")
+
+
+def write_movie(path: str | PathLike[str], frames: Iterable[Frame], fps: float) -> None:
+    """Write frames ``(H, W, 3)`` of one size, as a screen shows them, in the format that the file's ending names.
+
+    A ``.gif`` repeats for ever; its frames have 256 colours each, and last whole hundredths of a second that add up. An
+    ``.mp4`` holds H.264; a row or column is repeated where the height or width is odd.
+
+    Raises:
+        OutputError: as `check_movie`, or an encoder that fails.
+    """
+    destination = place_of(path, tuple(MOVIES))
+    temporary = temporary_beside(destination)
+    try:
+        MOVIES[temporary.suffix](temporary, frames, fps)
+        os.replace(temporary, destination)
+    except (OSError, ValueError, TypeError, ImportError) as problem:
+        raise OutputError(path, reason_of(problem, destination)) from problem
+    finally:
+        with suppress(OSError):  # it is only there after a failure
+            temporary.unlink()
+
+
+def _gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
+    from PIL import Image
+
+    pictures: list[Image.Image] = []
+    times: list[int] = []  # milliseconds
+    last = b""
+    for number, frame in enumerate(frames):
+        picture = Image.fromarray(frame).quantize(256)
+        shown = picture.convert("RGB").tobytes()
+        time = 10 * (round(100 * (number + 1) / fps) - round(100 * number / fps))
+        if pictures and shown == last:  # Pillow would do so too, and fail where nothing else is left
+            times[-1] += time
+        else:
+            pictures.append(picture)
+            times.append(time)
+        last = shown
+    encoded = BytesIO()
+    duration = times if len(times) > 1 else times[0]
+    pictures[0].save(encoded, "GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
+    temporary.write_bytes(encoded.getbuffer())
+
+
+def _mp4(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
+    import imageio.v2 as iio
+
+    codec = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 1}
+    options = {"output_params": _H264, "ffmpeg_log_level": "error"}
+    writer: Any = iio.get_writer(temporary, "FFMPEG", "I", fps=fps, **codec, **options)
+    with writer:
+        for frame in frames:
+            height, width = frame.shape[:2]
+            writer.append_data(np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge"))
+
+
+#: File ending -> what writes it.
+MOVIES: dict[str, Callable[[Path, Iterable[Frame], float], None]] = {".gif": _gif, ".mp4": _mp4}

@@ -1,0 +1,1 @@
+"""The integrators, one a file."""

@@ -1,0 +1,95 @@
+"""A preview by split sum: the first surface under the environment's prefiltered maps, and other lights with their shadows.
+
+What the environment brings is not shadowed and no light is reflected twice: that is the preview's error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt import lights
+from torchpt.ibl import IblMaps, Sky, brdf_table, maps
+from torchpt.integrators import stages as pure
+from torchpt.integrators.base import LIGHT_CHOICE, SAMPLES
+from torchpt.integrators.first_surface import FirstSurface, FirstSurfaceIntegrator
+from torchpt.integrators.split_sum import under
+from torchpt.integrators.stages import Plan
+from torchpt.math.vectors import dot
+from torchpt.records import Hit, PathState, Shadow, World, tensors_of
+from torchpt.shapes import interact
+
+__all__ = ["Ibl", "Preview"]
+
+
+class Ibl(FirstSurfaceIntegrator):
+    """A preview: the first surface under the environment by split sum (unshadowed), and under other lights."""
+
+    name = "ibl"
+    parameters: ClassVar = {**LIGHT_CHOICE, **SAMPLES}
+    strategy = "light"
+
+    def first(self, world: World) -> Preview:
+        """See :class:`Integrator`."""
+        return Preview.of(world)
+
+
+@dataclass(frozen=True)
+class Preview(FirstSurface):
+    """The environment ready for split-sum shading.
+
+    Attributes:
+        sky: its maps; None where there is no environment.
+        turn: ``(3, 3)`` from the world to the maps' own space; None where they are the same.
+    """
+
+    sky: Sky | None
+    turn: Tensor | None = None
+
+    @staticmethod
+    def of(world: World) -> Preview:
+        """Of a scene's environment; differentiable in it."""
+        around = lights.surroundings(world.lights)
+        if around is None:
+            return Preview(None)
+        if around.even:
+            texels = around.texels
+            return Preview(Sky.of(IblMaps(texels, (texels, texels), brdf_table().to(texels))), around.turn)
+        return Preview(Sky.of(maps(around.texels)), around.turn)
+
+    def turned(self, d: Tensor) -> Tensor:
+        """Directions ``(3, N)`` of the world in the maps' own space."""
+        return d if self.turn is None else torch.stack([dot(self.turn[k][:, None], d) for k in range(3)])
+
+    def again(self, world: World) -> Preview:
+        """See :class:`FirstSurface`."""
+        environment = None if world.lights is None else world.lights.environment
+        return Preview.of(world) if any(t.requires_grad for t in tensors_of(environment)) else self
+
+    def shade(
+        self,
+        plan: Plan,
+        world: World,
+        model: int,
+        state: PathState,
+        hit: Hit,
+        salts: Tensor,
+        pixel: Tensor | None,
+        slide: bool,
+    ) -> tuple[Tensor, Shadow | None]:
+        """See :class:`FirstSurface`."""
+        local = replace(world, lights=lights.without_environment(world.lights))
+        if hit.chance is not None:
+            state = replace(state, throughput=state.throughput * hit.chance)
+        at = interact(world, state.o, state.d, hit, slide)
+        surface, shadow = pure.shade(plan, local, model, state, at, salts, pixel)
+        radiance = torch.zeros_like(state.radiance)
+        if self.sky is not None:
+            n, v = self.turned(surface.frame.n), self.turned(-state.d)
+            radiance = state.throughput * under(self.sky, world.materials.models[model], surface.parameters, n, v)
+            if surface.shown is not None:
+                radiance = radiance * surface.shown
+        return radiance, shadow

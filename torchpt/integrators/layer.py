@@ -1,0 +1,82 @@
+"""What a layer of a picture (an AOV) is: what the first surface is, or what the film knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.film import Film
+from torchpt.integrators.surfaces import TexturePoint
+from torchpt.records import Hit, Interaction, World
+
+__all__ = ["FilmLayer", "Layer", "Seen", "SurfaceLayer"]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """First surfaces of one BSDF model; n lanes.
+
+    Attributes:
+        world: the scene's tensors.
+        model: number of the BSDF model.
+        d: directions ``(3, n)`` of the camera rays.
+        hit: what they met; ``t`` is the distance.
+        at: the points.
+        point: where textures are read; None where the model reads none.
+        centre: ``(3,)`` float64, from the lanes' coordinates to the scene's own.
+        dtype: of the lanes.
+    """
+
+    world: World
+    model: int
+    d: Tensor
+    hit: Hit
+    at: Interaction
+    point: TexturePoint | None
+    centre: Tensor
+    dtype: torch.dtype
+
+
+class Layer:
+    """A layer of pictures.
+
+    Attributes:
+        name: what ``film.aovs`` calls it.
+        channels: their names in EXR files.
+        light: whether it is of the light, so that an integrator without light has none.
+    """
+
+    name: ClassVar[str] = ""
+    channels: ClassVar[tuple[str, ...]] = ()
+    light: ClassVar[bool] = False
+
+
+class SurfaceLayer(Layer):
+    """A layer of what the first surface is; 0 where there is none.
+
+    Attributes:
+        averaged: whether a pixel shows the mean of its samples; else it shows its first one, as names have no average.
+        length: whether it is a length, or a place: counted in the scene's units.
+        uv: whether it reads texture coordinates, whether or not a texture does.
+    """
+
+    averaged: ClassVar[bool] = True
+    length: ClassVar[bool] = False
+    uv: ClassVar[bool] = False
+
+    @classmethod
+    def values(cls, seen: Seen) -> Tensor:
+        """The values ``(C, n)`` at first surfaces; a pure function of tensors, traced for the compiled loop too."""
+        raise NotImplementedError
+
+
+class FilmLayer(Layer):
+    """A layer that the film makes of its sums of radiance."""
+
+    @classmethod
+    def of(cls, film: Film) -> Tensor:
+        """The layer ``(H, W, C)`` float64."""
+        raise NotImplementedError

@@ -1,0 +1,65 @@
+"""A vertex by tensor operations, for models that no kernel can be made of, on the lanes of an arena."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import torch
+
+from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.loop.rows import HIT, Memory
+from torchpt.integrators.loop.vertex import no_search
+from torchpt.records import Hit, PathState
+from torchpt.samplers import salts
+
+__all__ = ["bounce_eagerly"]
+
+_STATE = tuple(field.name for field in fields(PathState))
+
+
+def bounce_eagerly(
+    kernels: Kernels,
+    model: int,
+    roulette: float,
+    source: Memory,
+    target: Memory,
+    places: Memory,
+    count: int,
+    start: int,
+    depth: int,
+) -> int:
+    """What the kernel of a bounce does where the search is no part of it.
+
+    Args:
+        kernels: of the render.
+        model: its number.
+        roulette: see :func:`torchpt.integrators.stages.bounce`.
+        source: the arena of the paths.
+        target: where they go, from lane ``start`` on.
+        places: the lanes concerned.
+        count: how many.
+        start: first place in ``target``.
+        depth: of the vertex.
+
+    Returns:
+        How many shadow rays it asks for.
+    """
+    rows, lanes = kernels.state, places.words[0, :count]
+    with torch.no_grad():
+        given = rows.take(source, lanes, _STATE)
+        state = PathState(**{"eta": None, "p": None, "n": None, **given})  # type: ignore[arg-type]
+        hit = Hit(**rows.take(source, lanes, tuple(HIT)))
+        after, _, shadow = kernels.wave.stages.bounce(
+            model, roulette, False, no_search, state, hit, torch.arange(count), salts(depth, torch.device("cpu"))
+        )
+    values = {name: getattr(after, name) for name in _STATE}
+    values |= rows.take(source, lanes, ("weight",))
+    if "shadow_o" in rows:
+        values |= {
+            "shadow_o": after.o if shadow is None else shadow.o,
+            "shadow_d": after.d if shadow is None else shadow.d,
+            "shadow_t": torch.zeros_like(after.t_max) if shadow is None else shadow.t_max,
+            "shadow_radiance": torch.zeros_like(after.o) if shadow is None else shadow.radiance,
+        }
+    rows.put(target, start, values)
+    return 0 if shadow is None else count

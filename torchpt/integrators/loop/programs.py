@@ -1,0 +1,94 @@
+"""Programs of a process: each stage is traced and compiled once for all scenes of one structure."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from torchpt.integrators.loop.layout import Layout
+from torchpt.integrators.loop.leaves import Leaves
+from torchpt.integrators.loop.packets import kinds_of
+from torchpt.integrators.loop.trace import Trace
+from torchpt.lanes import engine, operators, shelf  # noqa: F401  (the operators register how they are lowered)
+from torchpt.lanes.kernel import text
+from torchpt.lanes.packet import packet_search
+from torchpt.lanes.program import Program, holds
+from torchpt.lanes.sinks import Sinks
+from torchpt.lanes.tracing import Tracer, lanes_for
+
+__all__ = ["forget", "program_of"]
+
+#: More programs than this are not kept.
+MOST_PROGRAMS = 512
+#: By what they were traced for, the latest last.
+_programs: dict[Any, Program] = {}
+_tracing = threading.Lock()
+
+
+def program_of(
+    key: tuple[Any, ...], structure: Any, leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], listed: bool
+) -> Program:
+    """The program of a stage: of this process, from disk, or traced and compiled now.
+
+    Args:
+        key: names the stage.
+        structure: what else the trace may ask of the render, but for the numbers in its tensors.
+        leaves: the tensors.
+        layout: of the render.
+        build: traces the stage.
+        listed: whether the kernel takes lanes by a list.
+    """
+    whole = key, structure
+    with _tracing:  # one at a time in a process: see torchpt.lanes.tracing.tracing
+        program = _programs.get(whole)
+        name = shelf.key_of(whole) if program is None else None
+        if program is None and name is not None:
+            program = shelf.load(name)
+        if program is None or not holds(program, leaves.tensors):
+            program = _traced(leaves, layout, build, listed)
+            if name is not None:
+                shelf.store(name, program)
+            _programs.pop(whole, None)
+            _programs[whole] = program
+            if len(_programs) > MOST_PROGRAMS:
+                del _programs[next(iter(_programs))]
+        return program
+
+
+def forget() -> None:
+    """Drop the programs of this process; those on disk stay."""
+    _programs.clear()
+
+
+def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> Program:
+    tracer = Tracer(lanes_for(leaves.tensors.values()), leaves.ids)
+    trace = Trace(tracer, layout)
+    with torch.no_grad():
+        sinks = build(trace)
+    search = None
+    if any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes):
+        search = packet_search(kinds_of(layout.world), engine.estimates())
+    ir, needed = text(tracer.graph, sinks, len(tracer.tables), len(trace.uniforms), trace.tensors, listed, search)
+    made = engine.compiled(ir)
+    nodes: dict[str, int] = {}
+    for node in needed:
+        for file in tracer.graph.origins[node]:
+            nodes[file] = nodes.get(file, 0) + 1
+    return Program(
+        call=made.call,
+        code=made.key,
+        tables=tuple(tracer.tables),
+        steps=tuple(tracer.steps),
+        held=tuple(tracer.held),
+        guards=tuple(tracer.guards),
+        uniforms=tuple(trace.uniforms),
+        lists=sinks.lists(),
+        counters=sinks.counters(),
+        tensors=trace.tensors,
+        results=len(sinks.store),
+        shadows=sinks.shadows,
+        nodes=nodes,
+    )

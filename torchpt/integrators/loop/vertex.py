@@ -1,0 +1,186 @@
+"""The vertices of paths as kernels: camera rays, light that is met, the bounce, ends of paths.
+
+Each function traces one stage of :mod:`torchpt.integrators.stages` with the loads and stores around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchpt.integrators import stages
+from torchpt.integrators.loop.packets import nearest, occluded
+from torchpt.integrators.loop.trace import Trace
+from torchpt.lanes.sinks import Pack, Scatter, Sinks
+from torchpt.records import Hit, PathState, Shadow
+from torchpt.samplers import Dimension, Draws
+
+__all__ = ["PLACE", "bounce", "emit", "escape", "first", "generate", "no_search", "retire", "settle"]
+
+#: Numbers that say which samples a chunk holds: the first pixel of the picture and how many there are; the randomization
+#: and point of the first sample, the number of randomizations; the crop's corner and width, the film's width.
+PLACE = ("first", "pixels", "group", "point", "randomizations", "x", "y", "crop", "film")
+
+
+def no_search(state: PathState) -> Hit:
+    """Stands for a search in stages that must not ask for one."""
+    raise AssertionError("hits are found between stages where there is no tape")
+
+
+def generate(trace: Trace) -> Sinks:
+    """Camera rays; with their first hits where the search is inside."""
+    layout, tracer, wave = trace.layout, trace.tracer, trace.layout.wave
+    place = trace.uniform("place", torch.ones(len(PLACE), dtype=torch.int32))
+    salts = trace.salts()
+    unseen: dict[str, Tensor] = {}
+    with tracer:
+        chunk = dict(zip(PLACE, place.to(torch.int64).unbind(), strict=True))
+        # Lanes run over the chunk's pixels, then over its samples.
+        lane = torch.arange(tracer.lanes)
+        sample = torch.div(lane, chunk["pixels"], rounding_mode="floor")
+        pixel = lane - sample * chunk["pixels"] + chunk["first"]
+        row = torch.div(pixel, chunk["crop"], rounding_mode="floor")
+        x, y = pixel - row * chunk["crop"] + chunk["x"], row + chunk["y"]
+        number = y * chunk["film"] + x
+        turn = sample + chunk["group"]
+        group = turn % chunk["randomizations"]
+        point = torch.div(turn, chunk["randomizations"], rounding_mode="floor") + chunk["point"]
+        key = wave.sampler.points.key(layout.numbers, number, group, point)
+        x, y = x.to(layout.plan.dtype), y.to(layout.plan.dtype)
+        state = stages.generate(layout.plan, wave.camera, wave.filter, x, y, key, salts)
+        if wave.filter.signed:
+            unseen["weight"] = wave.filter.weight(Draws(layout.plan.sampler, key, salts).two(Dimension.PIXEL))
+        if "eta" in layout.state:
+            state = replace(state, eta=torch.ones_like(state.t_max))
+        if "p" in layout.state:
+            state = replace(state, p=state.o, n=torch.zeros_like(state.o))
+    sinks = Sinks()
+    if layout.fused:
+        _searched(trace, sinks, state, unseen)
+    else:
+        sinks.write += trace.kept(state, unseen)
+    return sinks
+
+
+def settle(trace: Trace, shadow: bool) -> Sinks:
+    """What the lanes of the arena met: light of their shadow rays, lists of lanes by model, ends of paths."""
+    tracer, rows = trace.tracer, trace.layout.state
+    state, unseen = trace.state()
+    prim = rows.read(tracer, "prim")["prim"]
+    sinks = Sinks()
+    if shadow:
+        arrived = rows.read(tracer, "shadow_radiance", "clear", "blocked")
+        with tracer:
+            light = arrived["shadow_radiance"]
+            if "clear" in arrived:
+                radiance = torch.addcmul(state.radiance, light, arrived["clear"])
+            else:
+                radiance = state.radiance + torch.where(arrived["blocked"] != 0, 0.0, light)
+        state = replace(state, radiance=radiance)
+        sinks.write += rows.nodes(tracer, radiance=radiance)
+    _, notes = trace.sorted(sinks, state, prim, unseen)
+    sinks.notes += notes
+    return sinks
+
+
+def emit(trace: Trace) -> Sinks:
+    """Light of emitters that were met, added where the lanes are."""
+    tracer, layout = trace.tracer, trace.layout
+    state, _ = trace.state()
+    hit = trace.hit()
+    place = trace.place()
+    with tracer:
+        light = stages.emit(layout.world, state, hit, torch.arange(tracer.lanes), False)
+        radiance = state.radiance + light
+    rows = tuple(layout.state.nodes(tracer, radiance=radiance))
+    return Sinks(scatter=[Scatter(-1, trace.node(place), rows)])
+
+
+def escape(trace: Trace) -> Sinks:
+    """Light from outside, and the ends of those paths."""
+    state, unseen = trace.state()
+    hit = trace.hit()
+    with trace.tracer:
+        light = stages.escape(trace.layout.world, state, hit, torch.arange(trace.tracer.lanes))
+        radiance = state.radiance + light
+    return Sinks(scatter=[trace.ended(-1, state.lane, radiance, unseen)])
+
+
+def retire(trace: Trace) -> Sinks:
+    """Ends of paths that are cut."""
+    state, unseen = trace.state()
+    return Sinks(scatter=[trace.ended(-1, state.lane, state.radiance, unseen)])
+
+
+def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
+    """One vertex of the paths on surfaces of a model."""
+    layout, tracer = trace.layout, trace.tracer
+    salts = trace.salts()
+    state, unseen = trace.state()
+    hit = trace.hit()
+    with tracer:
+        index = torch.arange(tracer.lanes)
+        after, _, shadow = stages.bounce(
+            layout.plan, layout.world, model, roulette, False, no_search, state, hit, index, salts,
+            layout.wave.stages.pixel,
+        )  # fmt: skip
+    if not layout.fused:
+        return _with_shadow(trace, after, shadow, unseen)
+    sinks = Sinks(shadows=int(shadow is not None))
+    if shadow is not None:
+        blocked = occluded(tracer, shadow.o, shadow.d, shadow.t_max)
+        with tracer:
+            radiance = after.radiance + torch.where(blocked, 0.0, shadow.radiance)
+        after = replace(after, radiance=radiance)
+    _searched(trace, sinks, after, unseen)
+    return sinks
+
+
+def first(trace: Trace, model: int) -> Sinks:
+    """The first surfaces of a model, where paths end at them."""
+    layout, wave = trace.layout, trace.layout.wave
+    salts = trace.salts()
+    state, unseen = trace.state()
+    hit = trace.hit()
+    assert wave.first is not None
+    with trace.tracer:
+        radiance, shadow = wave.first.shade(
+            layout.plan, layout.world, model, state, hit, salts, wave.stages.pixel, False
+        )
+        # No ray goes on: the lane ends where its shadow ray is known.
+        after = replace(state, radiance=state.radiance + radiance, t_max=torch.zeros_like(state.t_max))
+    return _with_shadow(trace, after, shadow, unseen)
+
+
+# -- the two ways in which lanes go on
+
+
+def _searched(trace: Trace, sinks: Sinks, state: PathState, unseen: dict[str, Tensor]) -> None:
+    """Search inside the kernel: the lanes that go on are packed together, the others end."""
+    hit = nearest(trace.tracer, state.o, state.d, state.t_max)
+    on, notes = trace.sorted(sinks, state, hit.prim, unseen)
+    rows = trace.kept(state, unseen)
+    rows += trace.layout.state.nodes(trace.tracer, t=hit.t, prim=hit.prim, u=hit.u, v=hit.v)
+    sinks.pack.append(Pack(on, tuple(rows), 0, tuple(notes)))
+
+
+def _with_shadow(trace: Trace, state: PathState, shadow: Shadow | None, unseen: dict[str, Tensor]) -> Sinks:
+    """Search later: all lanes are kept, with the shadow rays that are still to be searched."""
+    tracer, rows = trace.tracer, trace.layout.state
+    sinks = Sinks(shift=0, write=trace.kept(state, unseen), shadows=int(shadow is not None))
+    if "shadow_o" not in rows:
+        return sinks
+    with tracer:
+        if shadow is None:
+            nothing = torch.zeros_like(state.o)
+            shadow = Shadow(nothing, nothing, torch.zeros_like(state.t_max), nothing)
+    sinks.write += rows.nodes(
+        tracer,
+        shadow_o=shadow.o,
+        shadow_d=shadow.d,
+        shadow_t=shadow.t_max,
+        shadow_radiance=shadow.radiance,
+    )
+    return sinks

@@ -1,0 +1,213 @@
+"""Shapes of a description as parts: materials resolved, files read, everything that is a number declared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from torchpt.bsdfs import KINDS as BSDFS
+from torchpt.bsdfs.resolved import ResolvedMaterial
+from torchpt.errors import AssetError, SceneError
+from torchpt.format.description import Description
+from torchpt.format.materials import check_material, plain_material, read_material
+from torchpt.math.transforms import WITHIN, is_usable
+from torchpt.meshes import FileMaterial, MeshPart
+from torchpt.scene.materials import declare, resolved
+from torchpt.scene.meshes import Mesh, ignored, mesh_of, solid
+from torchpt.scene.parameters import Parameters
+from torchpt.scene.parts import Copy, Part, Source
+from torchpt.scene.sources import file_lights, labels_of
+from torchpt.scene.texels import Opener
+from torchpt.shapes.base import Surface, Triangles
+from torchpt.spec import Pose, Vertices, parameters_of
+from torchpt.spec.declared import Described
+from torchpt.textures import Node
+
+__all__ = ["Owner", "ShapeBuilder"]
+
+
+@dataclass(frozen=True)
+class Owner:
+    """A shape of a scene.
+
+    Attributes:
+        name: in the scene.
+        number: order in the scene, from 1.
+        shape: what it is.
+    """
+
+    name: str
+    number: int
+    shape: Described
+
+    @property
+    def key(self) -> str:
+        """Its dotted key."""
+        return f"shapes.{self.name}"
+
+    @property
+    def to_world(self) -> np.ndarray:
+        """Its transform."""
+        return self.shape.kind.to_world(self.shape.values)
+
+
+class ShapeBuilder:
+    """Makes parts of shapes.
+
+    Attributes:
+        sources: lights that mesh files have beside the triangles, in the order in which they were met.
+    """
+
+    def __init__(self, description: Description, parameters: Parameters, opener: Opener) -> None:
+        self.description, self.parameters, self.opener = description, parameters, opener
+        self.sources: list[Source] = []
+
+    def parts(self, owner: Owner) -> list[Part]:
+        """What a shape comes to; no instance."""
+        triangles = owner.shape.kind.triangles(owner.shape.values)
+        return self._primitives(owner) if triangles is None else self._meshes(owner, triangles)
+
+    def copies(self, owner: Owner, parts: list[Part]) -> list[Copy]:
+        """An instance, as one copy of each of the ``parts`` of its mesh."""
+        key, file, shapes = owner.key, self.description.file, self.description.shapes
+        of, material = owner.shape["of"], owner.shape["material"]
+        mesh = shapes.get(of)
+        if mesh is None or not mesh.kind.meshed:
+            names = [other for other, value in shapes.items() if value.kind.meshed]
+            known = f" ({', '.join(names[:8])}{', ...' if len(names) > 8 else ''})" if names else " (there is none)"
+            raise SceneError(f"{key}.of", of, f"the name of a mesh among the shapes{known}", file)
+        self.parameters.declare(f"{key}.to_world", owner.to_world, Pose())
+        if not is_usable(owner.to_world @ np.linalg.inv(mesh.kind.to_world(mesh.values))):
+            expected = f"a way from where {of} lies to where it is copied that can be inverted, {WITHIN}"
+            raise SceneError(f"{key}.transform", owner.to_world.tolist(), expected, file)
+        made = []
+        for part in (part for part in parts if part.shape == of):
+            slot = part.material if material is None else self._slot(material, key)
+            if slot.emission is not None:
+                raise SceneError(
+                    f"{key}.material", slot.name, "a material that does not emit: an instance cannot", file
+                )
+            declare(slot, self.parameters)
+            flip = owner.shape["flip_normals"] != part.flip
+            pose = self.parameters[f"{key}.to_world"]
+            made.append(Copy(key, owner.name, owner.number, part.name, slot, flip, pose))
+        return made
+
+    def _primitives(self, owner: Owner) -> list[Part]:
+        """A shape of primitives that share one pose."""
+        shape, pose = owner.shape, owner.to_world
+        own = shape.kind.own(shape.values)
+        if own is not None:
+            with np.errstate(over="ignore", invalid="ignore"):
+                pose = pose @ own
+            if not is_usable(pose):
+                expected = f"sizes that differ by less than 1e12, and a place: {WITHIN}"
+                raise SceneError(owner.key, pose.tolist(), expected, self.description.file)
+        surfaces = shape.kind.surfaces(shape.values, pose)
+        self._declare_pose(owner.key, pose, surfaces)
+        slot = self._slot(shape["material"], owner.key)
+        return [
+            self._part(owner, owner.key, slot, surface, pose if surface.local is None else pose @ surface.local)
+            for surface in surfaces
+        ]
+
+    def _declare_pose(self, stem: str, pose: np.ndarray, surfaces: list[Surface]) -> None:
+        angles = any(surface.kind == "sphere" for surface in surfaces)
+        self.parameters.declare(f"{stem}.to_world", pose, Pose(angles=angles))
+
+    def _meshes(self, owner: Owner, triangles: Triangles) -> list[Part]:
+        """A shape of triangles: a part for each material of its file."""
+        shape, pose = owner.shape, owner.to_world
+        mesh = mesh_of(triangles, owner.key, self.description, self.opener, materials=shape["material"] is None)
+        lights = [light for piece in mesh.pieces for light in piece.lights]
+        self.sources += file_lights(lights, owner.key, pose, mesh.source, self.parameters)
+        labels = labels_of([piece.name for piece in mesh.pieces])
+        parts: list[Part] = []
+        known: dict[int, ResolvedMaterial] = {}
+        for piece, label in zip(mesh.pieces, labels, strict=True):
+            stem = owner.key if len(mesh.pieces) == 1 else f"{owner.key}.{label}"
+            self.parameters.declare(f"{stem}.vertices", piece.vertices, Vertices())
+            self._declare_pose(stem, pose, [])
+            own = piece.material if shape["material"] is None else None
+            if own is None:
+                slot = self._slot(shape["material"], stem)
+            elif id(own) in known:  # parts of one material share its row and its textures
+                slot = known[id(own)]
+            else:
+                slot = known[id(own)] = self._file_slot(own, owner.key, f"{stem}.material", mesh.source)
+            part = self._part(owner, stem, slot, Surface("triangle"), pose)
+            parts.append(_filled(part, piece, mesh))
+        if all(len(part.faces) == 0 for part in parts if part.faces is not None):
+            problem = "every face is degenerate (without area)"
+            if mesh.source:
+                raise AssetError(mesh.source, f"{problem}, named by {owner.key}.path")
+            raise SceneError(f"{owner.key}.faces", "no face with area", "a face with area", self.description.file)
+        return parts
+
+    def _slot(self, given: Any, stem: str) -> ResolvedMaterial:
+        """The material that the scene gives a shape, by name or its own; the grey of one that has none."""
+        known = self.description.materials
+        if isinstance(given, str):
+            return resolved(known[given], f"materials.{given}", known, self.opener)
+        return resolved(plain_material() if given is None else given, f"{stem}.material", known, self.opener)
+
+    def _file_slot(self, own: FileMaterial, prefix: str, key: str, source: str) -> ResolvedMaterial:
+        """A mesh file's own material.
+
+        Raises:
+            AssetError: something that a material cannot have; it names the file and the material.
+        """
+        try:
+            material = read_material(own.material, key, BSDFS, None)
+            check_material(material, key, {}, {}, None)
+            return resolved(material, key, {}, self.opener.sharing(f"{prefix}.textures"))
+        except SceneError as error:
+            raise AssetError(source, f"material {own.name[:80]!r}: {error}") from None
+
+    def _part(self, owner: Owner, stem: str, slot: ResolvedMaterial, surface: Surface, pose: np.ndarray) -> Part:
+        """A surface of a shape, without what only triangles have; its emission and its material's numbers are declared."""
+        declare(slot, self.parameters)
+        emission, names = owner.shape["emission"], (f"{owner.key}.emission",)
+        texture = slot.emission if emission is None and isinstance(slot.emission, Node) else None
+        if emission is not None and names[0] not in self.parameters:
+            self.parameters.declare(names[0], emission, parameters_of(owner.shape.kind)["emission"])
+        if texture is not None:
+            emission, names = (1.0, 1.0, 1.0), (f"{slot.name}.emission_strength",)
+        elif emission is None and isinstance(slot.emission, tuple):
+            emission, names = slot.emission, (f"{slot.name}.emission", f"{slot.name}.emission_strength")
+        if emission is not None and names[0] not in self.parameters:
+            self.parameters[names[0]] = np.asarray(emission, np.float64)
+        return Part(
+            name=stem,
+            shape=owner.name,
+            object_id=owner.number,
+            kind=surface.kind,
+            material=slot,
+            emission=emission,
+            emission_names=names if emission is not None else (),
+            emission_texture=texture,
+            flip=owner.shape["flip_normals"],
+            to_world=pose,
+            local=surface.local,
+            quadric=surface.quadric,
+            piece=surface.label,
+        )
+
+
+def _filled(part: Part, piece: MeshPart, mesh: Mesh) -> Part:
+    """A part with its triangles."""
+    faces, dropped = solid(piece, part.to_world)
+    return replace(
+        part,
+        vertices=piece.vertices,
+        faces=faces,
+        normals=None if mesh.flat else piece.normals,
+        uvs=piece.uvs,
+        colors=piece.colors,
+        smooth=not mesh.flat,
+        dropped=dropped,
+        source=mesh.source,
+        ignored=ignored(piece, part.to_world),
+    )
