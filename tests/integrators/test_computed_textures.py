@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 import torch
+from torchpt.render import Rendering, render_scene
 
 import torchpt
 from torchpt import bsdfs
 from torchpt.format.description import settings
-from torchpt.render import Rendering, render_scene
 from torchpt.textures import TexturePoint
 
 NOISE: dict[str, Any] = {"type": "noise", "scale": 3, "octaves": 2, "seed": 1}
