@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.adjoint import attached
 from torchpt.bsdfs import KINDS, Bsdf, Parameters
 from torchpt.bsdfs.kinds.blend import Blend
 from torchpt.bsdfs.kinds.blinn_phong import BlinnPhong
@@ -819,12 +820,14 @@ def test_texels_are_held_to_what_their_slots_accept(tmp_path: Path) -> None:
 
 def test_indices_bend_rays_and_textures_of_them_too(tmp_path: Path) -> None:
     def bending(**keys: Any) -> set[str]:
-        found = loaded(keys)
-        return {name for part in found.built.parts for slot in part.material.all() for name in slot.bending()}
+        made = loaded(keys)
+        return {name for name in made.params if name.startswith("materials.m.") and attached(made, [name])}
 
     squares = {"type": "checkerboard", "color0": 1.3, "color1": 1.5}
     assert bending(type="dielectric") == {"materials.m.int_ior", "materials.m.ext_ior"}
-    assert bending(type="roughdielectric", int_ior=squares) == {"materials.m.int_ior", "materials.m.ext_ior"}
+    assert bending(type="roughdielectric", int_ior=squares) == {
+        "materials.m.int_ior.color0", "materials.m.int_ior.color1", "materials.m.ext_ior",
+    }  # fmt: skip
     assert not bending(type="plastic") and not bending(type="thindielectric")
 
 

@@ -25,7 +25,7 @@ from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import normalize
 from torchpt.math.warps import concentric_disk, one_minus_cos, uniform_cone, uniform_sphere
 from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.samplers import Sampler, salts
+from torchpt.samplers import Sampler, points_of, salts
 
 GRAIN = 32_768  # elements that torch leaves to one thread
 N = 70_003  # above that: two threads share it, and the last vector is not full
@@ -199,7 +199,7 @@ def _same(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 @pytest.mark.parametrize("sampler", list(SAMPLERS))
 def test_numbers_drawn_do_not_depend_on_their_place(sampler):
-    module, salt = SAMPLERS[sampler], salts(3, torch.device("cpu"))[4]
+    module, salt = points_of(sampler), salts(3, torch.device("cpu"))[4]
     key = Sampler(sampler, 5, 4, 97, 300).key(torch.arange(N), torch.arange(N) % 97)
     for draw in (module.draw_1d, module.draw_2d):
         whole = draw(key, salt)

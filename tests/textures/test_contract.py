@@ -262,7 +262,7 @@ def test_compiled_is_eager(name: str, opened: Callable[..., Opened]):
         table = table_of(opened(name, COLOUR if coloured else HEIGHT, **more, **filters), torch.float32)
 
         def stage(
-            uv: Tensor, colors: Tensor, area: Tensor, table: Table = table, coloured: bool = coloured
+            uv: Tensor, colors: Tensor, area: Tensor, *, table: Table = table, coloured: bool = coloured
         ) -> list[Tensor]:
             at = TexturePoint(uv, area if table.filtered else None, colors)
             slopes = list(inclines(table, at)) if not coloured and name in MAPPED else []
