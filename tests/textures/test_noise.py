@@ -28,7 +28,7 @@ def _read(uv: Tensor, area: Tensor | None, dtype: torch.dtype, slope: bool, **ke
     values = values_of(Noise, {"scale": 1.0, **keys}, "n", None).values
     made = Noise.of(values)
     node = ComputedNode(
-        made, "n", 0, values["uv_transform"].matrix(), tuple(made.constants(values).items()), area is not None
+        made, "n", 0, Noise.matrix(values), tuple(made.constants(values).items()), area is not None
     )
     numbers = {
         f"n.{key}": torch.tensor(values[key], dtype=torch.float64) for key in ("scale", "persistence", "lacunarity")

@@ -324,13 +324,18 @@ class Mapped(Texture):
 
     parameters: ClassVar = {
         "uv_transform": Other(
-            UvTransform(),
+            None,
             reader=_uv_transform,
             words="a mapping with scale, rotate, translate",
             doc="applied to texture coordinates: `scale` 1 (a number or [u, v]), `rotate` 0 (degrees, from u to v), "
             "`translate` [0, 0], in this order",
         ),
     }
+
+    @staticmethod
+    def matrix(values: Mapping[str, Any], repeats: tuple[float, float] = (1.0, 1.0)) -> Matrix:
+        """Rows ``(2, 3)`` of what is done to texture coordinates; with ``repeats`` as a scale after it."""
+        return (values["uv_transform"] or UvTransform()).matrix(repeats)
 
 
 def moved(maps: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:

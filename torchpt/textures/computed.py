@@ -68,7 +68,7 @@ class Computed(Mapped):
             made,
             opening.name,
             channel,
-            values["uv_transform"].matrix(),
+            cls.matrix(values),
             tuple(made.constants(values).items()),
             values.get("filter") in cls.filters,
         )

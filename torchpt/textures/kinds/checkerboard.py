@@ -36,7 +36,7 @@ class Checkerboard(Mapped):
         """See :class:`Texture`."""
         channel = opening.number(CHANNELS[:4], "squares have no alpha")
         opening.declare_all(cls, values)
-        matrix = values["uv_transform"].matrix(values["scale"])
+        matrix = cls.matrix(values, values["scale"])
         filtered = values["filter"] in cls.filters
         return ImageNode(opening.name, channel, "repeat", True, matrix, (1.0, 1.0, 1.0), filtered, _squares)
 

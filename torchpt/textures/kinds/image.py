@@ -83,7 +83,7 @@ class Image(Mapped):
                 "b": 0 if grey else 2,
                 "a": channels - 1,
             }[channel]
-        matrix, filter = values["uv_transform"].matrix(), values["filter"]
+        matrix, filter = cls.matrix(values), values["filter"]
         return ImageNode(name, index, values["wrap"], filter == "nearest", matrix, scale, filter in cls.filters)
 
 
