@@ -27,9 +27,7 @@ def noise(uv: Tensor, area: Tensor | None = None, dtype: torch.dtype = torch.flo
 def _read(uv: Tensor, area: Tensor | None, dtype: torch.dtype, slope: bool, **keys: Any) -> Tensor:
     values = values_of(Noise, {"scale": 1.0, **keys}, "n", None).values
     made = Noise.of(values)
-    node = ComputedNode(
-        made, "n", 0, Noise.matrix(values), tuple(made.constants(values).items()), area is not None
-    )
+    node = ComputedNode(made, "n", 0, Noise.matrix(values), tuple(made.constants(values).items()), area is not None)
     numbers = {
         f"n.{key}": torch.tensor(values[key], dtype=torch.float64) for key in ("scale", "persistence", "lacunarity")
     }
