@@ -37,7 +37,10 @@ scene = torchpt.load({
     "textures": {"lines": {"type": "stripes", "count": 3}},
     "materials": {"clay": {"type": "roughdiffuse", "reflectance": {"texture": "lines"}, "sigma": 30}},
     "shapes": {
-        "floor": {"type": "rectangle", "material": "clay", "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"scale": 3}]},
+        "floor": {
+            "type": "rectangle", "material": "clay",
+            "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"scale": 3}],
+        },
         "ball": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.5, "material": "clay"},
     },
     "lights": {"lamp": {"type": "searchlight", "position": [1, 3, 2], "target": [0, 0, 0], "intensity": 20}},
