@@ -24,7 +24,7 @@ def point(p0: Tensor, e1: Tensor, e2: Tensor, table: Quadrics, u: Tensor) -> tup
 
 def own_point(table: Quadrics, u: Tensor) -> Tensor:
     """The points ``(3, N)`` of :func:`point` in the surface's own space."""
-    return quadrics.sample(table.code, u)
+    return quadrics.sample(table, u)
 
 
 def world_area(area: Tensor, e1: Tensor, e2: Tensor, e3: Tensor, normal: Tensor) -> Tensor:

@@ -18,11 +18,11 @@ from torchpt.lights.solid_angle import shapes_of, table_of
 from torchpt.math.threads import mean_all
 from torchpt.math.vectors import dot, luminance, normalize
 from torchpt.records import KINDS, SOURCES, Geometry, Lights
-from torchpt.scene.assembly.curved import quadric_area
 from torchpt.scene.assembly.primitives import Primitives
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
 from torchpt.scene.texels import images_of
+from torchpt.shapes import quadrics
 
 if TYPE_CHECKING:
     from torchpt.lights.kinds.envmap import EnvironmentMap
@@ -172,7 +172,7 @@ def _surfaces(
     if primitives.frame is not None and primitives.quadrics is not None and "quadric" in names:
         bent = of_kind == KINDS.index("quadric")
         column = torch.where(bent, prim - sum(primitives.counts[:4]), 0)
-        own, world_area = quadric_area(primitives.quadrics.code, primitives.frame)
+        own, world_area = quadrics.areas(primitives.quadrics, primitives.frame)
         area = torch.where(bent, own.to(dtype).index_select(0, column), area)
         whole = torch.where(bent, world_area.index_select(0, column), whole)
     radiance = torch.cat([_emission(part, parameters, dtype)[:, None].expand(3, n) for part, n in emitting], 1)
