@@ -401,9 +401,10 @@ def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]
 
 def _kind(part: Part) -> str:
     """Mitsuba's name of a part's kind."""
-    if part.kind == "quadric" and part.quadric != "cylinder":
-        raise NoCounterpartError(f"{part.name}: Mitsuba has no {part.quadric}")
-    return part.quadric or part.kind
+    name = part.kind if part.quadric is None else part.quadric.name
+    if part.quadric is not None and name != "cylinder":
+        raise NoCounterpartError(f"{part.name}: Mitsuba has no {name}")
+    return name
 
 
 def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:

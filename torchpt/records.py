@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from torchpt.bsdfs import Bsdf, Parameters
     from torchpt.lights.choice import ByTree
     from torchpt.math.distributions import Discrete
+    from torchpt.shapes.primitive import Primitive
+    from torchpt.shapes.quadrics import Quadric
     from torchpt.textures import MaterialTextures, NodeMap, OpacityMaps, Table
 
 __all__ = [
     "KINDS",
-    "QUADRICS",
     "BsdfSample",
     "Copies",
     "Geometry",
@@ -33,6 +34,7 @@ __all__ = [
     "LightSample",
     "Lights",
     "PathState",
+    "QuadricTable",
     "Quadrics",
     "Shadow",
     "SplitSumMaterial",
@@ -42,10 +44,8 @@ __all__ = [
     "tensors_of",
 ]
 
-#: Primitive kinds in the order in which a :class:`Geometry` stores them.
+#: Primitive kinds in the order in which a :class:`Geometry` stores them; each is a file in ``shapes/primitives/``.
 KINDS = ("triangle", "rectangle", "disk", "sphere", "quadric")
-#: Surfaces of a quadric in its own space, in the order of their codes (:mod:`torchpt.shapes.quadrics`).
-QUADRICS = ("ellipsoid", "cylinder", "cone")
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class Geometry:
 
     A planar primitive is the affine map ``p = p0 + u (p1 - p0) + v (p2 - p0)``: a triangle holds ``u, v >= 0, u + v <= 1``,
     a rectangle (parallelogram) ``0 <= u, v <= 1``, a disk (ellipse) ``u^2 + v^2 <= 1`` about its centre ``p0``.
-    A sphere has its centre in ``p0`` and its radius in ``p1[0]``. A quadric is a surface of :data:`QUADRICS` in its own space
-    under the affine map ``p = p0 + x e1 + y e2 + z e3``, kept in float64 beside the others.
+    A sphere has its centre in ``p0`` and its radius in ``p1[0]``. A quadric is a surface in its own space under the affine map
+    ``p = p0 + x e1 + y e2 + z e3``, kept in float64 beside the others.
 
     Attributes:
         p0: ``(3, P)``.
         p1: ``(3, P)``; of a quadric its ``e1``.
         p2: ``(3, P)``; of a quadric its ``e2``.
         counts: how many primitives of each of :data:`KINDS`; stored in that order.
-        quadrics: ``(13, Q)`` float64: ``p0 e1 e2 e3`` and the code of the surface; None where there are none.
+        quadrics: None where there are none.
         copies: ``(15, I)`` float64: three rows of the map from a mesh to its copy, the first triangle of that mesh, how many it
             has, and the id of the copy's first primitive; None where there are no instances. A copy's primitives exist by
             their ids alone, which follow those of all others.
@@ -72,7 +72,7 @@ class Geometry:
     p1: Tensor
     p2: Tensor
     counts: tuple[int, int, int, int, int]
-    quadrics: Tensor | None = None
+    quadrics: QuadricTable | None = None
     copies: Tensor | None = None
 
     @property
@@ -82,10 +82,21 @@ class Geometry:
 
 
 @dataclass(frozen=True)
+class QuadricTable:
+    """The quadrics as the search sees them: numbers alone, whatever their surfaces are called; float64, detached."""
+
+    frame: Tensor  # (12, Q) p0 e1 e2 e3
+    form: Tensor  # (7, Q) the surface in its own space, see torchpt.shapes.quadrics.Form
+    low: Tensor  # (3, Q) its box in the world
+    high: Tensor  # (3, Q)
+
+
+@dataclass(frozen=True)
 class Quadrics:
     """What lanes gather of a quadric beside ``LaneGeometry.p0, e1, e2``: one column a quadric."""
 
-    code: Tensor  # (Q,) int64 index into QUADRICS
+    kinds: tuple[type[Quadric], ...]  # the surfaces among them; static
+    code: Tensor | None  # (Q,) int64 index into `kinds`; None where there is but one
     e3: Tensor  # (3, Q)
     n1: Tensor  # (3, Q) columns of the cofactor matrix of (e1, e2, e3), turned to the front; their common scale is free
     n2: Tensor  # (3, Q)
@@ -148,6 +159,7 @@ class Lights:
 class LaneGeometry:
     """Where surfaces lie, as the lanes gather it: P primitives, and I copies (see :class:`Copies`)."""
 
+    kinds: tuple[type[Primitive], ...]  # those that there are, in the order of KINDS; static
     counts: tuple[int, int, int, int, int]  # as in Geometry; static: lanes read `ends`
     ends: Tensor  # (5,) int64 the id after the last primitive of each kind
     p0: Tensor  # (3, P)
@@ -177,6 +189,12 @@ class LaneGeometry:
 
         copy = self.copy(prim)
         return torch.where(copy > 0, copy + (self.ends[4] - 1), prim)
+
+    def of(self, kind: type[Primitive], prim: Tensor) -> Tensor:
+        """Which of ``prim (N,)`` are of a kind that the scene has: ``(N,)`` bool."""
+        number = KINDS.index(kind.name)
+        after = prim >= self.ends[number - 1] if number else prim >= 0
+        return after & (prim < self.ends[number]) if any(self.counts[number + 1 :]) else after
 
     def copy(self, prim: Tensor) -> Tensor:
         """Columns ``(N,)`` of ``copies`` for ids of primitives as the search gives them."""
@@ -333,10 +351,13 @@ R = TypeVar("R", PathState, Hit, Quadrics, Copies)
 
 
 def rows(record: R, index: Tensor) -> R:
-    """The lanes ``index`` of a record of tensors."""
+    """The lanes ``index`` of a record of tensors; what is static stays."""
     values: dict[str, Any] = {f.name: getattr(record, f.name) for f in fields(record)}
-    found: dict[str, Any] = {name: None if value is None else take(value, index) for name, value in values.items()}
-    return type(record)(**found)
+    static = (tuple, type(None))
+    lanes: dict[str, Any] = {
+        name: value if isinstance(value, static) else take(value, index) for name, value in values.items()
+    }
+    return type(record)(**lanes)
 
 
 def joined(records: list[R]) -> R:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpt.lights.base import KINDS, Cone, Emitter
 from torchpt.math.vectors import dot
 from torchpt.records import KINDS as PRIMITIVES
-from torchpt.records import Lights
+from torchpt.records import Lights, Quadrics
 from torchpt.spec import Kinds
 
 __all__ = ["SURFACES", "Faces", "OnSurface", "Surface", "emitter"]
@@ -34,7 +34,7 @@ class Faces:
     e1: Tensor  # (3, E)
     face: Tensor  # (3, E) cross product of the edges
     column: Tensor  # (E,) int64 among the scene's primitives of the kind
-    code: Tensor | None  # (Q,) of the scene's quadrics
+    quadrics: Quadrics | None  # of the scene
     frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of them
 
 

@@ -31,7 +31,8 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
             brought.setdefault(owner.removeprefix("shapes."), {})[label] = source.kind
     for part in built.parts:
         count = len(part.faces) if part.faces is not None else 1
-        row: dict[str, Any] = {"kind": part.quadric or part.kind, "primitives": count, "material": part.material.name}
+        kind = part.kind if part.quadric is None else part.quadric.name
+        row: dict[str, Any] = {"kind": kind, "primitives": count, "material": part.material.name}
         if part.emission is not None:
             row["emission"] = list(part.emission) if part.emission_texture is None else "a texture"
         if part.source:
@@ -42,7 +43,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
             row["lights"] = brought.pop(part.shape)  # once for a shape of several parts
         if part.ignored:
             row["ignored_in_file"] = list(part.ignored)
-        if part.kind == "triangle":
+        if part.faces is not None:
             row["normals"] = (
                 "face" if not part.smooth else "computed, smooth" if part.normals is None else "from the file"
             )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.lights.surface import Faces, OnSurface, Surface
-from torchpt.math.vectors import affine, cross, dot
+from torchpt.math.vectors import affine, dot
 from torchpt.records import Lights
 from torchpt.shapes import quadrics
 
@@ -42,26 +42,15 @@ class Quadric(Surface):
     @classmethod
     def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
         """See :class:`Surface`: its own space's times ``|det|``; the world's by quadrature."""
-        assert faces.code is not None and faces.frame is not None
-        e1, e2, e3 = faces.frame[3:6], faces.frame[6:9], faces.frame[9:12]
-        own = torch.tensor(quadrics.AREAS, dtype=torch.float64, device=e1.device)[faces.code]
-        det = dot(e1, cross(e2, e3)).abs()
-        sides = [n.detach() for n in (cross(e2, e3), cross(e3, e1), cross(e1, e2))]
-        grid = (torch.arange(16, dtype=torch.float64, device=e1.device) + 0.5) / 16
-        spots = torch.cartesian_prod(grid, grid)
-        total = torch.zeros_like(own)
-        for spot in spots:
-            n = quadrics.normal(faces.code, quadrics.sample(faces.code, spot[:, None].expand(2, len(own))))
-            grown = affine(sides[0] * n[0], sides[1], n[1], sides[2], n[2])
-            total += (dot(grown, grown) / dot(n, n)).sqrt()
-        area, whole = own * det, own * total / len(spots)
+        assert faces.quadrics is not None and faces.frame is not None
+        area, whole = quadrics.areas(faces.quadrics, faces.frame)
         return area.index_select(0, faces.column), whole.index_select(0, faces.column)
 
     @classmethod
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
         """See :class:`Surface`."""
         assert at.quadrics is not None
-        own = quadrics.sample(at.quadrics.code, u)
+        own = quadrics.sample(at.quadrics, u)
         p = affine(at.p0 + at.e1 * own[0], at.e2, own[1], at.quadrics.e3, own[2])
         return OnSurface(p, quadrics.outward(at.quadrics, own), own=own)
 

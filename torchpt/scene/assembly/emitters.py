@@ -147,7 +147,6 @@ def _surfaces(
         x.index_select(1, prim)
         for x in (primitives.p0, primitives.e1, primitives.e2, primitives.face, primitives.normal)
     )
-    code = None if primitives.quadrics is None else primitives.quadrics.code
     areas, wholes, columns, tabled, start = [], [], [], False, 0
     for number, name in enumerate(KINDS):  # in whose order the primitives are
         stop = start + names.count(name)
@@ -155,7 +154,7 @@ def _surfaces(
             continue
         kind, span = SURFACES[name], slice(start, stop)
         column = prim[span] - sum(primitives.counts[:number])
-        area, whole = kind.areas(Faces(e1[:, span], face[:, span], column, code, primitives.frame))
+        area, whole = kind.areas(Faces(e1[:, span], face[:, span], column, primitives.quadrics, primitives.frame))
         areas.append(area)
         wholes.append(whole)
         columns.append(column if kind.tabled else torch.zeros_like(column))

@@ -75,6 +75,7 @@ def assemble(
     )
     world = World(
         geometry=LaneGeometry(
+            kinds=primitives.kinds,
             counts=primitives.counts,
             ends=torch.tensor(primitives.counts, dtype=torch.int64, device=device).cumsum(0),
             p0=primitives.p0,
