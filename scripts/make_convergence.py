@@ -84,10 +84,10 @@ def veach(out: Path) -> None:
 
 def points(out: Path) -> None:
     """Scatter plots of 128 points: random, stratified, Hammersley, Sobol'."""
-    import matplotlib
+    import matplotlib  # pyright: ignore[reportMissingImports]  (extra `bench`)
 
     matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    import matplotlib.pyplot as plt  # pyright: ignore[reportMissingImports]
 
     count = 128
     figure, axes = plt.subplots(1, 4, figsize=(11, 3), layout="constrained")
