@@ -37,7 +37,7 @@ from torchpt.format.description import Description, read_description
 from torchpt.format.materials import MAX_BLENDS
 from torchpt.records import BsdfSample
 from torchpt.scene.materials import resolved
-from torchpt.spec import Color, Flag, Index, Scalar, parameters_of
+from torchpt.spec import Color, Flag, Index, Refused, Scalar, parameters_of
 from torchpt.spec.declared import Described
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
@@ -699,7 +699,6 @@ MODELS_BAD: dict[str, tuple[Any, str, str]] = {
     "a common key": ({"mine": with_parameters({"opacity": 1})}, "bsdfs.mine.parameters.opacity", "another name"),
     "a later key": ({"mine": with_parameters({"bump_map": 1})}, "bsdfs.mine.parameters.bump_map", "another name"),
     "a taken name": ({"mine": with_parameters({"copy": 1})}, "bsdfs.mine.parameters.copy", "another name"),
-    "a flag": ({"mine": with_parameters({"x": Flag(True)})}, "bsdfs.mine.parameters.x", "a number or a colour"),
     "a default out of range": (
         {"mine": with_parameters({"x": Scalar(2.0, high=1.0)})},
         "bsdfs.mine.parameters.x",
@@ -734,7 +733,18 @@ class Specified(Tinted):
         "tint": Color((1.0, 0.5, 0.25), high=1.0, doc="a colour with bounds"),
         "index": Index(1.5, media=INDICES, doc="an index"),
         "maybe": Scalar(None, doc="one that may be left out"),
+        "half": Flag(False, doc="what the model itself never sees"),
     }
+
+    @classmethod
+    def check(cls, values: Any, given: frozenset[str]) -> None:
+        super().check(values, given)
+        if values["half"] and "level" in given:
+            raise Refused("no level beside half", values["level"], ("level",))
+
+    @classmethod
+    def given(cls, values: Any) -> dict[str, Any]:
+        return {**super().given(values), **({"level": 0.5} if values["half"] else {})}
 
 
 SPECIFIED = {"specified": Specified()}
@@ -748,6 +758,9 @@ def test_a_model_of_the_callers_own_may_have_specs() -> None:
     found = slot(SPECIFIED, type="specified", index="water")
     assert found.values == {"tint": (1.0, 0.5, 0.25), "amount": -2.0, "level": 0.25, "index": 1.333}
     assert slot(SPECIFIED, type="specified", maybe=3).values["maybe"] == 3.0
+    assert slot(SPECIFIED, type="specified", half=True).values["level"] == 0.5
+    error = refused({"m": {"type": "specified", "half": True, "level": 0.1}}, SPECIFIED)
+    assert error.key == "materials.m.level" and "no level beside half" in str(error)
     error = refused({"m": {"type": "specified", "level": 0.6}}, SPECIFIED)
     assert error.key == "materials.m.level" and "in 0..0.5, or a texture, got 0.6" in str(error)
     error = refused({"m": {"type": "specified", "tint": {"type": "vertex_color"}}}, SPECIFIED)

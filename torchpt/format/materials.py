@@ -17,7 +17,8 @@ from torchpt.spec.declared import Described, described, values_of
 from torchpt.spec.validate import Model
 
 __all__ = [
-    "MAX_BLENDS", "Kind", "check_material", "inner_of", "material_types", "model_of", "plain_material", "read_material",
+    "MAX_BLENDS", "POINTS", "Kind", "check_material", "inner_of", "material_types", "model_of", "plain_material",
+    "read_material",
 ]  # fmt: skip
 
 #: A type of material: a class of :data:`torchpt.bsdfs.KINDS`, or the one instance that a caller handed over.
@@ -60,10 +61,9 @@ def _check_own(model: Bsdf, key: str) -> None:
     """Refuse parameters that cannot be read."""
     if not isinstance(model.parameters, Mapping):
         raise SceneError(f"{key}.parameters", model.parameters, "a mapping from names to defaults")
-    for parameter, value in model.parameters.items():
+    own = {} if model.parameters is Bsdf.parameters else model.parameters
+    for parameter, value in own.items():
         at = f"{key}.parameters.{parameter}"
-        if model.parameters is Bsdf.parameters:
-            break
         if not isinstance(parameter, str) or not parameter.isidentifier() or parameter.startswith("_"):
             raise SceneError(f"{key}.parameters", parameter, "names made of letters, digits and underscores")
         if parameter == "type" or parameter in Bsdf.parameters or hasattr(Model, parameter):
@@ -73,17 +73,7 @@ def _check_own(model: Bsdf, key: str) -> None:
             if spec.default not in (REQUIRED, None) and not callable(spec.default):
                 spec.read(spec.default)
         except Refused as error:
-            raise SceneError(at, spec_value(value), error.expected) from None
-        if not spec.traced:
-            expected = (
-                "a number or a colour, with its default or a spec (an instance is one variant: make it as it is to be)"
-            )
-            raise SceneError(at, value, expected)
-
-
-def spec_value(value: Any) -> Any:
-    """What an error shows of a parameter: its default."""
-    return value.default if isinstance(value, Spec) else value
+            raise SceneError(at, value.default if isinstance(value, Spec) else value, error.expected) from None
 
 
 def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | None, depth: int = 0) -> Described:
