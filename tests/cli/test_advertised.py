@@ -29,7 +29,7 @@ shapes: {ball: {type: sphere, emission: 1}}
 
 def texts() -> Iterator[tuple[str, str]]:
     """Where a command may stand, and the text."""
-    for name in ("HELP", "HELP_RENDER", "HELP_INFO"):
+    for name in ("HELP", "HELP_RENDER", "HELP_ORBIT", "HELP_INFO"):
         yield f"cli.{name}", getattr(cli, name)
     for page in PAGES:
         yield str(page.relative_to(ROOT)), page.read_text(encoding="utf-8")
@@ -64,6 +64,8 @@ def commands(program: str) -> list[tuple[str, str]]:
 def shrunk(words: list[str]) -> list[str]:
     """The words of a command for a film of a few pixels; sweeps keep how many values they have."""
     left, made = dict(SMALL), []
+    if words[0] == "orbit":
+        left["frames"] = "2"
     for word in words:
         key, equals, value = word.partition("=")
         if equals and key in left:
@@ -83,7 +85,7 @@ TORCHPT = commands("torchpt")
 def test_there_are_commands_from_everywhere() -> None:
     where = {place for place, _ in TORCHPT}
     assert {"cli.HELP", "README.md", "docs/ibl.md", "configs/config.yaml", "configs/integrator/direct.yaml"} <= where
-    assert len(TORCHPT) > 40 and {command.split()[1] for _, command in TORCHPT} == {"render", "info"}
+    assert len(TORCHPT) > 40 and {command.split()[1] for _, command in TORCHPT} == {"render", "orbit", "info"}
 
 
 def test_every_file_in_configs_opens_with_its_command() -> None:
@@ -108,7 +110,7 @@ def test_advertised_commands_run(
     (tmp_path / "my").mkdir()
     (tmp_path / "my" / "scene.yaml").write_text(SCENE)
     words = shlex.split(command)[1:]
-    renders = words[0] == "render" and "--cfg" not in words
+    renders = words[0] in ("render", "orbit") and "--cfg" not in words
     assert main(shrunk(words) if renders else words) == 0, where
     captured = capfd.readouterr()
     assert captured.out
