@@ -110,6 +110,7 @@ FEATURES: dict[str, Feature] = {
         ("lights/kinds/constant.py",),
         lambda scene: _light(scene, type="constant", radiance=0.3),
         ("world.lights.environment",),
+        module="torchpt.lights.kinds.constant",
     ),
     "environment map": Feature(
         ("lights/kinds/envmap.py",),
@@ -118,7 +119,19 @@ FEATURES: dict[str, Feature] = {
         module="torchpt.lights.kinds.envmap",
     ),
     "point light": Feature(
-        ("lights/kinds/point.py",), lambda scene: _light(scene, type="point", position=[1, 2, 1], intensity=5)
+        ("lights/kinds/point.py",),
+        lambda scene: _light(scene, type="point", position=[1, 2, 1], intensity=5),
+        module="torchpt.lights.kinds.point",
+    ),
+    "directional light": Feature(
+        ("lights/kinds/directional.py",),
+        lambda scene: _light(scene, type="directional", direction=[1, -2, 1], irradiance=2),
+        module="torchpt.lights.kinds.directional",
+    ),
+    "round lamp": Feature(
+        ("lights/surfaces/sphere.py",),
+        lambda scene: scene["shapes"].update(bulb={"type": "sphere", "center": [1, 1, 0], "radius": 0.2, "emission": 3}),
+        module="torchpt.lights.surfaces.sphere",
     ),
     "layer": Feature(
         ("integrators/aov.py", "integrators/layers/normal.py"),
