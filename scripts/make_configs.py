@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from torchpt.settings import BLOCKS, TYPED, Film, Render
+from torchpt.settings import BLOCKS, RECORDS, TYPED
 from torchpt.spec import Choice, Spec, not_built, parameters_of
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -109,7 +109,7 @@ def plain(group: str, record: Any) -> str:
 
 def written() -> dict[str, str]:
     """The text of each file by its path below configs/."""
-    files = {"film/default.yaml": plain("film", Film), "render/default.yaml": plain("render", Render)}
+    files = {f"{group}/default.yaml": plain(group, record) for group, record in RECORDS.items()}
     for group in BLOCKS:
         if group in TYPED:
             files |= {f"{group}/{kind or 'default'}.yaml": typed(group, kind) for kind in (None, *TYPED[group][0])}

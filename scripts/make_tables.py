@@ -3,8 +3,8 @@
     python scripts/make_tables.py            # writes docs/*.md
     python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
 
-A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), ``common.lights``: what all kinds of
-it have, or ``summary.lights``: a row a kind.
+A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), ``common.lights``: what all kinds
+of it have, or ``summary.lights``: a row a kind.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ TABLES = {
     "cameras": ("torchpt.cameras", "KINDS"),
     "filters": ("torchpt.film", "FILTERS"),
     "integrators": ("torchpt.integrators", "KINDS"),
+    "layers": ("torchpt.integrators", "LAYERS"),
+    "settings": ("torchpt.settings", "RECORDS"),
     "shapes": ("torchpt.shapes", "KINDS"),
     "textures": ("torchpt.textures", "KINDS"),
 }
@@ -104,12 +106,16 @@ def about(kind: Any) -> str:
 
 def summary(table: Mapping[str, Any]) -> str:
     """A row a kind: its keys with their defaults."""
-    shared, lines = common(table), []
+    shared: dict[str, Spec] = common(table)
+    lines: list[tuple[str, str, str]] = []
     for name in table:
         own = {key: spec for key, spec in parameters_of(table[name]).items() if key not in shared}
         keys = [f"`{key}`{f' {shown(spec.default)}' if _plain(spec) else ''}" for key, spec in own.items()]
-        lines.append(f"| `{name}` | {', '.join(keys) or 'none'} | {about(table[name])} |\n".replace("||", "\\|\\|"))
-    return "| type | keys (default) | what it is |\n|---|---|---|\n" + "".join(lines)
+        lines.append((f"`{name}`", ", ".join(keys), about(table[name]).replace("||", "\\|\\|")))
+    if not any(keys for _, keys, _ in lines):
+        return "| name | what it is |\n|---|---|\n" + "".join(f"| {name} | {text} |\n" for name, _, text in lines)
+    rows = (f"| {name} | {keys or 'none'} | {text} |\n" for name, keys, text in lines)
+    return "| type | keys (default) | what it is |\n|---|---|---|\n" + "".join(rows)
 
 
 def _plain(spec: Spec) -> bool:

@@ -22,32 +22,23 @@ import numpy as np
 import torch
 
 import torchpt
+from torchpt.bsdfs import KINDS, Bsdf
+from torchpt.bsdfs.metal import by_reflectance
 from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.format.description import Description, read_description
-from torchpt.format.materials import (
-    Blend,
-    BlinnPhong,
-    Conductor,
-    Material,
-    Microfacet,
-    Nonmetal,
-    Phong,
-    RoughConductor,
-    RoughDielectric,
-    RoughPlastic,
-)
+from torchpt.format.materials import inner_of, read_material
 from torchpt.format.textures import TextureInput
 from torchpt.math.vectors import cross, dot, luminance
 from torchpt.scene import Scene
 from torchpt.scene.assembly import corners_of
 from torchpt.scene.parts import Part, Source
 from torchpt.scene.space import Space
-from torchpt.scene.texels import images_of
 from torchpt.settings import Film, Settings
 from torchpt.shapes import KINDS as SHAPES
 from torchpt.shapes import Shape
 from torchpt.spec.declared import Described, values_of
-from torchpt.textures import Node, VertexColors
+from torchpt.textures import Node
+from torchpt.textures.atlas import ImageNode
 
 __all__ = [
     "NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "lets_pass", "load_mitsuba", "nearest",
@@ -254,63 +245,73 @@ class _Nearest:
             own = {"transform": shape["transform"], "flip_normals": shape["flip_normals"], "emission": None}
             material = shape["material"] or mesh["material"]
             shape = replace(mesh, values={**mesh.values, **own, "material": material})
-        if isinstance(shape["material"], Material):
+        if isinstance(shape["material"], Described):
             material = self.material(f"{name}.material", shape["material"])
             shape = replace(shape, values={**shape.values, "material": material})
         return shape
 
-    def material(self, name: str, material: Material) -> Material:
+    def material(self, name: str, material: Described) -> Described:
         """A material whose model Mitsuba has, of the same highlight and base."""
-        if isinstance(material, Blend):
-            sides = {"a": material.a, "b": material.b}
-            inner = {k: self.material(f"{name}.{k}", v) if isinstance(v, Material) else v for k, v in sides.items()}
-            return material.model_copy(update=inner)
-        if isinstance(material.opacity, TextureInput) and material.alpha_cutoff is not None:
+        inner = {
+            side: self.material(f"{name}.{side}", item) if isinstance(item, Described) else item
+            for side, item in inner_of(material).items()
+        }
+        if inner:
+            return _with(material, **inner)
+        if isinstance(material["opacity"], TextureInput) and material["alpha_cutoff"] is not None:
             self.said[f"{name}.alpha_cutoff"] = "cutoff left out: opacity is coverage"
-            material = material.model_copy(update={"alpha_cutoff": None})
-        if isinstance(material, RoughConductor | RoughDielectric) and material.energy_compensation:
+            material = _with(material, alpha_cutoff=None)
+        if material.values.get("energy_compensation"):
             self.said[f"{name}.energy_compensation"] = "left out"
-            material = material.model_copy(update={"energy_compensation": False})
-        if isinstance(material, Conductor | RoughConductor) and material.schlick and material.reflectance is not None:
-            return self._metal(name, material, _numbers(name, material.reflectance))
+            material = _with(material, energy_compensation=False)
+        if "conductor" in material.name and by_reflectance(material.values) and material["reflectance"] is not None:
+            return self._metal(name, material, _numbers(name, material["reflectance"]))
         coat = _coat(name, material)
         if coat is None:
             return material
         base, reflectance, alpha, tint = coat
         root = math.sqrt(min(reflectance, MOST_REFLECTANCE))
         index = (1.0 + root) / (1.0 - root)
-        given = {key: getattr(material, key) for key in Material.model_fields}
-        given |= {"diffuse_reflectance": base, "int_ior": index, "ext_ior": 1.0, "alpha": alpha}
-        self.said[name] = f"{material.bsdf().name} is roughplastic of int_ior {index:.3g}, alpha {alpha:.3g}"
-        return RoughPlastic.model_construct(**given, specular_reflectance=tint)
+        self.said[name] = f"{material.name} is roughplastic of int_ior {index:.3g}, alpha {alpha:.3g}"
+        plastic = read_material(
+            {"type": "roughplastic", "int_ior": index, "ext_ior": 1.0, "alpha": alpha}, name, KINDS, None
+        )
+        common = {key: material[key] for key in Bsdf.parameters}
+        return _with(plastic, **common, diffuse_reflectance=base, specular_reflectance=tint)
 
-    def _metal(self, name: str, material: Conductor | RoughConductor, reflectance: tuple[float, ...]) -> Material:
+    def _metal(self, name: str, material: Described, reflectance: tuple[float, ...]) -> Described:
         """The index 1 with the absorption that reflects as much at normal incidence."""
         if reflectance == (1.0, 1.0, 1.0):
             return material
         self.said[name] = "metal by its reflectance has eta 1 and k of the same reflectance"
         k = tuple(2.0 * math.sqrt(r / (1.0 - r)) for r in (min(r, MOST_REFLECTANCE) for r in reflectance))
-        return material.model_copy(update={"material": None, "reflectance": None, "eta": (1.0, 1.0, 1.0), "k": k})
+        return _with(material, material=None, reflectance=None, eta=(1.0, 1.0, 1.0), k=k)
 
 
-def _coat(name: str, material: Material) -> tuple[Any, float, float, Any] | None:
+def _with(described: Described, /, **values: Any) -> Described:
+    """The same with other values."""
+    return replace(described, values={**described.values, **values})
+
+
+def _coat(name: str, material: Described) -> tuple[Any, float, float, Any] | None:
     """Base, reflectance at normal incidence, alpha and tint of a coated model that Mitsuba lacks; of others None.
 
     ``(h . n)^n`` is as wide as GGX with ``alpha^2 = 2 / (n + 2)`` (Walter et al. 2007); the lobe about the mirror direction
     is as wide as one of four times its exponent about the half vector.
     """
-    if isinstance(material, Phong):
-        blinn = isinstance(material, BlinnPhong)
-        (exponent,) = _numbers(name, material.exponent)
-        specular = sum(_numbers(name, material.specular)) / 3.0
+    if material.name in ("phong", "blinn_phong"):
+        blinn = material.name == "blinn_phong"
+        (exponent,) = _numbers(name, material["exponent"])
+        specular = sum(_numbers(name, material["specular"])) / 3.0
         alpha = math.sqrt(2.0 / ((exponent if blinn else 4.0 * exponent) + 2.0))
-        return material.diffuse, (4.0 if blinn else 1.0) * specular, alpha, None
-    if isinstance(material, Nonmetal):
-        ((specular,), (roughness,)) = _numbers(name, material.specular), _numbers(name, material.roughness)
-        return material.base_color, specular, max(roughness**2, LEAST_ALPHA), None
-    if isinstance(material, Microfacet):
-        ((index,), (roughness,)) = _numbers(name, material.ior), _numbers(name, material.roughness)
-        return material.diffuse, ((index - 1.0) / (index + 1.0)) ** 2, max(roughness**2, LEAST_ALPHA), material.specular
+        return material["diffuse"], (4.0 if blinn else 1.0) * specular, alpha, None
+    if material.name == "nonmetal":
+        ((specular,), (roughness,)) = _numbers(name, material["specular"]), _numbers(name, material["roughness"])
+        return material["base_color"], specular, max(roughness**2, LEAST_ALPHA), None
+    if material.name == "microfacet":
+        ((index,), (roughness,)) = _numbers(name, material["ior"]), _numbers(name, material["roughness"])
+        reflectance = ((index - 1.0) / (index + 1.0)) ** 2
+        return material["diffuse"], reflectance, max(roughness**2, LEAST_ALPHA), material["specular"]
     return None
 
 
@@ -400,16 +401,19 @@ def _shape(mitsuba: Any, scene: Scene, part: Part, file: Path) -> dict[str, Any]
 
 def _kind(part: Part) -> str:
     """Mitsuba's name of a part's kind."""
-    if part.kind == "quadric" and part.quadric != "cylinder":
-        raise NoCounterpartError(f"{part.name}: Mitsuba has no {part.quadric}")
-    return part.quadric or part.kind
+    name = part.kind if part.quadric is None else part.quadric.name
+    if part.quadric is not None and name != "cylinder":
+        raise NoCounterpartError(f"{part.name}: Mitsuba has no {name}")
+    return name
 
 
 def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
     """Mitsuba's dict of a texture."""
+    if not isinstance(node, ImageNode):
+        raise NoCounterpartError("a texture that is no image is not converted")
     if node.filtered:
         raise NoCounterpartError(f"{node.texels}: Mitsuba does not filter textures over a pixel")
-    image = images_of([node], scene.params)[node.texels].detach()
+    image = node.image(scene.params).detach()
     if node.channel is None:
         image = image[..., :3] if image.shape[2] >= 3 else image[..., :1].expand(-1, -1, 3)
         image = image * torch.tensor(node.scale)
@@ -427,7 +431,7 @@ def _bitmap(mitsuba: Any, scene: Scene, node: Node) -> dict[str, Any]:
 
 
 def _refuse(node: Node) -> dict[str, Any]:
-    raise NoCounterpartError(f"{node.texels}: a texture, and no scene to take it from")
+    raise NoCounterpartError("a texture, and no scene to take it from")
 
 
 Opened = Callable[[Node], dict[str, Any]]
@@ -463,8 +467,6 @@ def bsdf(slot: ResolvedMaterial, opened: Opened = _refuse) -> dict[str, Any]:
 
 def _value(value: Any, opened: Opened) -> Any:
     """A parameter as Mitsuba's dict has it."""
-    if isinstance(value, VertexColors):
-        raise NoCounterpartError("vertex colours are not converted")
     if isinstance(value, Node):
         return opened(value)
     return _rgb(value) if isinstance(value, tuple) else value

@@ -12,7 +12,7 @@ PACKAGE = Path(torchpt.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 MOST_LINES, MOST_FUNCTION = 400, 80
 #: Files and functions that are still too long, and how long they may be until they are divided. Nothing is to be added.
-OFFENDERS: dict[str, int] = {"spec/parameters.py": 520}
+OFFENDERS: dict[str, int] = {}
 
 
 def name_of(path: Path) -> str:

@@ -90,11 +90,13 @@ KINDS = {"autograd": autograd}
 def attached(scene: Scene, names: Iterable[str]) -> bool:
     """Whether any of the parameters moves surfaces or the camera, or bends rays that a delta lobe sends on."""
     owners = [*scene.built.parts, *scene.built.copies]
-    bending = {name for owner in owners for material in owner.material.all() for name in material.bending()}
+    bending = {material.name for owner in owners for material in owner.material.all() if material.bends}
 
     def moves(name: str) -> bool:
-        # A texture's numbers are called after it.
-        return scene.spec(name).moves is Moves.SURFACES or bool({name, name.rpartition(".")[0]} & bending)
+        moved = scene.spec(name).moves
+        if moved is Moves.RAYS:  # by the material's name, or by a texture that any of them may read
+            return any(name.startswith(f"{own}.") for own in bending) or bool(bending and "textures." in name)
+        return moved is Moves.SURFACES
 
     return any(map(moves, names))
 

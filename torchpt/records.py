@@ -16,15 +16,13 @@ if TYPE_CHECKING:
 
     from torchpt.bsdfs import Bsdf, Parameters
     from torchpt.lights.choice import ByTree
-    from torchpt.lights.kinds.envmap import EnvironmentMap
     from torchpt.math.distributions import Discrete
-    from torchpt.textures import Atlas, MaterialTextures, OpacityMaps
+    from torchpt.shapes.primitive import Primitive
+    from torchpt.shapes.quadrics import Quadric
+    from torchpt.textures import MaterialTextures, NodeMap, OpacityMaps, Table
 
 __all__ = [
-    "DISTANT",
     "KINDS",
-    "QUADRICS",
-    "SOURCES",
     "BsdfSample",
     "Copies",
     "Geometry",
@@ -36,6 +34,7 @@ __all__ = [
     "LightSample",
     "Lights",
     "PathState",
+    "QuadricTable",
     "Quadrics",
     "Shadow",
     "SplitSumMaterial",
@@ -45,14 +44,8 @@ __all__ = [
     "tensors_of",
 ]
 
-#: Primitive kinds in the order in which a :class:`Geometry` stores them.
+#: Primitive kinds in the order in which a :class:`Geometry` stores them; each is a file in ``shapes/primitives/``.
 KINDS = ("triangle", "rectangle", "disk", "sphere", "quadric")
-#: Lights that are no surfaces, in the order of their rows: those somewhere, then those infinitely far.
-SOURCES = ("point", "spot", "directional", "constant", "envmap")
-#: Those infinitely far.
-DISTANT = ("directional", "constant", "envmap")
-#: Surfaces of a quadric in its own space, in the order of their codes (:mod:`torchpt.shapes.quadrics`).
-QUADRICS = ("ellipsoid", "cylinder", "cone")
 
 
 @dataclass(frozen=True)
@@ -61,15 +54,15 @@ class Geometry:
 
     A planar primitive is the affine map ``p = p0 + u (p1 - p0) + v (p2 - p0)``: a triangle holds ``u, v >= 0, u + v <= 1``,
     a rectangle (parallelogram) ``0 <= u, v <= 1``, a disk (ellipse) ``u^2 + v^2 <= 1`` about its centre ``p0``.
-    A sphere has its centre in ``p0`` and its radius in ``p1[0]``. A quadric is a surface of :data:`QUADRICS` in its own space
-    under the affine map ``p = p0 + x e1 + y e2 + z e3``, kept in float64 beside the others.
+    A sphere has its centre in ``p0`` and its radius in ``p1[0]``. A quadric is a surface in its own space under the affine map
+    ``p = p0 + x e1 + y e2 + z e3``, kept in float64 beside the others.
 
     Attributes:
         p0: ``(3, P)``.
         p1: ``(3, P)``; of a quadric its ``e1``.
         p2: ``(3, P)``; of a quadric its ``e2``.
         counts: how many primitives of each of :data:`KINDS`; stored in that order.
-        quadrics: ``(13, Q)`` float64: ``p0 e1 e2 e3`` and the code of the surface; None where there are none.
+        quadrics: None where there are none.
         copies: ``(15, I)`` float64: three rows of the map from a mesh to its copy, the first triangle of that mesh, how many it
             has, and the id of the copy's first primitive; None where there are no instances. A copy's primitives exist by
             their ids alone, which follow those of all others.
@@ -79,7 +72,7 @@ class Geometry:
     p1: Tensor
     p2: Tensor
     counts: tuple[int, int, int, int, int]
-    quadrics: Tensor | None = None
+    quadrics: QuadricTable | None = None
     copies: Tensor | None = None
 
     @property
@@ -89,10 +82,21 @@ class Geometry:
 
 
 @dataclass(frozen=True)
+class QuadricTable:
+    """The quadrics as the search sees them: numbers alone, whatever their surfaces are called; float64, detached."""
+
+    frame: Tensor  # (12, Q) p0 e1 e2 e3
+    form: Tensor  # (7, Q) the surface in its own space, see torchpt.shapes.quadrics.Form
+    low: Tensor  # (3, Q) its box in the world
+    high: Tensor  # (3, Q)
+
+
+@dataclass(frozen=True)
 class Quadrics:
     """What lanes gather of a quadric beside ``LaneGeometry.p0, e1, e2``: one column a quadric."""
 
-    code: Tensor  # (Q,) int64 index into QUADRICS
+    kinds: tuple[type[Quadric], ...]  # the surfaces among them; static
+    code: Tensor | None  # (Q,) int64 index into `kinds`; None where there is but one
     e3: Tensor  # (3, Q)
     n1: Tensor  # (3, Q) columns of the cofactor matrix of (e1, e2, e3), turned to the front; their common scale is free
     n2: Tensor  # (3, Q)
@@ -121,24 +125,24 @@ class Copies:
 
 @dataclass(frozen=True)
 class Lights:
-    """The emitters: a row for each emissive primitive, then one for each light of :data:`SOURCES`, in that order.
+    """The emitters: a row for each emissive primitive, then one for each other light, sorted as ``lights.order`` says.
 
-    Columns are a primitive's own; what the others put there is said in their files in :mod:`torchpt.lights`.
+    Columns are a primitive's own; what the others put there is said in their files in :mod:`torchpt.lights.kinds`.
     """
 
     choice: Discrete | ByTree | None  # over the rows; None where there is but one
-    kinds: tuple[str, ...]  # kinds among the rows, of KINDS and SOURCES in their order
+    kinds: tuple[str, ...]  # kinds among the rows, in their order: of KINDS, then lights
     kind: Tensor | None  # (K,) index into `kinds`; None where there is but one
     p0: Tensor  # (3, K)
     e1: Tensor  # (3, K)
     e2: Tensor  # (3, K)
     normal: Tensor  # (3, K) unit, the side that emits
     flip: Tensor  # (K,) -1 where a sphere emits inward
-    area: Tensor  # (K,); of a quadric its own space's area times |det|, see torchpt.lights.quadric
+    area: Tensor  # (K,); of a quadric its own space's area times |det|, see torchpt.lights.surfaces.quadric
     bound: Tensor  # (K,) see LaneGeometry.bound
     radiance: Tensor  # (3, K); of a point or spot its intensity, of a directional light its irradiance
     opacity: Tensor | None  # (K,) of the surface that emits; None where all are opaque
-    environment: Tensor | EnvironmentMap | None  # what comes from outside: one radiance (3,), or a map
+    environment: Any  # what comes from outside, as the class of the last row made it; None where nothing does
     row_of_prim: Tensor | None  # (P + I,) int64, -1 where a primitive does not emit; None where none does
     quadric: (
         Tensor | None
@@ -155,6 +159,7 @@ class Lights:
 class LaneGeometry:
     """Where surfaces lie, as the lanes gather it: P primitives, and I copies (see :class:`Copies`)."""
 
+    kinds: tuple[type[Primitive], ...]  # those that there are, in the order of KINDS; static
     counts: tuple[int, int, int, int, int]  # as in Geometry; static: lanes read `ends`
     ends: Tensor  # (5,) int64 the id after the last primitive of each kind
     p0: Tensor  # (3, P)
@@ -185,6 +190,12 @@ class LaneGeometry:
         copy = self.copy(prim)
         return torch.where(copy > 0, copy + (self.ends[4] - 1), prim)
 
+    def of(self, kind: type[Primitive], prim: Tensor) -> Tensor:
+        """Which of ``prim (N,)`` are of a kind that the scene has: ``(N,)`` bool."""
+        number = KINDS.index(kind.name)
+        after = prim >= self.ends[number - 1] if number else prim >= 0
+        return after & (prim < self.ends[number]) if any(self.counts[number + 1 :]) else after
+
     def copy(self, prim: Tensor) -> Tensor:
         """Columns ``(N,)`` of ``copies`` for ids of primitives as the search gives them."""
         import torch
@@ -210,11 +221,14 @@ class LaneMaterials:
 class LaneTextures:
     """The textures, and those that surfaces read whatever their model."""
 
-    atlas: Atlas | None = None  # None where no texture is read
+    tables: tuple[Table, ...] = ()  # what is read, by the code that reads it
     opacity: OpacityMaps | None = None  # None where there are none
-    emission: Tensor | None = (
-        None  # (P + I,) int64 node of the emission map, -1 where there is none; None where none is
-    )
+    emission: NodeMap | None = None  # None where there are none
+
+    @property
+    def filtered(self) -> bool:
+        """Whether any averages over a pixel's footprint."""
+        return any(table.filtered for table in self.tables)
 
 
 @dataclass(frozen=True)
@@ -337,10 +351,13 @@ R = TypeVar("R", PathState, Hit, Quadrics, Copies)
 
 
 def rows(record: R, index: Tensor) -> R:
-    """The lanes ``index`` of a record of tensors."""
+    """The lanes ``index`` of a record of tensors; what is static stays."""
     values: dict[str, Any] = {f.name: getattr(record, f.name) for f in fields(record)}
-    found: dict[str, Any] = {name: None if value is None else take(value, index) for name, value in values.items()}
-    return type(record)(**found)
+    static = (tuple, type(None))
+    lanes: dict[str, Any] = {
+        name: value if isinstance(value, static) else take(value, index) for name, value in values.items()
+    }
+    return type(record)(**lanes)
 
 
 def joined(records: list[R]) -> R:

@@ -17,7 +17,7 @@ from torchpt.spec import Choice, Other, Refused, Scalar, Valued, Whole, not_buil
 from torchpt.spec.declared import Described, described, refuse_foreign, values_of
 from torchpt.spec.validate import check_keys, dotted, refuse_not_built
 
-__all__ = ["BLOCKS", "FILTERS", "INTEGRATORS", "SAMPLERS", "TYPED", "Film", "Render", "Settings", "merge"]
+__all__ = ["BLOCKS", "FILTERS", "INTEGRATORS", "RECORDS", "SAMPLERS", "TYPED", "Film", "Render", "Settings", "merge"]
 
 BLOCKS = ("film", "integrator", "sampler", "render")
 MAX_SIDE = 65_536
@@ -65,7 +65,11 @@ class Film(Valued):
     parameters: ClassVar = {
         "width": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
         "height": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
-        "filter": Other(lambda _: _typed("filter", {}, "film.filter"), doc="a type, or a mapping"),
+        "filter": Other(
+            lambda _: _typed("filter", {}, "film.filter"),
+            words=f"{', '.join(FILTERS)}, or a mapping",
+            doc="how samples become pixels",
+        ),
         "crop": Other(
             None,
             reader=_crop,
@@ -147,6 +151,10 @@ class Render(Valued):
             doc="albedo and normal beside it first, then the picture so far after each pass",
         ),
     }
+
+
+#: The blocks without types.
+RECORDS: Mapping[str, type[Valued]] = {"film": Film, "render": Render}
 
 
 @dataclass(frozen=True)

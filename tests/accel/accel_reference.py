@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from torchpt.records import Geometry
+from torchpt.shapes.quadrics import quadrics_of, table_of
 
 
 def geometry(p0, p1, p2, counts):
@@ -11,6 +12,11 @@ def geometry(p0, p1, p2, counts):
     a, b, c = (torch.tensor(np.asarray(p, np.float32).reshape(-1, 3).T.copy()) for p in (p0, p1, p2))
     n = [*counts, 0][:5]
     return Geometry(a, b, c, (n[0], n[1], n[2], n[3], n[4]))
+
+
+def quadric_table(kinds, frames):
+    """Quadrics of these kinds under maps ``(12, Q)`` float64, as the search sees them."""
+    return table_of(quadrics_of(kinds, [False] * len(kinds), frames, torch.float64), frames)
 
 
 def triangles(vertices, faces):

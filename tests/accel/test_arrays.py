@@ -5,10 +5,12 @@ import threading
 import numpy as np
 import pytest
 import torch
-from accel_reference import rays, soup, sphere_mesh, triangles
+from accel_reference import quadric_table, rays, soup, sphere_mesh, triangles
 
 from torchpt.accel import build
 from torchpt.records import Geometry
+from torchpt.shapes.kinds.cylinder import Cylinder
+from torchpt.shapes.kinds.sphere import Ellipsoid
 
 COUNTS = (0, 1, 15, 16, 63, 64, 65, 1000)
 
@@ -29,12 +31,10 @@ def with_copies():
 
 def with_quadrics():
     g = soup(2, (12, 3, 2, 2))
-    q = torch.tensor(
-        [[0.2, 0, 0, 0.5, 0, 0, 0, 0.4, 0, 0, 0, 0.3, 0.0], [-0.5, 0, 0, 0.3, 0, 0, 0, 0.3, 0, 0, 0, 1.0, 1.0]]
-    )
+    q = torch.tensor([[0.2, 0, 0, 0.5, 0, 0, 0, 0.4, 0, 0, 0, 0.3], [-0.5, 0, 0, 0.3, 0, 0, 0, 0.3, 0, 0, 0, 1.0]])
     q = q.double().T.contiguous()
     p = [torch.cat([a, b.float()], 1) for a, b in ((g.p0, q[0:3]), (g.p1, q[3:6]), (g.p2, q[6:9]))]
-    return Geometry(p[0], p[1], p[2], (*g.counts[:4], 2), q)
+    return Geometry(p[0], p[1], p[2], (*g.counts[:4], 2), quadric_table((Ellipsoid, Cylinder), q))
 
 
 SCENES = {

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 import torch
-from accel_reference import geometry, soup, sphere_mesh, triangles
+from accel_reference import geometry, quadric_table, soup, sphere_mesh, triangles
 from scalar_search import _triangle
 from test_arrays import with_copies, with_quadrics
 from test_bits import KINDS, equal_bits, found, make_rays
@@ -20,6 +20,8 @@ from torchpt.accel.tables import prepare
 from torchpt.accel.topology import REBUILD
 from torchpt.accel.wide import Wide
 from torchpt.records import Geometry
+from torchpt.shapes.kinds.cylinder import Cylinder
+from torchpt.shapes.kinds.sphere import Ellipsoid
 
 EMPTY = np.array([np.inf] * 3 + [-np.inf] * 3, np.float32)
 
@@ -42,10 +44,11 @@ def moved(g, seed, size):
     p = [p + size * torch.from_numpy(rng.normal(size=p.shape)).float() for p in (g.p0, g.p1, g.p2)]
     q = g.quadrics
     if q is not None:
-        q = torch.cat([q[:12] + size * torch.from_numpy(rng.normal(size=(12, q.shape[1]))), q[12:]])
+        frame = q.frame + size * torch.from_numpy(rng.normal(size=q.frame.shape))
+        q = quadric_table((Ellipsoid, Cylinder), frame)
         first = sum(g.counts[:4])
         for corner, at in zip(p, (0, 3, 6), strict=True):
-            corner[:, first:] = q[at : at + 3].float()
+            corner[:, first:] = frame[at : at + 3].float()
     return Geometry(p[0], p[1], p[2], g.counts, q, g.copies)
 
 
@@ -254,9 +257,9 @@ def test_a_ball_without_a_radius_is_no_point_to_be_hit():
 def test_quadrics_lose_their_volume_and_get_it_back(whatever_it_costs):
     g = with_quadrics()
     assert g.quadrics is not None
-    table = g.quadrics.clone()
-    table[3:6, 1] = 0
-    flat = Geometry(g.p0, g.p1, g.p2, g.counts, table)
+    frame = g.quadrics.frame.clone()
+    frame[3:6, 1] = 0
+    flat = Geometry(g.p0, g.p1, g.p2, g.counts, quadric_table((Ellipsoid, Cylinder), frame))
     rays = make_rays("random", g, 40_000)
     a, b = Wide(g, 1), refitted(Wide(g, 1), flat)
     assert (found(a, *rays)[1] == g.size - 1).sum() > 50 and not (found(b, *rays)[1] == g.size - 1).any()

@@ -117,8 +117,10 @@ def test_gradients_of_rays_and_footprints_are_finite_differences(name):
     leaves = [params[key].clone().requires_grad_() for key in names]
     assert torch.autograd.gradcheck(seen, leaves, eps=1e-6, atol=1e-7, rtol=1e-5)
     made = seen(*leaves)
-    weights = [numbers(*value.shape, 9) if value.dim() == 2 else torch.ones_like(value) for value in made]
-    total = sum((weight * value).sum() for weight, value in zip(weights, made, strict=True))
+    weights = [
+        numbers(value.shape[0], value.shape[1], 9) if value.dim() == 2 else torch.ones_like(value) for value in made
+    ]
+    total = torch.stack([(weight * value).sum() for weight, value in zip(weights, made, strict=True)]).sum()
     for key, gradient in zip(names, torch.autograd.grad(total, leaves), strict=True):
         assert float(gradient.abs().max()) > 1e-4, key  # none is left out
 

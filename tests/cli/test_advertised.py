@@ -73,6 +73,10 @@ def shrunk(words: list[str]) -> list[str]:
     return made + [f"{key}={value}" for key, value in left.items()]
 
 
+def quick(command: str) -> bool:
+    return "--cfg" in command or any(f"scene={name}" in command.split() for name in QUICK)
+
+
 TORCHPT = commands("torchpt")
 
 
@@ -94,15 +98,7 @@ def test_every_file_in_configs_opens_with_its_command() -> None:
 
 @pytest.mark.parametrize(
     ("where", "command"),
-    [
-        pytest.param(
-            *item,
-            marks=()
-            if any(f"scene={name} " in f"{item[1]} " for name in QUICK) or "--cfg" in item[1]
-            else pytest.mark.slow,
-        )
-        for item in TORCHPT
-    ],
+    [pytest.param(*item, marks=() if quick(item[1]) else pytest.mark.slow) for item in TORCHPT],
     ids=lambda value: value,
 )
 def test_advertised_commands_run(

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.adjoint import attached
 from torchpt.bsdfs import KINDS, Bsdf, Parameters
 from torchpt.bsdfs.kinds.blend import Blend
 from torchpt.bsdfs.kinds.blinn_phong import BlinnPhong
@@ -639,7 +640,9 @@ OWN = {"mine": Tinted()}
 
 
 def test_a_model_of_the_callers_own() -> None:
-    assert slot(OWN, type="mine") == ResolvedMaterial(Tinted(), "materials.m", {**Tinted.parameters})
+    assert slot(OWN, type="mine") == ResolvedMaterial(
+        Tinted(), "materials.m", {"tint": (0.5, 0.25, 1.0), "amount": -2.0}
+    )
     found = slot(OWN, type="mine", tint=-3, amount=1e6, **COMMON)
     assert found.values == {"tint": (-3, -3, -3), "amount": 1e6} and found.emission == (1, 2, 3)
     assert found.model is OWN["mine"]
@@ -817,10 +820,31 @@ def test_texels_are_held_to_what_their_slots_accept(tmp_path: Path) -> None:
 
 def test_indices_bend_rays_and_textures_of_them_too(tmp_path: Path) -> None:
     def bending(**keys: Any) -> set[str]:
-        found = loaded(keys)
-        return {name for part in found.built.parts for slot in part.material.all() for name in slot.bending()}
+        made = loaded(keys)
+        return {name for name in made.params if name.startswith("materials.m.") and attached(made, [name])}
 
     squares = {"type": "checkerboard", "color0": 1.3, "color1": 1.5}
     assert bending(type="dielectric") == {"materials.m.int_ior", "materials.m.ext_ior"}
-    assert bending(type="roughdielectric", int_ior=squares) == {"materials.m.int_ior", "materials.m.ext_ior"}
+    assert bending(type="roughdielectric", int_ior=squares) == {
+        "materials.m.int_ior.color0", "materials.m.int_ior.color1", "materials.m.ext_ior",
+    }  # fmt: skip
     assert not bending(type="plastic") and not bending(type="thindielectric")
+
+
+@pytest.mark.parametrize("kind", ["roughconductor", "roughdielectric"])
+def test_energy_compensation_beside_textures(kind: str) -> None:
+    """Its table is made once a material, also where the rest is prepared on lanes."""
+
+    def picture(**keys: Any) -> Tensor:
+        lights, film = {"sky": {"type": "constant"}}, {"width": 8, "height": 8}
+        material = {"type": kind, "alpha": 0.5, "energy_compensation": True, **keys}
+        described = {**scene({"m": material}, material="m"), "lights": lights, "film": film}
+        return torchpt.render(torchpt.load(described, "cpu"), spp=4, seed=1, compile="off")
+
+    def even(*color: float) -> dict[str, Any]:
+        return {"type": "checkerboard", "color0": list(color), "color1": list(color)}
+
+    flat = picture(normal_map=even(0.5, 0.5, 1.0))
+    torch.testing.assert_close(flat.mean(), picture().mean(), rtol=0.02, atol=0)
+    tint = picture(specular_reflectance=even(0.25, 0.5, 0.75))
+    torch.testing.assert_close(tint, picture(specular_reflectance=[0.25, 0.5, 0.75]), rtol=1e-4, atol=1e-5)

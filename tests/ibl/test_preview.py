@@ -13,8 +13,8 @@ from torch import Tensor
 import torchpt
 from torchpt import bsdfs
 from torchpt.ibl import IblMaps, Sky, brdf_table
-from torchpt.integrators.kinds.ibl import without_environment
 from torchpt.integrators.split_sum import under
+from torchpt.lights import without_environment
 from torchpt.math.distributions import Discrete
 
 IBL = {"type": "ibl"}

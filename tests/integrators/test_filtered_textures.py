@@ -15,6 +15,7 @@ from torchpt.errors import SceneError
 from torchpt.format.description import settings
 from torchpt.images import write_image
 from torchpt.rendering import render_scene
+from torchpt.textures.atlas import Atlas
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
 
@@ -137,19 +138,16 @@ def test_what_is_read_at_points_says_so(slot: str, image: str):
     }
     loaded = torchpt.load(named)
     world, _ = loaded.world(torch.float32)
-    assert (
-        world.textures.atlas is not None and world.textures.atlas.pyramids is None and world.geometry.bitangents is None
-    )
+    assert not world.textures.filtered and world.geometry.bitangents is None
 
 
 def test_nothing_is_built_without_it(image: str):
     world, _ = torchpt.load(floor(picture(image, "bilinear"))).world(torch.float32)
-    assert (
-        world.textures.atlas is not None and world.textures.atlas.pyramids is None and world.geometry.tangents is None
-    )
-    assert world.textures.atlas.texels.numel() == 3 * 33 * 64
+    (atlas,) = world.textures.tables
+    assert isinstance(atlas, Atlas) and atlas.pyramids is None and world.geometry.tangents is None
+    assert atlas.texels.numel() == 3 * 33 * 64
     world, _ = torchpt.load(floor(picture(image, "trilinear"))).world(torch.float32)
-    assert world.textures.atlas is not None and world.textures.atlas.texels.numel() == 3 * (
-        33 * 64 + 16 * 32 + 8 * 16 + 4 * 8 + 2 * 4 + 1 * 2 + 1
-    )
-    assert np.isfinite(world.textures.atlas.texels.numpy()).all()
+    (atlas,) = world.textures.tables
+    assert isinstance(atlas, Atlas)
+    assert atlas.texels.numel() == 3 * (33 * 64 + 16 * 32 + 8 * 16 + 4 * 8 + 2 * 4 + 1 * 2 + 1)
+    assert np.isfinite(atlas.texels.numpy()).all()

@@ -27,7 +27,6 @@ from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import normalize
 from torchpt.math.warps import concentric_disk, one_minus_cos, uniform_cone, uniform_sphere
 from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.samplers import Sampler, salts
 
 GRAIN = 32_768  # elements that torch leaves to one thread
 N = 70_003  # above that: two threads share it, and the last vector is not full
@@ -138,16 +137,6 @@ def test_a_lanes_value_does_not_depend_on_its_place(number):
 
 def _same(a: torch.Tensor, b: torch.Tensor) -> bool:
     return torch.equal(a.contiguous().view(torch.int32), b.contiguous().view(torch.int32))
-
-
-@pytest.mark.parametrize("sampler", list(SAMPLERS))
-def test_numbers_drawn_do_not_depend_on_their_place(sampler):
-    module, salt = SAMPLERS[sampler], salts(3, torch.device("cpu"))[4]
-    key = Sampler(sampler, 5, 4, 97, 300).key(torch.arange(N), torch.arange(N) % 97)
-    for draw in (module.draw_1d, module.draw_2d):
-        whole = draw(key, salt)
-        for first, size in ((0, 1), (1, 3), (3, 1001), (11, 32_769)):
-            assert torch.equal(draw(key[:, first : first + size], salt), whole[..., first : first + size])
 
 
 class _Recorder(TorchDispatchMode):

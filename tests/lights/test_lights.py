@@ -12,7 +12,7 @@ from trials import SIGNIFICANCE, chi_square_p
 
 import torchpt
 from torchpt import lights
-from torchpt.lights import sphere
+from torchpt.lights.surfaces import sphere
 from torchpt.math.distributions import Discrete
 from torchpt.math.vectors import dot
 from torchpt.records import Hit

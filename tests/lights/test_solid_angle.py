@@ -47,13 +47,13 @@ def code(name: str) -> int:
     return {"sliver": TRIANGLE, "strip": RECTANGLE}.get(name, CODES.get(name, OTHER))
 
 
-def kind(name: str) -> str:
-    return "triangle" if code(name) == TRIANGLE else "rectangle"
+def told(name: str) -> int:
+    return TRIANGLE if code(name) == TRIANGLE else RECTANGLE
 
 
 def table(name: str, light: tuple[Tensor, Tensor, Tensor] | None = None, near: float = math.inf) -> Tensor:
     """Of one light; without a limit of the distance unless told."""
-    found = solid_angle.table_of([kind(name)], *(light or LIGHTS[name]), near)
+    found = solid_angle.table_of([told(name)], *(light or LIGHTS[name]), near)
     assert found is not None
     return found
 
@@ -217,8 +217,8 @@ def _scatter(n: int, dtype: torch.dtype, near: float = math.inf) -> tuple[Tensor
     reach = size[row] * 10.0 ** (torch.rand(n, generator=g) * 5 - 3)
     p0 = torch.randn(3, k, generator=g)
     x = p0[:, row] + normalize(torch.randn(3, n, generator=g)) * reach
-    names = [("triangle", "rectangle", "rectangle", "disk")[code] for code in codes.tolist()]
-    lights = solid_angle.table_of(names, p0, e1, e2, near)
+    told = [(TRIANGLE, RECTANGLE, RECTANGLE, OTHER)[code] for code in codes.tolist()]
+    lights = solid_angle.table_of(told, p0, e1, e2, near)
     assert lights is not None and torch.equal(lights[:, 0].long(), codes)
     return lights, row, x.to(dtype), torch.rand(2, n, generator=g).to(dtype)
 
@@ -420,12 +420,12 @@ def test_beyond_some_radii_lights_are_sampled_by_area():
 def test_shapes():
     e1 = torch.tensor([[1.0, 0, 0], [1, 0, 0], [1e3, 0, 0], [1, 0, 0], [1, 0, 0]]).T
     e2 = torch.tensor([[0.0, 2, 0], [1e-3, 1, 0], [1e-9, 1e-3, 0], [1, 1, 0], [1, 1, 0]]).T
-    lights = solid_angle.table_of(["rectangle", "rectangle", "rectangle", "triangle", "constant"], e1, e1, e2)
+    lights = solid_angle.table_of([RECTANGLE, RECTANGLE, RECTANGLE, TRIANGLE, OTHER], e1, e1, e2)
     assert lights is not None and lights[:, 0].tolist() == [RECTANGLE, SKEW, RECTANGLE, TRIANGLE, OTHER]
-    assert solid_angle.table_of(["disk", "sphere"], e1[:, :2], e1[:, :2], e2[:, :2]) is None
+    assert solid_angle.table_of([OTHER, OTHER], e1[:, :2], e1[:, :2], e2[:, :2]) is None
     turned = torch.linalg.qr(torch.randn(100, 3, 3, generator=torch.Generator().manual_seed(1)))[0]
     a, b = turned[:, :, 0].T * 7, turned[:, :, 1].T * 0.1
-    lights = solid_angle.table_of(["rectangle"] * 100, a, a, b)
+    lights = solid_angle.table_of([RECTANGLE] * 100, a, a, b)
     assert lights is not None and bool((lights[:, 0] == RECTANGLE).all())
 
 

@@ -1,11 +1,11 @@
-"""What comes through trimesh: the long tail of formats, its objects as meshes, and its scenes as ours."""
+"""Objects of trimesh: its meshes as ours, and its scenes."""
 
 from __future__ import annotations
 
 import copy
 import io
-import zipfile
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,9 @@ from PIL import Image
 import torchpt
 from torchpt.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, read_texels
-from torchpt.meshes import FORMATS, PARSERS, load_mesh
 from torchpt.scene.from_trimesh import description_of
 
-trimesh: Any = pytest.importorskip("trimesh")
+trimesh: Any = import_module("trimesh")  # hardly typed
 PBRMaterial = trimesh.visual.material.PBRMaterial
 SimpleMaterial = trimesh.visual.material.SimpleMaterial
 TextureVisuals = trimesh.visual.TextureVisuals
@@ -51,183 +50,6 @@ def parts_of(source: Any, **keys: Any) -> Any:
         "shapes": {"thing": {"type": "mesh", "mesh": source, **keys}},
     }
     return torchpt.load(described, "cpu").built.parts
-
-
-# --- files
-
-
-def needs(kind: str) -> None:
-    for name in PARSERS[kind]:
-        pytest.importorskip(name, reason=f"{name} is not installed (extra `formats`)")
-
-
-XAML = """<Viewport3D xmlns="http://schemas.microsoft.com/winfx/2006/xaml/presentation"><ModelVisual3D><GeometryModel3D>
-<GeometryModel3D.Material><DiffuseMaterial><DiffuseMaterial.Brush><SolidColorBrush Color="#FF8000" Opacity="1"/>
-</DiffuseMaterial.Brush></DiffuseMaterial></GeometryModel3D.Material><GeometryModel3D.Geometry>
-<MeshGeometry3D Positions="0,0,0 1,0,0 1,1,0" Normals="0,0,1 0,0,1 0,0,1" TriangleIndices="0 1 2"/>
-</GeometryModel3D.Geometry></GeometryModel3D></ModelVisual3D></Viewport3D>"""
-
-DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><created>2020-01-01T00:00:00</created><modified>2020-01-01T00:00:00</modified></asset>
-<library_images><image id="img"><init_from>wood.png</init_from></image></library_images>
-<library_effects><effect id="fx"><profile_COMMON>
-<newparam sid="surf"><surface type="2D"><init_from>img</init_from></surface></newparam>
-<newparam sid="samp"><sampler2D><source>surf</source></sampler2D></newparam>
-<technique sid="common"><lambert><diffuse><texture texture="samp" texcoord="UV"/></diffuse></lambert></technique>
-</profile_COMMON></effect></library_effects>
-<library_materials><material id="mat"><instance_effect url="#fx"/></material></library_materials>
-<library_geometries><geometry id="geo"><mesh>
-<source id="p"><float_array id="pa" count="9">0 0 0 1 0 0 1 1 0</float_array><technique_common>
-<accessor source="#pa" count="3" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
-<param name="Z" type="float"/></accessor></technique_common></source>
-<source id="t"><float_array id="ta" count="6">0 0 1 0 1 0.75</float_array><technique_common>
-<accessor source="#ta" count="3" stride="2"><param name="S" type="float"/><param name="T" type="float"/></accessor>
-</technique_common></source>
-<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
-<triangles count="1" material="m"><input semantic="VERTEX" source="#v" offset="0"/>
-<input semantic="TEXCOORD" source="#t" offset="1"/><p>0 0 1 1 2 2</p></triangles></mesh></geometry></library_geometries>
-<library_visual_scenes><visual_scene id="s"><node><translate>0 0 5</translate><instance_geometry url="#geo"><bind_material>
-<technique_common><instance_material symbol="m" target="#mat"/></technique_common></bind_material></instance_geometry>
-</node></visual_scene></library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
-
-
-def zipped(**members: bytes) -> bytes:
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members.items():
-            archive.writestr(name.replace("_", "."), content)
-    return data.getvalue()
-
-
-def encoded(kind: str) -> bytes:
-    """A file of each format."""
-    needs(kind)
-    if kind == ".xaml":
-        return XAML.encode()
-    if kind == ".dae":
-        return DAE.encode()
-    if kind == ".zae":
-        picture().save(png := io.BytesIO(), "PNG")
-        return zipped(a_dae=DAE.encode(), wood_png=png.getvalue())
-    if kind == ".3dxml":
-        pytest.skip("nothing writes it")
-    exported = (trimesh.Scene(BALL) if kind == ".3mf" else BALL).export(file_type=kind[1:])
-    return exported.encode() if isinstance(exported, str) else exported
-
-
-def loaded(folder: Path, kind: str, data: bytes) -> Any:
-    (folder / f"a{kind}").write_bytes(data)
-    picture().save(folder / "wood.png")
-    return load_mesh(folder / f"a{kind}")
-
-
-@pytest.mark.parametrize("kind", [".off", ".3mf"])
-def test_what_trimesh_writes_is_read(tmp_path: Path, kind: str) -> None:
-    (part,) = loaded(tmp_path, kind, encoded(kind))
-    assert np.allclose(part.vertices[part.faces], BALL.vertices[BALL.faces], atol=1e-6)
-    assert part.normals is None and part.material is None
-    scene = torchpt.load(
-        {
-            "camera": {"origin": [0, 0, 4], "target": [0, 0, 0]},
-            "film": SMALL,
-            "shapes": {"ball": {"type": "mesh", "path": str(tmp_path / f"a{kind}")}},
-            "lights": {"sky": {"type": "constant", "radiance": 1}},
-        },
-        "cpu",
-    )
-    assert torchpt.render(scene, spp=1, compile="off")[9, 12, 0] == pytest.approx(0.5, abs=0.1)
-
-
-@pytest.mark.parametrize("kind", [".dae", ".zae"])
-def test_collada_has_its_nodes_materials_and_pictures(tmp_path: Path, kind: str) -> None:
-    (part,) = loaded(tmp_path, kind, encoded(kind))
-    assert np.allclose(part.vertices, [[0, 0, 5], [1, 0, 5], [1, 1, 5]])
-    assert np.allclose(part.uvs, [[0, 1], [1, 1], [1, 0.25]])  # row 0 at v = 0
-    look = part.material.material
-    assert look["type"] == "principled" and look["roughness"] == 1.0 and "metallic" not in look
-    texels = read_texels(look["base_color"]["path"])
-    assert np.array_equal(texels.values, np.asarray(picture(), np.float32) / np.float32(255)) and texels.eight_bit
-
-
-def test_xaml_has_its_colours(tmp_path: Path) -> None:
-    (part,) = loaded(tmp_path, ".xaml", encoded(".xaml"))
-    assert np.allclose(part.colors, [[1.0, 128 / 255, 0.0]] * 3) and np.allclose(part.normals, [[0, 0, 1]] * 3)
-    assert part.material.material["reflectance"] == {"type": "vertex_color"}
-
-
-def test_a_picture_that_is_missing_is_named(tmp_path: Path) -> None:
-    data = encoded(".dae").replace(b"wood.png", b"../secret.png")
-    with pytest.raises(AssetError, match=r"a\.dae: the file '../secret\.png' is missing"):
-        loaded(tmp_path, ".dae", data)
-    assert load_mesh(tmp_path / "a.dae", materials=False)
-
-
-@pytest.mark.parametrize("kind", [kind for kind, packages in PARSERS.items() if packages])
-def test_a_package_that_is_missing_is_named(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchpt.meshes.others.find_spec", lambda name: None)
-    with pytest.raises(AssetError) as caught:
-        loaded(tmp_path, kind, b"")
-    line = str(caught.value)
-    assert "\n" not in line and f"reading {kind} needs the package" in line and "torchpt-renderer[formats]" in line
-    assert all(name in line for name in PARSERS[kind])
-
-
-@pytest.mark.parametrize("kind", [".off", ".3mf", ".dae", ".zae", ".xaml"])
-def test_damaged_files_are_one_line(tmp_path: Path, kind: str) -> None:
-    data = encoded(kind)
-    rng = np.random.default_rng(7)
-    damages = [b"", b"OFF", b"PK\3\4", b"\0" * 100, data[: len(data) // 2], data[:-1], data + data]
-    for _ in range(12):
-        damaged = bytearray(data)
-        for at in rng.integers(0, len(data), 3):
-            damaged[at] = rng.integers(0, 256)
-        damages.append(bytes(damaged))
-    refused = 0
-    for damaged in damages:
-        try:
-            loaded(tmp_path, kind, damaged)
-        except AssetError as error:
-            refused += 1
-            assert "\n" not in str(error) and str(error).startswith(f"{tmp_path}/a{kind}: ")
-    assert refused >= 5
-
-
-OFF_ERRORS = {
-    "an index out of range": ("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", "face index outside"),
-    "a vertex that is not finite": ("OFF\n3 1 0\n0 0 nan\n1 0 0\n0 1 0\n3 0 1 2\n", "vertex 0 is not finite"),
-    "no face": ("OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", "a.off: "),
-    "more than there is": ("OFF\n99999999 1 0\n0 0 0\n", "malformed .off"),
-}
-
-
-@pytest.mark.parametrize("name", OFF_ERRORS)
-def test_what_is_wrong_with_an_off_file(tmp_path: Path, name: str) -> None:
-    text, said = OFF_ERRORS[name]
-    with pytest.raises(AssetError, match=said):
-        loaded(tmp_path, ".off", text.encode())
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
-def test_xml_that_declares_entities_is_refused(tmp_path: Path, encoding: str) -> None:
-    needs(".dae")
-    text = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]>' + DAE.partition("?>")[2]
-    with pytest.raises(AssetError, match="declares a document type"):
-        loaded(tmp_path, ".dae", text.encode(encoding))
-    with pytest.raises(AssetError, match="declares a document type"):
-        loaded(tmp_path, ".zae", zipped(a_dae=text.encode(encoding)))
-
-
-def test_an_archive_that_unfolds_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchpt.meshes.others.MOST_UNFOLDED", 10_000)
-    with pytest.raises(AssetError, match="unfolds to 20000 bytes, more than 10000"):
-        needs(".3mf")
-        loaded(tmp_path, ".3mf", zipped(a_model=b" " * 20_000))
-
-
-def test_unknown_endings_are_told_all_formats(tmp_path: Path) -> None:
-    with pytest.raises(AssetError, match=r"ending in \.obj.*\.off, \.3mf, \.dae.*got \.step"):
-        load_mesh(tmp_path / "a.step")
-    assert set(PARSERS) < set(FORMATS)
 
 
 # --- objects
@@ -421,8 +243,7 @@ def test_rays_hit_what_they_hit_in_trimesh() -> None:
     expected = np.full(4000, np.inf)
     expected[rays] = np.linalg.norm(places - origins[rays], axis=1)
     o, d = (torch.from_numpy(np.ascontiguousarray(rows.T, np.float32)) for rows in (origins, aims))
-    hits = scene.accel("auto", None).intersect(o, d, torch.full((4000,), torch.inf))
-    t = hits[0].numpy() if isinstance(hits, tuple) else hits.t.numpy()
+    t = scene.accel("auto", None).intersect(o, d, torch.full((4000,), torch.inf))[0].numpy()
     assert 0.3 < np.isfinite(expected).mean() < 1
     agree = np.isclose(t, expected, rtol=1e-4) | (np.isinf(t) & np.isinf(expected))
     assert agree.mean() > 0.999  # but for edges

@@ -89,12 +89,19 @@ FEATURES: dict[str, Feature] = {
     "texture": Feature(
         ("textures/atlas.py",),
         lambda scene: _material(scene, reflectance=_squares()),
-        ("world.textures.atlas", "world.geometry.uvs"),
+        ("world.textures.tables", "world.geometry.uvs"),
+        module="torchpt.textures.atlas",
+    ),
+    "noise": Feature(
+        ("textures/kinds/noise.py", "textures/computed.py"),
+        lambda scene: _material(scene, reflectance={"type": "noise", "color0": 0.2, "color1": 0.8, "octaves": 2}),
+        ("world.textures.tables", "world.geometry.uvs"),
+        module="torchpt.textures.kinds.noise",
     ),
     "normal map": Feature(
         ("integrators/relief.py",),
         lambda scene: _material(scene, normal_map=_squares(color0=[0.6, 0.45, 0.95], color1=[0.4, 0.5, 0.95])),
-        ("world.textures.atlas", "world.geometry.tangents"),
+        ("world.textures.tables", "world.geometry.tangents"),
     ),
     "opacity": Feature(
         ("integrators/search.py",), lambda scene: _material(scene, opacity=0.5), ("world.materials.opacity",), ("clear",)

@@ -15,6 +15,7 @@ from torchpt.integrators import compiled
 from torchpt.integrators.loop import kernels
 from torchpt.integrators.loop.schedule import Loop
 from torchpt.rendering import Rendering, render_scene
+from torchpt.samplers import points_of
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
 
@@ -145,7 +146,7 @@ def test_two_graphs_a_stage_and_none_later():
 def test_more_graphs_than_two_are_an_error_not_a_fall_back():
     scene = torchpt.load("cornell_box", device="cuda")
     world, _ = scene.world(torch.float32)
-    plan = compiled.Plan("sobol", "mis", None, torch.float32, False, False)
+    plan = compiled.Plan(points_of("sobol"), "mis", None, torch.float32, False, False)
     stages = compiled.CompiledStages(plan, world)
 
     def stage(x: torch.Tensor) -> torch.Tensor:

@@ -186,5 +186,4 @@ def _blocked(module: str) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("module", sorted({f.module for f in FEATURES.values() if f.module is not None}))
 def test_the_same_picture_where_its_module_cannot_be_imported(module, unblocked):
-    """Textures are imported together, and are not asked here."""
     assert _blocked(module) == [*unblocked, "missed"]

@@ -255,7 +255,7 @@ def test_only_spp_may_end_such_a_render(kind, key):
         settings(scene, {"sampler": kind, "render": {key: 5}})
     assert caught.value.key == f"render.{key}" and "\n" not in str(caught.value)
     assert not isinstance(caught.value, NotBuiltError)
-    assert settings(scene, {"sampler": kind, "render": {key: None}}).sampler.needs_count
+    assert settings(scene, {"sampler": kind, "render": {key: None}}).sampler.kind.needs_count
     with pytest.raises(ValueError, match="must know their number"):
         Sampler(kind, 0, 2, 1)
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from trials import SIGNIFICANCE, grid_cells, uniform_p
 
+from torchpt.math.hashing import logical_shift, mix, mix_int, to_unit
 from torchpt.samplers import KINDS, Dimension, Sampler, points_of, salts
-from torchpt.samplers.hashing import logical_shift, mix, mix_int, to_unit
 
 CPU = torch.device("cpu")
 independent = points_of("independent")

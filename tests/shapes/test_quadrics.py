@@ -89,7 +89,7 @@ def check(name: str, placed: str, n: int, seed: int, backends: tuple[str, ...]) 
         assert ((at.ng - bend).norm(dim=0) / (1 if world.geometry.counts[4] else 1 + scale)).max() < loose
         if world.geometry.counts[4]:
             assert at.own is not None
-            uv = quadrics.surface_uv(quadrics.rows(world, at.prim).code, at.own).double()
+            uv = quadrics.surface_uv(quadrics.rows(world, at.prim), at.own).double()
             apart = (uv - torch.from_numpy(truth["uv"])[:, side]).abs()
             apart[0] = torch.minimum(apart[0], 1 - apart[0])
             assert apart[1].max() < 1e-6
@@ -163,8 +163,7 @@ def test_bounds_are_tight():
         low, high = primitive_bounds(geometry)
         g = torch.Generator().manual_seed(7)
         n = 400_000
-        code = world.geometry.quadrics.code.expand(n)
-        own = quadrics.sample(code, torch.rand(2, n, generator=g, dtype=torch.float64))
+        own = quadrics.sample(world.geometry.quadrics, torch.rand(2, n, generator=g, dtype=torch.float64))
         p = (
             world.geometry.p0
             + world.geometry.e1 * own[0]
@@ -206,14 +205,13 @@ def test_tangents_are_the_inverse_of_how_texture_coordinates_change(name):
     world, _ = scene.world(torch.float64)
     assert world.geometry.quadrics is not None
     n = 2000
-    code = world.geometry.quadrics.code.expand(n)
-    own = quadrics.sample(code, torch.rand(2, n, generator=torch.Generator().manual_seed(2), dtype=torch.float64))
+    table = quadrics.rows(world, torch.zeros(n, dtype=torch.int64))
+    own = quadrics.sample(table, torch.rand(2, n, generator=torch.Generator().manual_seed(2), dtype=torch.float64))
     e1, e2, e3 = (x.expand(3, n) for x in (world.geometry.e1, world.geometry.e2, world.geometry.quadrics.e3))
     inverse = torch.linalg.inv(torch.cat((world.geometry.e1, world.geometry.e2, world.geometry.quadrics.e3), 1))
     p = (e1 * own[0] + e2 * own[1] + e3 * own[2]).requires_grad_()
-    u, v = quadrics.surface_uv(code, inverse @ p)
+    u, v = quadrics.surface_uv(table, inverse @ p)
     slopes = [torch.autograd.grad(x.sum(), p, retain_graph=True)[0] for x in (u, v)]
-    table = quadrics.rows(world, torch.zeros(n, dtype=torch.int64))
     moves = quadrics.tangent(e1, e2, own), quadrics.bitangent(table, e1, e2, own)
     for i, slope in enumerate(slopes):
         for j, move in enumerate(moves):
@@ -256,7 +254,7 @@ def test_mitsubas_cylinder_and_disk(name):
             np.testing.assert_allclose(at.ng[:, 0].numpy(), np.array(si.n), atol=2e-3)
             if name == "cylinder":
                 assert at.own is not None
-                uv = quadrics.surface_uv(quadrics.rows(world, at.prim).code, at.own)[:, 0].numpy()
+                uv = quadrics.surface_uv(quadrics.rows(world, at.prim), at.own)[:, 0].numpy()
                 apart = np.abs(uv - np.array(si.uv))
                 assert min(apart[0], 1 - apart[0]) < 1e-3 and apart[1] < 1e-3
             compared += 1

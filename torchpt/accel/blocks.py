@@ -11,7 +11,7 @@ from torchpt.accel.kernels_blocks import LEAF, LINE, MORE, NODE
 from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
 from torchpt.accel.kernels_layout import lay_out
 from torchpt.accel.kernels_tables import leaf_ids, triangle_tables, work
-from torchpt.accel.tables import inverses, prepare
+from torchpt.accel.tables import QUADRIC, inverses, prepare
 from torchpt.records import Geometry
 
 __all__ = [
@@ -63,14 +63,14 @@ class Others:
         area: ``(K,)`` bool: the primitive can be hit.
         boxes: ``(K, 6)`` float32: low x, y, z, high x, y, z; a box that ends before it begins where it cannot be hit.
         tensors: what the search's kernels take of them: corners ``(K, 12)`` float32, affine rows ``(K, 12)`` float32 and
-            quadrics ``(Q, 13)`` float64; NaN, which no ray meets, where a primitive cannot be hit.
+            quadrics ``(Q, 19)`` float64; NaN, which no ray meets, where a primitive cannot be hit.
     """
 
     def __init__(self, geometry: Geometry) -> None:
         rest = _without_triangles(geometry)
         if not rest.size:  # the operations below would take longer than the tree of a small mesh
             self.area, self.boxes = np.zeros(0, bool), np.zeros((0, 6), np.float32)
-            self.tensors = [torch.zeros(0, 12), torch.zeros(0, 12), torch.zeros(0, 13, dtype=torch.float64)]
+            self.tensors = [torch.zeros(0, 12), torch.zeros(0, 12), torch.zeros(0, QUADRIC, dtype=torch.float64)]
             return
         tables = prepare(rest)
         good = tables.area

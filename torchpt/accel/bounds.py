@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.records import QUADRICS, Geometry
+from torchpt.records import Geometry, QuadricTable
 
 __all__ = ["chosen", "primitive_bounds", "surface"]
 
@@ -16,8 +16,7 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     The margin (relative to coordinates and size) keeps rays that run exactly within a face of a box, and hits that a
     leaf test accepts by rounding, inside it.
 
-    A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse reaches ``sqrt(e1^2 + e2^2)`` from its centre on each axis,
-    an ellipsoid ``sqrt(e1^2 + e2^2 + e3^2)``; a cylinder is the hull of two ellipses, a cone that of one and its apex.
+    A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse reaches ``sqrt(e1^2 + e2^2)`` from its centre on each axis.
     """
     p0, p1, p2 = geometry.p0.double(), geometry.p1.double(), geometry.p2.double()
     n_tri, n_rect, n_disk, n_ball, _ = geometry.counts
@@ -30,7 +29,7 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
     reach = torch.cat([reach, p1[:1, c:q].abs().expand(3, -1)], 1)
     low[:, b:q], high[:, b:q] = p0[:, b:q] - reach, p0[:, b:q] + reach
     if geometry.quadrics is not None:
-        low[:, q:], high[:, q:] = _quadric_bounds(geometry.quadrics)
+        low[:, q:], high[:, q:] = geometry.quadrics.low, geometry.quadrics.high
     margin = 2.0**-22 * (torch.maximum(low.abs(), high.abs()) + (high - low).amax(0))
     low, high = low - margin, high + margin
     down, up = low.float(), high.float()
@@ -44,20 +43,12 @@ def chosen(geometry: Geometry, prim: Tensor) -> Geometry:
     starts = torch.tensor([sum(geometry.counts[:k]) for k in range(6)], device=prim.device)
     a, b, c, d, e = torch.diff(torch.searchsorted(prim, starts)).tolist()
     p0, p1, p2 = (p.index_select(1, prim) for p in (geometry.p0, geometry.p1, geometry.p2))
-    quadrics = (
-        None if geometry.quadrics is None else geometry.quadrics.index_select(1, prim[len(prim) - e :] - starts[4])
-    )
+    table, quadrics = geometry.quadrics, None
+    if table is not None:
+        columns = prim[len(prim) - e :] - starts[4]
+        parts = (x.index_select(1, columns) for x in (table.frame, table.form, table.low, table.high))
+        quadrics = QuadricTable(*parts)
     return Geometry(p0, p1, p2, (a, b, c, d, e), quadrics)
-
-
-def _quadric_bounds(table: Tensor) -> tuple[Tensor, Tensor]:
-    centre, e1, e2, e3, code = table[0:3], table[3:6], table[6:9], table[9:12], table[12]
-    ball, cone = code == QUADRICS.index("ellipsoid"), code == QUADRICS.index("cone")
-    ring = e1.square() + e2.square()
-    reach = torch.where(ball, ring + e3.square(), ring).sqrt()
-    far = torch.where(ball, 0.0, e3)  # where the other end lies
-    end = torch.where(cone, 0.0, reach)
-    return torch.minimum(-reach, far - end) + centre, torch.maximum(reach, far + end) + centre
 
 
 def surface(low: Tensor, high: Tensor) -> Tensor:

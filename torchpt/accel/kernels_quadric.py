@@ -30,44 +30,46 @@ def _diamond(x, y):
 
 @part()
 def quadric_hit(table, k, ox, oy, oz, dx, dy, dz):
-    """``t, u, v`` as float32 of the nearest positive root on quadric ``k`` of ``table (Q, 13)``; ``t`` is NaN for a miss.
+    """``t, u, v`` as float32 of the nearest positive root on quadric ``k`` of ``table (Q, 19)``; ``t`` is NaN for a miss.
 
     See :func:`torchpt.accel.leaf.quadric` for the formulas and what ``u, v`` are.
     """
     px, py, pz = np.float64(ox), np.float64(oy), np.float64(oz)
     rx, ry, rz = np.float64(dx), np.float64(dy), np.float64(dz)
     fx = (
-        item(table, 13 * k + 0) * px
-        + item(table, 13 * k + 1) * py
-        + item(table, 13 * k + 2) * pz
-        + item(table, 13 * k + 3)
+        item(table, 19 * k + 0) * px
+        + item(table, 19 * k + 1) * py
+        + item(table, 19 * k + 2) * pz
+        + item(table, 19 * k + 3)
     )
     fy = (
-        item(table, 13 * k + 4) * px
-        + item(table, 13 * k + 5) * py
-        + item(table, 13 * k + 6) * pz
-        + item(table, 13 * k + 7)
+        item(table, 19 * k + 4) * px
+        + item(table, 19 * k + 5) * py
+        + item(table, 19 * k + 6) * pz
+        + item(table, 19 * k + 7)
     )
     fz = (
-        item(table, 13 * k + 8) * px
-        + item(table, 13 * k + 9) * py
-        + item(table, 13 * k + 10) * pz
-        + item(table, 13 * k + 11)
+        item(table, 19 * k + 8) * px
+        + item(table, 19 * k + 9) * py
+        + item(table, 19 * k + 10) * pz
+        + item(table, 19 * k + 11)
     )
-    ex = item(table, 13 * k + 0) * rx + item(table, 13 * k + 1) * ry + item(table, 13 * k + 2) * rz
-    ey = item(table, 13 * k + 4) * rx + item(table, 13 * k + 5) * ry + item(table, 13 * k + 6) * rz
-    ez = item(table, 13 * k + 8) * rx + item(table, 13 * k + 9) * ry + item(table, 13 * k + 10) * rz
-    code = item(table, 13 * k + 12)
-    bend = 1.0 - code
-    level = 0.0 if code == 2.0 else 1.0
-    low = -_INF if code == 0.0 else 0.0
-    high = _INF if code == 0.0 else 1.0
-    wz = fz - 1.0 if code == 2.0 else fz
+    ex = item(table, 19 * k + 0) * rx + item(table, 19 * k + 1) * ry + item(table, 19 * k + 2) * rz
+    ey = item(table, 19 * k + 4) * rx + item(table, 19 * k + 5) * ry + item(table, 19 * k + 6) * rz
+    ez = item(table, 19 * k + 8) * rx + item(table, 19 * k + 9) * ry + item(table, 19 * k + 10) * rz
+    bend, level, shift = item(table, 19 * k + 12), item(table, 19 * k + 13), item(table, 19 * k + 14)
+    low, high = item(table, 19 * k + 15), item(table, 19 * k + 16)
+    around, half = item(table, 19 * k + 17), item(table, 19 * k + 18)
+    wz = fz - shift
     a = ex * ex + ey * ey + bend * (ez * ez)
     b = -(fx * ex + fy * ey + bend * (wz * ez))
     c = fx * fx + fy * fy + bend * (wz * wz) - level
     cx, cy, cz = fy * ez - wz * ey, wz * ex - fx * ez, fx * ey - fy * ex
     disc = level * a - (bend * (cx * cx + cy * cy) + cz * cz)
+    if half != 0.0:
+        b -= half * ez
+        c += 2.0 * half * wz
+        disc += half * (half * (ez * ez) + 2.0 * (ey * cx - ex * cy))
     root = math.sqrt(disc)  # NaN for a miss: every comparison below is then false
     q = b + (root if b >= 0.0 else -root)
     t1, t2 = c / q, q / a
@@ -78,7 +80,7 @@ def quadric_hit(table, k, ox, oy, oz, dx, dy, dz):
         return _NAN32, np.float32(0.0), np.float32(0.0)
     t = t1 if ok1 and not (ok2 and t2 < t1) else t2
     x, y, z = fx + t * ex, fy + t * ey, fz + t * ez
-    if code != 0.0:
+    if around == 0.0:
         return np.float32(t), np.float32(_diamond(x, y)), np.float32(z)
     size = abs(x) + abs(y) + abs(z)
     u, v = x / size, y / size

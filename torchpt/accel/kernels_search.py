@@ -96,7 +96,7 @@ def nearest(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
         codes: the same memory as int32.
         corner: ``(K, 12)`` corners of the primitives that are no triangles.
         rows: ``(K, 12)`` their affine rows.
-        quadrics: ``(Q, 13)`` float64.
+        quadrics: ``(Q, 19)`` float64.
         kinds: ``(5,)`` int64: ids of the first rectangle, disk, sphere and quadric; room of a stack.
         t: ``(N,)`` float32, filled; inf for a miss.
         prim: ``(N,)`` int32, filled; -1 for a miss.

@@ -34,7 +34,8 @@ class Lbvh(Accel):
         self.counts = list(geometry.counts)
         self.corners = torch.cat([geometry.p0, geometry.p1, geometry.p2]).float()
         self.rows = tables.rows.T.contiguous()
-        self.quadrics = inverses(geometry)
+        quadrics = inverses(geometry)
+        self.quadrics = quadrics if bool(quadrics[-1].any()) else quadrics[:-1]
         keep = torch.nonzero(tables.area)[:, 0]
         low, high = primitive_bounds(geometry)
         self.tree = build_tree(low[:, keep], high[:, keep], keep)

@@ -60,7 +60,7 @@ def distances(
         prim: ``(N,)`` int64 primitive ids.
         corners: ``(9, P)`` float32: p0, p1, p2.
         rows: ``(12, P)`` float32, see :mod:`torchpt.accel.tables`.
-        quadrics: ``(13, Q)`` float64, see :func:`torchpt.accel.tables.inverses`.
+        quadrics: ``(19, Q)`` float64, or 18 rows where no form has a ``half``, see :func:`torchpt.accel.tables.inverses`.
         counts: primitives of each kind.
 
     Returns:
@@ -142,20 +142,20 @@ def _sphere(o: Tensor, d: Tensor, corner: Tensor) -> Tensor:
 def quadric(o: Tensor, d: Tensor, row: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Nearest positive ``t`` on quadrics, and ``u, v`` that tell the point: float32, NaN and whatever for misses.
 
-    In its own space a surface is ``x^2 + y^2 + k w^2 = r``: the unit sphere (k = 1, r = 1, w = z), the cylinder about z
-    (k = 0, r = 1) and the cone with its apex at z = 1 (k = -1, r = 0, w = z - 1), the last two for ``0 <= z <= 1``. Half the
-    discriminant of a ray ``f + t e`` is, by Lagrange's identity for that form, ``r a - (k (m_x^2 + m_y^2) + m_z^2)`` with
-    ``m = f x e``: no difference of large squares. The roots come from ``q = b + sign(b) sqrt`` (Haines et al., Ray Tracing
-    Gems ch. 7), all in float64.
+    In its own space a surface is ``x^2 + y^2 + k w^2 + 2 h w = r`` with ``w = z - s``, between two heights
+    (:class:`torchpt.shapes.quadrics.Form`). Half the discriminant of a ray ``f + t e`` is, by Lagrange's identity for that
+    form, ``r a - (k (m_x^2 + m_y^2) + m_z^2) + h (h e_z^2 + 2 (e_y m_x - e_x m_y))`` with ``m = f x e``: no difference of
+    large squares where h is 0. The roots come from ``q = b + sign(b) sqrt`` (Haines et al., Ray Tracing Gems ch. 7), all in
+    float64.
 
-    ``v`` is z on a cylinder or cone, and ``u`` the way along the square ``|x| + |y| = 1`` from +x, in [-2, 2]; on an
-    ellipsoid they are octahedral (Cigolle et al., "A Survey of Efficient Representations for Independent Unit Vectors",
-    JCGT 2014). Both are algebraic, so that backends agree, and are read by :func:`torchpt.shapes.quadrics.place`.
+    ``v`` is z, and ``u`` the way along the square ``|x| + |y| = 1`` from +x, in [-2, 2]; of a surface that is told by the
+    direction to its points they are octahedral (Cigolle et al., "A Survey of Efficient Representations for Independent Unit
+    Vectors", JCGT 2014). Both are algebraic, so that backends agree, and are read by :func:`torchpt.shapes.quadrics.place`.
 
     Args:
         o: origins ``(3, N)``.
         d: directions ``(3, N)``.
-        row: ``(13, N)`` float64 world to own space, and the code.
+        row: ``(19, N)`` float64 world to own space, and the form; without its last row h is 0.
     """
     px, py, pz = o.double().unbind(0)
     rx, ry, rz = d.double().unbind(0)
@@ -165,16 +165,18 @@ def quadric(o: Tensor, d: Tensor, row: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     ex = row[0] * rx + row[1] * ry + row[2] * rz
     ey = row[4] * rx + row[5] * ry + row[6] * rz
     ez = row[8] * rx + row[9] * ry + row[10] * rz
-    code = row[12]
-    bend, ball, cone = 1.0 - code, code == 0, code == 2
-    level = (~cone).double()
-    low, high = torch.where(ball, -torch.inf, 0.0), torch.where(ball, torch.inf, 1.0)
-    wz = torch.where(cone, fz - 1.0, fz)
+    bend, level, shift, low, high, ball = *row[12:17], row[17] != 0
+    wz = fz - shift
     a = ex * ex + ey * ey + bend * (ez * ez)
     b = -(fx * ex + fy * ey + bend * (wz * ez))
     c = fx * fx + fy * fy + bend * (wz * wz) - level
     mx, my, mz = fy * ez - wz * ey, wz * ex - fx * ez, fx * ey - fy * ex
-    root = (level * a - (bend * (mx * mx + my * my) + mz * mz)).sqrt()
+    disc = level * a - (bend * (mx * mx + my * my) + mz * mz)
+    if len(row) > 18:
+        half = row[18]
+        b, c = b - half * ez, c + 2.0 * half * wz
+        disc = disc + half * (half * (ez * ez) + 2.0 * (ey * mx - ex * my))
+    root = disc.sqrt()
     q = b + torch.where(b >= 0, root, -root)
     t1, t2 = c / q, q / a
     z1, z2 = fz + t1 * ez, fz + t2 * ez

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from torchpt.records import Geometry
 
-__all__ = ["ROUNDING", "Tables", "extent", "inverses", "prepare", "tolerances"]
+__all__ = ["QUADRIC", "ROUNDING", "Tables", "extent", "inverses", "prepare", "tolerances"]
 
 #: 32 units of float32 rounding. The affine test of a primitive errs by at most 16 of them times the magnitudes that
 #: enter (see :func:`tolerances`); the other half covers grazing rays, where ``n . d`` itself is uncertain.
 ROUNDING = 2.0**-19
+#: Numbers of a quadric: its map to its own space, and its form there (:class:`torchpt.shapes.quadrics.Form`).
+QUADRIC = 19
 
 
 class Tables(NamedTuple):
@@ -61,24 +63,24 @@ def prepare(geometry: Geometry) -> Tables:
     rows = torch.where(good, rows, 0.0)
     round_ = ~planar & (number < balls) & torch.isfinite(p0).all(0) & (p1[0].abs() > 0) & torch.isfinite(p1[0])
     if geometry.quadrics is not None:
-        round_[balls:] = torch.isfinite(inverses(geometry)).all(0)
+        round_[balls:] = torch.isfinite(inverses(geometry)[:12]).all(0)
     return Tables(rows.float().T.contiguous(), rows.T, good | round_)
 
 
 def inverses(geometry: Geometry) -> Tensor:
-    """World to own space of the quadrics ``(13, Q)`` float64: three affine rows, and the code; NaN where there is none.
+    """World to own space of the quadrics ``(19, Q)`` float64: three affine rows, NaN where there are none, and the form.
 
     Searches intersect quadrics in their own space and in float64: however thin, sheared or distant one is, a ray that
     leaves it knows its side.
     """
     table = geometry.quadrics
     if table is None:
-        return torch.zeros(13, 0, dtype=torch.float64, device=geometry.p0.device)
-    p0, e1, e2, e3 = table[0:3], table[3:6], table[6:9], table[9:12]
+        return torch.zeros(QUADRIC, 0, dtype=torch.float64, device=geometry.p0.device)
+    p0, e1, e2, e3 = table.frame.split(3)
     faces = (torch.linalg.cross(a, b, dim=0) for a, b in ((e2, e3), (e3, e1), (e1, e2)))
     det = (e1 * torch.linalg.cross(e2, e3, dim=0)).sum(0)
     rows = [row for n in faces for row in (n / det, -(n * p0).sum(0, keepdim=True) / det)]
-    return torch.cat([*rows, table[12:]])
+    return torch.cat([*rows, table.form])
 
 
 def extent(geometry: Geometry) -> float:
@@ -90,7 +92,7 @@ def extent(geometry: Geometry) -> float:
     balls = geometry.p0[:, planar:round_].abs() + geometry.p1[0, planar:round_].abs()
     both = torch.cat([points.reshape(-1), balls.reshape(-1)])
     if geometry.quadrics is not None:
-        reach = geometry.quadrics[:12].abs().reshape(4, 3, -1).sum(0)
+        reach = geometry.quadrics.frame.abs().reshape(4, 3, -1).sum(0)
         both = torch.cat([both, reach.reshape(-1).float()])
     both = both[torch.isfinite(both)]
     return max(float(both.max()) if both.numel() else 1.0, 2.0**-126)

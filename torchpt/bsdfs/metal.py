@@ -34,7 +34,9 @@ class Metal(Bsdf, part=True):
     """A part of a model: a metal by its name, by ``eta`` and ``k``, or by its reflectance at normal incidence."""
 
     parameters: ClassVar = {
-        "material": Other(None, reader=_name, words=_NAMES, doc="the metal's name"),
+        "material": Other(
+            None, reader=_name, words=f"{_MIRROR} (a perfect mirror), or a metal's name", doc="which metal"
+        ),
         "eta": Color(None, texture=True, doc="the real part of its index, with `k`"),
         "k": Color(None, texture=True, doc="the imaginary part, with `eta`"),
         "reflectance": reflectance(None, "at normal incidence, by Schlick; 1 where no metal is said"),

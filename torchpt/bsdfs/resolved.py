@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchpt.bsdfs.base import Bsdf
-from torchpt.spec import Moves, parameters_of
-from torchpt.textures import Node, Reading, VertexColors
+from torchpt.textures import Node
 
 __all__ = ["ResolvedMaterial", "Value"]
 
-Value = float | tuple[float, float, float] | Reading
+Value = float | tuple[float, float, float] | Node
 
 
 @dataclass(frozen=True)
@@ -61,15 +60,12 @@ class ResolvedMaterial:
             "bump_map": self.bump_map,
         }
 
-    def readings(self) -> list[Reading]:
+    def readings(self) -> list[Node]:
         """Its textures, those of inner materials included."""
-        found: list[Reading] = [value for value in self.own().values() if isinstance(value, Node | VertexColors)]
-        return [*found, *(reading for inner in self.inner for reading in inner.readings())]
+        own = [value for value in self.own().values() if isinstance(value, Node)]
+        return [*own, *(reading for inner in self.inner for reading in inner.readings())]
 
-    def bending(self) -> set[str]:
-        """Names of the parameters that turn the rays of its deltas: numbers, and the texels of textures."""
-        if not (self.model.refracts and self.model.delta):
-            return set()
-        specs = parameters_of(self.model)
-        bent = {key: value for key, value in self.values.items() if specs[key].moves is Moves.RAYS}
-        return {value.texels if isinstance(value, Node) else f"{self.name}.{key}" for key, value in bent.items()}
+    @property
+    def bends(self) -> bool:
+        """Whether its deltas send rays on in directions that follow its indices of refraction."""
+        return self.model.refracts and self.model.delta

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpt.bsdfs.base import Bsdf, Parameters, Table, Values
 from torchpt.bsdfs.specs import fraction
 from torchpt.math import microfacet
-from torchpt.spec import Flag, Refused, parameters_of
+from torchpt.spec import Flag, Refused
 
 __all__ = ["Anisotropic", "Rough", "alphas", "energy_at", "energy_table", "mean_roughness", "rough"]
 
@@ -59,9 +59,9 @@ class Anisotropic(Rough, part=True):
 
     @property
     def tabulated(self) -> tuple[str, ...]:
-        """All of it where energy is given back: its table is made once a material."""
-        own = (key for key in parameters_of(type(self)) if key not in Bsdf.parameters)
-        return tuple(own) if self.energy_compensation else ()
+        """Where energy is given back, all that its table is made of."""
+        needed = ("alpha", "roughness", "alpha_u", "alpha_v", "int_ior", "ext_ior")
+        return needed if self.energy_compensation else ()
 
 
 def rough(values: Parameters, anisotropic: bool) -> Parameters:

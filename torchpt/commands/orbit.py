@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,9 +197,15 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
     from torchpt.rendering import render_scene
 
     place, seed = scene.params["camera.to_world"], settings(scene.description, job.overrides).render.seed
-    totals = {"rays": 0, "nonfinite_samples": 0}
+    totals: dict[str, int] = {"rays": 0, "nonfinite_samples": 0}
     begun = time.perf_counter()
     with Bar(frames.folder.stem) as bar:
+
+        def on_progress(number: int, rays: int, state: Any) -> bool:
+            done, seconds = number * state.total + state.done, time.perf_counter() - begun
+            bar.update(done, turn.frames * state.total, rays + state.rays, seconds)
+            return interrupt.signum is not None
+
         for number, pose in enumerate(poses(scene, turn)):
             if interrupt.signum is not None:
                 break
@@ -206,14 +213,8 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
                 continue
             once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
             wishes = settings(scene.description, once)
-
-            def on_progress(state: Any, number: int = number, before: int = totals["rays"]) -> bool:
-                done, rays = number * state.total + state.done, before + state.rays
-                bar.update(done, turn.frames * state.total, rays, time.perf_counter() - begun)
-                return interrupt.signum is not None
-
             scene.params["camera.to_world"] = torch.from_numpy(pose.copy()).to(place)
-            rendering = render_scene(scene, wishes, on_progress=on_progress)
+            rendering = render_scene(scene, wishes, on_progress=partial(on_progress, number, totals["rays"]))
             if not rendering.complete:
                 break
             frames.write(number, rendering.image, wishes.film)
@@ -295,19 +296,20 @@ class Frames:
 
 def _facts(scene: Scene, wishes: Any, turn: Turn) -> dict[str, Any]:
     """What frames depend on, by dotted name: the turn, the settings, and a digest of the scene."""
+    from torchpt.spec.declared import Described
+
     facts: dict[str, Any] = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
     stack: list[tuple[str, Any]] = [("", wishes)]
     while stack:
         name, value = stack.pop()
-        if isinstance(value, str | int | float | None):
-            facts[name] = plain(value)
-        elif isinstance(value, list | tuple):
-            facts[name] = str(value)
-        elif isinstance(value, type):
-            facts[name] = value.__name__
+        if isinstance(value, Described):
+            value = {"type": value.name, **value.values}
+        elif hasattr(value, "__dict__"):
+            value = vars(value)
+        if isinstance(value, Mapping):
+            stack += [(f"{name}.{key}" if name else str(key), inside) for key, inside in value.items()]
         else:
-            inside = value if isinstance(value, Mapping) else vars(value)
-            stack += [(f"{name}.{key}" if name else str(key), item) for key, item in inside.items()]
+            facts[name] = plain(value) if isinstance(value, int | float | None) else str(value)
     return {**{name: facts[name] for name in sorted(facts) if name not in _FREE}, "scene": _digest(scene)}
 
 

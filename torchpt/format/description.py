@@ -14,14 +14,14 @@ from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, SceneError
 from torchpt.format.cameras import read_camera
 from torchpt.format.materials import Kind, check_material, material_types, read_material
-from torchpt.format.textures import TEXTURES, Image, Named, Texture, TextureInput, texture_input
+from torchpt.format.textures import check_texture, texture_of
 from torchpt.format.yaml_file import plain, read_yaml
 from torchpt.lights import KINDS as LIGHTS
 from torchpt.settings import BLOCKS, Settings
 from torchpt.shapes import KINDS as SHAPES
-from torchpt.spec import Map, Refused, Spec
 from torchpt.spec.declared import Described, described
-from torchpt.spec.validate import check_keys, select
+from torchpt.spec.validate import check_keys
+from torchpt.textures import KINDS as TEXTURES
 
 __all__ = ["ASSETS", "Description", "read_description", "scene_names", "settings"]
 
@@ -58,7 +58,7 @@ class Description:
     integrator: dict[str, Any] = field(default_factory=dict)
     sampler: dict[str, Any] = field(default_factory=dict)
     render: dict[str, Any] = field(default_factory=dict)
-    textures: dict[str, Texture] = field(default_factory=dict)
+    textures: dict[str, Described] = field(default_factory=dict)
     materials: dict[str, Described] = field(default_factory=dict)
     shapes: dict[str, Described] = field(default_factory=dict)
     lights: dict[str, Described] = field(default_factory=dict)
@@ -165,7 +165,7 @@ def _describe(raw: dict[str, Any], types: Mapping[str, Kind], file: str | None, 
     blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
     camera = read_camera(raw["camera"], blocks["film"], file)
     run_settings.merge(blocks, {}, file)
-    textures = _named(raw, "textures", file, lambda item, key: select("texture", TEXTURES, item, key, file))
+    textures = _named(raw, "textures", file, lambda item, key: described("texture", TEXTURES, item, key, file))
     materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
     for name, material in materials.items():
         check_material(material, f"materials.{name}", materials, textures, file)
@@ -198,7 +198,7 @@ def _shape(
     item: Any,
     key: str,
     materials: Mapping[str, Described],
-    textures: Mapping[str, Texture],
+    textures: Mapping[str, Described],
     types: Mapping[str, Kind],
     file: str | None,
 ) -> Described:
@@ -206,13 +206,11 @@ def _shape(
         inline = read_material(item["material"], f"{key}.material", types, file)
         check_material(inline, f"{key}.material", materials, textures, file)
         item = {**item, "material": inline}
-    shape = described("shape", SHAPES, item, key, file, texture=_heights)
+    shape = described("shape", SHAPES, item, key, file, texture=texture_of)
     displacement = shape.values.get("displacement")
-    if displacement is not None and isinstance(displacement["texture"].texture, Named):
-        name = displacement["texture"].texture.texture
-        if name not in textures:
-            known = ", ".join(textures) or "none is defined"
-            raise SceneError(f"{key}.displacement.texture", name, f"the name of a texture ({known})", file)
+    if displacement is not None:
+        where = f"{key}.displacement.texture"
+        check_texture(displacement["texture"], where, textures, file, coordinates=True, points=True)
     material, emission, where = shape["material"], shape["emission"], f"{key}.material"
     if isinstance(material, str):
         if material not in materials:
@@ -223,11 +221,3 @@ def _shape(
         expected = f"no emission where the material emits as well ({where}.emission)"
         raise SceneError(f"{key}.emission", emission, expected, file)
     return shape
-
-
-def _heights(value: Mapping[str, Any], spec: Spec) -> TextureInput:
-    """The texture of a shape's displacement."""
-    slot = texture_input(value, spec.coloured, *Map.bounds)
-    if isinstance(slot.texture, Image) and slot.texture.filter == "trilinear":
-        raise Refused("nearest or bilinear, as displacement is read at points", "trilinear", ("filter",))
-    return slot

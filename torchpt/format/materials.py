@@ -11,7 +11,7 @@ from torchpt.bsdfs import KINDS, Bsdf
 from torchpt.bsdfs.base import made
 from torchpt.bsdfs.specs import Inner
 from torchpt.errors import EnergyWarning, NotBuiltError, SceneError
-from torchpt.format.textures import Named, Texture, TextureInput, VertexColor, texture_input
+from torchpt.format.textures import TextureInput, check_texture, texture_of
 from torchpt.spec import REQUIRED, Refused, Spec, parameters_of, spec_of
 from torchpt.spec.declared import Described, described, values_of
 from torchpt.spec.validate import Model
@@ -110,18 +110,12 @@ def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | Non
         inline = {side: raw[side] for side in sides if isinstance(raw.get(side), Mapping)}
         inner = {side: read_material(item, f"{key}.{side}", types, file, depth + 1) for side, item in inline.items()}
         raw = {**raw, **inner}
-    return described("material", types, raw, key, file, texture=_texture)
+    return described("material", types, raw, key, file, texture=texture_of)
 
 
 def plain_material() -> Described:
     """That of shapes which are given none: grey, diffuse."""
-    return values_of(KINDS["diffuse"], {}, "", None, texture=_texture)
-
-
-def _texture(raw: Mapping[str, Any], spec: Spec) -> TextureInput:
-    """A texture in place of a parameter."""
-    low, high = spec.bounds  # type: ignore[attr-defined]
-    return texture_input(raw, spec.coloured, low, high, linear=spec.linear)
+    return values_of(KINDS["diffuse"], {}, "", None, texture=texture_of)
 
 
 def _inner_keys(kind: Kind) -> tuple[str, ...]:
@@ -151,7 +145,7 @@ def check_material(
     material: Described,
     key: str,
     materials: Mapping[str, Described],
-    textures: Mapping[str, Texture],
+    textures: Mapping[str, Described],
     file: str | None,
 ) -> None:
     """What can be said of a material only once all are known.
@@ -181,7 +175,9 @@ def check_material(
     slots = {slot: value for slot, value in material.values.items() if isinstance(value, TextureInput)}
     for slot, value in slots.items():
         sheer = slot == "weight" and any(item.kind.sheer for item in _sides(material, materials))
-        _check_slot(slot, value, f"{key}.{slot}", sheer, textures, file)
+        check_texture(
+            value, f"{key}.{slot}", textures, file, coordinates=slot in _IMAGED or sheer, points=slot in POINTS or sheer
+        )
     model, _ = model_of(material, materials)
     for slot in slots:
         if slot in model.tabulated:
@@ -193,22 +189,6 @@ def check_material(
     if problem := material.kind.energy(material.values):
         where = f"{file}: {key}" if file else key
         warnings.warn(f"{where}: {problem}", EnergyWarning, stacklevel=2)
-
-
-def _check_slot(
-    slot: str, value: TextureInput, at: str, sheer: bool, textures: Mapping[str, Texture], file: str | None
-) -> None:
-    """Refuse a texture that its slot cannot be given by; ``sheer``: what it weighs lets rays pass."""
-    texture = value.texture
-    if isinstance(texture, Named):
-        if texture.texture not in textures:
-            known = ", ".join(textures) or "none is defined"
-            raise SceneError(f"{at}.texture", texture.texture, f"the name of a texture ({known})", file)
-        texture = textures[texture.texture]
-    if isinstance(texture, VertexColor) and (slot in _IMAGED or sheer):
-        raise SceneError(at, "vertex_color", "an image, or a number", file)
-    if (slot in POINTS or sheer) and getattr(value.texture, "filter", "") == "trilinear":
-        raise SceneError(f"{at}.filter", "trilinear", f"nearest or bilinear, as {slot} is read at points", file)
 
 
 def _check_blend(

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchpt.cameras import Camera
-from torchpt.film import FILTERS
 from torchpt.forward.kept import kept
 from torchpt.forward.schedule import randomizations_of
 from torchpt.integrators import LAYERS
@@ -20,7 +19,6 @@ from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.stages import Plan
 from torchpt.integrators.wave import Wave
 from torchpt.records import World
-from torchpt.samplers import KINDS as SAMPLERS
 from torchpt.samplers import Sampler
 from torchpt.scene import Scene
 from torchpt.settings import Settings
@@ -46,7 +44,8 @@ def make_wave(
     attached: bool = False,
 ) -> Wave:
     """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``."""
-    film, integrator, spp = settings.film, settings.integrator, settings.render.spp
+    film, spp = settings.film, settings.render.spp
+    integrator = settings.integrator.counted_in(scene.space.unit)
     uv = any(layer.uv for layer in surface_layers(settings).values())
     world, geometry = scene.world(dtype, params, uv, settings.light_choice)
     threads = None if settings.render.threads == "auto" else int(settings.render.threads)
@@ -55,7 +54,7 @@ def make_wave(
     own = not params  # the world is the scene's own, and what is made of it may be kept
     if not integrator.lit:
         world = _dark(scene, world, own)
-    points = SAMPLERS[settings.sampler.name](**settings.sampler.values)
+    points = settings.sampler.kind(**settings.sampler.values)
     plan = integrator.plan(points, dtype, tape, attached)
     camera = scene.camera(film, scene.merged(params), dtype)
     return Wave(
@@ -63,7 +62,7 @@ def make_wave(
         integrator=integrator,
         accel=accel,
         camera=camera,
-        filter=FILTERS[film.filter.name](film.filter.values, scene.device),
+        filter=film.filter.kind(film.filter.values, scene.device),
         sampler=Sampler(points, settings.render.seed, randomizations_of(spp), spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.space.shift,
@@ -120,7 +119,7 @@ def _dark(scene: Scene, world: World, own: bool) -> World:
 
 def _pixel_of(world: World, camera: Camera) -> Tensor | None:
     """What textures filtered by the pixel's footprint need of the camera; None where there are none."""
-    return camera.pixel() if world.textures.atlas is not None and world.textures.atlas.pyramids is not None else None
+    return camera.pixel() if world.textures.filtered else None
 
 
 def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: Tensor | None, own: bool) -> Stages:

@@ -10,9 +10,11 @@ import torch
 from torchpt.integrators.roulette import DEEP, DEEP_CAP
 from torchpt.integrators.stages import STRATEGIES, Plan
 from torchpt.lights import WAYS
-from torchpt.spec import Choice, Flag, Scalar, Spec, Valued
+from torchpt.spec import Choice, Flag, Scalar, Spec, Valued, parameters_of
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from torch import Tensor
 
     from torchpt.accel import Accel
@@ -98,6 +100,12 @@ class Integrator(Valued):
     def plan(self, sampler: Points, dtype: torch.dtype, tape: bool = False, attached: bool = False) -> Plan:
         """What it asks of the stages."""
         return Plan(sampler, self.strategy, self.rr_prob, dtype, tape, attached)
+
+    def counted_in(self, unit: float) -> Self:
+        """The same with its lengths in a unit that is so long in the scene's: the lanes'."""
+        specs = parameters_of(type(self))
+        lengths = {key: value / unit for key, value in self.values.items() if specs[key].length and value is not None}
+        return self.but(**lengths) if lengths and unit != 1.0 else self
 
     def first(self, world: World) -> FirstSurface | None:
         """What happens at first surfaces, made once a scene and differentiable in its world; None where paths go on."""

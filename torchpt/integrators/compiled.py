@@ -153,7 +153,7 @@ class CompiledStages(Stages):
         from torch.fx.experimental import _config
 
         options: dict[str, Any] = {"assert_indirect_indexing": False}
-        if self.world.textures.atlas is not None:
+        if any(table.count for table in self.world.textures.tables):
             options["realize_opcount_threshold"] = REALIZE
 
         def backend(graph: torch.fx.GraphModule, inputs: list[Tensor]) -> Any:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchpt.math.frames import Frame
 from torchpt.math.vectors import affine, cross, dot, normalize, take
 from torchpt.records import Interaction
-from torchpt.textures import Atlas, MaterialTextures, slope
+from torchpt.textures import MaterialTextures
 
 __all__ = ["Relief", "mapped"]
 
@@ -34,12 +34,10 @@ class Relief:
 
 
 def mapped(
-    atlas: Atlas,
     textures: MaterialTextures,
     row: Tensor,
     local: Tensor | None,
-    uv: Tensor,
-    footprint: Tensor | None,
+    slope: tuple[Tensor, Tensor] | None,
     d: Tensor,
     at: Interaction,
     side: Tensor | None,
@@ -52,12 +50,10 @@ def mapped(
     Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017): all as Mitsuba's ``normalmap`` and ``bumpmap``.
 
     Args:
-        atlas: all of the scene.
         textures: of the model.
         row: of the materials in it.
         local: what a normal map holds there ``(3, N)``; None where there is a bump map.
-        uv: where textures are read.
-        footprint: see :class:`torchpt.integrators.surfaces.TexturePoint`.
+        slope: of a bump map's heights with respect to u and v ``(N,)``; None where there is a normal map.
         d: directions of the rays that came.
         at: the points.
         side: see :class:`torchpt.integrators.surfaces.Surface`.
@@ -71,9 +67,8 @@ def mapped(
             strength = take(textures.strength, row)
             x, y = x * strength, y * strength
     else:
-        assert textures.bump is not None and textures.bump.nodes is not None and at.bitangent is not None
-        footprint = footprint if textures.bump.filtered else None
-        du, dv = slope(atlas, take(textures.bump.nodes, row), uv, footprint)
+        assert slope is not None and at.bitangent is not None
+        du, dv = slope
         along = torch.addcmul(at.tangent, at.ns, du - dot(at.ns, at.tangent))
         across = torch.addcmul(at.bitangent, at.ns, dv - dot(at.ns, at.bitangent))
         x, y, z = base.to_local(cross(along, across))

@@ -11,10 +11,10 @@ from torch import Tensor
 from torchpt import bsdfs
 from torchpt.integrators.relief import Relief, mapped
 from torchpt.math.frames import Frame
-from torchpt.math.vectors import cross, dot, luminance, normalize, take
+from torchpt.math.vectors import cross, dot, normalize, take
 from torchpt.records import Interaction, World
 from torchpt.shapes import surface_uv, vertex_colors
-from torchpt.textures import MaterialTextures, TextureBinding, look_up
+from torchpt.textures import MaterialTextures, NodeMap, TextureBinding, TexturePoint
 
 __all__ = [
     "Surface",
@@ -31,16 +31,8 @@ __all__ = [
 _SLANT = 1e-3
 
 
-@dataclass(frozen=True)
-class TexturePoint:
-    """Where textures are read."""
-
-    uv: Tensor  # (2, N)
-    footprint: Tensor | None  # (N,) area in texture coordinates; None: they are read at points
-
-
 def texture_point_at(world: World, number: int, at: Interaction, pixel: Tensor | None) -> TexturePoint | None:
-    """Where the textures of model ``number`` are read; None where it reads no image.
+    """Where the textures of model ``number`` are read; None where it reads none.
 
     Args:
         world: the scene's tensors.
@@ -49,10 +41,13 @@ def texture_point_at(world: World, number: int, at: Interaction, pixel: Tensor |
         pixel: how large a pixel is in the world, see :meth:`torchpt.cameras.Camera.pixel`; None: a point.
     """
     textures = world.materials.textures[number]
-    if textures is None or world.geometry.uvs is None:
+    if textures is None:
         return None
-    wide = textures.filtered and pixel is not None
-    return TexturePoint(surface_uv(world, at), _footprint(at, pixel) if wide and pixel is not None else None)
+    return TexturePoint(
+        surface_uv(world, at) if "uv" in textures.reads else None,
+        _footprint(at, pixel) if textures.filtered and pixel is not None else None,
+        vertex_colors(world, at) if "colors" in textures.reads else None,
+    )
 
 
 def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
@@ -115,11 +110,12 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
 def parameters_at(
     world: World, number: int, row: Tensor, at: Interaction, point: TexturePoint | None
 ) -> bsdfs.Parameters:
-    """Lane values of the BSDF ``number`` at rows ``(N,)``; ``point`` where images are read."""
+    """Lane values of the BSDF ``number`` at rows ``(N,)``; ``point`` where textures are read."""
     values, textures = bsdfs.gather(world.materials.parameters[number], row), world.materials.textures[number]
     if textures is None:
         return values
-    return world.materials.models[number].prepare(_filled(world, values, textures.readings, row, at, point))
+    assert point is not None
+    return world.materials.models[number].prepare(_filled(world, values, textures.readings, row, point))
 
 
 def _filled(
@@ -127,49 +123,56 @@ def _filled(
     values: bsdfs.Parameters,
     readings: dict[str, Any],
     row: Tensor,
-    at: Interaction,
-    point: TexturePoint | None,
+    point: TexturePoint,
 ) -> bsdfs.Parameters:
     """Values with those that textures give."""
-    found = dict(values)
+    filled = dict(values)
     for key, reading in readings.items():
         if isinstance(reading, TextureBinding):
-            found[key] = _read(world, reading, row, at, point)
+            filled[key] = _read(world, reading, row, point)
         else:
-            found[key] = _filled(world, values.get(key, {}), reading, row, at, point)
-    return found
+            filled[key] = _filled(world, values.get(key, {}), reading, row, point)
+    return filled
 
 
-def _read(world: World, binding: TextureBinding, row: Tensor, at: Interaction, point: TexturePoint | None) -> Tensor:
-    if binding.nodes is None:
-        colors = vertex_colors(world, at)
-        if binding.channel is None:
-            return colors
-        return colors[binding.channel] if binding.channel >= 0 else luminance(colors)
-    assert world.textures.atlas is not None and point is not None
-    footprint = point.footprint if binding.filtered else None
-    return look_up(world.textures.atlas, take(binding.nodes, row), point.uv, binding.channel is None, footprint)
+def _read(world: World, binding: TextureBinding, row: Tensor, point: TexturePoint) -> Tensor:
+    table = world.textures.tables[binding.table]
+    point = point if binding.filtered else point.bare
+    return table.look_up(take(binding.nodes, row), point, binding.channel is None)
+
+
+def _mapped_value(world: World, maps: NodeMap, at: Interaction, coloured: bool) -> Tensor:
+    """What textures by primitive give at points; any number where a surface has none."""
+    row, point = take(maps.nodes, at.slot).clamp_min(0), TexturePoint(surface_uv(world, at))
+    first, *others = (world.textures.tables[number] for number in maps.tables)
+    if maps.table is None:
+        return first.look_up(row, point, coloured)
+    which = take(maps.table, at.slot)
+    value = first.look_up(torch.where(which == 0, row, 0), point, coloured)
+    for k, table in enumerate(others, 1):
+        mine = which == k
+        value = torch.where(mine, table.look_up(torch.where(mine, row, 0), point, coloured), value)
+    return value
 
 
 def opacity_map(world: World, at: Interaction) -> Tensor:
     """What textures make of the opacity ``(N,)`` of surfaces; 1 where they have no such texture."""
-    assert world.textures.atlas is not None and world.textures.opacity is not None
     maps = world.textures.opacity
-    node = take(maps.nodes, at.slot)
-    value = look_up(world.textures.atlas, node.clamp_min(0), surface_uv(world, at), False)
+    assert maps is not None
+    value = _mapped_value(world, maps, at, False)
     value = torch.addcmul(take(maps.bias, at.slot), take(maps.factor, at.slot), value)
     if maps.cutoff is not None:
         cutoff = take(maps.cutoff, at.slot)
         value = torch.where(cutoff < 0, value, (value >= cutoff).to(value.dtype))
-    return torch.where(node < 0, 1.0, value)
+    return torch.where(take(maps.nodes, at.slot) < 0, 1.0, value)
 
 
 def emission_map(world: World, at: Interaction) -> Tensor:
     """What textures make of the emission of surfaces ``(3, N)``; 1 where they have no such texture."""
-    assert world.textures.atlas is not None and world.textures.emission is not None
-    node = take(world.textures.emission, at.slot)
-    value = look_up(world.textures.atlas, node.clamp_min(0), surface_uv(world, at), True)
-    return torch.where(node < 0, 1.0, value)
+    maps = world.textures.emission
+    assert maps is not None
+    value = _mapped_value(world, maps, at, True)
+    return torch.where(take(maps.nodes, at.slot) < 0, 1.0, value)
 
 
 def shading_normal(world: World, number: int, d: Tensor, at: Interaction, point: TexturePoint | None) -> Tensor:
@@ -193,6 +196,11 @@ def _mapped(
     side: Tensor | None,
 ) -> tuple[Frame, Relief]:
     """The frame about the normal of a normal or bump map, and what the map did."""
-    assert world.textures.atlas is not None
-    local = None if textures.normal is None else _read(world, textures.normal, row, at, point)
-    return mapped(world.textures.atlas, textures, row, local, point.uv, point.footprint, d, at, side)
+    local = None if textures.normal is None else _read(world, textures.normal, row, point)
+    slope = None
+    if local is None:
+        assert textures.bump is not None
+        table = world.textures.tables[textures.bump.table]
+        point = point if textures.bump.filtered else point.bare
+        slope = table.slope(take(textures.bump.nodes, row), point)
+    return mapped(textures, row, local, slope, d, at, side)

@@ -3,20 +3,21 @@
     sample(lights, x, which, u) -> LightSample     a point on the lights seen from x
     emitted(lights, prim, ...) -> radiance, pdf     what a ray that hit an emitter by chance brings
 
-One kind a file: ``area`` (triangle, rectangle, disk), ``sphere``, ``quadric``, ``point``, ``spot``, ``constant``,
-``envmap``; of a directional light there is nothing to compute. Which light is drawn is said in ``choice``: by power, or by
-the light ``tree``.
+One kind a file: lights that are no surfaces in ``kinds/`` (:class:`Light`), surfaces that emit in ``surfaces/``
+(:class:`Surface`). ``table`` puts together what they say of their rows; which row is drawn is said in ``choice``: by power, or
+by the light ``tree``.
 """
 
 from __future__ import annotations
 
-from torchpt.lights.base import Light
+from torchpt.lights.base import COLUMNS, KINDS, Environment, Light, Row, Setting, Surroundings, order
 from torchpt.lights.choice import WAYS, choice_of, local
-from torchpt.lights.table import emitted, environment, sample
+from torchpt.lights.surface import SURFACES, Faces, Surface, emitter
+from torchpt.lights.table import emitted, environment, sample, surroundings, without_environment
 from torchpt.lights.tree import fine
-from torchpt.spec import Kinds
 
-#: The kinds of lights that are no surfaces.
-KINDS: Kinds[Light] = Kinds("torchpt.lights.kinds", ("point", "spot", "directional", "constant", "envmap"))
-
-__all__ = ["KINDS", "WAYS", "Light", "choice_of", "emitted", "environment", "fine", "local", "sample"]
+__all__ = [
+    "COLUMNS", "KINDS", "SURFACES", "WAYS", "Environment", "Faces", "Light", "Row", "Setting", "Surface", "Surroundings",
+    "choice_of", "emitted", "emitter", "environment", "fine", "local", "order", "sample", "surroundings",
+    "without_environment",
+]  # fmt: skip

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import luminance
-from torchpt.records import DISTANT, Lights
+from torchpt.lights.base import COLUMNS
+from torchpt.lights.surface import emitter
+from torchpt.records import Lights
 
 __all__ = ["Bounds", "bounds_of"]
 
@@ -34,24 +35,18 @@ def bounds_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor]) -> Bo
         power: of all rows ``(K,)``.
         boxes: lower and upper corners ``(3, E)`` of boxes about the E primitives that emit, which come first.
     """
-    near = tuple(kind for kind in lights.kinds if kind not in DISTANT)
+    near = [kind for kind in map(emitter, lights.kinds) if not kind.distant]
     number = torch.zeros_like(lights.area, dtype=torch.int64) if lights.kind is None else lights.kind
     count = int((number < len(near)).sum())
     number = number[:count]
-    axis, radiance, place = (x[:, :count].detach().double() for x in (lights.normal, lights.radiance, lights.p0))
-    surfaces = boxes[0].shape[1]
+    columns = {name: getattr(lights, name)[..., :count].detach().double() for name in COLUMNS}
+    place, surfaces = columns["p0"], boxes[0].shape[1]
     low, high = (torch.cat((box.double(), place[:, surfaces:]), 1) for box in boxes)
-    cos_o, cos_e = torch.ones_like(place[0]), torch.zeros_like(place[0])
-    # Seen face on a flat light is as bright as any of its power; a convex one shows a quarter of its area on average.
+    cos_o, cos_e = torch.empty_like(place[0]), torch.empty_like(place[0])
     intensity = power[:count].detach().double() / math.pi
     for k, kind in enumerate(near):
         rows = (number == k).nonzero().squeeze(1)
-        if kind == "spot":
-            # Whole within the beam, and beyond its edge up to the cutoff: see torchpt.lights.spot.
-            cutoff, slope = (x.index_select(0, rows).detach().double() for x in lights.e1[:2])
-            cos_o[rows], cos_e[rows] = torch.cos((cutoff - 1.0 / slope).clamp_min(0.0)), torch.cos(1.0 / slope)
-            intensity[rows] = luminance(radiance.index_select(1, rows).abs())
-        elif kind not in ("triangle", "rectangle", "disk"):
-            cos_o[rows] = -1.0
-            intensity[rows] *= 0.25
-    return Bounds(low, high, axis, cos_o, cos_e, intensity)
+        at = replace(lights, **{name: column.index_select(-1, rows) for name, column in columns.items()})
+        cone = kind.bounds(at, intensity[rows])
+        cos_o[rows], cos_e[rows], intensity[rows] = cone.cos_o, cone.cos_e, cone.intensity
+    return Bounds(low, high, columns["normal"], cos_o, cos_e, intensity)

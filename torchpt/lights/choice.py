@@ -6,7 +6,7 @@ to rays that meet a light by chance.
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from torchpt.math.threads import sum_all
 from torchpt.math.vectors import take
 from torchpt.records import Lights
 
-__all__ = ["MANY", "WAYS", "ByTree", "choice_of", "draw", "environment", "local", "probability"]
+__all__ = ["MANY", "WAYS", "ByTree", "choice_of", "draw", "environment", "local", "probability", "without_last"]
 
 #: Ways to choose: all lights alike, by power, by the tree, or by power below MANY lights that lie somewhere, by the tree from
 #: there on.
@@ -145,3 +145,16 @@ def environment(choice: Discrete | ByTree | None) -> Tensor | float:
     chosen = choice if isinstance(choice, Discrete) else choice.beside
     assert chosen is not None
     return chosen.pmf[-1]
+
+
+def without_last(choice: Discrete | ByTree) -> Discrete | ByTree:
+    """The choice among all rows but the last, which is infinitely far and not the only one left."""
+    if isinstance(choice, ByTree):
+        beside = choice.beside
+        assert beside is not None  # what is infinitely far is not of the tree
+        return replace(choice, beside=None if len(beside.pmf) == 2 else _fewer(beside))
+    return _fewer(choice)
+
+
+def _fewer(choice: Discrete) -> Discrete:
+    return Discrete.of(choice.pmf[:-1], choice.pmf.dtype)

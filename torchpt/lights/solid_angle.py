@@ -30,7 +30,6 @@ from torchpt.math.warps import uniform_triangle
 from torchpt.native.operators import operator
 
 __all__ = [
-    "KINDS",
     "LEAST",
     "MOST",
     "NEAR",
@@ -47,8 +46,6 @@ __all__ = [
     "tensor_sample",
 ]
 
-#: Primitive kinds that are sampled here.
-KINDS = ("triangle", "rectangle")
 #: Codes of shapes: a triangle, a rectangle, a parallelogram that is no rectangle, anything else.
 TRIANGLE, RECTANGLE, SKEW, OTHER = 0, 1, 2, 3
 #: Solid angles, in steradians, beyond which lights are sampled by area.
@@ -59,11 +56,11 @@ NEAR = 2.0
 SQUARE = 1e-6
 
 
-def table_of(kinds: Sequence[str], p0: Tensor, e1: Tensor, e2: Tensor, near: float = NEAR) -> Tensor | None:
+def table_of(codes: Sequence[int], p0: Tensor, e1: Tensor, e2: Tensor, near: float = NEAR) -> Tensor | None:
     """What :func:`sample` reads of lights.
 
     Args:
-        kinds: of the rows.
+        codes: of the rows' shapes: :data:`TRIANGLE`, :data:`RECTANGLE` (which may be sheared) or :data:`OTHER`.
         p0: ``(3, K)``.
         e1: ``(3, K)``.
         e2: ``(3, K)``.
@@ -71,13 +68,12 @@ def table_of(kinds: Sequence[str], p0: Tensor, e1: Tensor, e2: Tensor, near: flo
 
     Returns:
         ``(K, 14)`` float64: the shape's code, the squared distance from which on it is sampled by area, the centre which
-        that is from, ``p0``, ``e1``, ``e2``. None where none of the kinds is sampled by its solid angle.
+        that is from, ``p0``, ``e1``, ``e2``. None where none of them is sampled by its solid angle.
     """
-    if not set(KINDS) & set(kinds):
+    if set(codes) <= {OTHER}:
         return None
     p, a, b = (x.detach().double() for x in (p0, e1, e2))
-    numbers = {"triangle": TRIANGLE, "rectangle": RECTANGLE}
-    code = torch.tensor([numbers.get(kind, OTHER) for kind in kinds], device=p.device)
+    code = torch.tensor(codes, device=p.device)
     skew = dot(a, b).abs() > SQUARE * (dot(a, a) * dot(b, b)).sqrt()
     code = torch.where(skew & (code == RECTANGLE), SKEW, code)
     share = torch.where(code == TRIANGLE, 1.0 / 3.0, 0.5).double()

@@ -12,13 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
+from torchpt.lights import KINDS as LIGHTS
 from torchpt.meshes.gltf_document import Document
 from torchpt.meshes.mesh_part import FileCamera, FileLight
+from torchpt.spec import parameters_of
 
 __all__ = ["PUNCTUAL", "camera_at", "light_at"]
 
 PUNCTUAL = "KHR_lights_punctual"
 _KEYS = ("name", "type", "color", "intensity", "spot", "extras")
+#: The extension's kinds of lights, which are called as ours.
+_TYPES = ("point", "spot", "directional")
 #: Amounts and lengths beyond it are taken for mistakes.
 _MOST = 1e30
 #: Degrees that a beam has at least: light that is whole on the axis alone.
@@ -61,8 +65,9 @@ class _Rules:
     def __init__(self, document: Document, index: int, block: dict[str, Any]) -> None:
         self.document, self.index, self.block = document, index, block
         self.kind = str(block.get("type"))
-        if self.kind not in ("point", "spot", "directional"):
+        if self.kind not in _TYPES:
             raise self.wrong(f"type {self.kind[:40]!r}, expected point, spot or directional")
+        self.parameters = parameters_of(LIGHTS[self.kind])
 
     def numbers(self) -> dict[str, float | tuple[float, ...]]:
         """What a scene file's light of its type has beside its place."""
@@ -73,10 +78,10 @@ class _Rules:
         amount = tuple(self.number("color", value) * intensity for value in color)
         if max(amount) > _MOST:
             raise self.wrong(f"color times intensity is above {_MOST:g}")
-        if self.kind == "directional":
-            return {"irradiance": amount}
-        if self.kind == "point":
-            return {"intensity": amount}
+        key = "intensity" if "intensity" in self.parameters else "irradiance"
+        return {key: amount, **(self.cone() if "cutoff_angle" in self.parameters else {})}
+
+    def cone(self) -> dict[str, float]:
         cone = self.block.get("spot", {})
         inner = self.number("innerConeAngle", cone.get("innerConeAngle", 0.0))
         outer = self.number("outerConeAngle", cone.get("outerConeAngle", math.pi / 4.0))
@@ -86,7 +91,7 @@ class _Rules:
             raise self.wrong(f"innerConeAngle {inner:g} is not below outerConeAngle {outer:g}")
         cutoff = math.degrees(outer)
         beam = min(max(math.degrees(inner), _NARROWEST), cutoff)
-        return {"intensity": amount, "cutoff_angle": cutoff, "beam_width": beam}
+        return {"cutoff_angle": cutoff, "beam_width": beam}
 
     def number(self, key: str, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= _MOST:

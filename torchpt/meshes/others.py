@@ -50,7 +50,7 @@ def load_others(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
         raise AssetError(path, f"malformed {kind} ({type(error).__name__}: {reason})") from None
     if lost and materials:
         raise AssetError(path, f"the file {lost[0][:80]!r} is missing")
-    parts = mesh_parts_of(scene, str(path), most=max(MOST_PLACED, len(data)))
+    parts = mesh_parts_of(scene, str(path), materials=materials, most=max(MOST_PLACED, len(data)))
     ignored = tuple(dict.fromkeys((*parts[0].ignored, *notes.texts)))
     return [replace(parts[0], ignored=ignored), *parts[1:]]
 

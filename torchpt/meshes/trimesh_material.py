@@ -36,10 +36,11 @@ class Looks:
 
     Args:
         label: what errors call their owner.
+        wanted: whether there are to be any.
     """
 
-    def __init__(self, label: str) -> None:
-        self.label = label
+    def __init__(self, label: str, wanted: bool = True) -> None:
+        self.label, self.wanted = label, wanted
         # What an id belongs to is kept, so that it stays its own.
         self._materials: dict[tuple[int, bool], tuple[Any, FileMaterial | None, NDArray[np.float64] | None]] = {}
         self._pictures: dict[int, tuple[Any, EncodedImage]] = {}
@@ -52,6 +53,8 @@ class Looks:
         Raises:
             AssetError: a picture that cannot be used, numbers that no material has.
         """
+        if not self.wanted:
+            return None, colors
         key = id(material), colors is not None
         if key not in self._materials:
             one = None if colors is None else np.ones((1, 3))

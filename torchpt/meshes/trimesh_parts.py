@@ -26,7 +26,9 @@ Matrix = NDArray[np.float64]
 Placed = tuple[str, str, Matrix]
 
 
-def mesh_parts_of(source: Any, label: str = "trimesh", *, most: int = MOST_PLACED) -> list[MeshPart]:
+def mesh_parts_of(
+    source: Any, label: str = "trimesh", *, materials: bool = True, most: int = MOST_PLACED
+) -> list[MeshPart]:
     """What a ``trimesh.Trimesh`` or ``trimesh.Scene`` holds, one part for each node and material, in the scene's space.
 
     Normals are those that the mesh has (given to it, or asked of it before), as when trimesh writes a file. Nothing of the
@@ -35,6 +37,7 @@ def mesh_parts_of(source: Any, label: str = "trimesh", *, most: int = MOST_PLACE
     Args:
         source: the object.
         label: what errors call it.
+        materials: whether to read its own materials.
         most: vertices or faces that the nodes may come to.
 
     Raises:
@@ -42,7 +45,7 @@ def mesh_parts_of(source: Any, label: str = "trimesh", *, most: int = MOST_PLACE
     """
     import trimesh
 
-    looks = Looks(label)
+    looks = Looks(label, materials)
     if isinstance(source, trimesh.Trimesh):
         return checked(parts_of(source, "", looks), Path(label))
     if not isinstance(source, trimesh.Scene):

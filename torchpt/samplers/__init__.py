@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from torchpt.lanes.tracing import tracing
+from torchpt.math.hashing import as_int32, mix_int
 from torchpt.samplers.base import Numbers, Points
 from torchpt.samplers.dimensions import Dimension, salt
-from torchpt.samplers.hashing import as_int32, mix_int
 from torchpt.spec import Kinds
 
 __all__ = ["KINDS", "Dimension", "Draws", "Numbers", "Points", "Sampler", "points_of", "salts"]

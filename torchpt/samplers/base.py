@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchpt.samplers.hashing import mix
+from torchpt.math.hashing import mix
 from torchpt.spec import Spec
 
 __all__ = ["Numbers", "Points"]

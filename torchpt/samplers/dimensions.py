@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from torchpt.samplers.hashing import mix_int
+from torchpt.math.hashing import mix_int
 
 __all__ = ["STREAMS", "Dimension", "salt"]
 

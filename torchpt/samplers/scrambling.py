@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchpt.samplers.hashing import as_int32, logical_shift
+from torchpt.math.hashing import as_int32, logical_shift
 
 __all__ = ["X", "Y", "reverse_bits", "scramble", "second_dimension"]
 

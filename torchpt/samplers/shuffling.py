@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.samplers.hashing import as_int32, logical_shift, mix
+from torchpt.math.hashing import as_int32, logical_shift, mix
 
 __all__ = ["ROUNDS", "STEP", "STRIDE", "shuffle"]
 

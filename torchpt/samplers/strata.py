@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.samplers.hashing import mix, to_unit
+from torchpt.math.hashing import mix, to_unit
 from torchpt.samplers.scrambling import X
 from torchpt.samplers.shuffling import shuffle
 

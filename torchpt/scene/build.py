@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchpt.format.description import Description
-from torchpt.records import KINDS, SOURCES
+from torchpt.lights import order
+from torchpt.records import KINDS
 from torchpt.scene.materials import declare, resolved
 from torchpt.scene.parameters import Parameters
 from torchpt.scene.parts import Copy, Part, Source
@@ -28,7 +29,7 @@ class Built:
         parameters: arrays by dotted name.
         centre: ``(3,)`` float64, subtracted from all positions.
         unit: what all lengths are divided by.
-        sources: lights that are no surfaces, in the order of ``records.SOURCES``.
+        sources: lights that are no surfaces, in the order of ``lights.order``.
         copies: instances of parts.
     """
 
@@ -56,7 +57,7 @@ def build_parts(description: Description) -> Built:
     for name, material in description.materials.items():
         declare(resolved(material, f"materials.{name}", description.materials, opener), parameters)
     sources = sources_of(description, parameters)
-    sources = sorted([*sources, *builder.sources], key=lambda source: SOURCES.index(source.kind))
+    sources = sorted([*sources, *builder.sources], key=lambda source: order(source.kind))
     parameters.declare_all("camera", description.camera.kind, description.camera.values)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from torchpt.errors import AssetError
 from torchpt.math.transforms import is_usable
 from torchpt.meshes import FileLight, MeshPart
+from torchpt.meshes.mesh_part import checked
 from torchpt.meshes.trimesh_material import Looks
 from torchpt.meshes.trimesh_parts import lights_of, parts_of, placed_in
 from torchpt.scene.scene import Scene, load
@@ -97,7 +99,7 @@ def _shapes(source: Any) -> tuple[dict[str, Any], bool]:
     labels = labels_of(["".join(c if c.isprintable() else "_" for c in node).strip() for node, _, _ in nodes])
     for label, (_, name, matrix) in zip(labels, nodes, strict=True):
         if name not in known:
-            known[name] = parts_of(source.geometry[name], str(name)[:80], looks)
+            known[name] = checked(parts_of(source.geometry[name], str(name)[:80], looks), Path(_LABEL))
         emits = any("emission" in part.material.material for part in known[name] if part.material is not None)
         glows |= emits
         if name in first and not emits and is_usable(matrix):

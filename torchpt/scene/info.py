@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
-
 from torchpt import bsdfs
 from torchpt.accel import Accel
 from torchpt.film import FILTERS
+from torchpt.lights import KINDS as LIGHTS
+from torchpt.lights import SURFACES, Environment
 from torchpt.lights.choice import ByTree
 from torchpt.records import KINDS, Lights, World, tensors_of
 from torchpt.settings import Settings
@@ -31,7 +31,8 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
             brought.setdefault(owner.removeprefix("shapes."), {})[label] = source.kind
     for part in built.parts:
         count = len(part.faces) if part.faces is not None else 1
-        row: dict[str, Any] = {"kind": part.quadric or part.kind, "primitives": count, "material": part.material.name}
+        kind = part.kind if part.quadric is None else part.quadric.name
+        row: dict[str, Any] = {"kind": kind, "primitives": count, "material": part.material.name}
         if part.emission is not None:
             row["emission"] = list(part.emission) if part.emission_texture is None else "a texture"
         if part.source:
@@ -42,7 +43,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
             row["lights"] = brought.pop(part.shape)  # once for a shape of several parts
         if part.ignored:
             row["ignored_in_file"] = list(part.ignored)
-        if part.kind == "triangle":
+        if part.faces is not None:
             row["normals"] = (
                 "face" if not part.smooth else "computed, smooth" if part.normals is None else "from the file"
             )
@@ -60,16 +61,10 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
         "lights": {} if lights is None else _lights(lights),
         "scene_bytes": memory,
     }
-    around = None if lights is None else lights.environment
-    if around is not None and not isinstance(around, Tensor):
-        compensated = around.compensated is not None
-        made["lights"]["envmap"] = {"texels": [around.width, around.height], "mis_compensation": compensated}
-    if world.textures.atlas is not None:
-        texels = world.textures.atlas.texels
-        made["textures"] = {
-            "reads": world.textures.atlas.places.shape[1],
-            "bytes": texels.numel() * texels.element_size(),
-        }
+    reads = sum(table.count for table in world.textures.tables)
+    if reads:
+        tensors = tensors_of(world.textures.tables)
+        made["textures"] = {"reads": reads, "bytes": sum(x.numel() * x.element_size() for x in tensors)}
     if built.centre.any():
         made["origin_moved_to"] = built.centre.tolist()
     if built.unit != 1.0:
@@ -96,6 +91,9 @@ def _lights(lights: Lights) -> dict[str, Any]:
         found["choice"] = {"tree": {"nodes": len(tree.nodes), "levels": tree.levels}}
     elif lights.choice is not None:
         found["choice"] = "a fixed chance for each"
+    last = LIGHTS.get(lights.kinds[-1])
+    if last is not None and issubclass(last, Environment) and (told := last.info(lights.environment)):
+        found[last.name] = told
     return found
 
 
@@ -132,7 +130,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
             absent.append("environment")
         if lights.row_of_prim is None:
             absent.append("area lights")
-        absent += [f"sampling of {kind} lights" for kind in KINDS if kind not in lights.kinds]
+        absent += [f"sampling of {kind} lights" for kind in SURFACES if kind not in lights.kinds]
     if not FILTERS[settings.film.filter.name].tabulated:
         absent.append(f"filter table ({settings.film.filter.name})")
     if not description.camera.kind.lens:
@@ -144,8 +142,8 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
         absent.append("Russian roulette (paths end before rr_depth)")
     if not settings.film.aovs:
         absent.append("aov layers")
-    if world.textures.atlas is None:
-        absent.append("textures (no image is read)")
+    if not any(table.count for table in world.textures.tables):
+        absent.append("textures (no image is read, none is computed)")
     if world.geometry.colors is None:
         absent.append("vertex colours")
     if all(

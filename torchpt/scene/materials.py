@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 from torchpt.bsdfs.base import made
@@ -11,15 +10,14 @@ from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.format.materials import POINTS, inner_of
 from torchpt.format.textures import TextureInput
 from torchpt.scene.parameters import Parameters
-from torchpt.spec import Color, Scalar, Spec, Texels, parameters_of
+from torchpt.spec import parameters_of
 from torchpt.spec.declared import Described
-from torchpt.spec.reading import LARGEST
-from torchpt.textures import Node, Reading
+from torchpt.textures import Node
 
 __all__ = ["declare", "resolved"]
 
 #: What makes the texture of a slot, by its dotted key, one that can be read.
-Resolve = Callable[[TextureInput, str], Reading]
+Resolve = Callable[[TextureInput, str], Node]
 
 
 def resolved(
@@ -44,8 +42,8 @@ def resolved(
     def opened(key: str, value: Any) -> Any:
         if resolve is None or not isinstance(value, TextureInput):
             return value
-        reading = resolve(value, f"{name}.{key}")
-        return replace(reading, filtered=False) if key in POINTS and isinstance(reading, Node) else reading
+        node = resolve(value, f"{name}.{key}")
+        return node.at_points() if key in POINTS else node
 
     def common(key: str) -> Any:
         return opened(key, material[key])
@@ -67,27 +65,10 @@ def resolved(
 
 
 def declare(material: ResolvedMaterial, parameters: Parameters) -> None:
-    """Add a material's numbers to the parameters, and what its slots accept to the texels that they read."""
+    """Add a material's numbers to the parameters; those of its textures are added as they are opened."""
     specs = parameters_of(material.model)
     for key, value in material.own().items():
         if isinstance(value, float | tuple):
             parameters.declare(f"{material.name}.{key}", value, specs[key])
-        elif isinstance(value, Node):
-            _declare_texels(value, specs[key], parameters)
     for inner in material.inner:
         declare(inner, parameters)
-
-
-def _declare_texels(node: Node, slot: Spec, parameters: Parameters) -> None:
-    """What a slot accepts of the texels that give it, which other slots may read as well."""
-    assert isinstance(slot, Scalar | Color)
-    low, high = slot.bounds
-    texels = node.texels
-    for name in [texels] if texels in parameters else [key for key in parameters if key.startswith(f"{texels}.")]:
-        spec = parameters.specs.get(name, Texels(low=None))
-        if isinstance(spec, Texels | Color):
-            for factor in set(node.scale) - {0.0}:
-                ends = sorted((low / factor, high / factor))
-                least, most = max(ends[0], spec.bounds[0]), min(ends[1], spec.bounds[1])
-                spec = replace(spec, low=least if least > -LARGEST else None, high=most if most < LARGEST else None)
-            parameters.specs[name] = spec

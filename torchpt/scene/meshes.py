@@ -57,7 +57,7 @@ def mesh_of(triangles: Triangles, key: str, description: Description, opener: Op
     elif triangles.object is not None:
         from torchpt.meshes.trimesh_parts import mesh_parts_of
 
-        pieces, source = mesh_parts_of(triangles.object), "trimesh"
+        pieces, source = mesh_parts_of(triangles.object, materials=materials), "trimesh"
     else:
         assert triangles.vertices is not None and triangles.faces is not None
         arrays = (triangles.vertices, triangles.faces, triangles.normals, triangles.uvs)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from torchpt.bsdfs.resolved import ResolvedMaterial
+from torchpt.shapes.quadrics import Quadric
 from torchpt.textures import Node
 
 __all__ = ["Copy", "Part", "Source"]
@@ -28,7 +31,7 @@ class Part:
         flip: whether the normals are turned around.
         to_world: ``(4, 4)`` float64.
         local: ``(4, 4)`` float64 applied before the parameter ``to_world``, or None; where several parts share that.
-        quadric: which of ``records.QUADRICS``, or "".
+        quadric: its surface in its own space, where the kind is ``quadric``.
         piece: its name within its shape, where the shape has several under one name.
         vertices: ``(V, 3)`` float64 in the file's own space; None for analytic shapes.
         faces: ``(F, 3)`` int64.
@@ -51,7 +54,7 @@ class Part:
     flip: bool
     to_world: np.ndarray
     local: np.ndarray | None = None
-    quadric: str = ""
+    quadric: type[Quadric] | None = None
     piece: str = ""
     vertices: np.ndarray | None = None
     faces: np.ndarray | None = None
@@ -94,8 +97,10 @@ class Source:
 
     Attributes:
         name: dotted prefix of its parameters, e.g. ``lights.sky``.
-        kind: one of ``records.SOURCES``.
+        kind: one of ``lights.KINDS``.
+        values: of its parameters as it was loaded, those that are no tensors included.
     """
 
     name: str
     kind: str
+    values: Mapping[str, Any] = field(default_factory=dict)

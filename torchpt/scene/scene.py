@@ -24,6 +24,7 @@ from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
 from torchpt.scene.info import describe
+from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, middle_of
 from torchpt.settings import Film, Settings
 from torchpt.spec import Moves, Pose, Refused, Scalar, Spec, parameters_of
@@ -133,6 +134,7 @@ class Scene:
                 found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
                 raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}")
             self._check(name, value.detach())
+        check_sources(self._built.sources, params or {}, self.merged(params))
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """All parameters, those of ``params`` (once checked) in place of the scene's."""

@@ -21,6 +21,7 @@ from torchpt.scene.parts import Copy, Part, Source
 from torchpt.scene.sources import file_lights, labels_of
 from torchpt.scene.texels import Opener
 from torchpt.shapes.base import Surface, Triangles
+from torchpt.shapes.primitive import PRIMITIVES
 from torchpt.spec import Pose, Vertices, parameters_of
 from torchpt.spec.declared import Described
 from torchpt.textures import Node
@@ -114,7 +115,7 @@ class ShapeBuilder:
         ]
 
     def _declare_pose(self, stem: str, pose: np.ndarray, surfaces: list[Surface]) -> None:
-        angles = any(surface.kind == "sphere" for surface in surfaces)
+        angles = any(PRIMITIVES[surface.kind].angles for surface in surfaces)
         self.parameters.declare(f"{stem}.to_world", pose, Pose(angles=angles))
 
     def _meshes(self, owner: Owner, triangles: Triangles) -> list[Part]:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
 import numpy as np
+from torch import Tensor
 
 from torchpt.errors import AssetError, SceneError
 from torchpt.format.description import Description
@@ -11,10 +16,11 @@ from torchpt.math.transforms import apply_points
 from torchpt.meshes import FileLight
 from torchpt.scene.parameters import Parameters
 from torchpt.scene.parts import Source
-from torchpt.scene.texels import radiance_of
-from torchpt.spec import Texels
+from torchpt.spec import Refused, parameters_of
+from torchpt.spec.declared import Described
+from torchpt.spec.validate import refused
 
-__all__ = ["file_lights", "labels_of", "sources_of"]
+__all__ = ["check_sources", "file_lights", "labels_of", "sources_of"]
 
 
 def sources_of(description: Description, parameters: Parameters) -> list[Source]:
@@ -26,19 +32,49 @@ def sources_of(description: Description, parameters: Parameters) -> list[Source]
         expected = f"one environment only ({first} is one)"
         raise SceneError(f"lights.{second}", lights[second].name, expected, description.file)
     for name, light in lights.items():
-        parameters.declare_all(f"lights.{name}", light.kind, light.values)
-        if light.name == "envmap":
-            key = f"lights.{name}.path"
-            source = description.resolve(light["path"], key)
-            parameters.declare(f"lights.{name}.texels", radiance_of(source, key, description.file), Texels())
-    return [Source(f"lights.{name}", light.name) for name, light in lights.items()]
+        key = f"lights.{name}"
+        parameters.declare_all(key, light.kind, light.values)
+        try:
+            arrays = light.kind.files(light.values, partial(_file, description, key, light))
+        except Refused as error:
+            raise refused(error, key, None, description.file) from None
+        for stem, (values, spec) in arrays.items():
+            parameters.declare(f"{key}.{stem}", values, spec)
+    return [Source(f"lights.{name}", light.name, light.values) for name, light in lights.items()]
+
+
+def _file(description: Description, key: str, light: Described, parameter: str) -> Path:
+    return description.resolve(light[parameter], f"{key}.{parameter}")
+
+
+def check_sources(sources: Sequence[Source], given: Collection[str], parameters: Mapping[str, Tensor]) -> None:
+    """Refuse parameters that do not go together.
+
+    Args:
+        sources: of the scene.
+        given: names of the parameters that were replaced.
+        parameters: all of them.
+
+    Raises:
+        SceneError: as the kinds' own checks of a scene file.
+    """
+    for source in sources:
+        kind = LIGHTS[source.kind]
+        names = {key: f"{source.name}.{key}" for key in parameters_of(kind)}
+        if not any(name in given for name in names.values()):
+            continue
+        numbers = {key: parameters[name].tolist() for key, name in names.items() if name in parameters}
+        try:
+            kind.check({**source.values, **numbers}, frozenset(numbers))
+        except Refused as error:
+            raise refused(error, f"params.{source.name}", None, None) from None
 
 
 def file_lights(
     lights: list[FileLight], prefix: str, pose: np.ndarray, source: str, parameters: Parameters
 ) -> list[Source]:
     """The lights of a mesh file, placed in the scene; their numbers become parameters."""
-    found = []
+    sources = []
     for light, label in zip(lights, labels_of([light.name for light in lights]), strict=True):
         stem = f"{prefix}.lights.{label}"
         with np.errstate(over="ignore", invalid="ignore"):
@@ -49,13 +85,13 @@ def file_lights(
         if not held:
             raise AssetError(source, f"light {light.name!r} has no finite place under the transform of {prefix}")
         direction = direction / np.linalg.norm(direction)
-        place = {"direction": direction} if light.kind == "directional" else {"position": position}
-        if light.kind == "spot":
-            # As far off as the origin, so that the difference of the two is as exact as they are.
-            place["target"] = position + direction * max(1.0, np.abs(position).max())
-        parameters.declare_all(stem, LIGHTS[light.kind], {**place, **light.numbers})
-        found.append(Source(stem, light.kind))
-    return found
+        # A target as far off as the origin, so that the difference of the two is as exact as they are.
+        target = position + direction * max(1.0, np.abs(position).max())
+        places = {"position": position, "direction": direction, "target": target}
+        values = {key: places.get(key, light.numbers.get(key)) for key in parameters_of(LIGHTS[light.kind])}
+        parameters.declare_all(stem, LIGHTS[light.kind], values)
+        sources.append(Source(stem, light.kind, values))
+    return sources
 
 
 def labels_of(names: list[str]) -> list[str]:

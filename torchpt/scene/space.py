@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpt.errors import SceneError
+from torchpt.lights import KINDS as LIGHTS
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.spec.declared import Described
 
@@ -136,9 +137,9 @@ def _reaches(
     found = [("camera", float(np.abs(parameters["camera.to_world"][:3, 3] - centre).max()))]
     found += [(f"camera.{key}", float(camera[key])) for key in camera.kind.reaches]
     for source in sources:
-        position = parameters.get(f"{source.name}.position")
-        if position is not None:
-            found.append((f"{source.name}.position", float(np.abs(position - centre).max())))
+        for place in LIGHTS[source.kind].places:
+            name = f"{source.name}.{place}"
+            found.append((name, float(np.abs(parameters[name] - centre).max())))
     return found
 
 

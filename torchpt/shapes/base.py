@@ -15,6 +15,7 @@ from torchpt.spec import Color, Flag, Other, Pose, Refused, Spec
 __all__ = ["BOTTOM", "TOP", "UPRIGHT", "Place", "Shape", "Size", "Surface", "Triangles", "placed"]
 
 if TYPE_CHECKING:
+    from torchpt.shapes.quadrics import Quadric
     from torchpt.spec.declared import Described
 
 Matrix = NDArray[np.float64]
@@ -42,13 +43,13 @@ class Surface:
         kind: of primitive, one of ``records.KINDS``.
         label: its name within the shape, where that has several.
         local: ``(4, 4)`` from the primitive's own space to the shape's; None: the same.
-        quadric: which of ``records.QUADRICS``, or "".
+        quadric: its surface in its own space, where the kind is ``quadric``.
     """
 
     kind: str
     label: str = ""
     local: Matrix | None = None
-    quadric: str = ""
+    quadric: type[Quadric] | None = None
 
 
 @dataclass(frozen=True)

@@ -7,28 +7,11 @@ files and the tables of the docs are made of these.
 
 from __future__ import annotations
 
+from torchpt.spec.base import REQUIRED, Moves, Spec
+from torchpt.spec.choices import Choice, Flag, Map, Other, Pair, Path, Whole
 from torchpt.spec.kinds import Block, Kinds, parameters_of
-from torchpt.spec.parameters import (
-    REQUIRED,
-    Angle,
-    Choice,
-    Color,
-    Direction,
-    Flag,
-    Index,
-    Map,
-    Moves,
-    Other,
-    Path,
-    Point,
-    Pose,
-    Scalar,
-    Spec,
-    Texels,
-    Vertices,
-    Whole,
-    spec_of,
-)
+from torchpt.spec.numbers import Angle, Color, Index, Scalar, Texels, spec_of
+from torchpt.spec.places import Direction, Point, Pose, Vertices
 from torchpt.spec.reading import Refused
 from torchpt.spec.valued import Valued
 
@@ -45,6 +28,7 @@ __all__ = [
     "Map",
     "Moves",
     "Other",
+    "Pair",
     "Path",
     "Point",
     "Pose",

@@ -11,7 +11,8 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar
 
-from torchpt.spec.parameters import Spec, spec_of
+from torchpt.spec.base import Spec
+from torchpt.spec.numbers import spec_of
 
 __all__ = ["Block", "Kinds", "parameters_of"]
 

@@ -1,4 +1,4 @@
-"""Plain mappings to models: the `type:` table look-up, and pydantic's errors as one :class:`SceneError`."""
+"""Plain mappings to models, and pydantic's errors as one :class:`SceneError`."""
 
 from __future__ import annotations
 
@@ -12,11 +12,9 @@ from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_plain_validator_function
 
 from torchpt.errors import NotBuiltError, SceneError
-from torchpt.spec import Refused, not_built
+from torchpt.spec import Refused
 
-__all__ = [
-    "Check", "Model", "check_keys", "construct", "dotted", "refuse_foreign", "refuse_not_built", "refused", "select",
-]  # fmt: skip
+__all__ = ["Check", "Model", "check_keys", "construct", "dotted", "refuse_not_built", "refused"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,68 +102,6 @@ def refused(error: Refused, key: str, value: Any, file: str | None) -> SceneErro
     shown = value if error.value is ... else error.value
     kind = NotBuiltError if error.not_built else SceneError
     return kind(dotted(key, *error.at), shown, error.expected, file)
-
-
-def select(kind: str, table: Mapping[str, type[M]], raw: Any, key: str, file: str | None, default: str = "") -> M:
-    """The model of a mapping whose ``type`` picks it from a table.
-
-    Args:
-        kind: what the table holds, a key of :data:`not_built.TYPES`, e.g. ``material``.
-        table: the built types.
-        raw: the mapping as written.
-        key: dotted key of the mapping.
-        file: scene file for the error.
-        default: the type where none is given; without one ``type`` is required.
-
-    Raises:
-        SceneError: no mapping, an unknown type, an unknown key, a bad value.
-        NotBuiltError: a type or key that the format knows and this version does not build.
-    """
-    planned = not_built.TYPES.get(kind, {})
-    types = ", ".join([*table, *planned])
-    if not isinstance(raw, Mapping):
-        raise SceneError(key, raw, f"a mapping with a type of {types}", file)
-    name = raw.get("type", default or None)
-    if not isinstance(name, str) or (name not in table and name not in planned):
-        close = difflib.get_close_matches(name, [*table, *planned], 1) if isinstance(name, str) else []
-        hint = f" (did you mean {close[0]}?)" if close else ""
-        raise SceneError(dotted(key, "type"), name, f"a known {kind} type{hint}: {types}", file)
-    what = f"{kind} type {name}"
-    if name in planned:
-        check_keys(raw, ("type", *planned[name]), key, what, file)
-        raise NotBuiltError(dotted(key, "type"), name, ", ".join(table), file)
-    model = table[name]
-    later = {**not_built.KEYS.get(kind, {}), **not_built.KEYS.get(name, {})}
-    check_keys({k: v for k, v in raw.items() if k not in later}, ("type", *_fields(model)), key, what, file)
-    rest = refuse_not_built(raw, later, key, ", ".join(_fields(model)), file)
-    given = {k: value for k, value in rest.items() if value is not None}  # null means unset
-    return construct(model, {**given, "type": name}, key, file, what)
-
-
-def refuse_foreign(kind: str, table: Mapping[str, type[Model]], raw: Any, default: str, file: str | None) -> None:
-    """Raises for a key of a block that another type of the table reads: it could be accepted only to do nothing.
-
-    Args:
-        kind: what the table holds, which is the block's key too.
-        table: the built types.
-        raw: the block as written.
-        default: the type where none is given.
-        file: scene file for the error.
-    """
-    name = raw.get("type", default) if isinstance(raw, Mapping) else None
-    if not isinstance(name, str) or name not in table:
-        return
-    own = table[name].model_fields
-    for key, value in raw.items():
-        owners = [other for other, model in table.items() if key in model.model_fields]
-        if key not in own and owners:
-            keys, others = ", ".join(own), ", ".join(owners)
-            expected = f"only keys that the {name} {kind} reads ({keys}); {key} belongs to {others}"
-            raise SceneError(dotted(kind, key), value, expected, file)
-
-
-def _fields(model: type[Model]) -> list[str]:
-    return [name for name in model.model_fields if name != "type"]
 
 
 def refuse_not_built(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from torchpt.spec.base import REQUIRED, Spec
 from torchpt.spec.kinds import parameters_of
-from torchpt.spec.parameters import REQUIRED, Spec
 
 if TYPE_CHECKING:
     from typing import Self

@@ -1,32 +1,41 @@
-"""Textures on the lanes: one atlas of all that is read, and look-ups that are differentiable."""
+"""Textures on the lanes: images lie in one atlas, others are computed; look-ups are differentiable.
+
+One kind a file in ``kinds/``. ``base.py`` says what a kind, a node and a table are, ``atlas.py`` reads images, ``computed.py``
+is for textures whose values are computed from coordinates, and ``bindings.py`` says which material reads what.
+"""
 
 from __future__ import annotations
 
-from torchpt.textures.atlas import (
-    WRAPS,
-    Atlas,
-    MaterialTextures,
+from torchpt.spec import Kinds
+from torchpt.textures.base import (
+    CHANNELS,
+    Named,
     Node,
-    OpacityMaps,
-    Pyramids,
-    TextureBinding,
-    atlas_of,
-    look_up,
-    slope,
+    Opening,
+    Table,
+    Texture,
+    TextureInput,
+    TexturePoint,
 )
-from torchpt.textures.reading import Reading, VertexColors
+from torchpt.textures.bindings import MaterialTextures, NodeMap, OpacityMaps, Place, TextureBinding, tables_of
 
 __all__ = [
-    "WRAPS",
-    "Atlas",
+    "CHANNELS",
+    "KINDS",
     "MaterialTextures",
+    "Named",
     "Node",
+    "NodeMap",
     "OpacityMaps",
-    "Pyramids",
-    "Reading",
+    "Opening",
+    "Place",
+    "Table",
+    "Texture",
     "TextureBinding",
-    "VertexColors",
-    "atlas_of",
-    "look_up",
-    "slope",
+    "TextureInput",
+    "TexturePoint",
+    "tables_of",
 ]
+
+#: The kinds of textures.
+KINDS: Kinds[Texture] = Kinds("torchpt.textures.kinds", ("image", "checkerboard", "vertex_color"))

@@ -1,6 +1,6 @@
 """One atlas for all images of a scene, and look-ups into it that are differentiable in texels and coordinates.
 
-An image lies in the atlas as planes of floats, one a channel. A *node* is one way of reading it: which plane, how it
+An image lies in the atlas as planes of floats, one a channel. A node says how it is read: which plane, how it
 repeats, how texture coordinates are transformed. Texel centres are at ``(i + 1/2) / size``; row 0 is ``v = 0`` (Mitsuba).
 
 A node that filters has its image in smaller and smaller sizes too (Williams, *Pyramidal Parametrics*, 1983). Each is a further
@@ -10,27 +10,18 @@ node that reads as the first one does, and a look-up lies between the two whose 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchpt.math.threads import mean_all
 from torchpt.math.vectors import luminance, take
+from torchpt.textures.base import SAME, Matrix, Node, Table, TexturePoint, moved
 
-__all__ = [
-    "WRAPS",
-    "Atlas",
-    "MaterialTextures",
-    "Node",
-    "OpacityMaps",
-    "Pyramids",
-    "TextureBinding",
-    "atlas_of",
-    "look_up",
-    "slope",
-]
+__all__ = ["WRAPS", "Atlas", "ImageNode", "Pyramids", "atlas_of", "look_up", "slope"]
 
 #: How an image goes on beyond its edges, in the order of the codes in :class:`Atlas`.
 WRAPS = ("repeat", "clamp", "mirror")
@@ -39,26 +30,55 @@ _FAR = 2.0**30
 
 
 @dataclass(frozen=True)
-class Node:
-    """One way of reading an image; static.
+class ImageNode(Node):
+    """One way of reading an image.
 
     Attributes:
-        texels: which of the images.
-        channel: None for a colour, else the channel read as a number: its index, or -1 for luminance.
+        texels: which of the images: the parameter that holds it, or of which ``made`` makes it.
+        channel: see :class:`Node`.
         wrap: one of :data:`WRAPS`.
         nearest: take the nearest texel; else bilinear.
         transform: rows of the affine map ``(2, 3)`` of texture coordinates.
         scale: factors of the three channels (of a number: the first).
         filtered: whether footprints larger than a texel read the image in smaller sizes.
+        made: makes the image ``(H, W, C)`` of the parameters and ``texels``; None: it is a parameter.
     """
 
     texels: str
     channel: int | None
     wrap: str
     nearest: bool
-    transform: tuple[tuple[float, float, float], tuple[float, float, float]]
+    transform: Matrix
     scale: tuple[float, float, float]
     filtered: bool = False
+    made: Callable[[Mapping[str, Tensor], str], Tensor] | None = None
+
+    @property
+    def variant(self) -> Hashable:
+        """See :class:`Node`."""
+        return Atlas
+
+    def divided(self, unit: float) -> ImageNode:
+        """See :class:`Node`."""
+        x, y, z = self.scale
+        return replace(self, scale=(x / unit, y / unit, z / unit))
+
+    def image(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """What it reads ``(H, W, C)``, linear."""
+        return parameters[self.texels] if self.made is None else self.made(parameters, self.texels)
+
+    def table(
+        self, nodes: Sequence[Any], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
+    ) -> Table:
+        """See :class:`Node`."""
+        first = {node.texels: node for node in reversed(nodes)}
+        return atlas_of(nodes, {name: node.image(parameters) for name, node in first.items()}, dtype, device)
+
+    def mean(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Of the whole image, however it is read; see :class:`Node`."""
+        image = self.image(parameters).detach().double()
+        color = image[..., :3].mean((0, 1)) if image.shape[2] >= 3 else mean_all(image[..., 0]).expand(3)
+        return color * color.new_tensor(self.scale)
 
 
 @dataclass(frozen=True)
@@ -77,7 +97,7 @@ class Pyramids:
 
 
 @dataclass(frozen=True)
-class Atlas:
+class Atlas(Table):
     """All planes, and the nodes that read them.
 
     Attributes:
@@ -98,62 +118,28 @@ class Atlas:
     moved: bool
     pyramids: Pyramids | None = None
 
+    @property
+    def count(self) -> int:
+        """Nodes, smaller sizes included."""
+        return self.places.shape[1]
 
-@dataclass(frozen=True)
-class TextureBinding:
-    """Which texture a material reads, for the rows of one model.
+    @property
+    def filtered(self) -> bool:
+        """See :class:`Table`."""
+        return self.pyramids is not None
 
-    Attributes:
-        nodes: ``(R,)`` int64 into the atlas; None: the colours of vertices.
-        channel: static; None: a colour. Of vertex colours as in :class:`Node`, of nodes any number.
-        filtered: static; whether any of them filters.
-    """
+    def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
+        """See :class:`Table`."""
+        assert point.uv is not None
+        return look_up(self, nodes, point.uv, coloured, point.footprint)
 
-    nodes: Tensor | None
-    channel: int | None
-    filtered: bool = False
-
-
-@dataclass(frozen=True)
-class MaterialTextures:
-    """What the materials of one model read from textures.
-
-    Attributes:
-        readings: :class:`TextureBinding` by parameter, nested as the parameters are.
-        normal: normals in the surface's own frame, or None.
-        bump: heights, or None.
-        strength: ``(R,)`` how far those normals lean, as a factor; None where it is 1.
-        filtered: static; whether any texture here filters.
-    """
-
-    readings: dict[str, Any]
-    normal: TextureBinding | None
-    bump: TextureBinding | None
-    strength: Tensor | None = None
-    filtered: bool = False
+    def slope(self, nodes: Tensor, point: TexturePoint) -> tuple[Tensor, Tensor]:
+        """See :class:`Table`."""
+        assert point.uv is not None
+        return slope(self, nodes, point.uv, point.footprint)
 
 
-@dataclass(frozen=True)
-class OpacityMaps:
-    """Textures of opacity, by primitive and copy: ``bias + factor * value``, and where that counts as 0 or 1.
-
-    Attributes:
-        nodes: ``(P + I,)`` int64, -1 where there is none.
-        bias: ``(P + I,)``.
-        factor: ``(P + I,)``.
-        cutoff: ``(P + I,)``, -1 where there is none; None where there is none at all.
-    """
-
-    nodes: Tensor
-    bias: Tensor
-    factor: Tensor
-    cutoff: Tensor | None
-
-
-_SAME = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-
-
-def atlas_of(nodes: Sequence[Node], images: dict[str, Tensor], dtype: torch.dtype, device: torch.device) -> Atlas:
+def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch.dtype, device: torch.device) -> Atlas:
     """The atlas of ``nodes``, in their order; differentiable in the images.
 
     Args:
@@ -173,11 +159,11 @@ def atlas_of(nodes: Sequence[Node], images: dict[str, Tensor], dtype: torch.dtyp
             while block in filtered and max(sizes[-1].shape[1:]) > 1:
                 sizes.append(_halved(_halved(sizes[-1], 1), 2))
             blocks[block] = []
-            for found in sizes:
-                count, height, width = found.shape
+            for size in sizes:
+                count, height, width = size.shape
                 blocks[block].append([end, width * height if count == 3 else 0, width, height])
-                planes.append(found.reshape(-1).to(device=device, dtype=dtype))
-                end += found.numel()
+                planes.append(size.reshape(-1).to(device=device, dtype=dtype))
+                end += size.numel()
         ways = [WRAPS.index(node.wrap), 0 if node.nearest else 1]
         places.append([*blocks[block][0], *ways])
         maps.append([*node.transform[0], *node.transform[1], *node.scale])
@@ -200,12 +186,12 @@ def atlas_of(nodes: Sequence[Node], images: dict[str, Tensor], dtype: torch.dtyp
         torch.tensor(maps, dtype=dtype, device=device).T.contiguous(),
         tuple(wrap for wrap in WRAPS if any(node.wrap == wrap for node in nodes)),
         any(node.scale != (1.0, 1.0, 1.0) for node in nodes),
-        any(node.transform != _SAME for node in nodes),
+        any(node.transform != SAME for node in nodes),
         pyramids,
     )
 
 
-def _density(place: Sequence[int], node: Node) -> float:
+def _density(place: Sequence[int], node: ImageNode) -> float:
     """Texels in a unit square of texture coordinates."""
     (a, b, _), (c, d, _) = node.transform
     return abs(a * d - b * c) * place[2] * place[3]
@@ -255,6 +241,7 @@ class _Corners:
     y: Tensor
     width: Tensor
     height: Tensor
+    blend: Tensor  # 1, or 0 where the nearest texel is taken
     maps: Tensor
 
 
@@ -292,9 +279,9 @@ def slope(atlas: Atlas, node: Tensor, uv: Tensor, footprint: Tensor | None = Non
 def _slope(atlas: Atlas, node: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     c = _corners(atlas, node, uv, False)
     low, high = c.low[1] - c.low[0], c.high[1] - c.high[0]
-    across = (low + (high - low) * c.y) * c.width
+    across = (low + (high - low) * c.y) * (c.width * c.blend)
     left, right = c.high[0] - c.low[0], c.high[1] - c.low[1]
-    along = (left + (right - left) * c.x) * c.height
+    along = (left + (right - left) * c.x) * (c.height * c.blend)
     if atlas.scaled:
         across, along = across * c.maps[6], along * c.maps[6]
     if not atlas.moved:
@@ -318,12 +305,7 @@ def _sizes(pyramids: Pyramids, node: Tensor, footprint: Tensor) -> tuple[Tensor,
 def _corners(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> _Corners:
     place, maps = take(atlas.places, node), take(atlas.maps, node)
     first, stride, width, height, wrap, linear = (place[k] for k in range(6))
-    u, v = uv[0], uv[1]
-    if atlas.moved:
-        u, v = (
-            torch.addcmul(torch.addcmul(maps[2], u, maps[0]), v, maps[1]),
-            torch.addcmul(torch.addcmul(maps[5], u, maps[3]), v, maps[4]),
-        )
+    u, v = moved(maps, uv) if atlas.moved else (uv[0], uv[1])
     blend = linear.to(uv.dtype)
     wide, tall = width.to(uv.dtype), height.to(uv.dtype)
     x = (u * wide - 0.5 * blend).clamp(-_FAR, _FAR)
@@ -342,12 +324,12 @@ def _corners(atlas: Atlas, node: Tensor, uv: Tensor, coloured: bool) -> _Corners
             for row in (top, bottom)
             for column in (left, right)
         )
-    return _Corners((a, b), (c, d), x, y, wide, tall, maps)
+    return _Corners((a, b), (c, d), x, y, wide, tall, blend, maps)
 
 
 def _wrapped(wraps: tuple[str, ...], index: Tensor, size: Tensor, code: Tensor) -> Tensor:
     """Indices folded into ``0..size - 1``."""
-    found: Tensor | None = None
+    folded: Tensor | None = None
     for wrap in wraps:
         if wrap == "repeat":
             here = torch.remainder(index, size)
@@ -356,6 +338,6 @@ def _wrapped(wraps: tuple[str, ...], index: Tensor, size: Tensor, code: Tensor) 
         else:
             turned = torch.remainder(index, 2 * size)
             here = torch.minimum(turned, 2 * size - 1 - turned)
-        found = here if found is None else torch.where(code == WRAPS.index(wrap), here, found)
-    assert found is not None
-    return found
+        folded = here if folded is None else torch.where(code == WRAPS.index(wrap), here, folded)
+    assert folded is not None
+    return folded

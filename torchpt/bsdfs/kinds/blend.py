@@ -20,7 +20,9 @@ __all__ = ["Blend"]
 
 @dataclass(frozen=True)
 class Blend(Bsdf):
-    """Two models at once. Where one lets light through and the other does not, the opaque one meets both sides alike.
+    """A mixture: `1 - weight` of `a` and `weight` of `b`.
+
+    Where one lets light through and the other does not, the opaque one meets both sides alike.
 
     Attributes:
         a: the model at weight 0.

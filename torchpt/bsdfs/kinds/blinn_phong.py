@@ -26,11 +26,11 @@ __all__ = ["BlinnPhong"]
 
 @dataclass(frozen=True)
 class BlinnPhong(Power):
-    """A diffuse lobe and one about the half vector."""
+    """Lambert and a lobe about the half vector, as published: it reflects up to `diffuse + 4 specular`."""
 
     name = "blinn_phong"
     parameters: ClassVar = {
-        "specular": reflectance((0.1, 0.1, 0.1), "reflectance of the glossy lobe, up to four times")
+        "specular": reflectance((0.1, 0.1, 0.1), "reflectance of the glossy one: where it is sharp, four times as much")
     }
     most = 4.0
     conserves = False

@@ -19,7 +19,7 @@ __all__ = ["Conductor"]
 
 @dataclass(frozen=True)
 class Conductor(Metal):
-    """A mirror.
+    """A polished metal; without a metal, a perfect mirror.
 
     Attributes:
         schlick: its colour is given as ``reflectance`` at normal incidence rather than as ``eta`` and ``k``.

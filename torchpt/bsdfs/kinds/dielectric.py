@@ -19,7 +19,7 @@ __all__ = ["Dielectric"]
 
 @dataclass(frozen=True)
 class Dielectric(Glass):
-    """Reflection and refraction, chosen by the reflectance."""
+    """A polished boundary between two clear media."""
 
     name = "dielectric"
     parameters: ClassVar = dict.fromkeys(("alpha", "roughness"), smooth("roughdielectric"))

@@ -18,7 +18,7 @@ __all__ = ["Diffuse"]
 
 @dataclass(frozen=True)
 class Diffuse(Bsdf):
-    """The same radiance into all directions."""
+    """Lambert: the same radiance into all directions."""
 
     name = "diffuse"
     parameters: ClassVar = {"reflectance": reflectance(GREY, "share of the light that is reflected")}

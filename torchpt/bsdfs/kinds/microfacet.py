@@ -22,7 +22,10 @@ __all__ = ["Microfacet"]
 
 @dataclass(frozen=True)
 class Microfacet(Glossy):
-    """Dielectric facets over a diffuse base; not reciprocal, as Fresnel knows of ``wo`` only."""
+    """Cook and Torrance's highlight over Lambert, as in the GAMES101 course.
+
+    Not reciprocal, as Fresnel knows of ``wo`` only.
+    """
 
     name = "microfacet"
     parameters: ClassVar = {

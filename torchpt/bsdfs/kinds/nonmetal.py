@@ -17,7 +17,7 @@ __all__ = ["Nonmetal"]
 
 @dataclass(frozen=True)
 class Nonmetal(Glossy):
-    """Facets of one reflectance at every angle over a diffuse base."""
+    """A fixed share of a GGX highlight over Lambert."""
 
     name = "nonmetal"
     parameters: ClassVar = {

@@ -17,7 +17,7 @@ __all__ = ["Null"]
 
 @dataclass(frozen=True)
 class Null(Bsdf):
-    """Straight through, from both sides."""
+    """Nothing: light passes as if the surface were not there."""
 
     name = "null"
     sheer = True

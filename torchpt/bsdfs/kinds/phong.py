@@ -24,7 +24,7 @@ __all__ = ["Phong"]
 
 @dataclass(frozen=True)
 class Phong(Power):
-    """A diffuse lobe and one about the mirror direction; conserves energy where ``diffuse + specular <= 1``."""
+    """Lambert and a lobe about the mirror direction; it conserves energy where `diffuse + specular <= 1`."""
 
     name = "phong"
 

@@ -23,7 +23,9 @@ __all__ = ["Plastic"]
 
 @dataclass(frozen=True)
 class Plastic(Coat):
-    """A mirror coat over a diffuse base. Its diffuse fits (see ``fresnel_diffuse``) conserve energy to 0.2 %.
+    """A polished coat over a diffuse base.
+
+    Its diffuse fits (see ``fresnel_diffuse``) conserve energy to 0.2 %.
 
     Attributes:
         nonlinear: light that the coat throws back takes the base's colour again.

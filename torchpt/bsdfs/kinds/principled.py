@@ -54,7 +54,7 @@ _PART_OF = {"sheen_tint": "sheen", "clearcoat_gloss": "clearcoat"}
 
 @dataclass(frozen=True)
 class Principled(Bsdf):
-    """All parameters of the two papers but for thin surfaces; what a material does not use it does not compute.
+    """Burley's principled model, but for thin surfaces; a feature whose amount is 0 is left out, not computed.
 
     Attributes:
         transmissive: light passes through (``spec_trans``).

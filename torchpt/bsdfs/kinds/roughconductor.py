@@ -21,7 +21,9 @@ __all__ = ["RoughConductor"]
 
 @dataclass(frozen=True)
 class RoughConductor(Anisotropic, Metal):
-    """A rough mirror. A row with both roughnesses below ``1e-4`` is a smooth one: a delta lobe.
+    """A metal with GGX microfacets.
+
+    A row with both roughnesses below ``1e-4`` is a smooth one: a delta lobe.
 
     Facets shade one another; light that meets more than one of them is lost, unless it is given back as Turquin does
     (*Practical Multiple Scattering Compensation for Microfacet Models*, 2019, equation 16): each direction ``wo`` has its
@@ -59,12 +61,15 @@ class RoughConductor(Anisotropic, Metal):
         """See :class:`Bsdf`."""
         return not self.energy_compensation
 
+    def tabulate(self, values: Parameters) -> Parameters:
+        """The energy that facets give back at once."""
+        return {"energy": energy_table(rough(values, self.anisotropic), [None])} if self.energy_compensation else {}
+
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
-        out = {**metal(values), **rough(values, self.anisotropic)}
-        if self.energy_compensation:
-            out["energy"] = energy_table(out, [None])
-        return out
+        tables = values if "energy" in values else self.tabulate(values)
+        energy = {"energy": tables["energy"]} if self.energy_compensation else {}
+        return {**metal(values), **rough(values, self.anisotropic), **energy}
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """See :class:`Bsdf`."""

@@ -25,7 +25,9 @@ __all__ = ["RoughDielectric"]
 
 @dataclass(frozen=True)
 class RoughDielectric(Anisotropic, Glass):
-    """Frosted glass. A row with both roughnesses below ``1e-4`` is polished glass, one with equal indices is nothing.
+    """A boundary between two clear media with GGX microfacets: frosted glass.
+
+    A row with both roughnesses below ``1e-4`` is polished glass, one with equal indices is nothing.
 
     Attributes:
         anisotropic: ``alpha_u`` and ``alpha_v`` may differ.
@@ -57,15 +59,24 @@ class RoughDielectric(Anisotropic, Glass):
         """See :class:`Bsdf`."""
         return not self.energy_compensation
 
+    def tabulate(self, values: Parameters) -> Parameters:
+        """The energy that facets give back at once, from either side."""
+        if not self.energy_compensation:
+            return {}
+        surface = self._surface(values)
+        # Equal indices would refract nothing: such a row is smooth, and reads no energy.
+        eta = torch.where(surface["smooth"], 1.5, surface["eta"])
+        return {"energy": energy_table(surface, [eta, 1.0 / eta])}
+
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
+        tables = values if "energy" in values else self.tabulate(values)
+        return {**self._surface(values), **({"energy": tables["energy"]} if self.energy_compensation else {})}
+
+    def _surface(self, values: Parameters) -> Parameters:
         out = {**clear(values), **rough(values, self.anisotropic)}
         # Facets between equal indices bend nothing, however they lie.
         out["smooth"] = out["smooth"] | ((out["eta"] - 1.0).abs() < INDEX_MATCHED)
-        if self.energy_compensation:
-            # Equal indices would refract nothing: such a row is smooth, and reads no energy.
-            eta = torch.where(out["smooth"], 1.5, out["eta"])
-            out["energy"] = energy_table(out, [eta, 1.0 / eta])
         return out
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:

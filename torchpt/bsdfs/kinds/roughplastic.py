@@ -27,9 +27,10 @@ _ENTRIES = 64  # cosines of the tables, as Mitsuba has them
 
 @dataclass(frozen=True)
 class RoughPlastic(Rough, Coat):
-    """A coat of GGX microfacets over a diffuse base. A row with a roughness below ``1e-4`` has a mirror for a coat.
+    """A coat with GGX microfacets over a diffuse base.
 
-    What the coat lets through is tabulated for each material over the cosine of a direction.
+    A row with a roughness below ``1e-4`` has a mirror for a coat. What the coat lets through is tabulated for each material
+    over the cosine of a direction.
 
     Attributes:
         nonlinear: light that the coat throws back takes the base's colour again.

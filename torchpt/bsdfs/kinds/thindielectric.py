@@ -21,7 +21,10 @@ __all__ = ["ThinDielectric"]
 
 @dataclass(frozen=True)
 class ThinDielectric(Glass):
-    """Reflection, or straight through; both count the series of reflections between its boundaries."""
+    """A thin polished pane: both its boundaries in one surface, and nothing is bent.
+
+    Reflection, or straight through; both count the series of reflections between its boundaries.
+    """
 
     name = "thindielectric"
     parameters: ClassVar = dict.fromkeys(("alpha", "roughness"), smooth("roughdielectric"))

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
-from torchpt.lights.base import Light
+import torch
+from torch import Tensor
+
+from torchpt.lights.base import Light, Row, Setting, bright
+from torchpt.math.vectors import normalize
+from torchpt.records import Lights, LightSample
 from torchpt.spec import Color, Direction, Moves
 
 __all__ = ["Directional"]
@@ -19,3 +25,17 @@ class Directional(Light):
         "irradiance": Color((1.0, 1.0, 1.0), doc="on a surface that faces it"),
     }
     distant = True
+
+    @classmethod
+    def row(cls, scene: Setting) -> Row:
+        """See :class:`Light`."""
+        color = scene["irradiance"]
+        axis = normalize(scene["direction"][:, None])[:, 0]
+        return Row(color, math.pi * scene.reach**2 * bright(color), normal=axis)
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
+        """See :class:`Light`."""
+        one = torch.ones_like(u[0], dtype=at.radiance.dtype)
+        wi = (-at.normal).expand(3, u.shape[1])
+        return LightSample(wi, wi, None, at.radiance.expand_as(wi), one * torch.inf, one)

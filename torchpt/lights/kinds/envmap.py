@@ -21,18 +21,25 @@ less than a tenth of its light above the mean, spread over more than a tenth of 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchpt.lights.base import Light
+from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.math.angles import azimuth
 from torchpt.math.distributions import Cells, invert_linear
 from torchpt.math.threads import sum_all
-from torchpt.math.vectors import dot, luminance, take
-from torchpt.spec import Moves, Path, Pose, Scalar
+from torchpt.math.vectors import dot, luminance, safe_reciprocal, take
+from torchpt.records import Lights, LightSample
+from torchpt.spec import Moves, Path, Pose, Scalar, Spec, Texels
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = ["EVEN", "EnvironmentMap", "Envmap", "Grid", "build", "environment", "pdf", "radiance", "sample"]
 
@@ -278,7 +285,7 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
     return wi, density, _mix(corners, x, y) * map.scale
 
 
-class Envmap(Light):
+class Envmap(Environment):
     """An environment given by a picture of all directions."""
 
     name = "envmap"
@@ -292,5 +299,46 @@ class Envmap(Light):
             doc="turns it, and may mirror it; where it is moved to, and how much it is enlarged, do not matter",
         ),
     }
-    distant = True
-    environment = True
+
+    @classmethod
+    def files(
+        cls, values: Mapping[str, Any], find: Callable[[str], FilePath]
+    ) -> dict[str, tuple[NDArray[np.float32], Spec]]:
+        """See :class:`Light`."""
+        from torchpt.lights.pictures import radiance_of
+
+        spec = Texels(doc="radiance `(H, W, 3)`, before `scale`")
+        return {"texels": (radiance_of(find("path"), "path"), spec)}
+
+    @classmethod
+    def row(cls, scene: Setting) -> Row:
+        """See :class:`Light`; what its functions are given is an :class:`EnvironmentMap`."""
+        texels, scale = (scene.given(key).to(scene.dtype) for key in ("texels", "scale"))
+        linear = scene["to_world"][:3, :3]
+        turn = torch.linalg.inv(linear) * torch.linalg.det(linear).abs() ** (1.0 / 3.0)
+        around = build(texels, turn.to(scene.dtype), scale)
+        color = (around.mean * around.scale.detach()).expand(3)
+        return Row(color, 4.0 * math.pi**2 * scene.reach**2 * bright(color), environment=around)
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
+        """See :class:`Light`."""
+        wi, density, light = sample(at.environment, u, mis)
+        weight = torch.where(density > 0, safe_reciprocal(density), 0.0)
+        return LightSample(wi, wi, None, light, density, weight)
+
+    @classmethod
+    def arriving(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
+        """See :class:`Environment`."""
+        return environment(around, d, mis)
+
+    @classmethod
+    def surroundings(cls, around: EnvironmentMap) -> Surroundings:
+        """See :class:`Environment`."""
+        texels = (around.texels * around.scale).T.reshape(around.height, around.width, 3)
+        return Surroundings(texels, around.turn)
+
+    @classmethod
+    def info(cls, around: EnvironmentMap) -> dict[str, Any]:
+        """See :class:`Environment`."""
+        return {"texels": [around.width, around.height], "mis_compensation": around.compensated is not None}

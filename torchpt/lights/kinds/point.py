@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchpt import spec
-from torchpt.lights.base import Light
+from torchpt.lights.base import Light, Row, Setting, bright
 from torchpt.math.vectors import dot, safe_reciprocal
+from torchpt.records import Lights, LightSample
 from torchpt.spec import Color, Moves
 
 __all__ = ["Point", "toward"]
@@ -30,3 +32,17 @@ class Point(Light):
         "position": spec.Point(moves=Moves.SHADOWS, doc="where it is"),
         "intensity": Color((1.0, 1.0, 1.0), doc="power per solid angle"),
     }
+    places = ("position",)
+
+    @classmethod
+    def row(cls, scene: Setting) -> Row:
+        """See :class:`Light`."""
+        color = scene.intensity("intensity")
+        return Row(color, (4.0 * math.pi) * bright(color), scene.point("position"))
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
+        """See :class:`Light`."""
+        wi, weight = toward(x, at.p0)
+        infinite = torch.full_like(weight, torch.inf)
+        return LightSample(wi, at.p0.expand_as(wi), None, at.radiance.expand_as(wi), infinite, weight)

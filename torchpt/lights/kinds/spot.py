@@ -5,15 +5,19 @@ Whole up to the beam's edge, from there falling linearly in the angle to zero at
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchpt.lights.base import Light
+from torchpt.lights.base import Cone, Light, Row, Setting, bright
+from torchpt.lights.kinds import point
 from torchpt.math.angles import azimuth
-from torchpt.math.vectors import cross, dot
+from torchpt.math.vectors import cross, dot, luminance, normalize
+from torchpt.records import Lights, LightSample
 from torchpt.spec import Angle, Color, Moves, Point, Refused
 
 __all__ = ["Spot", "falloff"]
@@ -49,6 +53,7 @@ class Spot(Light):
             doc="from the axis, up to which the intensity is whole; from there it falls linearly to 0 at the cutoff",
         ),
     }
+    places = ("position",)
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
@@ -58,3 +63,31 @@ class Spot(Light):
         if values["beam_width"] > values["cutoff_angle"]:
             expected = f"an angle of at most cutoff_angle ({values['cutoff_angle']:g})"
             raise Refused(expected, values["beam_width"], ("beam_width",))
+
+    @classmethod
+    def row(cls, scene: Setting) -> Row:
+        """See :class:`Light`."""
+        color = scene.intensity("intensity")
+        axis = normalize((scene["target"] - scene["position"])[:, None])[:, 0]
+        cutoff, beam = (scene[key] * (math.pi / 180.0) for key in ("cutoff_angle", "beam_width"))
+        # How fast it falls from the beam's edge to the cutoff; finite where the two are one.
+        slope = 1.0 / (cutoff - beam).clamp_min(1e-6)
+        # What falls linearly from a to b is on average as the mean of cosines between them, which is this product.
+        mean = torch.cos(0.5 * (cutoff + beam)) * torch.sinc((cutoff - beam) * (0.5 / math.pi))
+        share = 2.0 * math.pi * (1.0 - mean).detach()
+        numbers = torch.stack((cutoff, slope, torch.zeros_like(cutoff)))
+        return Row(color, share * bright(color), scene.point("position"), numbers, normal=axis)
+
+    @classmethod
+    def bounds(cls, at: Lights, intensity: Tensor) -> Cone:
+        """See :class:`Emitter`: whole within the beam, and beyond its edge up to the cutoff."""
+        cutoff, slope = at.e1[0], at.e1[1]
+        edge = 1.0 / slope
+        return Cone(torch.cos((cutoff - edge).clamp_min(0.0)), torch.cos(edge), luminance(at.radiance.abs()))
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
+        """See :class:`Light`."""
+        drawn = point.Point.sample(at, x, u, mis)
+        share = falloff(drawn.wi, at.normal, at.e1[0], at.e1[1])
+        return replace(drawn, radiance=drawn.radiance * share)

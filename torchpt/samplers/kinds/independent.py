@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.math.hashing import as_int32, mix, to_unit
 from torchpt.samplers.base import Points
-from torchpt.samplers.hashing import as_int32, mix, to_unit
 
 __all__ = ["Independent"]
 

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.math.hashing import mix, to_unit
 from torchpt.samplers.base import Points
-from torchpt.samplers.hashing import mix, to_unit
 from torchpt.samplers.scrambling import X, Y, reverse_bits, scramble, second_dimension
 
 __all__ = ["Sobol"]

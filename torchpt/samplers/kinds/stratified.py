@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.math.hashing import mix, to_unit
 from torchpt.samplers.base import Points
-from torchpt.samplers.hashing import mix, to_unit
 from torchpt.samplers.scrambling import X, Y
 from torchpt.samplers.shuffling import shuffle
 from torchpt.samplers.strata import jittered, place

@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.math.hashing import logical_shift, mix, to_unit
 from torchpt.samplers.base import Numbers, Points
-from torchpt.samplers.hashing import logical_shift, mix, to_unit
 from torchpt.samplers.scrambling import X, Y, reverse_bits, scramble, second_dimension
 
 __all__ = ["DIGITS", "ZSobol"]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpt.bsdfs import Bsdf, Parameters
 from torchpt.bsdfs.resolved import ResolvedMaterial
-from torchpt.textures import Node, Reading, VertexColors
+from torchpt.textures import Node
 
 __all__ = ["LaneMaterial", "OpacityTexture", "lane_material"]
 
@@ -49,7 +49,7 @@ class LaneMaterial:
 
 def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], dtype: torch.dtype) -> LaneMaterial:
     """Resolve a material under ``parameters`` (every tensor by dotted name)."""
-    readings = {key: value for key, value in material.values.items() if isinstance(value, Node | VertexColors)}
+    readings = {key: value for key, value in material.values.items() if isinstance(value, Node)}
     values: Parameters = {
         key: parameters[f"{material.name}.{key}"].to(dtype)[..., None] for key in material.values if key not in readings
     }
@@ -72,15 +72,15 @@ def lane_material(material: ResolvedMaterial, parameters: Mapping[str, Tensor], 
 
 
 def _blended(
-    kind: Callable[[Bsdf, Bsdf], Bsdf], weight: Tensor | None, reading: Reading | None, a: LaneMaterial, b: LaneMaterial
+    kind: Callable[[Bsdf, Bsdf], Bsdf], weight: Tensor | None, reading: Node | None, a: LaneMaterial, b: LaneMaterial
 ) -> LaneMaterial:
     """The blend of two materials, ``weight (1,)`` of the second: what is met of each, and how often either is."""
     opacity = None
     if weight is None:  # a texture, beside which nothing but null lets rays pass
         assert reading is not None
-        if isinstance(reading, Node) and a.model.sheer:
+        if a.model.sheer:
             return LaneMaterial(b.model, b.values, None, b.readings, OpacityTexture(reading))
-        if isinstance(reading, Node) and b.model.sheer:
+        if b.model.sheer:
             return LaneMaterial(a.model, a.values, None, a.readings, OpacityTexture(reading, 1.0, -1.0))
     elif a.opacity is not None or b.opacity is not None:
         first = (1.0 - weight) * (1.0 if a.opacity is None else a.opacity)

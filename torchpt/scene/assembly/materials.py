@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,9 +14,9 @@ from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.errors import SceneError
 from torchpt.scene.assembly.lane_material import LaneMaterial
 from torchpt.scene.parts import Copy, Part
-from torchpt.textures import MaterialTextures, Node, OpacityMaps, TextureBinding, VertexColors
+from torchpt.textures import MaterialTextures, Node, NodeMap, OpacityMaps, Place, TextureBinding
 
-__all__ = ["MOST_MODELS", "Groups", "groups_of", "nodes_of", "opacity_maps_of", "opacity_of"]
+__all__ = ["MOST_MODELS", "Groups", "groups_of", "node_map_of", "opacity_maps_of", "opacity_of"]
 
 
 #: Lanes are sorted by keys of 8 bits, two for each model.
@@ -25,12 +25,6 @@ MOST_MODELS = 120
 
 #: What the lanes of a group have in common: a model, and which of its parameters are read from what.
 Kind = tuple[Bsdf, Any]
-
-
-def nodes_of(materials: Iterable[ResolvedMaterial]) -> dict[Node, int]:
-    """Every way in which images are read, numbered."""
-    readings = [reading for material in materials for reading in material.readings()]
-    return {node: k for k, node in enumerate(dict.fromkeys(r for r in readings if isinstance(r, Node)))}
 
 
 @dataclass(frozen=True)
@@ -55,7 +49,7 @@ class Groups:
 def groups_of(
     materials: Mapping[str, ResolvedMaterial],
     made: Mapping[str, LaneMaterial],
-    nodes: Mapping[Node, int],
+    places: Mapping[Node, Place],
     parameters: Mapping[str, Tensor],
     dtype: torch.dtype,
     device: torch.device,
@@ -81,7 +75,7 @@ def groups_of(
             textures.append(None)
         else:
             stacks.append(stacked([_tabulated(model, made[name].values) for name in names], model.factors))
-            read = _textures([materials[name] for name in names], [made[name] for name in names], nodes, device)
+            read = _textures([materials[name] for name in names], [made[name] for name in names], places, device)
             strong = [f"{name}.normal_strength" for name in names]
             if any(name in parameters for name in strong):
                 one = torch.ones((), dtype=dtype, device=device)
@@ -111,55 +105,76 @@ def _kind(material: ResolvedMaterial, made: LaneMaterial) -> Kind:
     def form(value: Any) -> Any:
         if isinstance(value, dict):
             return tuple(sorted((key, form(item)) for key, item in value.items()))
-        if isinstance(value, VertexColors):
-            return ("vertices", str(value.channel))
-        return ("image", str(value.channel is None)) if isinstance(value, Node) else "number"
+        return value.form if isinstance(value, Node) else "number"
 
-    maps = material.normal_map is not None, material.bump_map is not None
+    maps = form(material.normal_map), form(material.bump_map)
     return made.model, (form(made.values), form(made.readings), maps)
 
 
 def _textures(
-    materials: Sequence[ResolvedMaterial], made: Sequence[LaneMaterial], nodes: Mapping[Node, int], device: torch.device
+    materials: Sequence[ResolvedMaterial],
+    made: Sequence[LaneMaterial],
+    places: Mapping[Node, Place],
+    device: torch.device,
 ) -> MaterialTextures:
     """The textures of materials of one form."""
 
-    def image(column: Sequence[Node]) -> TextureBinding:
-        numbers = torch.tensor([nodes[node] for node in column], device=device)
-        return TextureBinding(numbers, column[0].channel, any(node.filtered for node in column))
+    def binding(column: Sequence[Node]) -> TextureBinding:
+        rows = torch.tensor([places[node].row for node in column], device=device)
+        table, first = places[column[0]].table, column[0]
+        return TextureBinding(table, rows, first.channel, any(node.filtered for node in column))
 
     def relief(column: list[Node | None]) -> TextureBinding | None:
-        found = [node for node in column if node is not None]
-        return image(found) if found else None
+        nodes = [node for node in column if node is not None]
+        return binding(nodes) if nodes else None
 
     def bound(column: list[Any]) -> Any:
         first = column[0]
         if isinstance(first, dict):
             return {key: bound([item[key] for item in column]) for key in first}
-        if isinstance(first, VertexColors):
-            return TextureBinding(None, first.channel)
-        return image(column)
+        return binding(column)
 
+    every = [node for material in materials for node in material.readings()]
     readings = bound([one.readings for one in made])
     return MaterialTextures(
         readings,
         relief([material.normal_map for material in materials]),
         relief([material.bump_map for material in materials]),
-        filtered=any(isinstance(r, Node) and r.filtered for material in materials for r in material.readings()),
+        filtered=any(node.filtered for node in every),
+        reads=tuple(sorted({node.reads for node in every})),
     )
+
+
+def node_map_of(
+    nodes: Sequence[Node | None], places: Mapping[Node, Place], sizes: list[int], device: torch.device
+) -> NodeMap | None:
+    """Textures by primitive, from those of parts of ``sizes``; None where there are none."""
+    if all(node is None for node in nodes):
+        return None
+    size = torch.tensor(sizes, dtype=torch.int64, device=device)
+    tables = tuple(sorted({places[node].table for node in nodes if node is not None}))
+
+    def spread(values: list[int]) -> Tensor:
+        return torch.repeat_interleave(torch.tensor(values, device=device), size)
+
+    rows = spread([-1 if node is None else places[node].row for node in nodes])
+    if len(tables) == 1:
+        return NodeMap(rows, tables, None)
+    return NodeMap(rows, tables, spread([0 if node is None else tables.index(places[node].table) for node in nodes]))
 
 
 def opacity_maps_of(
     parts: Sequence[Part | Copy],
     made: Mapping[str, LaneMaterial],
-    nodes: Mapping[Node, int],
+    places: Mapping[Node, Place],
     sizes: list[int],
     dtype: torch.dtype,
     device: torch.device,
 ) -> OpacityMaps | None:
     """Textures of opacity by primitive; None where there are none."""
     textures = [made[part.material.name].opacity_texture for part in parts]
-    if all(texture is None for texture in textures):
+    maps = node_map_of([None if texture is None else texture.node for texture in textures], places, sizes, device)
+    if maps is None:
         return None
     size = torch.tensor(sizes, dtype=torch.int64, device=device)
 
@@ -171,10 +186,9 @@ def opacity_maps_of(
         for texture, part in zip(textures, parts, strict=True)
     ]
     return OpacityMaps(
-        spread(
-            [-1 if texture is None else nodes[texture.node] for texture in textures],
-            torch.int64,
-        ),
+        maps.nodes,
+        maps.tables,
+        maps.table,
         spread([0.0 if texture is None else texture.bias for texture in textures], dtype),
         spread([1.0 if texture is None else texture.factor for texture in textures], dtype),
         spread(cutoffs, dtype) if any(cutoff >= 0 for cutoff in cutoffs) else None,

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchpt.math.vectors import cross, dot, normalize
 from torchpt.records import KINDS, Geometry, Quadrics
-from torchpt.scene.assembly.corners import Corners
-from torchpt.scene.assembly.curved import quadrics_of
 from torchpt.scene.parts import Part
+from torchpt.shapes.primitive import PRIMITIVES, Corners, Primitive
+from torchpt.shapes.quadrics import quadrics_of, table_of
 
 __all__ = ["Primitives", "primitives_of"]
 
@@ -21,6 +21,7 @@ __all__ = ["Primitives", "primitives_of"]
 class Primitives:
     """The P primitives, ordered by kind; see :class:`~torchpt.records.World` for what has no comment."""
 
+    kinds: tuple[type[Primitive], ...]  # those that there are
     sizes: list[int]  # how many each part has
     counts: tuple[int, int, int, int, int]
     p0: Tensor
@@ -51,7 +52,7 @@ class Primitives:
         q0, q1, q2 = (x.detach().to(torch.float32).contiguous() for x in (self.p0, self.p1, self.p2))
         table = None
         if self.quadrics is not None and self.frame is not None:
-            table = torch.cat((self.frame, self.quadrics.code[None].double())).detach()
+            table = table_of(self.quadrics, self.frame)
         return Geometry(q0, q1, q2, self.counts, table, None if copies is None else copies.detach())
 
 
@@ -66,9 +67,10 @@ def primitives_of(
     def joined(pieces: list[Tensor]) -> Tensor:
         return torch.cat(pieces, -1) if pieces else torch.zeros(3, 0, dtype=dtype, device=device)
 
-    ball = counts[3] + counts[4] > 0
+    kinds = tuple(PRIMITIVES[kind] for kind, count in zip(KINDS, counts, strict=True) if count)
+    flat = sum(count for kind, count in zip(KINDS, counts, strict=True) if count and PRIMITIVES[kind].flat)
     p0, p1, p2 = (joined([getattr(c, name) for c in corners]) for name in ("p0", "p1", "p2"))
-    planar = (torch.arange(p0.shape[1], device=device) < sum(counts[:3])) if ball else None
+    planar = (torch.arange(p0.shape[1], device=device) < flat) if flat < sum(counts) else None
     e1 = p1 - p0 if planar is None else torch.where(planar, p1 - p0, p1)
     e2 = p2 - p0 if planar is None else torch.where(planar, p2 - p0, p2)
     signs = torch.tensor([-1.0 if part.flip else 1.0 for part in parts], dtype=dtype, device=device)
@@ -77,8 +79,8 @@ def primitives_of(
     normal = normalize(face) * sign
     normals = None
     if any(c.normals is not None for c in corners):
-        flat = normal.split(sizes, 1)
-        triples = [c.normals or (n, n, n) for c, n in zip(corners, flat, strict=True)]
+        faces = normal.split(sizes, 1)
+        triples = [c.normals or (n, n, n) for c, n in zip(corners, faces, strict=True)]
         flips = [-1.0 if part.flip and c.normals is not None else 1.0 for part, c in zip(parts, corners, strict=True)]
         n0, n1, n2 = (joined([t[k] * f for t, f in zip(triples, flips, strict=True)]) for k in range(3))
         normals = (n0, n1, n2)
@@ -92,5 +94,10 @@ def primitives_of(
         bound = torch.where(planar, bound, (p0.abs().sum(0) + 2.0 * e1[0].abs()).detach())
     frames = [c.frame for c in corners if c.frame is not None]
     frame = torch.cat(frames, 1) if frames else None
-    curved = None if frame is None else quadrics_of([part for part in parts if part.kind == "quadric"], frame, dtype)
-    return Primitives(sizes, counts, p0, p1, p2, e1, e2, face, sign, normal, normals, bound, frame, curved)
+    curved = None
+    if frame is not None:
+        bent = [part for part in parts if part.quadric is not None]
+        curved = quadrics_of(
+            [part.quadric for part in bent if part.quadric], [part.flip for part in bent], frame, dtype
+        )
+    return Primitives(kinds, sizes, counts, p0, p1, p2, e1, e2, face, sign, normal, normals, bound, frame, curved)

@@ -19,12 +19,11 @@ from torchpt.scene.assembly.copies import copies_of, copy_maps
 from torchpt.scene.assembly.corners import corners_of
 from torchpt.scene.assembly.emitters import lights_of
 from torchpt.scene.assembly.lane_material import lane_material
-from torchpt.scene.assembly.materials import Groups, groups_of, nodes_of, opacity_maps_of, opacity_of
+from torchpt.scene.assembly.materials import Groups, groups_of, node_map_of, opacity_maps_of, opacity_of
 from torchpt.scene.assembly.primitives import Primitives, primitives_of
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.scene.space import FARTHEST, Space
-from torchpt.scene.texels import images_of
-from torchpt.textures import atlas_of
+from torchpt.textures import tables_of
 
 __all__ = ["assemble"]
 
@@ -44,7 +43,7 @@ def assemble(
     Args:
         parts: ordered by kind as ``records.KINDS``.
         parameters: every tensor by dotted name.
-        sources: lights that are no made, ordered by kind as ``records.SOURCES``.
+        sources: lights that are no surfaces, ordered as ``lights.order`` says.
         space: the lanes' coordinates.
         dtype: of the lanes.
         copies: instances of parts.
@@ -61,15 +60,13 @@ def assemble(
     owners: list[Part | Copy] = [*parts, *copies]
     materials = {owner.material.name: _in_units(owner.material, space.unit) for owner in owners}
     made = {name: lane_material(material, parameters, dtype) for name, material in materials.items()}
-    nodes = nodes_of(materials.values())
-    groups = groups_of(materials, made, nodes, parameters, dtype, device)
+    nodes = [node for material in materials.values() for node in material.readings()]
+    tables, places = tables_of(nodes, parameters, dtype, device)
+    groups = groups_of(materials, made, places, parameters, dtype, device)
     wide = primitives.sizes + [1] * len(copies)
     opacity = opacity_of(owners, made, wide, dtype, device)
     dark = primitives.spread([int(part.emission is None) for part in parts] + [1] * len(copies))
-    emission_maps = None
-    if any(part.emission_texture is not None for part in parts):
-        emitting = [-1 if part.emission_texture is None else nodes[part.emission_texture] for part in parts]
-        emission_maps = primitives.spread(emitting + [-1] * len(copies))
+    glowing = [part.emission_texture for part in parts] + [None] * len(copies)
     maps = copy_maps(parts, primitives.sizes, copies, parameters, space) if copies else None
     geometry = primitives.geometry(maps)
     opacity_mapped = any(part.emission is not None and made[part.material.name].opacity_texture for part in parts)
@@ -78,6 +75,7 @@ def assemble(
     )
     world = World(
         geometry=LaneGeometry(
+            kinds=primitives.kinds,
             counts=primitives.counts,
             ends=torch.tensor(primitives.counts, dtype=torch.int64, device=device).cumsum(0),
             p0=primitives.p0,
@@ -94,9 +92,9 @@ def assemble(
         ),
         materials=_materials(owners, primitives, groups, dark, opacity),
         textures=LaneTextures(
-            atlas=atlas_of(list(nodes), images_of(list(nodes), parameters), dtype, device) if nodes else None,
-            opacity=opacity_maps_of(owners, made, nodes, wide, dtype, device),
-            emission=emission_maps,
+            tables=tables,
+            opacity=opacity_maps_of(owners, made, places, wide, dtype, device),
+            emission=node_map_of(glowing, places, wide, device),
         ),
         lights=lights,
     )
@@ -126,8 +124,7 @@ def _in_units(material: ResolvedMaterial, unit: float) -> ResolvedMaterial:
     """A material where lengths are counted in ``unit``: the heights of a bump map are lengths."""
     if unit == 1.0 or material.bump_map is None:
         return material
-    x, y, z = material.bump_map.scale
-    return replace(material, bump_map=replace(material.bump_map, scale=(x / unit, y / unit, z / unit)))
+    return replace(material, bump_map=material.bump_map.divided(unit))
 
 
 def _check_reach(parts: Sequence[Part], primitives: Primitives, space: Space) -> None:

@@ -27,7 +27,7 @@ def _object(value: Any) -> Any:
     """An object of trimesh; or parts, which Python code read itself. Whoever builds the scene takes it apart."""
     if isinstance(value, tuple | list) and value and all(hasattr(part, "faces") for part in value):
         return tuple(value)
-    if type(value).__module__.split(".")[0] != "trimesh":
+    if all(kind.__module__.partition(".")[0] != "trimesh" for kind in type(value).__mro__):
         raise Refused("a trimesh.Trimesh or trimesh.Scene (an object of Python; files have a path)")
     return value
 
@@ -37,7 +37,7 @@ class Mesh(Shape):
 
     name = "mesh"
     parameters: ClassVar = {
-        "path": Path(None, doc="the file: OBJ, PLY, STL or glTF"),
+        "path": Path(None, doc="the file: OBJ, PLY, STL, glTF, or one that trimesh reads"),
         "mesh": Other(
             None,
             reader=_object,

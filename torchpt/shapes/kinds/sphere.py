@@ -2,15 +2,59 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
+from torch import Tensor
 
+from torchpt.math.angles import azimuth
 from torchpt.math.transforms import similarity_scale
+from torchpt.math.warps import uniform_sphere
 from torchpt.shapes.base import Matrix, Place, Shape, Size, Surface, placed
+from torchpt.shapes.quadrics import Form, Quadric, octahedral
 
-__all__ = ["Sphere"]
+__all__ = ["Ellipsoid", "Sphere"]
+
+
+class Ellipsoid(Quadric):
+    """The unit sphere."""
+
+    name = "ellipsoid"
+    form = Form(bend=1.0, level=1.0, low=-math.inf, high=math.inf, around=True)
+    area = 4.0 * math.pi
+
+    @classmethod
+    def place(cls, u: Tensor, v: Tensor) -> Tensor:
+        """See :class:`Quadric`."""
+        return octahedral(u, v)
+
+    @classmethod
+    def normal(cls, q: Tensor) -> Tensor:
+        """See :class:`Quadric`."""
+        return q
+
+    @classmethod
+    def climb(cls, q: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Quadric`: from the pole down."""
+        return math.pi * q[2], -math.pi * radius
+
+    @classmethod
+    def v(cls, q: Tensor, radius: Tensor) -> Tensor:
+        """See :class:`Quadric`: the angle from z over pi."""
+        return azimuth(q[2], radius) * (1.0 / math.pi)
+
+    @classmethod
+    def sample(cls, u: Tensor) -> Tensor:
+        """See :class:`Quadric`."""
+        return uniform_sphere(u)
+
+    @classmethod
+    def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Quadric`."""
+        reach = (e1.square() + e2.square() + e3.square()).sqrt()
+        return -reach, reach
 
 
 class Sphere(Shape):
@@ -33,4 +77,4 @@ class Sphere(Shape):
         """See :class:`Shape`."""
         if similarity_scale(pose) is not None:
             return [Surface("sphere")]
-        return [Surface("quadric", quadric="ellipsoid")]
+        return [Surface("quadric", quadric=Ellipsoid)]

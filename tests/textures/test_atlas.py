@@ -1,4 +1,4 @@
-"""MaterialTextures-ups into the atlas, against torch's own sampling of images and against plain loops."""
+"""Look-ups into the atlas, against torch's own sampling of images and against plain loops."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.textures import WRAPS, Atlas, Node, atlas_of, look_up, slope
+from torchpt.textures.atlas import WRAPS, Atlas, ImageNode, atlas_of, look_up, slope
 
 CPU = torch.device("cpu")
 SAME = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -25,7 +25,7 @@ def points(n: int = 4000, seed: int = 5) -> Tensor:
     return torch.rand(2, n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * 8 - 4
 
 
-def one(node: Node, uv: Tensor, coloured: bool = True, dtype: torch.dtype = torch.float64) -> Tensor:
+def one(node: ImageNode, uv: Tensor, coloured: bool = True, dtype: torch.dtype = torch.float64) -> Tensor:
     atlas = atlas_of([node], IMAGES, dtype, CPU)
     return look_up(atlas, torch.zeros(uv.shape[1], dtype=torch.int64), uv.to(dtype), coloured)
 
@@ -35,7 +35,7 @@ def one(node: Node, uv: Tensor, coloured: bool = True, dtype: torch.dtype = torc
 @pytest.mark.parametrize("wrap", ["clamp", "mirror"])
 def test_grid_sample(name: str, nearest: bool, wrap: str):
     image, uv = IMAGES[name], points()
-    found = one(Node(name, None, wrap, nearest, SAME, PLAIN), uv)
+    found = one(ImageNode(name, None, wrap, nearest, SAME, PLAIN), uv)
     expected = torch.nn.functional.grid_sample(
         image[..., :3].permute(2, 0, 1)[None],
         (2 * uv.T - 1)[None, None],
@@ -54,13 +54,13 @@ def test_repeat_is_grid_sample_of_the_tiled_image(name: str):
         tiled.permute(2, 0, 1)[None], ((uv.T + 2) / 2 - 1)[None, None], padding_mode="border", align_corners=False
     )[0, :, 0]
     inside = (uv.abs() < 1.5).all(0)
-    found = one(Node(name, None, "repeat", False, SAME, PLAIN), uv)
+    found = one(ImageNode(name, None, "repeat", False, SAME, PLAIN), uv)
     assert torch.allclose(found[:, inside], expected.expand_as(found)[:, inside], atol=1e-12)
 
 
 def test_many_nodes_at_once_are_each_alone():
     nodes = [
-        Node(name, channel, wrap, nearest, ((1.5, 0.25, 0.1), (-0.5, 2.0, 0.7)), (2.0, 0.5, 3.0))
+        ImageNode(name, channel, wrap, nearest, ((1.5, 0.25, 0.1), (-0.5, 2.0, 0.7)), (2.0, 0.5, 3.0))
         for name, channel, wrap, nearest in itertools.product(IMAGES, (None, 0, -1), WRAPS, (False, True))
     ]
     atlas = atlas_of(nodes, IMAGES, torch.float64, CPU)
@@ -75,24 +75,24 @@ def test_many_nodes_at_once_are_each_alone():
 
 def test_channels():
     uv = points(100)
-    rgb = one(Node("clear", None, "repeat", False, SAME, PLAIN), uv)
+    rgb = one(ImageNode("clear", None, "repeat", False, SAME, PLAIN), uv)
     for k in range(3):
-        assert torch.allclose(one(Node("clear", k, "repeat", False, SAME, PLAIN), uv, False), rgb[k], atol=1e-15)
+        assert torch.allclose(one(ImageNode("clear", k, "repeat", False, SAME, PLAIN), uv, False), rgb[k], atol=1e-15)
     grey = 0.212671 * rgb[0] + 0.715160 * rgb[1] + 0.072169 * rgb[2]
-    assert torch.allclose(one(Node("clear", -1, "repeat", False, SAME, PLAIN), uv, False), grey, atol=1e-15)
+    assert torch.allclose(one(ImageNode("clear", -1, "repeat", False, SAME, PLAIN), uv, False), grey, atol=1e-15)
 
 
 @pytest.mark.parametrize("wrap", WRAPS)
 def test_far_coordinates_stay_inside(wrap: str):
     uv = torch.tensor([[1e30, -1e30, 3e8, -3e8], [0.5, -1e20, 1e9, 1e38]])
-    found = one(Node("clear", None, wrap, False, SAME, PLAIN), uv, dtype=torch.float32)
+    found = one(ImageNode("clear", None, wrap, False, SAME, PLAIN), uv, dtype=torch.float32)
     assert torch.isfinite(found).all() and (found >= 0).all() and (found <= 1).all()
 
 
 def test_gradients():
     texels = IMAGES["small"].clone().requires_grad_()
     uv = points(40).requires_grad_()
-    node = Node("small", None, "mirror", False, ((0.7, 0.2, 0.1), (0.3, -0.9, 0.2)), (0.5, 2.0, 1.0))
+    node = ImageNode("small", None, "mirror", False, ((0.7, 0.2, 0.1), (0.3, -0.9, 0.2)), (0.5, 2.0, 1.0))
 
     def value(texels: Tensor, uv: Tensor) -> Tensor:
         atlas = atlas_of([node], {"small": texels}, torch.float64, CPU)
@@ -103,7 +103,7 @@ def test_gradients():
 
 @pytest.mark.parametrize("wrap", WRAPS)
 def test_slope_is_the_derivative(wrap: str):
-    node = Node("grey", 0, wrap, False, ((0.7, 0.2, 0.1), (0.3, -0.9, 0.2)), (1.5, 1.5, 1.5))
+    node = ImageNode("grey", 0, wrap, False, ((0.7, 0.2, 0.1), (0.3, -0.9, 0.2)), (1.5, 1.5, 1.5))
     atlas: Atlas = atlas_of([node], IMAGES, torch.float64, CPU)
     uv = points(500).requires_grad_()
     index = torch.zeros(500, dtype=torch.int64)
@@ -133,7 +133,7 @@ def smaller(image: Tensor) -> Tensor:
     return image
 
 
-def filtered(node: Node, uv: Tensor, footprint: Tensor, images: dict[str, Tensor] = FILTERED) -> Tensor:
+def filtered(node: ImageNode, uv: Tensor, footprint: Tensor, images: dict[str, Tensor] = FILTERED) -> Tensor:
     atlas = atlas_of([node], images, torch.float64, CPU)
     return look_up(atlas, torch.zeros(uv.shape[1], dtype=torch.int64), uv, node.channel is None, footprint)
 
@@ -149,10 +149,10 @@ def test_filtered_look_ups_lie_between_images_of_half_the_size(name: str, wrap: 
     texels = image.shape[0] * image.shape[1]
     for level in (0.0, 0.25, 1.0, 1.5, 2.75, 9.0):
         footprint = torch.full((300,), 4.0**level / texels, dtype=torch.float64)
-        node = Node(name, None, wrap, False, transform, (2.0, 0.5, 1.0), True)
+        node = ImageNode(name, None, wrap, False, transform, (2.0, 0.5, 1.0), True)
         low = min(int(level), len(sizes) - 1)
         high, share = min(low + 1, len(sizes) - 1), level - int(level)
-        alone = Node("image", None, wrap, False, transform, (2.0, 0.5, 1.0))
+        alone = ImageNode("image", None, wrap, False, transform, (2.0, 0.5, 1.0))
         a, b = (
             look_up(
                 atlas_of([alone], {"image": sizes[k]}, torch.float64, CPU),
@@ -167,7 +167,9 @@ def test_filtered_look_ups_lie_between_images_of_half_the_size(name: str, wrap: 
 
 @pytest.mark.parametrize("name", FILTERED)
 def test_the_last_size_is_the_mean(name: str):
-    found = filtered(Node(name, None, "repeat", False, SAME, PLAIN, True), points(5), torch.full((5,), 1e6).double())
+    found = filtered(
+        ImageNode(name, None, "repeat", False, SAME, PLAIN, True), points(5), torch.full((5,), 1e6).double()
+    )
     assert torch.allclose(found, FILTERED[name].mean((0, 1)).expand(3)[:, None].expand(3, 5), atol=1e-14)
 
 
@@ -175,15 +177,17 @@ def test_up_to_one_texel_a_filtered_look_up_is_bilinear_to_the_bit():
     uv = points(200)
     for footprint in (0.0, 1e-9, 0.999 / (13 * 7)):
         found = filtered(
-            Node("odd", None, "repeat", False, SAME, PLAIN, True), uv, torch.full((200,), footprint).double()
+            ImageNode("odd", None, "repeat", False, SAME, PLAIN, True), uv, torch.full((200,), footprint).double()
         )
-        atlas = atlas_of([Node("odd", None, "repeat", False, SAME, PLAIN)], FILTERED, torch.float64, CPU)
+        atlas = atlas_of([ImageNode("odd", None, "repeat", False, SAME, PLAIN)], FILTERED, torch.float64, CPU)
         assert torch.equal(found, look_up(atlas, torch.zeros(200, dtype=torch.int64), uv, True))
 
 
 def test_nodes_that_do_not_filter_are_untouched_by_those_that_do():
     names = list(FILTERED)
-    nodes = [Node(name, None, "mirror", False, SAME, PLAIN, filtered) for name in names for filtered in (False, True)]
+    nodes = [
+        ImageNode(name, None, "mirror", False, SAME, PLAIN, filtered) for name in names for filtered in (False, True)
+    ]
     atlas = atlas_of(nodes, FILTERED, torch.float64, CPU)
     uv = points(50)
     footprint = torch.rand(50, generator=torch.Generator().manual_seed(3)).double()
@@ -202,8 +206,8 @@ def test_gradients_of_filtered_look_ups():
     footprint = (0.01 + torch.rand(6, generator=torch.Generator().manual_seed(3)).double()).requires_grad_()
     transform = ((0.7, 0.2, 0.1), (0.3, -0.9, 0.2))
     nodes = [
-        Node("odd", None, "mirror", False, transform, (0.5, 2.0, 1.0), True),
-        Node("flat", 0, "repeat", False, transform, (3.0, 3.0, 3.0), True),
+        ImageNode("odd", None, "mirror", False, transform, (0.5, 2.0, 1.0), True),
+        ImageNode("flat", 0, "repeat", False, transform, (3.0, 3.0, 3.0), True),
     ]
 
     def value(texels: Tensor, heights: Tensor, uv: Tensor, footprint: Tensor) -> Tensor:

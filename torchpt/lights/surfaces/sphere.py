@@ -11,11 +11,13 @@ import math
 import torch
 from torch import Tensor
 
+from torchpt.lights.surface import Faces, OnSurface, Surface
 from torchpt.math.frames import Frame
 from torchpt.math.vectors import dot, normalize, safe_reciprocal
 from torchpt.math.warps import one_minus_cos, uniform_cone, uniform_sphere
+from torchpt.records import Lights
 
-__all__ = ["inverse_pdf", "sample"]
+__all__ = ["Sphere", "inverse_pdf", "sample"]
 
 
 def _cone(x: Tensor, centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -47,3 +49,37 @@ def inverse_pdf(x: Tensor, centre: Tensor, radius: Tensor, normal: Tensor, wi: T
     cosine = -dot(wi, normal)
     whole = (4.0 * math.pi) * radius * radius * cosine * safe_reciprocal(square)
     return torch.where(cosine > 0, torch.where(outside, (2.0 * math.pi) * width, whole), 0.0)
+
+
+class Sphere(Surface):
+    """A sphere; ``Lights.p0`` is its centre, ``Lights.e1`` begins with its radius."""
+
+    name = "sphere"
+    convex = True
+
+    @classmethod
+    def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
+        """See :class:`Surface`."""
+        area = (4.0 * math.pi) * faces.e1[0].double() ** 2
+        return area, area.detach()
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+        """See :class:`Surface`."""
+        # Detached: from a moving reference point the same spot on the light is held, as on planar lights.
+        radius = at.e1[0]
+        p, normal = sample(x.detach(), at.p0.detach(), radius.detach(), at.flip, u)
+        grown = radius / torch.where(radius == 0, 1.0, radius).detach()  # 1; rows of other kinds may have a 0 there
+        return OnSurface(at.p0 + (p - at.p0).detach() * grown, normal)
+
+    @classmethod
+    def inverse_pdf(
+        cls, at: Lights, x: Tensor, normal: Tensor, wi: Tensor, square: Tensor, by_area: Tensor
+    ) -> Tensor | None:
+        """See :class:`Surface`."""
+        found = inverse_pdf(x.detach(), at.p0.detach(), at.e1[0].detach(), normal, wi.detach(), square.detach())
+        if not by_area.requires_grad:
+            return found
+        # In area measure the derivative of a sphere's share is that of the planar form.
+        value = by_area.detach()
+        return found * torch.where(value > 0, by_area / torch.where(value > 0, value, 1.0), 1.0)

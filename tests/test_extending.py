@@ -1,0 +1,81 @@
+"""docs/extending.md is carried out: its files are put where it says, and a scene uses all of them."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+FILES = dict(re.findall(r"`(torchpt/[\w/]+\.py)`:\n\n```python\n(.*?)```\n", PAGE, re.DOTALL))
+KINDS = {
+    "bsdfs/kinds", "lights/kinds", "cameras/kinds", "samplers/kinds", "film/kinds", "textures/kinds", "integrators/kinds",
+    "integrators/layers",
+}  # fmt: skip
+
+#: What a process does once its packages also look into the folder of the new files.
+USES = """
+import json, sys
+from importlib import import_module
+from pathlib import Path
+
+folder = Path(sys.argv[1])
+for package in json.loads(sys.argv[2]):
+    import_module("torchpt." + package.replace("/", ".")).__path__.append(str(folder / package))
+
+import torch
+import torchpt
+
+scene = torchpt.load({
+    "camera": {"type": "fisheye", "origin": [0, 1, 3], "target": [0, 0.5, 0], "fov": 120},
+    "film": {"width": 24, "height": 16, "filter": "lanczos"},
+    "sampler": {"type": "lattice"},
+    "textures": {"lines": {"type": "stripes", "count": 3}},
+    "materials": {"clay": {"type": "roughdiffuse", "reflectance": {"texture": "lines"}, "sigma": 30}},
+    "shapes": {
+        "floor": {
+            "type": "rectangle", "material": "clay",
+            "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"scale": 3}],
+        },
+        "ball": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.5, "material": "clay"},
+    },
+    "lights": {"lamp": {"type": "searchlight", "position": [1, 3, 2], "target": [0, 0, 0], "intensity": 20}},
+}, device="cpu")
+for wish in ({}, {"integrator": "ao"}, {"integrator": "aov", "film": {"aovs": ["facing"]}}):
+    eager, compiled = (torchpt.render(scene, spp=32, compile=mode, **wish) for mode in (False, True))
+    assert bool(torch.isfinite(eager).all()) and float(eager.mean()) > 0.01, wish
+    assert torch.allclose(eager.mean(), compiled.mean(), rtol=1e-3), wish
+for name in ("materials.clay.sigma", "textures.lines.color1", "lights.lamp.exponent", "camera.fov"):
+    given = {name: scene.params[name].clone().requires_grad_()}
+    image = torchpt.render(scene, spp=4, params=given)
+    (gradient,) = torch.autograd.grad(image.mean(), given[name])
+    assert bool(torch.isfinite(gradient).all()) and bool(gradient.any()), name
+for name, value in (("materials.clay.sigma", 91.0), ("lights.lamp.exponent", -1.0), ("camera.fov", 400.0)):
+    try:
+        torchpt.render(scene, spp=1, params={name: torch.tensor(value)})
+    except torchpt.SceneError as error:
+        assert error.key == f"params.{name}"
+    else:
+        raise AssertionError(name)
+"""
+
+
+def test_there_is_one_file_of_each_kind() -> None:
+    assert {path.removeprefix("torchpt/").rpartition("/")[0] for path in FILES} == KINDS
+    assert not [path for path in FILES if (ROOT / path).exists()]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_they_work_where_they_are_put(tmp_path: Path) -> None:
+    for path, text in FILES.items():
+        place = tmp_path / path.removeprefix("torchpt/")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text(text, encoding="utf-8")
+    packages = str(sorted(KINDS)).replace("'", '"')
+    words = [sys.executable, "-W", "ignore", "-c", USES, str(tmp_path), packages]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=240, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr[-3000:]

@@ -1,0 +1,1 @@
+"""Surfaces that emit: one kind of primitive a file."""

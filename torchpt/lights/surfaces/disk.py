@@ -1,0 +1,27 @@
+"""Disks and ellipses, drawn by area."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from torchpt.lights import area
+from torchpt.lights.surface import OnSurface, Surface
+from torchpt.math.warps import concentric_disk
+from torchpt.records import Lights
+
+__all__ = ["Disk"]
+
+
+class Disk(Surface):
+    """An ellipse."""
+
+    name = "disk"
+    share = math.pi
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+        """See :class:`Surface`."""
+        place = concentric_disk(u)
+        return OnSurface(area.point(at.p0, at.e1, at.e2, place), at.normal, place)

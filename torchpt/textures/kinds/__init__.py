@@ -1,0 +1,1 @@
+"""Kinds of textures: one a file."""
