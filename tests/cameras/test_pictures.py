@@ -12,7 +12,6 @@ from trials import film_of, shoot
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.forward import BYTES_PER_LANE
 from torchpt.rendering import render_scene
 
 AHEAD = {"origin": [0, 0, 0], "target": [0, 0, -1]}
@@ -109,28 +108,6 @@ def test_a_parallel_projection_shows_the_same_size_at_any_depth(depth):
     expected = torch.zeros(16, 32)  # 4 pixels a unit: x from -1 to 2, y from -0.5 to 0.5
     expected[6:10, 12:24] = 2
     assert torch.equal(image, expected)
-
-
-@pytest.mark.parametrize("name", CAMERAS)
-def test_a_crop_shows_the_pixels_of_the_whole_picture(name):
-    scene, whole = room(name), {"width": 24, "height": 18}
-    full = shoot(scene, 4, 7, "sobol", {"max_depth": 3}, whole).image
-    part = shoot(scene, 4, 7, "sobol", {"max_depth": 3}, {**whole, "crop": [5, 3, 11, 8]}).image
-    assert torch.equal(part, full[3:11, 5:16])
-    assert full.std() > 0.05
-
-
-@pytest.mark.parametrize("name", ["thinlens", "hexagon", "orthographic"])
-def test_the_same_bits_in_chunks_and_threads(name):
-    scene = room(name)
-
-    def image(lanes: int | None, threads: int) -> torch.Tensor:
-        memory = None if lanes is None else lanes * BYTES_PER_LANE
-        return shoot(scene, 9, 1, "sobol", {"max_depth": 1}, film_of(96), max_memory=memory, threads=threads).image
-
-    whole = image(None, 1)
-    for lanes, threads in ((1003, 1), (None, 2)):
-        assert torch.equal(image(lanes, threads), whole)
 
 
 def test_layers():

@@ -13,7 +13,7 @@ from trials import film_of, shoot, z_limit
 import torchpt
 from torchpt.film import Filter, filter_of
 from torchpt.format.description import settings
-from torchpt.rendering import first_hit, render_scene
+from torchpt.rendering import first_hit
 from torchpt.scene import Scene
 
 CPU = torch.device("cpu")
@@ -203,12 +203,3 @@ def test_a_clamp_bounds_both_signs(half):
 def test_a_preview_of_one_sample_has_no_weights(half):
     layers = first_hit(half, settings(half.description, {"film": {"filter": "mitchell"}}), ("depth",))
     assert float(layers["depth"].min()) == 0
-
-
-def test_the_picture_is_the_same_compiled_from_any_chunk(half):
-    wish = {"film": {"filter": "mitchell", "aovs": ["normal"]}, "render": {"spp": 7, "compile": "off"}}
-    whole = render_scene(half, settings(half.description, wish))
-    wish["render"]["max_memory"] = 101 * 640
-    parts = render_scene(half, settings(half.description, wish))
-    assert torch.equal(whole.image, parts.image)
-    assert torch.equal(whole.layers["normal"], parts.layers["normal"])

@@ -153,13 +153,6 @@ def test_the_environment_is_cut_from_the_table() -> None:
     assert without_environment(alone) is None and without_environment(None) is None
 
 
-def test_the_same_bits_for_any_chunk(sky: dict[str, Any]) -> None:
-    scene = ball({"type": "principled", "roughness": 0.3, "base_color": 0.6}, sky)
-    whole = preview(scene, seed=3)
-    assert torch.equal(whole, preview(scene, seed=3, max_memory=640 * 77))
-    assert torch.equal(whole, preview(scene, seed=3, threads=1))
-
-
 @pytest.mark.parametrize("kind", ["constant", "envmap"])
 def test_gradients_flow_to_sky_and_material(kind: str, sky: dict[str, Any]) -> None:
     scene = ball({"type": "roughconductor", "reflectance": 0.6, "roughness": 0.5}, WHITE if kind == "constant" else sky)

@@ -71,15 +71,6 @@ def picture(image: str, filter: str, repeats: float = 20) -> dict[str, Any]:
     return {"type": "image", "path": image, "filter": filter, "uv_transform": {"scale": repeats}}
 
 
-def test_chunks_and_threads_make_no_difference(image: str):
-    scene = torchpt.load(
-        floor(picture(image, "trilinear"), normal_map={**picture(image, "trilinear"), "scale": [0.6, 0.6, 1]})
-    )
-    whole = torchpt.render(scene, spp=2, threads=1)
-    assert torch.equal(whole, torchpt.render(scene, spp=2, threads=2))
-    assert torch.equal(whole, torchpt.render(scene, spp=2, threads=1, max_memory=640 * 777))
-
-
 def test_gradients_to_texels(image: str):
     """In float64 against differences: texels near and far, through all sizes of the image."""
     scene = torchpt.load(floor(picture(image, "trilinear", 100)))

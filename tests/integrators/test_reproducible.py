@@ -1,4 +1,7 @@
-"""The same bits whatever the chunk, the place in it and the number of threads (eager, CPU)."""
+"""Each operation on lanes gives the same bits whatever the lane's place and the number of threads (eager, CPU).
+
+Whole pictures are tests/render/test_invariance.py's.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,6 @@ from torch.utils._pytree import tree_leaves, tree_map
 from trials import film_of, shoot
 
 import torchpt
-from torchpt.forward import BYTES_PER_LANE as PER_LANE
 from torchpt.integrators.wave import Wave
 from torchpt.math.distributions import Discrete
 from torchpt.math.frames import Frame
@@ -25,7 +27,6 @@ from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import normalize
 from torchpt.math.warps import concentric_disk, one_minus_cos, uniform_cone, uniform_sphere
 from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.samplers import Sampler, points_of, salts
 
 GRAIN = 32_768  # elements that torch leaves to one thread
 N = 70_003  # above that: two threads share it, and the last vector is not full
@@ -45,65 +46,6 @@ MIXED: dict[str, Any] = {
         },
     },
 }
-
-
-@pytest.fixture(scope="module", params=["cornell_box", "mixed"])
-def scene(request):
-    return torchpt.load(MIXED if request.param == "mixed" else "cornell_box", device="cpu")
-
-
-def test_every_material_in_chunks_and_threads():
-    scene = torchpt.load(showcase(), device="cpu")
-
-    def image(lanes: int | None, threads: int) -> torch.Tensor:
-        memory = None if lanes is None else lanes * PER_LANE
-        return shoot(scene, 4, 1, "sobol", {"max_depth": 4}, film_of(40), max_memory=memory, threads=threads).image
-
-    whole = image(None, 1)
-    for lanes, threads in ((1003, 1), (None, 2)):
-        assert torch.equal(image(lanes, threads), whole), (lanes, threads)
-
-
-@pytest.mark.parametrize("sampler", ["sobol", "independent"])
-def test_the_picture_does_not_depend_on_chunks_or_threads(scene, sampler):
-    # 64 x 64 x 15 spp in passes of 4, 4, 7: up to 28,672 lanes a wave.
-    def image(lanes: int | None, threads: int) -> torch.Tensor:
-        memory = None if lanes is None else lanes * PER_LANE
-        keys = {"max_memory": memory, "threads": threads}
-        return shoot(scene, 15, 11, sampler, {"max_depth": 8, "rr_depth": 3}, film_of(64), **keys).image
-
-    whole = image(None, 1)
-    assert whole.amax() > 0
-    for lanes, threads in ((1003, 1), (4801, 2), (20_011, 1), (20_011, 2), (None, 2)):
-        assert torch.equal(image(lanes, threads), whole), (lanes, threads)
-
-
-def test_waves_that_threads_divide(scene):
-    def image(threads: int, memory: int | None = None) -> torch.Tensor:
-        keys = {"max_memory": memory, "threads": threads}
-        return shoot(scene, 12, 5, "sobol", {"max_depth": 4}, film_of(112), **keys).image
-
-    one = image(1)
-    assert torch.equal(image(2), one)
-    assert torch.equal(image(2, 40_009 * PER_LANE), one)
-
-
-@pytest.mark.parametrize("lanes", [1, 3, 7])
-def test_waves_of_a_few_lanes(scene, lanes):
-    def image(memory: int | None) -> torch.Tensor:
-        return shoot(scene, 5, 2, "sobol", {"max_depth": 3}, film_of(4, 3), max_memory=memory).image
-
-    assert torch.equal(image(lanes * PER_LANE), image(None))
-
-
-def test_the_same_seed_again_and_another(scene):
-    def image(seed: int) -> torch.Tensor:
-        return shoot(scene, 4, seed, "sobol", {"max_depth": 4}, film_of(16)).image
-
-    assert torch.equal(image(1), image(1))
-    assert not torch.equal(image(1), image(2))
-    assert not torch.equal(image(1), image(1 + 2**32))
-    image(2**63 - 1)
 
 
 def _real(seed: int, *shape: int) -> torch.Tensor:
@@ -195,16 +137,6 @@ def test_a_lanes_value_does_not_depend_on_its_place(number):
 
 def _same(a: torch.Tensor, b: torch.Tensor) -> bool:
     return torch.equal(a.contiguous().view(torch.int32), b.contiguous().view(torch.int32))
-
-
-@pytest.mark.parametrize("sampler", list(SAMPLERS))
-def test_numbers_drawn_do_not_depend_on_their_place(sampler):
-    module, salt = points_of(sampler), salts(3, torch.device("cpu"))[4]
-    key = Sampler(sampler, 5, 4, 97, 300).key(torch.arange(N), torch.arange(N) % 97)
-    for draw in (module.draw_1d, module.draw_2d):
-        whole = draw(key, salt)
-        for first, size in ((0, 1), (1, 3), (3, 1001), (11, 32_769)):
-            assert torch.equal(draw(key[:, first : first + size], salt), whole[..., first : first + size])
 
 
 class _Recorder(TorchDispatchMode):

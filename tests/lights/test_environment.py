@@ -1,4 +1,4 @@
-"""Scenes lit by an environment map: keys and errors, closed forms, strategies, derivatives, bits, and Mitsuba."""
+"""Scenes lit by an environment map: keys and errors, closed forms, strategies, derivatives, and Mitsuba."""
 
 from __future__ import annotations
 
@@ -207,13 +207,6 @@ def test_a_turned_map_has_a_derivative(quadrants):
     lit(other, "mis").backward()
     assert other.grad is not None
     assert float(other.grad) == pytest.approx(float(difference), rel=0.1)
-
-
-def test_bits_do_not_depend_on_chunks_or_threads(quadrants):
-    scene = torchpt.load(under({"type": "envmap", "path": str(quadrants)}), "cpu")
-    whole = shoot(scene, 4, sampler="sobol").image
-    assert torch.equal(whole, shoot(scene, 4, sampler="sobol", max_memory="2MB").image)
-    assert torch.equal(whole, shoot(scene, 4, sampler="sobol", threads=2).image)
 
 
 def test_pictures_of_eight_bits_are_srgb(tmp_path):

@@ -1,4 +1,4 @@
-"""The compiled loop's pictures bit for bit: threads, chunks, faults, forks, and renders side by side."""
+"""The compiled loop under faults: samples that are no numbers, errors, early ends, forks, and renders side by side."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ import torchpt
 from torchpt.errors import RenderError
 from torchpt.format.description import settings
 from torchpt.forward import BYTES_PER_LANE
-from torchpt.integrators.loop import schedule
 from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.path import Tally
 from torchpt.rendering import Progress, Rendering, render_scene
@@ -42,35 +41,6 @@ def same(a: Rendering, b: Rendering) -> bool:
     facts = (a.rays, a.paths, a.spp, a.relmse, a.truncated_paths, a.nonfinite_samples)
     assert facts == (b.rays, b.paths, b.spp, b.relmse, b.truncated_paths, b.nonfinite_samples)
     return torch.equal(a.image, b.image) and all(torch.equal(a.layers[name], b.layers[name]) for name in a.layers)
-
-
-@pytest.fixture(scope="module", params=["cornell_box", "showcase"])
-def scene(request) -> torchpt.Scene:
-    return torchpt.load(showcase("lattice", "glass", "tiles") if request.param == "showcase" else request.param, "cpu")
-
-
-def test_threads_and_chunks(scene, monkeypatch):
-    """15 samples in passes of 2, 2, 4, 7 of 851 pixels: nothing is a whole number of vectors."""
-    whole = rendered(scene, 15, threads=1)
-    assert float(whole.image.amax()) > 0
-    for lanes, threads in ((None, 2), (1, 1), (3, 2), (37, 1), (1003, 2)):
-        if lanes == 1:  # a lane a chunk takes long
-            small = {"film": film_of(5, 4)}
-            assert same(rendered(scene, 3, **small), rendered(scene, 3, **small, max_memory=BYTES_PER_LANE))
-            continue
-        memory = None if lanes is None else lanes * BYTES_PER_LANE + 11
-        assert same(rendered(scene, 15, threads=threads, max_memory=memory), whole), (lanes, threads)
-    for tasks, fewest in ((1, 1), (50, 1), (3, 5000)):
-        monkeypatch.setattr(schedule, "TASKS", tasks)
-        monkeypatch.setattr(schedule, "FEWEST", fewest)
-        assert same(rendered(scene, 15, threads=2), whole), (tasks, fewest)
-
-
-def test_the_same_seed_again_and_another(scene):
-    a, b = (rendered(scene, 4, seed=seed) for seed in (1, 1 + 2**32))
-    assert same(a, rendered(scene, 4, seed=1))
-    assert not torch.equal(a.image, b.image)
-    rendered(scene, 1, seed=2**63 - 1)
 
 
 # -- samples that are no numbers

@@ -1,4 +1,4 @@
-"""The samplers that know their number of points: strata, nets, padding, blue noise; and one picture whatever the chunks."""
+"""The samplers that know their number of points: strata, nets, padding, blue noise."""
 
 from __future__ import annotations
 
@@ -212,20 +212,6 @@ SOFT = {
             {"rotate": {"axis": [1, 0, 0], "angle": 90}}, {"translate": [1, 4, 0]}]},
     },
 }  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", COUNTED)
-def test_the_picture_does_not_depend_on_chunks_and_a_crop_shows_it(kind):
-    scene = torchpt.load(SOFT, device="cpu")
-
-    def image(film: dict, **keys: object) -> Tensor:
-        return shoot(scene, 7, 4, kind, {"max_depth": 3, "rr_depth": 1}, film, **keys).image
-
-    whole = image(film_of(32, 20))
-    for lanes, threads in ((197, 1), (1003, 2)):
-        assert torch.equal(image(film_of(32, 20), max_memory=lanes * 640, threads=threads), whole)
-    part = image({**film_of(32, 20), "crop": [9, 5, 16, 9]})
-    assert torch.equal(part, whole[5:14, 9:25])
 
 
 def test_errors_of_zsobol_are_blue():
