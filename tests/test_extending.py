@@ -13,8 +13,8 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"`(torchpt/[\w/]+\.py)`:\n\n```python\n(.*?)```\n", PAGE, re.DOTALL))
 KINDS = {
-    "bsdfs/kinds", "lights/kinds", "cameras/kinds", "samplers/kinds", "film/kinds", "textures/kinds", "integrators/kinds",
-    "integrators/layers",
+    "bsdfs/kinds", "lights/kinds", "shapes/kinds", "cameras/kinds", "samplers/kinds", "film/kinds", "textures/kinds",
+    "integrators/kinds", "integrators/layers",
 }  # fmt: skip
 
 #: What a process does once its packages also look into the folder of the new files.
@@ -41,7 +41,8 @@ scene = torchpt.load({
             "type": "rectangle", "material": "clay",
             "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"scale": 3}],
         },
-        "ball": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.5, "material": "clay"},
+        "bowl": {"type": "paraboloid", "apex": [0, 1.2, 0], "radius": 0.6, "material": "clay"},
+        "glow": {"type": "paraboloid", "apex": [1, 0.5, 0], "radius": 0.2, "height": 0.5, "emission": 2},
     },
     "lights": {"lamp": {"type": "searchlight", "position": [1, 3, 2], "target": [0, 0, 0], "intensity": 20}},
 }, device="cpu")
@@ -49,7 +50,7 @@ for wish in ({}, {"integrator": "ao"}, {"integrator": "aov", "film": {"aovs": ["
     eager, compiled = (torchpt.render(scene, spp=32, compile=mode, **wish) for mode in (False, True))
     assert bool(torch.isfinite(eager).all()) and float(eager.mean()) > 0.01, wish
     assert torch.allclose(eager.mean(), compiled.mean(), rtol=1e-3), wish
-for name in ("materials.clay.sigma", "textures.lines.color1", "lights.lamp.exponent", "camera.fov"):
+for name in ("materials.clay.sigma", "textures.lines.color1", "lights.lamp.exponent", "camera.fov", "shapes.glow.emission"):
     given = {name: scene.params[name].clone().requires_grad_()}
     image = torchpt.render(scene, spp=4, params=given)
     (gradient,) = torch.autograd.grad(image.mean(), given[name])
