@@ -13,7 +13,6 @@ import torch
 import torchpt
 from torchpt.format.description import settings
 from torchpt.rendering import render_scene
-from torchpt.scene import texels
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0], "fov": 20}
 
@@ -206,7 +205,7 @@ def test_images_are_capped_unless_said_otherwise(png: str, monkeypatch: pytest.M
     with pytest.raises(torchpt.AssetError, match="more than 23 pixels"):
         material = {"type": "principled", "base_color": image, "roughness": {**image, "max_pixels": 23}}
         scene({"m": material})
-    monkeypatch.setattr(texels, "MAX_PIXELS", 10)
+    monkeypatch.setattr("torchpt.textures.kinds.image.MAX_PIXELS", 10)
     with pytest.raises(torchpt.AssetError, match="more than 10 pixels"):
         scene({"m": {"type": "diffuse", "reflectance": image}})
     scene({"m": {"type": "diffuse", "reflectance": {**image, "max_pixels": 24}}})

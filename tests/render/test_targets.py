@@ -9,7 +9,7 @@ import torch
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.integrators.loop import kernels
+from torchpt.integrators.loop import programs
 from torchpt.lanes import engine
 from torchpt.rendering import render_scene
 
@@ -30,7 +30,7 @@ def test_older_machines_show_the_same_picture(monkeypatch, name, cpu):
     own = picture(name, 4)
     made = engine.counts()
     monkeypatch.setitem(engine._state, "host", engine.Target(cpu, ""))
-    monkeypatch.setattr(kernels, "_programs", {})
+    monkeypatch.setattr(programs, "_programs", {})
     other = picture(name, 4)
     assert engine.counts() != made  # code of its own, made now or read from disk
     # Sums are rounded otherwise, and a decision may fall the other way for it: a few paths differ.

@@ -108,7 +108,7 @@ def copies(scale: float) -> dict[str, Any]:
 
 def bumps(scale: float) -> dict[str, Any]:
     # Heights are lengths too.
-    relief = {"type": "checkerboard", "scale": 4, "color0": 0.0, "color1": 0.5 * scale}
+    relief = {"type": "noise", "scale": 4, "color0": 0.0, "color1": 0.5 * scale}
     wall = {
         "type": "rectangle",
         "transform": [{"translate": [0, 0, -0.95]}],
