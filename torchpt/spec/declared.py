@@ -101,6 +101,8 @@ def values_of(
 ) -> Described:
     """The values of a kind's parameters, from a mapping that holds nothing else; null means unset.
 
+    A kind's own ``check(values, given)`` may fill in values that follow from others, as a camera does with its pose.
+
     Raises:
         SceneError: an unknown key, a bad value, or values that the kind's own ``check(values, given)`` refuses.
     """
