@@ -108,6 +108,18 @@ FEATURES: dict[str, Feature] = {
     "point light": Feature(
         ("lights/kinds/point.py",), lambda scene: _light(scene, type="point", position=[1, 2, 1], intensity=5)
     ),
+    "sphere": Feature(
+        ("shapes/primitives/sphere.py",),
+        lambda scene: scene["shapes"].update(more={"type": "sphere", "radius": 0.4, "material": "clay"}),
+        ("world.geometry.flip",),
+        module="torchpt.shapes.primitives.sphere",
+    ),
+    "quadric": Feature(
+        ("shapes/primitives/quadric.py", "shapes/quadrics.py", "shapes/kinds/cylinder.py"),
+        lambda scene: scene["shapes"].update(more={"type": "cylinder", "radius": 0.4, "capped": False, "material": "clay"}),
+        ("world.geometry.quadrics",),
+        module="torchpt.shapes.kinds.cylinder",
+    ),
     "layer": Feature(
         ("integrators/aov.py",), lambda scene: scene["film"].update(aovs=["normal"]), module="torchpt.integrators.aov"
     ),
