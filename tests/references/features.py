@@ -133,6 +133,18 @@ FEATURES: dict[str, Feature] = {
         lambda scene: scene["shapes"].update(bulb={"type": "sphere", "center": [1, 1, 0], "radius": 0.2, "emission": 3}),
         module="torchpt.lights.surfaces.sphere",
     ),
+    "sphere": Feature(
+        ("shapes/primitives/sphere.py",),
+        lambda scene: scene["shapes"].update(more={"type": "sphere", "radius": 0.4, "material": "clay"}),
+        ("world.geometry.flip",),
+        module="torchpt.shapes.primitives.sphere",
+    ),
+    "quadric": Feature(
+        ("shapes/primitives/quadric.py", "shapes/quadrics.py", "shapes/kinds/cylinder.py"),
+        lambda scene: scene["shapes"].update(more={"type": "cylinder", "radius": 0.4, "capped": False, "material": "clay"}),
+        ("world.geometry.quadrics",),
+        module="torchpt.shapes.kinds.cylinder",
+    ),
     "layer": Feature(
         ("integrators/aov.py", "integrators/layers/normal.py"),
         lambda scene: scene["film"].update(aovs=["normal"]),

@@ -15,7 +15,7 @@ from torchpt.errors import SceneError
 from torchpt.math.transforms import compose
 from torchpt.records import KINDS as STORED
 from torchpt.records import Hit, World
-from torchpt.shapes import KINDS, interact, quadrics, surface_uv
+from torchpt.shapes import KINDS, interact, quadrics, reattach, surface_uv
 from torchpt.shapes.primitive import PRIMITIVES
 from torchpt.shapes.quadrics import Quadric
 from torchpt.spec import parameters_of
@@ -134,6 +134,27 @@ def test_texture_coordinates_lead_back_to_the_point(name: str, placed: str):
         own = row.chart[piece](u[mine], v[mine])
         away = matrix[:3, :3] @ own + matrix[:3, 3:] - at.p.double().numpy()[:, mine]
         assert np.abs(away).max() < 1e-5, piece
+
+
+@pytest.mark.parametrize("placed", ["turned", "mirrored", "sheared and mirrored"])
+@pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.chart])
+def test_tangents_are_the_slopes_of_the_charts(name: str, placed: str):
+    """How points move with u and with v, which bump maps ask for."""
+    bumps = {"type": "diffuse", "bump_map": {"type": "checkerboard", "scale": 4}}
+    row, (scene, matrix) = ROWS[name], load(name, placed, material=bumps)
+    o, d, hit = found(scene, *rays(matrix))
+    world, _ = scene.world(torch.float32)
+    at = interact(world, o, d, hit)
+    assert at.tangent is not None and at.bitangent is not None
+    u, v = surface_uv(world, at).double().numpy()
+    h = 1e-5
+    for number, part in enumerate(scene.built.parts):
+        mine = (at.prim.numpy() == number) & (np.minimum(np.minimum(u, v), np.minimum(1 - u, 1 - v)) > 0.02)
+        assert mine.sum() > 10
+        chart = row.chart[part.piece]
+        for found_, i, j in ((at.tangent, h, 0.0), (at.bitangent, 0.0, h)):
+            slope = (chart(u[mine] + i, v[mine] + j) - chart(u[mine] - i, v[mine] - j)) / (2 * h)
+            np.testing.assert_allclose(found_.double().numpy()[:, mine], matrix[:3, :3] @ slope, atol=2e-3)
 
 
 @every_place
@@ -268,6 +289,43 @@ def test_points_follow_transforms_and_vertices(name: str, placed: str):
         assert torch.autograd.gradcheck(
             moved, torch.zeros(4, dtype=torch.float64).requires_grad_(), eps=1e-5, atol=2e-5
         )
+
+
+@every_row
+def test_held_points_move_with_the_shape(name: str):
+    """A traced direction and its measure follow the place that was hit: derivatives by the transform."""
+    placed = "turned" if name == "sphere" else "sheared"  # spheres that stay such are moved and scaled alone
+    scene, matrix = load(name, placed)
+    o, d, hit = _inner(name, scene, matrix, 12)
+    key = "shapes.s.to_world"
+    pose = scene.params[key].double()
+    at = interact(scene.world(torch.float64)[0], o, d, hit)
+    there = torch.linalg.inv(pose)
+    own = there[:3, :3] @ at.p + there[:3, 3:]  # in the space that the pose maps
+    along = pose[:3, :3].T @ at.ng
+    along = along / along.norm(dim=0)
+    g = torch.Generator().manual_seed(3)
+    shift = 0.3 * torch.randn(4, 4, generator=g, dtype=torch.float64)
+    shift[3] = 0
+    if name == "sphere":
+        shift[:3, :3] = 0.2 * pose[:3, :3]
+
+    def exact(step: float) -> tuple[torch.Tensor, torch.Tensor]:
+        m = pose + step * shift
+        away = m[:3, :3] @ own + m[:3, 3:] - o
+        turned = torch.linalg.det(m[:3, :3]) * torch.linalg.inv(m[:3, :3]).T @ along
+        distance = away.norm(dim=0)
+        return away / distance, ((away * turned).sum(0).abs() / distance**3).log()
+
+    def held(step: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return reattach(scene.world(torch.float64, {key: pose + step * shift})[0], o, hit, d)
+
+    h = 1e-5
+    wanted = [(a - b) / (2 * h) for a, b in zip(exact(h), exact(-h), strict=True)]
+    step = torch.zeros((), dtype=torch.float64)
+    _, slopes_ = torch.autograd.functional.jvp(held, step, torch.ones_like(step))
+    for one, other in zip(slopes_, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
 
 
 @every_row

@@ -70,7 +70,7 @@ class Quadric:
 
     @classmethod
     def normal(cls, q: Tensor) -> Tensor:
-        """Outward normals ``(3, N)`` at its points, all of one length."""
+        """Outward normals ``(3, N)`` at its points, of any length; where there is none, along the axis."""
         raise NotImplementedError
 
     @classmethod
