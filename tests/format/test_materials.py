@@ -395,7 +395,7 @@ TEXTURES: dict[str, tuple[dict[str, Any], str, str]] = {
     "colours as opacity": (
         {"type": "diffuse", "opacity": {"type": "vertex_color"}},
         "opacity",
-        "an image, or a number",
+        "read by coordinates",
     ),
     "an inner map": (
         {"type": "blend", "a": {"type": "diffuse", "normal_map": IMAGE}, "b": DIFFUSE, "weight": 0.5},

@@ -58,6 +58,8 @@ def _input(raw: Any, coloured: bool, low: float, high: float, linear: bool, move
     channel = texture.channel if isinstance(texture, Named) else texture.values.get("channel")
     if coloured and channel is not None:
         raise Refused("no channel where a colour is wanted", channel, ("channel",))
+    if isinstance(texture, Described):
+        texture.kind.suits(texture.values, coloured)
     return TextureInput(texture, coloured, linear, low, high, moves)
 
 
@@ -101,7 +103,8 @@ def check_texture(
     if isinstance(texture, Named):
         if texture.texture not in textures:
             known = ", ".join(textures) or "none is defined"
-            raise SceneError(f"{key}.texture", texture.texture, f"the name of a texture ({known})", file)
+            where = key if key.endswith(".texture") else f"{key}.texture"
+            raise SceneError(where, texture.texture, f"the name of a texture ({known})", file)
         texture = textures[texture.texture]
     if coordinates and texture.kind.reads != "uv":
         raise SceneError(key, texture.name, "an image, or another texture that is read by coordinates", file)

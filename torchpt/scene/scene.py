@@ -255,4 +255,4 @@ def _undeclared(name: str, built: Built) -> Spec:
         return Scalar(moves=Moves.SURFACES, **low)
     if ".material." in name or name.startswith("materials."):
         return Index() if key in ("int_ior", "ext_ior", "ior") else Scalar()
-    return Scalar() if key in ("emission", "texels") else Scalar(low=None)
+    return Scalar()

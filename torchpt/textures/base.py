@@ -276,6 +276,14 @@ class Texture:
         """
 
     @classmethod
+    def suits(cls, values: Mapping[str, Any], coloured: bool) -> None:
+        """Refuse what a slot of a colour, or of a number, cannot read of a texture that is written in it.
+
+        Raises:
+            Refused: says what is accepted.
+        """
+
+    @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
         """The node of a slot, its parameters declared.
 

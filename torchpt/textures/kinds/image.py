@@ -12,7 +12,7 @@ from torchpt.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS
-from torchpt.spec import Choice, Color, Other, Path, Whole
+from torchpt.spec import Choice, Color, Other, Path, Refused, Whole
 from torchpt.spec import Texels as TexelsSpec
 from torchpt.textures.atlas import WRAPS, ImageNode
 from torchpt.textures.base import CHANNELS, Mapped, Node, Opening
@@ -56,6 +56,12 @@ class Image(Mapped):
         """See :class:`Texture`."""
         path = values["path"]
         return path.label if isinstance(path, EncodedImage) else path[0]
+
+    @classmethod
+    def suits(cls, values: Mapping[str, Any], coloured: bool) -> None:
+        """See :class:`Texture`."""
+        if not coloured and len(set(values["scale"])) > 1:
+            raise Refused("one number as scale where a number is wanted", list(values["scale"]), ("scale",))
 
     @classmethod
     def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
