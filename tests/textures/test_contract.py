@@ -20,7 +20,8 @@ from torchpt.lanes.function import lanewise
 from torchpt.math.vectors import luminance
 from torchpt.scene.parameters import Parameters
 from torchpt.scene.texels import Opener
-from torchpt.spec import Color, Scalar, Spec, Texels, parameters_of
+from torchpt.spec import Color, Moves, Scalar, Spec, Texels, parameters_of
+from torchpt.spec.declared import described
 from torchpt.textures import KINDS, Node, Table, TexturePoint
 
 CPU = torch.device("cpu")
@@ -112,11 +113,11 @@ Opened = tuple[Node, dict[str, Tensor], dict[str, Spec]]
 def opened(path: str) -> Callable[..., Opened]:
     """A kind's row as a slot opens it: its node, parameters in float64, and their specs."""
 
-    def make(name: str, spec: Spec = COLOUR, **more: Any) -> Opened:
-        entry = {key: path if value == "PATH" else value for key, value in ROWS[name].entry.items()}
-        parameters = Parameters()
-        opener = Opener({}, lambda paths, key: Path(paths[0]), parameters, None)
-        node = opener(texture_of({"type": name, **entry, **more}, spec), "slot")
+    def make(name: str, spec: Spec = COLOUR, *, named: str | None = None, **more: Any) -> Opened:
+        entry, parameters = entry_of(name, path, **more), Parameters()
+        textures = {"t": described("texture", KINDS, entry, "t", None)}
+        opener = Opener(textures, lambda paths, key: Path(paths[0]), parameters, None)
+        node = opener(texture_of({"texture": "t", "channel": named} if named else entry, spec), "slot")
         given = {key: torch.from_numpy(np.asarray(value, np.float64)) for key, value in parameters.items()}
         return node, given, parameters.specs
 
@@ -164,15 +165,8 @@ def test_a_number_is_a_channel_of_the_colour(name: str, opened: Callable[..., Op
     assert colour.shape == (3, 300) and float((colour[0] - colour[1]).abs().max()) > 0.1
     expected = {"luminance": luminance(colour), **dict(zip("rgb", colour, strict=True))}
     for channel, values in expected.items():
-        node = number_node(opened, name, channel)
-        assert torch.allclose(read(table_of(node), point, False), values, atol=1e-6), channel
-
-
-def number_node(opened: Callable[..., Opened], name: str, channel: str, spec: Spec = NUMBER) -> Opened:
-    """A number's node of a named texture, which is how any kind is asked for a channel."""
-    node, given, specs = opened(name, spec)
-    index = ("luminance", "r", "g", "b").index(channel) - 1
-    return replace(node, channel=index), given, specs  # type: ignore[type-var]
+        table = table_of(opened(name, NUMBER, named=channel))
+        assert torch.allclose(read(table, point, False), values, atol=1e-6), channel
 
 
 @pytest.mark.parametrize("name", MAPPED)
@@ -187,23 +181,24 @@ def test_the_transform_moves_the_coordinates(name: str, opened: Callable[..., Op
     assert float((read(turned, point) - read(plain, point)).abs().max()) > 0.1
 
 
+@pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize("name", MAPPED)
-def test_the_slope_is_the_derivative(name: str, opened: Callable[..., Opened]):
-    table = table_of(opened(name, HEIGHT, uv_transform=TURN))
-    point = points(1000)
+def test_the_slope_is_the_derivative(name: str, wide: bool, opened: Callable[..., Opened]):
+    """Of what is read at points, and of what a footprint leaves of it."""
+    filters = ROWS[name].filters if wide else {}
+    footprint = torch.full((1000,), 0.1, dtype=torch.float64) if wide else None
+    table = table_of(opened(name, HEIGHT, uv_transform=TURN, **filters))
+    point = points(1000, footprint=footprint)
     assert point.uv is not None
     h = 1e-6
-    steps = torch.tensor([[[h], [0.0]], [[0.0], [h]]], dtype=torch.float64)
-    expected = torch.stack(
-        [
-            (read(table, TexturePoint(point.uv + step), False) - read(table, TexturePoint(point.uv - step), False))
-            / (2 * h)
-            for step in steps
-        ]
-    )
-    error = (inclines(table, point) - expected).abs() / (1.0 + expected.abs())
-    assert float((error > 1e-4).double().mean()) < 0.01  # but at creases
-    assert (float(expected.abs().median()) > 0.02) == ROWS[name].smooth
+
+    def at(*step: float) -> Tensor:
+        return read(table, replace(point, uv=point.uv + torch.tensor(step, dtype=torch.float64)[:, None]), False)
+
+    expected = torch.stack((at(h, 0) - at(-h, 0), at(0, h) - at(0, -h))) / (2 * h)
+    error = (inclines(table, point) - expected).abs() / (1e-3 + expected.abs())
+    assert float((error > 1e-2).double().mean()) < 0.01  # but at creases
+    assert (float(expected.abs().median()) > 0.01) == ROWS[name].smooth
 
 
 @pytest.mark.parametrize("name", ROWS)
@@ -378,13 +373,22 @@ def test_what_a_render_may_not_be_given(name: str, path: str):
 
 
 @pytest.mark.parametrize("name", [name for name in ROWS if ROWS[name].beyond])
-def test_two_slots_narrow_a_range(name: str, path: str):
-    """And one with a wider range does not widen it."""
-    for slots in ({}, {"spec_trans": {"texture": "t"}, "opacity": {"texture": "t"}}, {"emission": {"texture": "t"}}):
-        spec = torchpt.load(scene(entry_of(name, path), **slots), "cpu")
-        key = next(key for key in spec.params if key.startswith("textures.t"))
-        found = spec.spec(key)
-        assert isinstance(found, Color | Texels) and found.bounds == (0.0, 1.0)
+def test_several_slots_narrow_a_range(name: str, path: str):
+    """And one with a wider range does not widen it; whichever is read first."""
+    glass = {"type": "dielectric", "int_ior": {"texture": "t"}}
+    for slots, inner, expected in (
+        ({}, None, (0.0, 1.0)),
+        ({"emission": {"texture": "t"}, "opacity": {"texture": "t"}}, None, (0.0, 1.0)),
+        ({}, glass, (1e-3, 1.0)),
+    ):
+        whole = scene(entry_of(name, path), **slots)
+        if inner is not None:
+            whole["shapes"]["second"] = {"type": "sphere", "material": inner}
+        for shapes in (whole["shapes"], dict(reversed(whole["shapes"].items()))):
+            loaded = torchpt.load({**whole, "shapes": shapes}, "cpu")
+            spec = loaded.spec(next(key for key in loaded.params if key.startswith("textures.t")))
+            assert isinstance(spec, Color | Texels) and spec.bounds == expected
+            assert (spec.moves is Moves.RAYS) == (inner is not None)
 
 
 @pytest.mark.parametrize("name", ROWS)

@@ -161,6 +161,10 @@ def test_octaves_fade_one_after_another():
         share = float((mean * here).mean() / here.square().mean())
         found = noise(uv, torch.full((20_000,), side**2, dtype=torch.float64), octaves=1) - 0.5
         assert float((found / here).median()) == pytest.approx(share, abs=0.02), side
+    two = noise(uv, octaves=2) - 0.5
+    second = 1.5 * two - here  # times a half, the second's height
+    kept = 1.5 * (noise(uv, torch.full((20_000,), 0.25, dtype=torch.float64), octaves=2) - 0.5) - 2**-0.25 * here
+    assert torch.allclose(kept, second * 2**-1.0, atol=1e-12)  # whose cells are a quarter as large
     wide = torch.full((20_000,), 4.0, dtype=torch.float64)
     fine = (noise(uv, wide, octaves=6) - 0.5).std() / (noise(uv, octaves=6) - 0.5).std()
     assert float(fine) < 0.08
