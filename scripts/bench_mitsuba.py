@@ -119,6 +119,7 @@ def race(arguments: argparse.Namespace) -> None:
     rivals = (LLVM, SCALAR) if arguments.scalar else (LLVM,)
     contenders = [Contender(engine, arguments.threads) for engine in (OURS, *rivals)]
     found: dict[str, Any] = {}
+    overall: dict[str, dict[str, float]] = {}
     print(f"{'Mpaths/s':22s}{OURS:>9s}" + "".join(f"{rival:>13s}   ratio" for rival in rivals) + "    means, z")
     for scene in arguments.scenes or SCENES:
         with started(scene, contenders, arguments) as workers:
@@ -140,7 +141,7 @@ def race(arguments: argparse.Namespace) -> None:
         }
         save(arguments, {"scenes": found, "geometric_means": overall})
     for group in GROUPS:
-        cells = "".join(f"{overall[rival][group]:21.3f}" for rival in rivals if group in overall[rival])
+        cells = "".join(f"{means[group]:21.3f}" for means in overall.values() if group in means)
         if cells:
             print(f"{'geometric mean, ' + group:31s}{cells}")
     if arguments.markdown:

@@ -54,7 +54,9 @@ class _Autograd(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]: the decorator hides names
+        ctx: Any, *cotangents: Tensor
+    ) -> tuple[Tensor | None, ...]:
         tensors = tuple(t.detach() for t in ctx.saved_tensors)
         flat = cotangents[0].reshape(-1, 3).T
         total = [torch.zeros_like(t) for t in (*tensors, *ctx.held)]

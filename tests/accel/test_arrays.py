@@ -51,6 +51,7 @@ def test_arrays_give_what_tensors_give_and_touch_no_other_lane(name):
     accel = build(make(), kind, 1)
     o, d, t_max = rays(5, max(COUNTS) + 40)
     t_max[::5], t_max[3::50], d[1, 4::60] = 1.0, 0.0, float("nan")
+    prim = np.empty(0, np.int32)
     for count in COUNTS:
         hits = accel.intersect(o[:, :count], d[:, :count], t_max[:count])
         t, u, v = np.full((3, len(t_max)), 7, np.float32)

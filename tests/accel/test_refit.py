@@ -315,7 +315,7 @@ def test_a_tree_is_built_anew_once_it_costs_too_much():
     """Small steps add up: what counts is the tree as it was built, not the one before."""
     v, f = sphere_mesh(20)
     rng = np.random.default_rng(3)
-    first = tree = Wide(triangles(v, f), 1)
+    first = tree = last = Wide(g := triangles(v, f), 1)
     steps = []
     for _ in range(60):
         v = v + 0.012 * rng.normal(size=v.shape).astype(np.float32)

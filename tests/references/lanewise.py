@@ -96,13 +96,14 @@ class _Recorder(Stages):
         self.escapes.append((_copied(state), hit, index))
         return super().escape(state, hit, index)
 
-    def bounce(self, model: int, *args: Any) -> Any:
-        _, _, _, state, hit, index, salt = args
-        if not self._seen or self._seen[-1] is not salt:
-            self._seen.append(salt)
+    def bounce(  # names as in Stages
+        self, model: int, roulette: Any, slide: Any, search: Any, state: Any, hit: Any, index: Any, salts: Any
+    ) -> Any:
+        if not self._seen or self._seen[-1] is not salts:
+            self._seen.append(salts)
             self.states.append(_copied(state))
         self.bounces.append((model, _copied(state), hit, index, len(self._seen)))
-        return super().bounce(model, *args)
+        return super().bounce(model, roulette, slide, search, state, hit, index, salts)
 
 
 def _copied(state: PathState) -> PathState:

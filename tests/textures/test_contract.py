@@ -189,11 +189,11 @@ def test_the_slope_is_the_derivative(name: str, wide: bool, opened: Callable[...
     footprint = torch.full((1000,), 0.1, dtype=torch.float64) if wide else None
     table = table_of(opened(name, HEIGHT, uv_transform=TURN, **filters))
     point = points(1000, footprint=footprint)
-    assert point.uv is not None
-    h = 1e-6
+    uv, h = point.uv, 1e-6
+    assert uv is not None
 
     def at(*step: float) -> Tensor:
-        return read(table, replace(point, uv=point.uv + torch.tensor(step, dtype=torch.float64)[:, None]), False)
+        return read(table, replace(point, uv=uv + torch.tensor(step, dtype=torch.float64)[:, None]), False)
 
     expected = torch.stack((at(h, 0) - at(-h, 0), at(0, h) - at(0, -h))) / (2 * h)
     error = (inclines(table, point) - expected).abs() / (1e-3 + expected.abs())

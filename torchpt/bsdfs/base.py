@@ -72,8 +72,8 @@ class Bsdf:
     tabulated: tuple[str, ...] = ()
     sheer: ClassVar[bool] = False
     lobed: ClassVar[bool] = False
-    conserves: ClassVar[bool] = True
-    reciprocal: ClassVar[bool] = True
+    conserves: bool = True
+    reciprocal: bool = True
     delta: bool = False
     smooth: bool = False
     transmits: bool = False
@@ -85,6 +85,11 @@ class Bsdf:
         super().__init_subclass__(**kwargs)
         if not part and cls.eval_pdf is Bsdf.eval_pdf and (cls.eval is Bsdf.eval or cls.pdf is Bsdf.pdf):
             raise TypeError(f"{cls.__name__} has to define eval_pdf, or eval and pdf")
+
+    def has(self, **traits: Any) -> None:
+        """Traits above that depend on a variant's own fields; to be called from ``__post_init__``."""
+        for name, value in traits.items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def check(cls, values: Values, given: frozenset[str]) -> None:

@@ -57,11 +57,9 @@ class Anisotropic(Rough, part=True):
 
     energy_compensation: bool
 
-    @property
-    def tabulated(self) -> tuple[str, ...]:
-        """Where energy is given back, all that its table is made of."""
-        needed = ("alpha", "roughness", "alpha_u", "alpha_v", "int_ior", "ext_ior")
-        return needed if self.energy_compensation else ()
+    def __post_init__(self) -> None:
+        if self.energy_compensation:
+            self.has(tabulated=("alpha", "roughness", "alpha_u", "alpha_v", "int_ior", "ext_ior"), reciprocal=False)
 
 
 def rough(values: Parameters, anisotropic: bool) -> Parameters:

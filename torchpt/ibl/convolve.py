@@ -229,7 +229,9 @@ class _Gather(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]: the decorator hides names
+        ctx: Any, *cotangents: Tensor
+    ) -> tuple[Tensor, Tensor, None]:
         rule: _Rule = ctx.rule
         flat = cotangents[0].reshape(-1, 3)
         # A channel at a time: several times faster than rows of three on a CPU.

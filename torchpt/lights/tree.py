@@ -209,16 +209,16 @@ def _walk(
         total = weight.sum(1, keepdim=True)
         weight = torch.where(total > 0, weight, (places < tree.full[inner, None]).double())
         ends = weight.cumsum(1)
-        if left is None:
+        aim = None if left is None else left * ends[:, -1]
+        if aim is None:
             assert way is not None
             chosen, way = way & 7, way >> 3
         else:
-            aim = left * ends[:, -1]
             # The last child with any weight whose interval starts no later.
             chosen = torch.where((weight > 0) & (ends - weight <= aim[:, None]), places, 0).amax(1)
         share, end = (a.gather(1, chosen[:, None])[:, 0] for a in (weight, ends))
         deeper = node >= 0
-        if left is not None:
+        if aim is not None and left is not None:
             left = torch.where(deeper, ((aim - (end - share)) / share).clamp(0.0, 1.0), left)
         p = torch.where(deeper, p * share / ends[:, -1], p)
         node = torch.where(deeper, tree.child[inner, chosen].long(), node)

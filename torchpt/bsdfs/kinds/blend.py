@@ -55,45 +55,18 @@ class Blend(Bsdf):
         inner = cls(matt, made["conductor"](schlick=True))
         return cls(matt, rough), cls(glass, matt), cls(inner, made["roughdielectric"]())
 
-    @property
-    def factors(self) -> tuple[str, ...]:
-        """Those of both."""
-        return (*self.a.factors, *self.b.factors)
-
-    @property
-    def delta(self) -> bool:
-        """Where one of them may be."""
-        return self.a.delta or self.b.delta
-
-    @property
-    def smooth(self) -> bool:
-        """Where both are."""
-        return self.a.smooth and self.b.smooth
-
-    @property
-    def transmits(self) -> bool:
-        """Where one does."""
-        return self.a.transmits or self.b.transmits
-
-    @property
-    def refracts(self) -> bool:
-        """Where one does."""
-        return self.a.refracts or self.b.refracts
-
-    @property
-    def anisotropic(self) -> bool:
-        """Where one is."""
-        return self.a.anisotropic or self.b.anisotropic
-
-    @property
-    def conserves(self) -> bool:
-        """Where both do."""
-        return self.a.conserves and self.b.conserves
-
-    @property
-    def reciprocal(self) -> bool:
-        """Where both are."""
-        return self.a.reciprocal and self.b.reciprocal
+    def __post_init__(self) -> None:
+        a, b = self.a, self.b
+        self.has(
+            factors=(*a.factors, *b.factors),
+            delta=a.delta or b.delta,
+            smooth=a.smooth and b.smooth,
+            transmits=a.transmits or b.transmits,
+            refracts=a.refracts or b.refracts,
+            anisotropic=a.anisotropic or b.anisotropic,
+            conserves=a.conserves and b.conserves,
+            reciprocal=a.reciprocal and b.reciprocal,
+        )
 
     def tabulate(self, values: Parameters) -> Parameters:
         """Both, each by its own."""

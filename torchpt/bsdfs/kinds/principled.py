@@ -106,20 +106,13 @@ class Principled(Bsdf):
                 found[feature] = 0.0
         return {key: value for key, value in found.items() if key in _ALWAYS or value != 0.0}
 
+    def __post_init__(self) -> None:
+        self.has(transmits=self.transmissive, refracts=self.transmissive)
+
     @classmethod
     def variants(cls) -> tuple[Bsdf, ...]:
         """See :class:`Bsdf`."""
         return tuple(cls(transmissive, anisotropic) for anisotropic in (False, True) for transmissive in (False, True))
-
-    @property
-    def transmits(self) -> bool:
-        """Where it has the lobe for it."""
-        return self.transmissive
-
-    @property
-    def refracts(self) -> bool:
-        """Where it transmits."""
-        return self.transmissive
 
     def prepare(self, values: Parameters) -> Parameters:
         """Roughness becomes ``alpha_u`` and ``alpha_v``, ``specular`` becomes ``eta``. What is absent counts as 0.

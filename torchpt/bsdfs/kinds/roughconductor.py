@@ -56,11 +56,6 @@ class RoughConductor(Anisotropic, Metal):
         plain = [cls(schlick, anisotropic) for anisotropic in (False, True) for schlick in (False, True)]
         return *plain, cls(energy_compensation=True), cls(anisotropic=True, energy_compensation=True)
 
-    @property
-    def reciprocal(self) -> bool:
-        """See :class:`Bsdf`."""
-        return not self.energy_compensation
-
     def tabulate(self, values: Parameters) -> Parameters:
         """The energy that facets give back at once."""
         return {"energy": energy_table(rough(values, self.anisotropic), [None])} if self.energy_compensation else {}

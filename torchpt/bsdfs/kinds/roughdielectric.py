@@ -54,11 +54,6 @@ class RoughDielectric(Anisotropic, Glass):
         """See :class:`Bsdf`."""
         return tuple(cls(anisotropic, compensated) for compensated in (False, True) for anisotropic in (False, True))
 
-    @property
-    def reciprocal(self) -> bool:
-        """See :class:`Bsdf`."""
-        return not self.energy_compensation
-
     def tabulate(self, values: Parameters) -> Parameters:
         """The energy that facets give back at once, from either side."""
         if not self.energy_compensation:
