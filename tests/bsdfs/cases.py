@@ -194,7 +194,9 @@ def _rough_conductor(model: Bsdf) -> Iterator[Case]:
     compensated = getattr(model, "energy_compensation", False)
     for i, rough in enumerate(_roughness(model)):
         tint = {"specular_reflectance": RED} if i == 2 else {}
-        yield Case(model, {**_metal(model), **rough, **tint}, differentiable=_is_wide(rough))
+        # At 89.9 degrees the table of a compensated metal of alpha 1e-4 is 3e-4 off: E is linear between few cosines.
+        between = 1e-3 if compensated else 0.0
+        yield Case(model, {**_metal(model), **rough, **tint}, furnace=between, differentiable=_is_wide(rough))
     for rough in _roughness(model)[-2:] if compensated else _roughness(model)[-1:]:
         yield Case(model, {**_mirror(model), **rough}, lossless=compensated, furnace=0.01 if compensated else 0.0)
     smooth = {"alpha_u": 0.0, "alpha_v": 0.0} if model.anisotropic else {"alpha": 0.0}

@@ -119,7 +119,9 @@ class Half:
 class Experiment:
     """Draws of a material from one direction, and the integrals that they estimate."""
 
-    def __init__(self, setting: Setting, number: int | None = None, drawn: Values | None = None) -> None:
+    def __init__(
+        self, setting: Setting, number: int | None = None, drawn: Values | None = None, again: int = 0
+    ) -> None:
         self.setting, self.case, self.model = setting, setting.case, setting.case.model
         # A lobe is narrower across, by the cosine, than along. Where it is so by a few units of float32's last place, its
         # shape is judged in float64.
@@ -129,7 +131,7 @@ class Experiment:
         if narrow:
             self.wo = normalize(self.wo.double())
         self.number = number or (FULL if setting.full else FAST)
-        self.generator = torch.Generator().manual_seed(zlib.crc32(str(setting).encode()))
+        self.generator = torch.Generator().manual_seed(zlib.crc32(str(setting).encode()) + again)
         self.sampled_rows = (replace(self.case, values=drawn) if drawn else self.case).rows(self.dtype)
         self.rows = self.case.rows(torch.float64)
         self.draws = self.drawn(self.number)

@@ -27,7 +27,7 @@ from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, middle_of
 from torchpt.settings import Film, Settings
-from torchpt.spec import Moves, Pose, Refused, Scalar, Spec, parameters_of
+from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
 __all__ = ["Scene", "device_of", "load"]
 
@@ -142,7 +142,7 @@ class Scene:
 
     def spec(self, name: str) -> Spec:
         """What a parameter is."""
-        return self._built.parameters.specs.get(name) or _undeclared(name)
+        return self._built.parameters.specs[name]
 
     def _check(self, name: str, value: Tensor) -> None:
         """Refuse numbers that no scene file could hold."""
@@ -264,9 +264,3 @@ class Scene:
             return
         self._worlds.clear()
         self._accels.clear()
-
-
-def _undeclared(name: str) -> Spec:
-    """What a parameter is whose kind does not declare it yet, by its name."""
-    key = name.rpartition(".")[2]
-    return Scalar() if key in ("emission", "texels") else Scalar(low=None)
