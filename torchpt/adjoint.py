@@ -134,5 +134,5 @@ def chunks(
         return values.sum(1) / settings.render.spp
 
     with limited_threads(settings.render.threads):  # while whoever asked for the chunks differentiates them
-        for first, count, sample, samples, _ in chunks_of(settings, lanes, still.sampler.randomizations, pixels):
+        for first, count, sample, samples in chunks_of(settings, lanes, pixels):
             yield Chunk(first, count, partial(radiance, (first, count, sample, samples)))

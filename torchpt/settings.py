@@ -111,6 +111,12 @@ def _device(value: Any) -> str:
     return value
 
 
+def _pilots(value: Any) -> bool | str:
+    if isinstance(value, bool) or value == "auto":
+        return value
+    raise Refused("auto, true or false")
+
+
 def _preview(value: Any) -> str:
     if isinstance(value, str) and value.strip() and value.isprintable():
         return value
@@ -121,7 +127,7 @@ class Render(Valued):
     """How the work is done; none of it but ``spp`` and ``seed`` changes what the picture converges to."""
 
     parameters: ClassVar = {
-        "spp": Whole(64, low=1, doc="samples a pixel"),
+        "spp": Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take"),
         "seed": Whole(0, high=2**63 - 1, doc="the same seed gives the same picture"),
         "device": Other("auto", reader=_device, words="auto, cpu, cuda or cuda:N", doc="auto: CUDA where there is one"),
         "accel": Choice("auto", names=("auto", "torch", "numba", "brute"), doc="the search structure"),
@@ -143,6 +149,18 @@ class Render(Valued):
             reader=reading.memory_size,
             words="null, bytes, or a size such as 4GB",
             doc="of what is traced at once",
+        ),
+        "pilots": Other(
+            "auto",
+            reader=_pilots,
+            words="auto, true or false",
+            doc="whether one pixel of 16 is sampled twice, by which the picture knows its error; auto: not in Python",
+        ),
+        "time_limit": Scalar(
+            None, above=0.0, words="null or seconds > 0", doc="seconds of sampling; loading, building, compiling apart"
+        ),
+        "target_error": Scalar(
+            None, above=0.0, words="null or a relMSE > 0", doc="the relMSE, by its pilots, at which the picture is done"
         ),
         "preview": Other(
             None,
@@ -172,6 +190,19 @@ class Settings:
     integrator: Integrator
     sampler: Described
     render: Render
+
+    @property
+    def adaptive(self) -> bool:
+        """Whether samples go where the error is."""
+        return bool(self.sampler.values.get("adaptive", False))
+
+    @property
+    def pilots(self) -> bool:
+        """Whether one pixel of a block is sampled twice; ``auto``: where something asks for it."""
+        if not self.integrator.light or "variance" in self.film.aovs:
+            return False
+        asked = self.adaptive or self.render.target_error is not None
+        return asked if self.render.pilots == "auto" else bool(self.render.pilots)
 
     @property
     def light_choice(self) -> str:
@@ -234,12 +265,33 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
             blame = None if _given(overrides, error.key) else file
             raise type(error)(error.key, error.value, error.expected, blame) from None
     settings = Settings(**blocks)
+    _check_pilots(settings, file)
     if not settings.integrator.light:
         for name in settings.film.aovs:
             if LAYERS[name].light:
                 expected = f"no {name} where integrator is {settings.integrator.name} (it carries no light)"
                 raise SceneError("film.aovs", list(settings.film.aovs), expected, file)
     return settings
+
+
+def _check_pilots(settings: Settings, file: str | None) -> None:
+    """Raises where what is asked for takes pilots and there can be none, or where every pixel is sampled twice anyway."""
+    film, render = settings.film, settings.render
+    adaptive, variance = settings.adaptive, "variance" in film.aovs
+    for key, wanted in (("sampler.adaptive", adaptive), ("render.target_error", render.target_error is not None)):
+        if not wanted:
+            continue
+        value = render.target_error if key.startswith("render") else adaptive
+        if render.pilots is False:
+            raise SceneError("render.pilots", False, f"auto or true beside {key}", file)
+        if not settings.integrator.light:
+            expected = f"an integrator that carries light, not {settings.integrator.name}"
+            raise SceneError(key, value, expected, file)
+        if variance:
+            raise SceneError("film.aovs", list(film.aovs), f"no variance beside {key}", file)
+    if variance and render.pilots is True:
+        expected = "auto or false where film.aovs asks for variance: every pixel is sampled by two streams then"
+        raise SceneError("render.pilots", True, expected, file)
 
 
 def _open_end(raw: Mapping[str, Any], sampler: Described) -> None:

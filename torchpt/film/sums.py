@@ -43,6 +43,32 @@ class Film:
             self._sums[group, :, pixels] += radiance[:, s]
             self._counts[group, pixels] += 1
 
+    def taken(self, places: Tensor) -> Film:
+        """Some of its pixels as a film of their own."""
+        part = Film(len(places), 1, self.randomizations, self._sums.device, len(self._first))
+        part._first, part._sums = self._first[:, places].contiguous(), self._sums[:, :, places].contiguous()
+        part._counts = self._counts[:, places].contiguous()
+        return part
+
+    def put(self, places: Tensor, part: Film) -> None:
+        """What :meth:`taken` took, after more samples."""
+        self._first[:, places], self._sums[:, :, places] = part._first, part._sums
+        self._counts[:, places] = part._counts
+
+    @property
+    def counts(self) -> Tensor:
+        """Samples of each pixel ``(pixels,)`` int64."""
+        return self._counts.sum(0)
+
+    def values(self) -> Tensor:
+        """Means of the pixels ``(pixels, C)`` float64; those without samples are black."""
+        return (self._sums.sum(0) / self._counts.sum(0).clamp_min(1)).T.contiguous()
+
+    def streams(self) -> list[Tensor]:
+        """Means of each stream ``(pixels, C)`` float64."""
+        parts = zip(self._sums, self._counts, strict=True)
+        return [(total / count.clamp_min(1)).T.contiguous() for total, count in parts]
+
     @property
     def sums(self) -> Tensor:
         """``(randomizations, C, pixels)`` float64."""

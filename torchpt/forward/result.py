@@ -22,13 +22,17 @@ class Rendering:
         seconds: wall time.
         build_seconds: of it, for the world and its search structure.
         compile_seconds: of it, for compiling.
+        render_seconds: of it, for sampling.
         paths: camera samples traced.
         rays: rays traced, shadow rays included.
         nonfinite_samples: samples that were NaN or infinite, and counted as black.
         truncated_paths: paths ended by the cap on endless depth.
         clamped: fraction of the light that ``integrator.clamp`` took away; None where it is off.
-        relmse: the picture's estimate of its own relMSE; None for a single randomization.
-        complete: whether all samples asked for were taken.
+        relmse: the picture's estimate of its own relMSE; None where it has no pilots.
+        relmse_interval: of 95 % for it; None where there are too few pilots.
+        heavy_tailed: whether few pixels carry the error, so that the interval is not to be trusted.
+        stopped_by: the rule that ended it: spp, time_limit or target_error; "" where it was ended from outside.
+        complete: whether a rule ended it.
         eager: stages that ran as tensor operations although kernels were wanted, and why.
     """
 
@@ -38,12 +42,16 @@ class Rendering:
     seconds: float = 0.0
     build_seconds: float = 0.0
     compile_seconds: float = 0.0
+    render_seconds: float = 0.0
     paths: int = 0
     rays: int = 0
     nonfinite_samples: int = 0
     truncated_paths: int = 0
     clamped: float | None = None
     relmse: float | None = None
+    relmse_interval: tuple[float, float] | None = None
+    heavy_tailed: bool = False
+    stopped_by: str = ""
     complete: bool = True
     eager: tuple[str, ...] = ()
 
@@ -53,13 +61,19 @@ class Rendering:
             "spp": self.spp,
             "build_seconds": round(self.build_seconds, 4),
             "compile_seconds": round(self.compile_seconds, 4),
+            "render_seconds": round(self.render_seconds, 4),
             "seconds": round(self.seconds, 4),
-            "paths_per_second": round(self.paths / max(self.seconds, 1e-9)),
+            "paths_per_second": round(self.paths / max(self.render_seconds, 1e-9)),
             "rays": self.rays,
             "nonfinite_samples": self.nonfinite_samples,
             "mean": [float(x) for x in self.image.double().mean((0, 1))],
             "relmse": self.relmse,
+            "relmse_interval": None if self.relmse_interval is None else list(self.relmse_interval),
         }
+        if self.heavy_tailed:
+            facts["heavy_tailed"] = True
+        if self.stopped_by not in ("", "spp"):
+            facts["stopped_by"] = self.stopped_by
         if self.truncated_paths:
             facts["truncated_paths"] = self.truncated_paths
         if self.clamped is not None:
@@ -77,10 +91,10 @@ class Progress:
 
     Attributes:
         done: camera samples taken.
-        total: camera samples asked for.
+        total: camera samples that there will be; a guess where time or error end the render.
         rays: rays traced.
         seconds: since the start.
-        pass_finished: whether every pixel now has the same number of samples.
+        pass_finished: whether a pass over all pixels ends here.
         snapshot: makes the picture so far.
     """
 

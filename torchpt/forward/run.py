@@ -12,14 +12,18 @@ import torch
 from torch import Tensor
 
 from torchpt.errors import RenderError
-from torchpt.film import Film
+from torchpt.film import Film, KnownError
+from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.kept import kept
 from torchpt.forward.result import Progress, Rendering
-from torchpt.forward.schedule import chunks_of, lanes_for, passes
+from torchpt.forward.schedule import Span, lanes_for, pieces
+from torchpt.forward.stopping import Stop
+from torchpt.forward.twice import second_values
 from torchpt.forward.wave import kernels_of, looped, make_wave, surface_layers
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
 from torchpt.integrators.loop.schedule import Loop, Share
+from torchpt.integrators.plate import Plate
 from torchpt.lanes.graph import Unsupported
 from torchpt.scene import Scene
 from torchpt.settings import Settings
@@ -54,12 +58,18 @@ class Run:
 
     def _begin(self) -> None:
         """Nothing is sampled yet."""
-        width, height, device = self.width, self.height, self.device
-        self.film = Film(width, height, self.wave.sampler.randomizations, device)
-        self.layers = {name: Film(width, height, 1, device, len(layer.channels)) for name, layer in self.seen.items()}
+        device, streams = self.device, self.wave.sampler.streams
+        film = Film(self.width, self.height, streams.count, device)
+        layers = {
+            name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
+        }
+        self.picture = Plate(film, layers, streams)
+        self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
         self.tally, self.done, self.ended = Tally(), 0, False
+        self.stop = Stop(self.settings.render, streams.count)
         self.bad = torch.zeros((), dtype=torch.int64, device=device)
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
+        self.begun: float | None = None
 
     def _loop(self, scene: Scene) -> Loop:
         """The compiled loop; its kernels are kept with the scene."""
@@ -74,8 +84,6 @@ class Run:
         limited = self.settings.render.max_memory is not None
         return Loop(
             kernels,
-            self.film,
-            self.layers,
             torch.get_num_threads(),
             lanes_for(self.settings, self.device) if limited else None,
             self.integrator.clamp,
@@ -83,70 +91,144 @@ class Run:
         )
 
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
-        """Take all samples, or as many as ``on_progress`` lets."""
+        """Take all samples, or as many as the rules or ``on_progress`` let."""
         self.on_progress = on_progress
-        if self.loop is not None:
-            try:
-                self._looped(self.loop)
-                return self.result()
-            except Unsupported as error:
-                self.eager.append(f"all stages: {error}")
-                say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
-                self._begin()
-        pixels = self.width * self.height
-        lanes = lanes_for(self.settings, self.device)
-        for first, count, sample, samples, ends in chunks_of(self.settings, lanes, self.film.randomizations, pixels):
-            self._chunk(first, count, sample, samples)
-            if self._advanced(count * samples, ends):
-                break
+        try:
+            self._complete()
+        except Unsupported as error:
+            if self.loop is None:
+                raise
+            self.eager.append(f"all stages: {error}")
+            say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
+            self.loop = None
+            self._begin()
+            self._complete()
         return self.result()
 
-    def _advanced(self, samples: int, ends: bool) -> bool:
-        """Tell of progress; returns whether to stop."""
-        self.done += samples
-        total = self.width * self.height * self.settings.render.spp
-        if self.on_progress is None or self.ended:  # tasks of other threads still come in after the wish to stop
-            return self.ended
-        seconds = time.perf_counter() - self.start
-        state = Progress(self.done, total, self.tally.rays, seconds, ends, self.result)
-        self.ended = bool(self.on_progress(state)) and self.done < total
-        return self.ended
+    # -- which samples
 
-    def _looped(self, loop: Loop) -> None:
-        pixels = self.width * self.height
+    def _complete(self) -> None:
+        """The picture, and then what it takes to know its error."""
+        self._sample()
+        if self.twice is not None and not self.ended and not self._take(self.twice.look_again(self.picture.film)):
+            self.twice.third = None
+
+    def _sample(self) -> None:
+        """Pass by pass, until a rule says that it is enough."""
+        self.begun = time.perf_counter()
+        taken = 0
+        while size := self.stop.step(taken):
+            spans = [(self.picture, taken, size)]
+            if self.twice is not None:
+                spans.append((self.twice.plate, taken, size))
+            if not self._take(spans):
+                return
+            taken += size
+            self.stop.told(taken, self.seconds_of_sampling(), self._decisive())
+            if self.twice is not None and self.settings.adaptive and taken >= FIRST_ROUND:
+                self._adapt(taken)
+                return
+
+    def _adapt(self, taken: int) -> None:
+        """Rounds that double the samples there are, each where pilots say."""
+        assert self.twice is not None
+        shares = Shares(self.twice.pilots, self.picture.film)
+        mean = float(taken)
+        while self.stop.going(mean):
+            aim = min(2.0 * mean, float(self.settings.render.spp))
+            aim = mean + self.stop.affordable(aim - mean)
+            spans = shares.spans(self.picture, self.twice, aim)
+            whole = bool(spans) and self._take(spans)
+            shares.put_back()
+            if not whole:
+                break
+            mean = float(self.picture.film.counts.double().mean())
+            self.stop.told(mean, self.seconds_of_sampling(), self._decisive())
+
+    def _decisive(self) -> float | None:
+        """RelMSE as pilots alone tell it, where the render may end by it."""
+        if self.twice is None or self.settings.render.target_error is None:
+            return None
+        return self.twice.alone(self.picture.film)
+
+    def seconds_of_sampling(self) -> float:
+        """Since the first sample, without what was spent on kernels."""
+        if self.begun is None:
+            return 0.0
+        made = 0.0 if self.loop is None else self.loop.kernels.seconds
+        return max(time.perf_counter() - self.begun - made, 0.0)
+
+    # -- how they are taken
+
+    def _take(self, spans: list[tuple[Plate, int, int]]) -> bool:
+        """Samples of plates, with the first one and how many; returns whether all were taken."""
+        left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
 
         def each(share: Share | None) -> bool:
+            nonlocal left
             if share is None:
                 return self._advanced(0, False)
             self.tally.rays += share.tally.rays
             self.tally.truncated += share.tally.truncated
             self.bad += share.bad
             self.light += torch.tensor(share.light, dtype=torch.float64)
-            return self._advanced(share.samples, self.done + share.samples == pixels * (first + samples))
+            left -= share.samples
+            return self._advanced(share.samples, left == 0)
 
-        for first, samples in passes(self.settings.render.spp, self.film.randomizations):
-            if not loop.run(first, samples, each):
-                break
+        if self.loop is not None:
+            return self.loop.run(spans, each)
+        lanes = lanes_for(self.settings, self.device)
+        for plate, first, count in spans:
+            pixels = plate.film.width * plate.film.height
+            for pixel, n, sample, samples in pieces(lanes, pixels, first, count):
+                self._chunk(plate, (pixel, n, sample, samples))
+                if each(Share(Tally(), n * samples)):
+                    return False
+        return True
 
-    def _chunk(self, first: int, count: int, sample: int, samples: int) -> None:
+    def _advanced(self, samples: int, ends: bool) -> bool:
+        """Tell of progress; returns whether to stop."""
+        self.done += samples
+        if self.on_progress is None or self.ended:  # tasks of other threads still come in after the wish to stop
+            return self.ended
+        seconds = time.perf_counter() - self.start
+        state = Progress(self.done, self._total(), self.tally.rays, seconds, ends, self.result)
+        self.ended = bool(self.on_progress(state)) and self.done < self._asked()
+        return self.ended
+
+    def _total(self) -> int:
+        """Camera samples that there will be, as far as one can tell: fewer where time or error end the render."""
+        asked = self._asked()
+        if not self.stop.open or self.stop.share <= 0.0:
+            return max(asked, self.done)
+        return max(min(asked, round(self.done / self.stop.share)), self.done)
+
+    def _asked(self) -> int:
+        """Camera samples that ``render.spp`` comes to."""
+        pixels = self.width * self.height + (0 if self.twice is None else len(self.twice.pilots))
+        return pixels * self.settings.render.spp
+
+    def _chunk(self, plate: Plate, span: Span) -> None:
+        first, count, sample, samples = span
         if self.integrator.light:
-            radiance, tally = self.wave.radiance(first, count, sample, samples)
+            radiance, tally = self.wave.radiance(first, count, sample, samples, plate)
             self.tally.rays += tally.rays
             self.tally.truncated += tally.truncated
-            self.film.add(self._checked(radiance, first, sample), first, sample)
-        if self.seen:
-            layers = self.wave.layers(tuple(self.seen), first, count, sample, samples)
+            plate.film.add(self._checked(radiance, plate, first, sample), first, sample)
+        if plate.layers:
+            layers = self.wave.layers(tuple(plate.layers), first, count, sample, samples, plate)
             self.tally.rays += count * samples
             for name, values in layers.items():
-                self.layers[name].add(values, first, sample)
+                plate.layers[name].add(values, first, sample)
 
-    def _checked(self, radiance: Tensor, first: int, sample: int) -> Tensor:
+    def _checked(self, radiance: Tensor, plate: Plate, first: int, sample: int) -> Tensor:
         """Count what is not finite and take it as black; apply the clamp."""
         finite = torch.isfinite(radiance).all(0)
         self.bad += (~finite).sum()
         if self.integrator.strict and not bool(finite.all()):
             s, p = (int(i) for i in (~finite).nonzero()[0])
-            x, y = (first + p) % self.width + self.wave.crop[0], (first + p) // self.width + self.wave.crop[1]
+            p = first + p if plate.places is None else int(plate.places[first + p])
+            x, y = p % self.width + self.wave.crop[0], p // self.width + self.wave.crop[1]
             raise RenderError(f"integrator.strict: sample {sample + s} of pixel ({x}, {y}) is not finite")
         radiance = torch.where(finite, radiance, 0.0)
         clamp = self.integrator.clamp
@@ -159,9 +241,12 @@ class Run:
 
     def result(self) -> Rendering:
         """The picture so far."""
-        image, radiant = self.film.mean().to(self.dtype), self.integrator.light
+        radiant, film = self.integrator.light, self.picture.film
         layers = self._layers()
-        if not radiant:
+        if radiant:
+            values = film.mean() if self.twice is None else self.twice.picture(film)
+            image = values.to(self.dtype)
+        else:
             shown = layers[next(iter(self.seen))]
             blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
             image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else torch.cat((shown, blank), -1)
@@ -169,33 +254,47 @@ class Run:
         if radiant and self.integrator.clamp is not None:
             before, after = self.light.tolist()
             clamped = 1.0 - after / before if before > 0 else 0.0
-        pixels = self.width * self.height
+        counts = (film if radiant else next(iter(self.picture.layers.values()))).counts
+        compile_seconds = 0.0 if self.loop is None else self.loop.kernels.seconds
+        known = self._known() if radiant else None
         return Rendering(
             image=image,
             layers=layers,
-            spp=self.done // pixels,
+            spp=int(counts.sum()) // len(counts),
             seconds=time.perf_counter() - self.start,
             build_seconds=self.build_seconds,
-            compile_seconds=0.0 if self.loop is None else self.loop.kernels.seconds,
+            compile_seconds=compile_seconds,
+            render_seconds=self.seconds_of_sampling(),
             paths=self.done,
             rays=self.tally.rays,
             nonfinite_samples=int(self.bad),
             truncated_paths=self.tally.truncated,
             clamped=clamped,
-            relmse=self.film.relmse() if radiant else None,
-            complete=self.done == pixels * self.settings.render.spp,
+            relmse=None if known is None else known.relmse,
+            relmse_interval=None if known is None else known.interval,
+            heavy_tailed=known is not None and known.heavy_tailed,
+            stopped_by=self.stop.reason,
+            complete=bool(self.stop.reason) and not self.ended,
             eager=tuple(self.eager),
         )
+
+    def _known(self) -> KnownError | None:
+        """The picture's own error."""
+        film = self.picture.film
+        if self.twice is not None:
+            return self.twice.known(film)
+        relmse = film.relmse()
+        return None if relmse is None else KnownError(relmse, None, False)
 
     def _layers(self) -> dict[str, Tensor]:
         """The layers so far: those of first surfaces, and those that the film makes."""
         layers = {}
         for name, layer in self.seen.items():
-            film = self.layers[name]
+            film = self.picture.layers[name]
             values = film.mean() * (self.unit if layer.length else 1.0) if layer.averaged else film.first()
             layers[name] = values.to(self.dtype)
         for name in self.settings.film.aovs:
             if name not in self.seen:
                 made: Any = LAYERS[name]  # a FilmLayer
-                layers[name] = made.of(self.film).to(self.dtype)
+                layers[name] = made.of(self.picture.film).to(self.dtype)
         return layers

@@ -8,36 +8,49 @@ import torch
 
 from torchpt.settings import Settings
 
-__all__ = ["BYTES_PER_LANE", "LANES", "Span", "chunks_of", "lanes_for", "passes", "randomizations_of"]
+__all__ = ["BLOCK", "BYTES_PER_LANE", "LANES", "Span", "chunks_of", "lanes_for", "passes", "pieces", "streams_of"]
 
 #: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
 LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
 #: Peak bytes a lane takes in a wave, measured on the Cornell box; under a tape each vertex keeps about this much.
 BYTES_PER_LANE = 640
-#: From this many samples a pixel on they are shared by four independent randomizations, below by two. Each takes something
-#: from Sobol' points (Cornell box, 64 spp: relMSE 0.38, 0.50, 0.58 of independent sampling for one, two, four), and two
-#: already tell the picture's error; four make the variance of a single pixel less of a guess.
+#: From this many samples a pixel on they are shared by four streams, below by two, where every pixel is to know its variance.
+#: Each takes something from Sobol' points (Cornell box, 64 spp: relMSE 0.38, 0.50, 0.58 of independent sampling for one, two,
+#: four); four make the variance of a single pixel less of a guess.
 MANY_SAMPLES = 256
 #: A pass never holds more samples a pixel than this.
 LARGEST_PASS = 64
+#: Where something else than the number of samples may end a render, passes hold no more than this.
+BLOCK = 16
 
 #: ``(first_pixel, pixels, first_sample, samples)``
 Span = tuple[int, int, int, int]
 
 
-def randomizations_of(spp: int) -> int:
-    """How many independent randomizations share the samples of a pixel."""
-    return min(spp, 4 if spp >= MANY_SAMPLES else 2)
+def streams_of(settings: Settings) -> int:
+    """How many streams share the samples of a pixel: one, unless each pixel is to know its variance."""
+    spp = settings.render.spp
+    return min(spp, 4 if spp >= MANY_SAMPLES else 2) if "variance" in settings.film.aovs else 1
 
 
-def passes(spp: int, randomizations: int) -> Iterator[tuple[int, int]]:
+def passes(spp: int, streams: int) -> Iterator[tuple[int, int]]:
     """First sample and number of samples of each pass; sizes double and depend on ``spp`` alone."""
-    first, size = 0, randomizations
+    first, size = 0, streams
     while first < spp:
         count = min(size, spp - first)
         yield first, count
         first += count
-        size = min(2 * size, LARGEST_PASS) if first > randomizations else size
+        size = min(2 * size, LARGEST_PASS) if first > streams else size
+
+
+def pieces(lanes: int, pixels: int, first: int, count: int) -> Iterator[Span]:
+    """Samples ``first .. first + count`` of all pixels in chunks of so many lanes: they split pixels, never samples' order."""
+    batch = max(min(count, lanes), 1)
+    for start in range(first, first + count, batch):
+        samples = min(batch, first + count - start)
+        step = max(lanes // samples, 1)
+        for pixel in range(0, pixels, step):
+            yield pixel, min(step, pixels - pixel), start, samples
 
 
 def lanes_for(settings: Settings, device: torch.device, per_lane: int = BYTES_PER_LANE) -> int:
@@ -48,15 +61,7 @@ def lanes_for(settings: Settings, device: torch.device, per_lane: int = BYTES_PE
     return lanes
 
 
-def chunks_of(
-    settings: Settings, lanes: int, randomizations: int, pixels: int
-) -> Iterator[tuple[int, int, int, int, bool]]:
-    """Ranges ``(first_pixel, pixels, first_sample, samples, ends_pass)``. Chunks split pixels, never samples' order."""
-    for first_sample, samples in passes(settings.render.spp, randomizations):
-        batch = max(min(samples, lanes), 1)
-        for start in range(first_sample, first_sample + samples, batch):
-            count = min(batch, first_sample + samples - start)
-            step = max(lanes // count, 1)
-            for first in range(0, pixels, step):
-                last = first + step >= pixels and start + count == first_sample + samples
-                yield first, min(step, pixels - first), start, count, last
+def chunks_of(settings: Settings, lanes: int, pixels: int) -> Iterator[Span]:
+    """All samples of all pixels, pass by pass."""
+    for first, count in passes(settings.render.spp, streams_of(settings)):
+        yield from pieces(lanes, pixels, first, count)

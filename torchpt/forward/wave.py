@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.cameras import Camera
 from torchpt.forward.kept import kept
-from torchpt.forward.schedule import randomizations_of
+from torchpt.forward.schedule import streams_of
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
 from torchpt.integrators.compiled import CompiledStages, Stages
@@ -19,10 +19,11 @@ from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.stages import Plan
 from torchpt.integrators.wave import Wave
 from torchpt.records import World
-from torchpt.samplers import Sampler
+from torchpt.samplers import ADAPTIVE, Points, Sampler
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 from torchpt.spec import Moves
+from torchpt.spec.declared import Described
 
 if TYPE_CHECKING:
     from torchpt.integrators.first_surface import FirstSurface
@@ -54,7 +55,7 @@ def make_wave(
     own = not params  # the world is the scene's own, and what is made of it may be kept
     if not integrator.lit:
         world = _dark(scene, world, own)
-    points = settings.sampler.kind(**settings.sampler.values)
+    points = points_of(settings.sampler)
     plan = integrator.plan(points, dtype, tape, attached)
     camera = scene.camera(film, scene.merged(params), dtype)
     return Wave(
@@ -63,7 +64,7 @@ def make_wave(
         accel=accel,
         camera=camera,
         filter=film.filter.kind(film.filter.values, scene.device),
-        sampler=Sampler(points, settings.render.seed, randomizations_of(spp), spp, film.width),
+        sampler=Sampler(points, settings.render.seed, streams_of(settings), spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.space.shift,
         first=_first(scene, integrator, world, own),
@@ -81,6 +82,11 @@ def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, T
     camera = scene.camera(settings.film, scene.merged(params), wave.stages.plan.dtype)
     stages = Stages(wave.stages.plan, world, _pixel_of(world, camera))
     return replace(wave, stages=stages, camera=camera, first=None if wave.first is None else wave.first.again(world))
+
+
+def points_of(sampler: Described) -> Points:
+    """Where the points lie, of the settings of a sampler."""
+    return sampler.kind(**{key: value for key, value in sampler.values.items() if key not in ADAPTIVE})
 
 
 def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:

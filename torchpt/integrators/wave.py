@@ -13,6 +13,7 @@ from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.base import Integrator, Limits, Tally
 from torchpt.integrators.compiled import Stages
+from torchpt.integrators.plate import Plate
 from torchpt.integrators.search import Search
 from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, salts
@@ -54,22 +55,28 @@ class Wave:
         """Where paths end; None where no light is carried."""
         return self.integrator.limits if self.integrator.light else None
 
-    def rays(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> PathState:
-        """Camera rays of consecutive pixels of the picture, row by row; lanes run over pixels, then over samples."""
+    def rays(
+        self, first_pixel: int, pixels: int, first_sample: int, samples: int, plate: Plate | None = None
+    ) -> PathState:
+        """Camera rays of consecutive pixels of a plate (the picture, row by row); lanes run over pixels, then over samples."""
         device = self.centre.device
         x0, y0, width, _ = self.crop
         place = torch.arange(first_pixel, first_pixel + pixels, device=device)
+        if plate is not None and plate.places is not None:
+            place = plate.places[first_pixel : first_pixel + pixels].to(device)
         x, y = place % width + x0, place // width + y0
         # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
         pixel = (y * self.camera.resolution[0] + x).repeat(samples)
         sample = torch.arange(first_sample, first_sample + samples, device=device).repeat_interleave(pixels)
-        key = self.sampler.key(pixel, sample)
+        key = self.sampler.key(pixel, sample, None if plate is None else plate.streams)
         x, y = (a.to(self.stages.plan.dtype).repeat(samples) for a in (x, y))
         return self.stages.generate(self.camera, self.filter, x, y, key, salts(0, device))
 
-    def radiance(self, first_pixel: int, pixels: int, first_sample: int, samples: int) -> tuple[Tensor, Tally]:
+    def radiance(
+        self, first_pixel: int, pixels: int, first_sample: int, samples: int, plate: Plate | None = None
+    ) -> tuple[Tensor, Tally]:
         """Radiance ``(3, samples, pixels)`` and what it took."""
-        state = self.rays(first_pixel, pixels, first_sample, samples)
+        state = self.rays(first_pixel, pixels, first_sample, samples, plate)
         radiance, tally = self.integrator.radiance(self.stages, self.accel, state, self.first)
         if self.filter.signed:
             radiance = radiance * self._weight(state)
@@ -81,12 +88,18 @@ class Wave:
         return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.stages.plan.dtype)
 
     def layers(
-        self, names: tuple[str, ...], first_pixel: int, pixels: int, first_sample: int, samples: int
+        self,
+        names: tuple[str, ...],
+        first_pixel: int,
+        pixels: int,
+        first_sample: int,
+        samples: int,
+        plate: Plate | None = None,
     ) -> dict[str, Tensor]:
         """The layers ``names``, each ``(C, samples, pixels)``."""
         from torchpt.integrators import aov
 
-        state = self.rays(first_pixel, pixels, first_sample, samples)
+        state = self.rays(first_pixel, pixels, first_sample, samples, plate)
         plan, world = self.stages.plan, self.stages.world
         search = Search(self.accel, world, plan.sampler, plan.dtype)
         found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel)

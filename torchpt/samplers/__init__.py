@@ -1,7 +1,8 @@
 """Stateless samplers: ``(seed, pixel, sample, dimension) -> u``.
 
-A picture is the mean over several independent *randomizations*: sample ``i`` is point ``i // R`` of randomization
-``i % R``. Their spread gives the picture's own error; the spread of points within one Sobol' sequence would not.
+A pixel's samples are the points of one or more independent *randomizations* of a sequence, its streams: of R streams sample
+``i`` is point ``i // R`` of stream ``i % R``. The spread of streams tells an error; that of points within one Sobol' sequence
+would not.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from torch import Tensor
 
 from torchpt.lanes.tracing import tracing
 from torchpt.math.hashing import as_int32, mix_int
-from torchpt.samplers.base import Numbers, Points
+from torchpt.samplers.base import ADAPTIVE, Numbers, Points
 from torchpt.samplers.dimensions import Dimension, salt
 from torchpt.spec import Kinds
 
-__all__ = ["KINDS", "Dimension", "Draws", "Numbers", "Points", "Sampler", "points_of", "salts"]
+__all__ = ["ADAPTIVE", "KINDS", "Dimension", "Draws", "Numbers", "Points", "Sampler", "Streams", "points_of", "salts"]
 
 #: The kinds of samplers.
 KINDS: Kinds[Points] = Kinds(
@@ -37,14 +38,26 @@ def _plain(kind: str) -> Points:
 
 
 @dataclass(frozen=True)
+class Streams:
+    """Randomizations that share samples: ``count`` of them from number ``first`` on."""
+
+    first: int = 0
+    count: int = 1
+
+
+#: Streams beside those of the picture that a sampler has seeds for.
+SPARE = 16
+
+
+@dataclass(frozen=True)
 class Sampler:
     """A sampler of one kind under one seed.
 
     Attributes:
         kind: where the points lie; or the name of a kind.
         seed: any integer from 0 to 2^63 - 1.
-        randomizations: R, how many independent sequences share the samples of a pixel: ``spp // R`` points each, and one
-            more for the first ``spp % R``.
+        randomizations: R, how many streams share the samples of a pixel: ``spp // R`` points each, and one more for the
+            first ``spp % R``. Those from R on are there for pixels that are sampled again.
         spp: samples a pixel in all, for the kinds that must know it beforehand; 0 where nobody knows.
         width: of the film in pixels, by which pixels are numbered; for kinds that ask where a pixel lies.
     """
@@ -64,15 +77,22 @@ class Sampler:
         """Where the points lie."""
         return points_of(self.kind)
 
-    def key(self, pixel: Tensor, sample: Tensor) -> Tensor:
-        """:meth:`Points.key` for int64 pixel and sample indices ``(N,)``."""
-        group, point = sample % self.randomizations, sample // self.randomizations
+    @property
+    def streams(self) -> Streams:
+        """Those of the picture."""
+        return Streams(0, self.randomizations)
+
+    def key(self, pixel: Tensor, sample: Tensor, streams: Streams | None = None) -> Tensor:
+        """:meth:`Points.key` for int64 pixel and sample indices ``(N,)``, by the picture's streams or others."""
+        streams = streams or self.streams
+        group, point = sample % streams.count + streams.first, sample // streams.count
         return self.points.key(self.numbers(pixel.device), pixel, group, point)
 
     def numbers(self, device: torch.device) -> Numbers:
         """What :meth:`Points.key` needs of the sampler."""
         seeds = [
-            mix_int(mix_int(mix_int(self.seed) ^ as_int32(self.seed >> 32)) + g) for g in range(self.randomizations)
+            mix_int(mix_int(mix_int(self.seed) ^ as_int32(self.seed >> 32)) + g)
+            for g in range(self.randomizations + SPARE)
         ]
         every, more = divmod(self.spp, self.randomizations)
         most = -(-self.spp // self.randomizations)

@@ -11,16 +11,21 @@ import torch
 from torch import Tensor
 
 from torchpt.math.hashing import mix
-from torchpt.spec import Spec
+from torchpt.spec import Flag, Spec
 
-__all__ = ["Numbers", "Points"]
+__all__ = ["ADAPTIVE", "Numbers", "Points"]
+
+#: Of kinds whose points may be any number, so that pixels may have more or fewer.
+ADAPTIVE: dict[str, Spec] = {
+    "adaptive": Flag(False, doc="whether samples go where the error is; `spp` is then their mean number"),
+}
 
 
 @dataclass(frozen=True)
 class Numbers:
     """A sampler under one seed as tensors, so that a kernel made for one serves all of its kind."""
 
-    seeds: Tensor  # (R,) int32 of the randomizations
+    seeds: Tensor  # (R,) int32 of the streams
     every: Tensor  # () int64 points of each randomization
     more: Tensor  # () int64 how many of them have one more
     bits: Tensor  # () int64 of the largest index of a point
@@ -29,7 +34,7 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Points(ABC):
-    """A kind of sampler: where the points of a pixel lie. Its fields are the values of its parameters.
+    """A kind of sampler: where the points of a pixel lie. Its fields are the values of its parameters, ``ADAPTIVE`` apart.
 
     Every number is a pure function of a key (which pixel, which point) and a salt (which dimension), the same for a lane
     wherever it stands: integer operations, or such as round alike everywhere.
@@ -50,13 +55,13 @@ class Points(ABC):
     def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
         """What tells a sample from all others, ``(rows, N)`` int32: a pixel's seed, a point's index, how many there are.
 
-        The seed is a bijection of the pixel's index for each (seed, randomization), so no two pixels share a sequence. The
+        The seed is a bijection of the pixel's index for each (seed, stream), so no two pixels share a sequence. The
         third row is there only where ``rows`` says so.
 
         Args:
             numbers: of the sampler.
             pixel: index on the film ``(N,)`` int64, row by row.
-            group: randomization ``(N,)`` int64.
+            group: stream ``(N,)`` int64.
             point: index in its sequence ``(N,)`` int64.
         """
         seed = torch.index_select(numbers.seeds, 0, group)

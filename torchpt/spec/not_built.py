@@ -17,6 +17,5 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
 
 #: kind of thing -> keys of built types that are not built -> the value that asks for nothing.
 KEYS: dict[str, dict[str, object]] = {
-    "sampler": {"adaptive": False},
-    "render": {"time_limit": None, "target_error": None, "checkpoint": None, "resume": False},
+    "render": {"checkpoint": None, "resume": False},
 }

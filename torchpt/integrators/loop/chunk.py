@@ -33,6 +33,7 @@ from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.loop.rows import Memory
 from torchpt.integrators.loop.search import ChunkSearch
 from torchpt.integrators.path import ENDLESS, Tally
+from torchpt.integrators.plate import Plate
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.block import WIDTH
 
@@ -44,8 +45,9 @@ LANES = CAPACITY - WIDTH
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive pixels of the picture, and consecutive samples of each."""
+    """Consecutive pixels of a plate, and consecutive samples of each."""
 
+    plate: Plate
     first_pixel: int
     pixels: int
     first_sample: int
@@ -79,11 +81,11 @@ class Worker:
         tally = Tally()
         count = chunk.pixels * chunk.samples
         if self.wave.first is not None:
-            self._first_surfaces(count, tally)
+            self._first_surfaces(chunk, count, tally)
         elif self.kernels.fused:
-            self._fused(count, tally)
+            self._fused(chunk, count, tally)
         else:
-            self._searched(count, tally)
+            self._searched(chunk, count, tally)
         return tally
 
     def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
@@ -94,10 +96,11 @@ class Worker:
         if self.shown is None or len(self.shown.words) != channels:
             self.shown = Memory(channels)
         self.shown.words[:, :count] = 0
-        arena, lists = self._arenas[0], self._lists[0]
+        arena, other = self._arenas
+        lists = self._lists[0]
         calls.clear()
         calls.name_salts(0)
-        calls.run(kernels.generate(), count, arena, arena, lists=lists)
+        self._generate(chunk, arena, other, lists)
         if not kernels.fused:
             self.search.nearest(arena, count, 1)
             calls.clear()
@@ -111,27 +114,37 @@ class Worker:
 
     def start(self, chunk: Chunk) -> None:
         """Say which samples are next."""
-        wave, sampler = self.wave, self.wave.sampler
+        wave, streams = self.wave, chunk.plate.streams
         x, y, width, _ = wave.crop
-        group, point = chunk.first_sample % sampler.randomizations, chunk.first_sample // sampler.randomizations
+        point, turn = divmod(chunk.first_sample, streams.count)
         self.calls.place[:] = np.array(
             (
-                chunk.first_pixel, chunk.pixels, group, (point + (1 << 31)) % (1 << 32) - (1 << 31),
-                sampler.randomizations, x, y, width, wave.camera.resolution[0],
+                chunk.first_pixel, chunk.pixels, turn, (point + (1 << 31)) % (1 << 32) - (1 << 31),
+                streams.first, streams.count, x, y, width, wave.camera.resolution[0],
             ),
             np.int64,
         ).astype(np.int32)  # fmt: skip
 
+    def _generate(self, chunk: Chunk, arena: Memory, other: Memory, lists: list[Memory] | None = None) -> None:
+        """Camera rays of a chunk in ``arena``; ``other`` holds the numbers of chosen pixels until then."""
+        count, places = chunk.pixels * chunk.samples, chunk.plate.places
+        source = arena
+        if places is not None:
+            chosen = places[chunk.first_pixel : chunk.first_pixel + chunk.pixels].numpy().astype(np.int32)
+            other.words[self.kernels.state.first("prim"), :count] = np.tile(chosen, chunk.samples)
+            source = other
+        self.calls.run(self.kernels.generate(places is not None), count, source, arena, lists=lists)
+
     # -- the three loops
 
-    def _fused(self, count: int, tally: Tally) -> None:
+    def _fused(self, chunk: Chunk, count: int, tally: Tally) -> None:
         """Paths whose stages search by themselves."""
-        kernels, calls = self.kernels, self.calls
+        calls = self.calls
         arena, other = self._arenas
         lists, next_lists = self._lists
         calls.clear()
         calls.name_salts(0)
-        calls.run(kernels.generate(), count, arena, arena, lists=lists)
+        self._generate(chunk, arena, other, lists)
         tally.rays += count
         depth = 1
         while True:
@@ -144,13 +157,13 @@ class Worker:
             arena, other, lists, next_lists = other, arena, next_lists, lists
             depth += 1
 
-    def _searched(self, count: int, tally: Tally) -> None:
+    def _searched(self, chunk: Chunk, count: int, tally: Tally) -> None:
         """Paths whose rays are searched between stages."""
         kernels, calls = self.kernels, self.calls
         arena, other = self._arenas
         lists, next_lists = self._lists
         calls.name_salts(0)
-        calls.run(kernels.generate(), count, arena, arena)
+        self._generate(chunk, arena, other)
         depth, shadow = 1, False
         while count:
             tally.rays += count
@@ -169,13 +182,13 @@ class Worker:
             arena, other, lists, next_lists = other, arena, next_lists, lists
             depth += 1
 
-    def _first_surfaces(self, count: int, tally: Tally) -> None:
+    def _first_surfaces(self, chunk: Chunk, count: int, tally: Tally) -> None:
         """The first surfaces, with the shadow rays that they ask for, and no further."""
         kernels, calls = self.kernels, self.calls
         arena, other = self._arenas
         lists, next_lists = self._lists
         calls.name_salts(0)
-        calls.run(kernels.generate(), count, arena, arena)
+        self._generate(chunk, arena, other)
         tally.rays += count
         self.search.nearest(arena, count, 1)
         calls.clear()

@@ -104,9 +104,9 @@ class Kernels(Layout):
 
     # -- vertices of paths
 
-    def generate(self) -> Kernel:
+    def generate(self, chosen: bool) -> Kernel:
         """See :func:`torchpt.integrators.loop.vertex.generate`."""
-        return self._get(False, vertex.generate)
+        return self._get(False, vertex.generate, chosen)
 
     def settle(self, shadow: bool) -> Kernel:
         """See :func:`torchpt.integrators.loop.vertex.settle`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
@@ -17,6 +17,7 @@ from torchpt.integrators.loop.calls import Halted
 from torchpt.integrators.loop.chunk import LANES, Chunk, Worker
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.path import Tally
+from torchpt.integrators.plate import Plate
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.block import WIDTH
 from torchpt.lanes.kernel import HEAD
@@ -53,8 +54,6 @@ class Loop:
 
     Args:
         kernels: of the render.
-        film: sums of radiance.
-        layers: sums of layers by name.
         threads: how many.
         lanes: most of a chunk; None: as many as caches like.
         clamp: largest contribution of a path, or None.
@@ -64,37 +63,37 @@ class Loop:
     def __init__(
         self,
         kernels: Kernels,
-        film: Film,
-        layers: dict[str, Film],
         threads: int,
         lanes: int | None,
         clamp: float | None,
         strict: bool,
     ) -> None:
-        self.kernels, self.film, self.layers = kernels, film, layers
-        self.threads, self.clamp, self.strict = threads, clamp, strict
+        self.kernels, self.threads, self.clamp, self.strict = kernels, threads, clamp, strict
         self.lanes = LANES if lanes is None else max(1, min(lanes, LANES))
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
         self._halt = threading.Event()
 
-    def run(self, first: int, count: int, each: Callable[[Share | None], bool]) -> bool:
-        """Takes samples ``first .. first + count`` of every pixel.
+    def run(self, spans: Sequence[tuple[Plate, int, int]], each: Callable[[Share | None], bool]) -> bool:
+        """Takes samples of every pixel of plates.
 
         Args:
-            first: sample.
-            count: how many.
+            spans: plates, with the first sample and how many are to be taken.
             each: called in this thread after every task, and now and then with None while tasks run (or compile);
                 returning True ends the render: tasks stop at their next kernel.
 
         Returns:
             Whether all were taken.
         """
-        blocks = list(self._blocks(count))
+        blocks = [
+            (plate, start, size, first, count)
+            for plate, first, count in spans
+            for start, size in self._blocks(plate, count)
+        ]
         # Tasks never run in this thread: it looks after signals.
         pool = ThreadPoolExecutor(min(self.threads, len(blocks)), thread_name_prefix="torchpt")
         try:
-            waiting: set[Future[Share]] = {pool.submit(self._task, start, size, first, count) for start, size in blocks}
+            waiting: set[Future[Share]] = {pool.submit(self._task, *block) for block in blocks}
             while waiting:
                 done, waiting = wait(waiting, PATIENCE, FIRST_COMPLETED)
                 shares = [future.result() for future in done if not future.cancelled()]
@@ -109,26 +108,26 @@ class Loop:
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
-    def _blocks(self, samples: int) -> Iterator[tuple[int, int]]:
+    def _blocks(self, plate: Plate, samples: int) -> Iterator[tuple[int, int]]:
         """Consecutive pixels of each task."""
-        pixels = self.film.width * self.film.height
+        pixels = plate.film.width * plate.film.height
         size = -(-pixels // (self.threads * TASKS)) if self.threads > 1 else pixels
         size = max(size, -(-FEWEST // samples))
         size = min(-(-size // WIDTH) * WIDTH, self.lanes)
         for start in range(0, pixels, size):
             yield start, min(size, pixels - start)
 
-    def _task(self, start: int, size: int, first: int, count: int) -> Share:
+    def _task(self, plate: Plate, start: int, size: int, first: int, count: int) -> Share:
         with self._lock:
             worker = self._workers.pop() if self._workers else Worker(self.kernels, self._halt)
         share = Share(Tally())
         try:
             step = max(self.lanes // size, 1)
             for sample in range(first, first + count, step):
-                chunk = Chunk(start, size, sample, min(step, first + count - sample))
+                chunk = Chunk(plate, start, size, sample, min(step, first + count - sample))
                 if self.kernels.wave.limits is not None:
                     self._radiance(worker, chunk, share)
-                if self.layers:
+                if plate.layers:
                     self._layers(worker, chunk, share)
                 share.samples += size * chunk.samples
         except Halted:
@@ -145,7 +144,7 @@ class Loop:
         values = worker.slots.floats
         used = values[:, : chunk.pixels * chunk.samples]
         before = _total(used) if self.clamp is not None else 0.0
-        bad = self._deposit(worker, values, chunk, self.film, 3, self.clamp)
+        bad = self._deposit(worker, values, chunk, chunk.plate.film, 3, self.clamp)
         share.bad += bad
         if self.clamp is not None:
             share.light = share.light[0] + before, share.light[1] + _total(used)
@@ -153,14 +152,15 @@ class Loop:
             raise self._not_finite(used, chunk)
 
     def _layers(self, worker: Worker, chunk: Chunk, share: Share) -> None:
-        names = tuple(self.layers)
+        layers = chunk.plate.layers
+        names = tuple(layers)
         share.tally.rays += worker.layers(chunk, names)
         assert worker.shown is not None
         first = 0
         for name in names:
             channels = len(LAYERS[name].channels)
             values = worker.shown.floats[first : first + channels]
-            self._deposit(worker, values, chunk, self.layers[name], channels, None)
+            self._deposit(worker, values, chunk, layers[name], channels, None)
             first += channels
 
     def _deposit(
@@ -197,6 +197,8 @@ class Loop:
         sample, pixel = divmod(place, chunk.pixels)
         x0, y0, width, _ = self.kernels.wave.crop
         pixel += chunk.first_pixel
+        if chunk.plate.places is not None:
+            pixel = int(chunk.plate.places[pixel])
         x, y = pixel % width + x0, pixel // width + y0
         return RenderError(f"integrator.strict: sample {chunk.first_sample + sample} of pixel ({x}, {y}) is not finite")
 

@@ -19,9 +19,9 @@ from torchpt.samplers import Dimension, Draws
 
 __all__ = ["PLACE", "bounce", "emit", "escape", "first", "generate", "no_search", "retire", "settle"]
 
-#: Numbers that say which samples a chunk holds: the first pixel of the picture and how many there are; the randomization
-#: and point of the first sample, the number of randomizations; the crop's corner and width, the film's width.
-PLACE = ("first", "pixels", "group", "point", "randomizations", "x", "y", "crop", "film")
+#: Numbers that say which samples a chunk holds: the first pixel of the picture and how many there are; the stream and point
+#: of the first sample, the first stream and how many share the samples; the crop's corner and width, the film's width.
+PLACE = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y", "crop", "film")
 
 
 def no_search(state: PathState) -> Hit:
@@ -29,24 +29,25 @@ def no_search(state: PathState) -> Hit:
     raise AssertionError("hits are found between stages where there is no tape")
 
 
-def generate(trace: Trace) -> Sinks:
-    """Camera rays; with their first hits where the search is inside."""
+def generate(trace: Trace, chosen: bool) -> Sinks:
+    """Camera rays; with their first hits where the search is inside. Row ``prim`` holds the numbers of ``chosen`` pixels."""
     layout, tracer, wave = trace.layout, trace.tracer, trace.layout.wave
     place = trace.uniform("place", torch.ones(len(PLACE), dtype=torch.int32))
     salts = trace.salts()
+    pixels = layout.state.read(tracer, "prim")["prim"] if chosen else torch.empty(0)
     unseen: dict[str, Tensor] = {}
     with tracer:
         chunk = dict(zip(PLACE, place.to(torch.int64).unbind(), strict=True))
         # Lanes run over the chunk's pixels, then over its samples.
         lane = torch.arange(tracer.lanes)
         sample = torch.div(lane, chunk["pixels"], rounding_mode="floor")
-        pixel = lane - sample * chunk["pixels"] + chunk["first"]
+        pixel = pixels if chosen else lane - sample * chunk["pixels"] + chunk["first"]
         row = torch.div(pixel, chunk["crop"], rounding_mode="floor")
         x, y = pixel - row * chunk["crop"] + chunk["x"], row + chunk["y"]
         number = y * chunk["film"] + x
-        turn = sample + chunk["group"]
-        group = turn % chunk["randomizations"]
-        point = torch.div(turn, chunk["randomizations"], rounding_mode="floor") + chunk["point"]
+        turn = sample + chunk["turn"]
+        group = turn % chunk["streams"] + chunk["stream"]
+        point = torch.div(turn, chunk["streams"], rounding_mode="floor") + chunk["point"]
         key = wave.sampler.points.key(layout.numbers, number, group, point)
         x, y = x.to(layout.plan.dtype), y.to(layout.plan.dtype)
         state = stages.generate(layout.plan, wave.camera, wave.filter, x, y, key, salts)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.hashing import as_int32, mix, to_unit
-from torchpt.samplers.base import Points
+from torchpt.samplers.base import ADAPTIVE, Points
 
 __all__ = ["Independent"]
 
@@ -27,6 +27,7 @@ class Independent(Points):
     """Random numbers, for comparisons and for tests that need independent samples."""
 
     name = "independent"
+    parameters = ADAPTIVE
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """See :class:`Points`."""

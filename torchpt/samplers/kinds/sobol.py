@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.hashing import mix, to_unit
-from torchpt.samplers.base import Points
+from torchpt.samplers.base import ADAPTIVE, Points
 from torchpt.samplers.scrambling import X, Y, reverse_bits, scramble, second_dimension
 
 __all__ = ["Sobol"]
@@ -20,6 +20,7 @@ class Sobol(Points):
     """An Owen-scrambled (0, 2)-sequence for each pixel and set of dimensions: any number of samples, and more may follow."""
 
     name = "sobol"
+    parameters = ADAPTIVE
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """See :class:`Points`."""

@@ -1,0 +1,252 @@
+"""What a picture knows of its own error, from pilots: pixels with two independent values.
+
+A pilot's first value A is sampled as every pixel is, its second value B by other random numbers. ``(A - B)² / 2`` has the
+mean of A's variance, whatever sampler made them. relMSE divides it by ``r² + 0.01`` with the true radiance r; the median of A,
+B and the mean of the eight pixels around stands for it.
+
+Where few pixels carry the error (caustics, edges of bright lights) pilots say little: they meet few such pixels or none, and two
+values do not tell r. So some pixels are looked at again, by several more streams that are no part of the picture:
+
+- *suspects*: the pixels that stand out most from their second brightest neighbour, wherever they are. Of each the error that
+  the picture really has is then known, so what sparkles in the picture is counted and not guessed.
+- *doubtful pilots*: those whose two values differ most, for the r that theirs is divided by.
+
+The interval is that of the mean over pilots, symmetric in its logarithm, as errors are squares and lean to the right. It is
+called heavy-tailed where one pilot has a large part of the variance: then it is not to be trusted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.film.pilots import Pilots
+from torchpt.film.sums import RELMSE_FLOOR
+
+__all__ = [
+    "STREAMS",
+    "Again",
+    "KnownError",
+    "around",
+    "error_at",
+    "known_error",
+    "pilots_alone",
+    "to_look_at",
+]
+
+#: Pilots from which on an interval is given.
+FEWEST = 8
+#: Share of the variance that one pilot may have before the interval is called heavy-tailed.
+HEAVY = 0.2
+#: One of so many pixels is a suspect, one of so many pilots doubtful.
+SUSPECTS, DOUBTFUL = 512, 32
+#: Streams that they are looked at again by.
+STREAMS = 8
+#: Further values may all miss a light that few samples meet: r is taken for no less than this part of a pilot's mean, or of a
+#: suspect's value.
+BRIGHTER, BRIGHTEST = 4.0, 16.0
+
+
+@dataclass(frozen=True)
+class KnownError:
+    """An estimate of relMSE, the mean of ``(x - r)² / (r² + 0.01)`` over pixels and channels.
+
+    Attributes:
+        relmse: of the picture.
+        interval: of 95 % for it; None for a handful of pilots.
+        heavy_tailed: whether so few pixels carry the error that the interval is not to be trusted.
+    """
+
+    relmse: float
+    interval: tuple[float, float] | None
+    heavy_tailed: bool
+
+
+def around(values: Tensor, known: Tensor | None = None) -> Tensor:
+    """The mean of the eight neighbours of each pixel ``(H, W, C)``, of those that there are (and are ``known (H, W)``).
+
+    Where a pixel has none its own value stands.
+    """
+    height, width, _ = values.shape
+    there = values.new_ones(height, width) if known is None else known.to(values.dtype)
+    total, count = torch.zeros_like(values), torch.zeros_like(there)
+    padded = torch.nn.functional.pad((values * there[..., None]), (0, 0, 1, 1, 1, 1))
+    marks = torch.nn.functional.pad(there, (1, 1, 1, 1))
+    for dy in range(3):
+        for dx in range(3):
+            if (dx, dy) != (1, 1):
+                total += padded[dy : dy + height, dx : dx + width]
+                count += marks[dy : dy + height, dx : dx + width]
+    return torch.where(count[..., None] > 0, total / count.clamp_min(1.0)[..., None], values)
+
+
+def error_at(a: Tensor, b: Tensor, near: Tensor) -> Tensor:
+    """Squared error of each pilot's first value ``(n, C)`` over ``r² + 0.01``, as two values tell it.
+
+    Args:
+        a: first values ``(n, C)``.
+        b: second values.
+        near: what lies around.
+    """
+    radiance = torch.stack((a, b, near)).median(0).values
+    return (a - b).square() / 2 / (radiance.square() + RELMSE_FLOOR)
+
+
+def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> float:
+    """By the pilots alone, so that no other pixel has a say: the relMSE that decisions are made by.
+
+    What lies around is the mean of the pilots around.
+    """
+    grid = a.new_zeros(*pilots.blocks, a.shape[1])
+    known = torch.zeros(pilots.blocks, dtype=torch.bool)
+    at = tuple(pilots.block)
+    grid[at], known[at] = (a + b) / 2, True
+    share = error_at(a, b, around(grid, known)[at]).mean(1) * _first_part(a, b, spare)
+    pixels = float(pilots.weight.sum())
+    return float((share * pilots.weight).sum()) / pixels * (1.0 - 0.5 * len(pilots) / pixels if counted else 1.0)
+
+
+@dataclass(frozen=True)
+class Again:
+    """Pixels that were looked at again.
+
+    Attributes:
+        places: which pixels of the picture ``(m,)`` int64; suspects first.
+        suspects: how many of them are suspects; the others are pilots.
+        mean: of their further values ``(m, C)``.
+        spare: the variance of that mean.
+    """
+
+    places: Tensor
+    suspects: int
+    mean: Tensor
+    spare: Tensor
+
+
+def to_look_at(picture: Tensor, pilots: Pilots, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Which pixels are to be looked at again: suspects, and doubtful pilots; places ``(m,)`` on the picture.
+
+    Args:
+        picture: first values ``(H, W, C)`` float64.
+        pilots: n of them.
+        b: their second values ``(n, C)``.
+    """
+    standing, flat = _standing_out(picture, picture).reshape(-1), picture.reshape(-1, picture.shape[2])
+    count = max(len(flat) // SUSPECTS, 1)
+    suspects = standing.topk(min(count, len(flat))).indices.sort().values
+    rest = ~torch.isin(pilots.places, suspects)
+    a = flat[pilots.places]
+    low = torch.minimum(a, b).clamp_min(0.0)
+    doubt = ((a - b).square() / (low.square() + RELMSE_FLOOR)).mean(1) * rest
+    count = min(max(len(pilots) // DOUBTFUL, 4), int(rest.sum()))
+    return suspects, pilots.places[doubt.topk(count).indices.sort().values]
+
+
+def known_error(
+    picture: Tensor, pilots: Pilots, b: Tensor, spare: Tensor | None, counted: bool, again: Again | None
+) -> KnownError | None:
+    """The error that a picture knows.
+
+    Args:
+        picture: first values of all pixels ``(H, W, C)`` float64, on the CPU.
+        pilots: n of them.
+        b: their second values ``(n, C)``.
+        spare: an estimate of the variance of ``b`` where it is not that of first values.
+        counted: whether second values are part of the picture that the error is of, as half of each pilot.
+        again: what was looked at again; None: nothing yet.
+
+    Returns:
+        The estimate; None where there is no pilot.
+    """
+    if not len(pilots):
+        return None
+    flat, near = picture.reshape(-1, picture.shape[2]), around(picture).reshape(-1, picture.shape[2])
+    places = pilots.places
+    first = _first_part(flat[places], b, spare)
+    sure, rest = 0.0, torch.ones(len(pilots), dtype=torch.bool)
+    suspects = places[:0]
+    if again is not None:
+        suspects = again.places[: again.suspects]
+        seen = _really(flat[suspects], again.mean[: again.suspects], again.spare[: again.suspects])
+        half = torch.where(torch.isin(suspects, places), 0.5, 1.0) if counted else torch.ones(len(suspects))
+        sure, rest = float((seen * half).sum()), ~torch.isin(places, suspects)
+        # A second value that would be a suspect itself tells of others like it, which are counted already.
+        least = float(_standing_out(picture, picture).reshape(-1)[suspects].min()) if len(suspects) else math.inf
+        bright = _standing_out(picture, _with(picture, places, b)).reshape(-1)[places] > least
+        b = torch.where(bright[:, None], near[places], b)
+    a, beside = flat[places], near[places]
+    share = error_at(a, b, beside)
+    if again is not None:
+        doubtful = {int(place): k for k, place in enumerate(again.places[again.suspects :], again.suspects)}
+        at = [k for k, place in enumerate(places.tolist()) if place in doubtful]
+        mean = again.mean[[doubtful[int(places[k])] for k in at]]
+        radiance = torch.maximum(mean.abs(), ((a[at] + b[at]) / 2 / BRIGHTER).abs())
+        share[at] = (a[at] - b[at]).square() / 2 / (radiance.square() + RELMSE_FLOOR)
+    share = share.mean(1)[rest] * first
+    if not len(share):
+        return None
+    pixels = len(flat)
+    part = (pixels - len(suspects)) / pixels * (1.0 - 0.5 * len(pilots) / pixels if counted else 1.0)
+    weight = pilots.weight[rest] / pilots.weight[rest].sum()
+    mean = float((weight * share).sum())
+    parts = weight * (share - mean) * part
+    return _with_interval(sure / pixels + mean * part, parts)
+
+
+def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
+    """Twice the part that first values have in the variance of differences; 1 where second values are like them.
+
+    Second values made of two streams of half the length vary more, as Sobol' points gain by being more. How much is told by all
+    pilots together, and it is no less than a half and no more than double.
+    """
+    if spare is None:
+        return 1.0
+    scale = 1.0 / (((a + b) / 2).square() + RELMSE_FLOOR)
+    both, second = (float((x * scale).clamp_max(1.0).sum()) for x in ((a - b).square(), spare))
+    return 2.0 * min(max(1.0 - second / both, 1 / 3), 0.5) if both > 0.0 else 1.0
+
+
+def _standing_out(picture: Tensor, values: Tensor) -> Tensor:
+    """By how much ``values (H, W, C)`` exceed the second brightest of eight neighbours, relative to their mean ``(H, W)``."""
+    height, width, _ = picture.shape
+    padded = torch.nn.functional.pad(picture.movedim(2, 0)[None], (1, 1, 1, 1), mode="replicate")[0].movedim(0, 2)
+    others = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3) if (x, y) != (1, 1)]
+    largest = second = torch.full_like(picture, -math.inf)
+    for other in others:
+        largest, second = torch.maximum(largest, other), torch.maximum(second, torch.minimum(largest, other))
+    near = torch.stack(others).mean(0)
+    return ((values - second).clamp_min(0.0).square() / (near.square() + RELMSE_FLOOR)).mean(2)
+
+
+def _with(picture: Tensor, places: Tensor, values: Tensor) -> Tensor:
+    changed = picture.reshape(-1, picture.shape[2]).clone()
+    changed[places] = values
+    return changed.view(picture.shape)
+
+
+def _really(values: Tensor, mean: Tensor, spare: Tensor) -> Tensor:
+    """The squared error that pixels have, over ``r² + 0.01``, from the mean of further values and its variance."""
+    radiance = torch.maximum(mean.abs(), values.abs() / BRIGHTEST)
+    return (((values - mean).square() - spare) / (radiance.square() + RELMSE_FLOOR)).mean(1)
+
+
+def _with_interval(mean: float, parts: Tensor) -> KnownError:
+    """The estimate with its interval; ``parts`` are the pilots' deviations, whose sum of squares is its variance."""
+    count = len(parts)
+    if not mean > 0.0 or not math.isfinite(mean):
+        return KnownError(mean, (0.0, 0.0) if mean == 0.0 and count >= FEWEST else None, not math.isfinite(mean))
+    if count < FEWEST:
+        return KnownError(mean, None, True)
+    total = float(parts.square().sum())
+    heavy = total > 0.0 and float(parts.square().max()) > HEAVY * total
+    factor = math.exp(min(_quantile(count - 1) * math.sqrt(total) / mean, 300.0))
+    return KnownError(mean, (mean / factor, mean * factor), heavy)
+
+
+def _quantile(freedom: int) -> float:
+    """Student's t at 97.5 % (Abramowitz and Stegun 26.7.5, to the second term)."""
+    z = 1.959964
+    return z + (z**3 + z) / (4 * freedom) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * freedom**2)

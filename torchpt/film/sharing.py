@@ -1,0 +1,66 @@
+"""How adaptive sampling shares samples out: more for blocks of pixels whose error falls most by them.
+
+A pixel of n samples whose relative variance is ``e`` has ``s = sqrt(e n)`` a sample; for so many samples in all the sum of
+``s² / n`` over pixels is least where n goes with s. What ``e`` is, pilots say, one a block, smoothed over blocks nearby.
+Other pixels are not asked, so none of them owes its number of samples to its own value.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["shared_out", "smoothed"]
+
+#: Samples come in blocks of so many, at multiples of it.
+BLOCK = 16
+#: No block of pixels takes more than this many times its samples at once: it is known by few pilots.
+GROWTH = 4
+#: Errors below this part of the mean count as much: what no pilot has met yet may be there all the same.
+FLOOR = 0.05
+
+
+def smoothed(values: Tensor, known: Tensor) -> Tensor:
+    """Means ``(R, C)`` over 5 x 5 blocks with binomial weights, of the blocks that are ``known``; the mean of all elsewhere."""
+    kernel = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0], dtype=values.dtype)
+
+    def spread(x: Tensor) -> Tensor:
+        for axis in (0, 1):
+            wide = torch.nn.functional.pad(x, (0, 0, 0, 0, 2, 2) if axis == 0 else (0, 0, 2, 2))
+            size = x.shape[axis]
+            parts = [kernel[k] * wide.narrow(axis, k, size) for k in range(5)]
+            x = parts[0] + parts[1] + parts[2] + parts[3] + parts[4]
+        return x
+
+    there = known.to(values.dtype)
+    weight = spread(there)
+    total = spread(values * there)
+    mean = (values * there).sum() / there.sum().clamp_min(1.0)
+    return torch.where(weight > 0, total / weight.clamp_min(1e-30), mean)
+
+
+def shared_out(error: Tensor, counts: Tensor, pixels: Tensor, mean: float) -> Tensor:
+    """Samples a pixel that blocks are to have ``(B,)`` int64, none fewer than they have.
+
+    Args:
+        error: relative variance of the pixels of each block ``(B,)`` float64, at its present number of samples.
+        counts: that number ``(B,)`` int64.
+        pixels: of each block ``(B,)``.
+        mean: samples a pixel over the picture that there are to be.
+    """
+    positive = error.clamp_min(0.0)
+    floor = FLOOR * (positive * pixels).sum() / pixels.sum()
+    need = (positive.clamp_min(floor) * counts).sqrt()
+    have, most = counts.double(), (GROWTH * counts).double()
+    total = mean * float(pixels.sum())
+    if not bool((need > 0).any()):
+        need = torch.ones_like(need)
+    low, high = 0.0, float((most / need.clamp_min(1e-30)).max())
+    for _ in range(60):  # the number of samples a unit of need at which they come to the total
+        middle = 0.5 * (low + high)
+        if float((torch.minimum(torch.maximum(have, middle * need), most) * pixels).sum()) < total:
+            low = middle
+        else:
+            high = middle
+    wanted = torch.minimum(torch.maximum(have, low * need), most)
+    return torch.maximum(counts, ((wanted - have) / BLOCK).round().long() * BLOCK + counts)

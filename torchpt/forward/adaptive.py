@@ -1,0 +1,86 @@
+"""Adaptive sampling: rounds of samples where pilots say that the error is."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpt.film import Film, Pilots
+from torchpt.film.known_error import around, error_at
+from torchpt.film.pilots import BLOCK
+from torchpt.film.sharing import shared_out, smoothed
+from torchpt.forward.twice import Twice
+from torchpt.integrators.plate import Plate
+
+__all__ = ["FIRST_ROUND", "Shares"]
+
+#: Samples that every pixel takes before any is asked.
+FIRST_ROUND = 16
+
+
+class Shares:
+    """Samples of the blocks of a picture.
+
+    Args:
+        pilots: of the picture.
+        film: of the picture.
+    """
+
+    def __init__(self, pilots: Pilots, film: Film) -> None:
+        self.pilots = pilots
+        x, y = torch.arange(film.width) + pilots.corner[0], torch.arange(film.height) + pilots.corner[1]
+        rows, columns = pilots.blocks
+        #: Block of each pixel.
+        self.block = ((y // BLOCK)[:, None] * columns + (x // BLOCK)[None]).reshape(-1)
+        self.pixels = torch.bincount(self.block, minlength=rows * columns)
+        self._parts: list[tuple[Film, Tensor, Film]] = []
+
+    def spans(self, picture: Plate, twice: Twice, mean: float) -> list[tuple[Plate, int, int]]:
+        """What is to be sampled for the picture to have ``mean`` samples a pixel: plates of pixels with as many samples."""
+        device = picture.film.counts.device
+        counts = self._of_blocks(picture.film.counts.cpu())
+        aims = shared_out(self._errors(twice), counts, self.pixels, mean)
+        spans: list[tuple[Plate, int, int]] = []
+        kinds = torch.stack((counts, aims))[:, aims > counts].unique(dim=1)
+        pilot_blocks = self.block[self.pilots.places]
+        for have, aim in kinds.T.tolist():
+            chosen = (counts == have) & (aims == aim)
+            places = chosen[self.block].nonzero()[:, 0]
+            spans.append((self._part(picture, places.to(device), places), have, aim - have))
+            seconds = chosen[pilot_blocks].nonzero()[:, 0]
+            if len(seconds):
+                part = self._part(twice.plate, seconds.to(device), self.pilots.places[seconds])
+                spans.append((part, have, aim - have))
+        return spans
+
+    def put_back(self) -> None:
+        """Add what was sampled to the films that it is of."""
+        for whole, places, part in self._parts:
+            whole.put(places, part)
+        self._parts.clear()
+
+    def _part(self, plate: Plate, places: Tensor, pixels: Tensor) -> Plate:
+        """Some pixels of a plate as a plate of their own."""
+        films = {}
+        for name, film in (("", plate.film), *plate.layers.items()):
+            films[name] = film.taken(places)
+            self._parts.append((film, places, films[name]))
+        return Plate(films.pop(""), films, plate.streams, pixels)
+
+    def _of_blocks(self, counts: Tensor) -> Tensor:
+        """Samples of the pixels of each block, which are the same."""
+        found = torch.zeros(len(self.pixels), dtype=torch.int64)
+        found[self.block] = counts
+        return found
+
+    def _errors(self, twice: Twice) -> Tensor:
+        """Relative variance of the pixels of each block, up to a factor: second values alone are asked."""
+        a, b = (x.cpu() for x in twice.plate.film.streams())
+        at = tuple(self.pilots.block)
+        grid = a.new_zeros(*self.pilots.blocks, a.shape[1])
+        known = torch.zeros(*self.pilots.blocks, 1, dtype=torch.bool)
+        grid[at], known[at] = (a + b) / 2, True
+        near = around(grid, known[..., 0])[at]
+        errors = a.new_zeros(*self.pilots.blocks, 1)
+        errors[at] = error_at(a, b, near).mean(1, keepdim=True)
+        return smoothed(errors, known).reshape(-1)

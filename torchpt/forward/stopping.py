@@ -1,0 +1,98 @@
+"""When a render ends, and how many samples it takes until it asks again.
+
+Where only ``render.spp`` ends it, passes double. Else they are blocks of 16 samples, after a start that doubles, and shorter
+where a block would take more time than is left, or is more than a quarter of the samples there are: every pass begins at a
+multiple of its own length, so that sequences stay balanced.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torchpt.forward.schedule import BLOCK, LARGEST_PASS
+from torchpt.settings import Render
+
+__all__ = ["Stop"]
+
+#: What of ``render.time_limit`` may be left over or exceeded.
+SLACK = 0.03
+
+
+@dataclass
+class Stop:
+    """The rules of one render.
+
+    Attributes:
+        render: the settings.
+        streams: that share the samples of a pixel.
+        reason: the rule that ended it; "" as long as it goes on.
+        share: of the work that is done, 0..1, by the rule that is nearest to its end.
+    """
+
+    render: Render
+    streams: int = 1
+    reason: str = ""
+    share: float = 0.0
+    _pace: float | None = field(default=None, repr=False)  # seconds a sample of every pixel, in the last pass
+    _last: tuple[float, float] = field(default=(0.0, 0.0), repr=False)
+
+    @property
+    def open(self) -> bool:
+        """Whether something else than the number of samples may end it."""
+        return self.render.time_limit is not None or self.render.target_error is not None
+
+    def told(self, taken: float, seconds: float, error: float | None) -> None:
+        """What was reached after a pass: samples a pixel, seconds of sampling, and relMSE where it is asked for."""
+        before, since = self._last
+        if taken > before and seconds > since:
+            self._pace = (seconds - since) / (taken - before)
+        self._last = taken, seconds
+        done = {"spp": taken / self.render.spp}
+        if self.render.time_limit is not None:
+            done["time_limit"] = seconds / self.render.time_limit
+        if self.render.target_error is not None and error is not None:
+            done["target_error"] = self.render.target_error / error if error > 0.0 else 1.0
+        self.share = min(max(done.values()), 1.0)
+        for rule, share in done.items():
+            near = 1.0 - SLACK if rule == "time_limit" else 1.0
+            if share >= near and not self.reason:
+                self.reason = rule
+
+    def step(self, taken: int) -> int:
+        """Samples of the next pass; 0 where it is to end."""
+        left = self.render.spp - taken
+        if self.reason or left <= 0:
+            self.reason = self.reason or "spp"
+            return 0
+        if not self.open:
+            return min(max(taken, self.streams), LARGEST_PASS, left)
+        if taken == 0:
+            return min(self.streams, left)
+        # The lowest bit that is set: what a pass of that length begins at a multiple of.
+        size = min(BLOCK, taken & -taken)
+        if self.render.target_error is not None and taken >= BLOCK:
+            while size > max(taken // 4, 1):
+                size //= 2
+        if self.render.time_limit is not None and self._pace is not None:
+            while size > 1 and self._pace * size > self.time_left() + SLACK * self.render.time_limit:
+                size //= 2
+            if self._pace * size > self.time_left() + SLACK * self.render.time_limit:
+                self.reason = "time_limit"
+                return 0
+        return min(size, left)
+
+    def going(self, mean: float) -> bool:
+        """Whether adaptive sampling goes on, at so many samples a pixel; it never comes to a whole number of them."""
+        if not self.reason and mean >= self.render.spp - 0.5 * BLOCK:
+            self.reason = "spp"
+        if not self.reason and self.affordable(1.0) < 1.0:
+            self.reason = "time_limit"
+        return not self.reason
+
+    def time_left(self) -> float:
+        """Seconds that ``render.time_limit`` leaves."""
+        return float("inf") if self.render.time_limit is None else self.render.time_limit - self._last[1]
+
+    def affordable(self, more: float) -> float:
+        """Of ``more`` samples a pixel those for which there is time."""
+        return more if self._pace is None or self._pace <= 0.0 else min(more, max(self.time_left(), 0.0) / self._pace)
