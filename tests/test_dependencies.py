@@ -19,7 +19,7 @@ EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 #: Extras of users; the others are the developers'.
 FEATURES = ("formats", "video", "compare")
 #: Distribution -> what it is imported as, where that is another name.
-MODULES = {"pillow": "PIL", "pyyaml": "yaml", "hydra-core": "hydra", "pycollada": "collada"}
+MODULES = {"pillow": "PIL", "pyyaml": "yaml", "hydra-core": "hydra", "pycollada": "collada", "scikit-image": "skimage"}
 #: Tools of developers that nothing imports -> the words that use them.
 TOOLS = {
     "pytest-xdist": ("Makefile", "-n 2"),

@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 from torchpt import __version__
 from torchpt.commands import collector, keys
 from torchpt.commands.arguments import GROUPS, Arguments, UsageError, parse
+from torchpt.commands.compare import HELP as HELP_COMPARE
+from torchpt.commands.compare import compare
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.orbit import HELP as HELP_ORBIT
 from torchpt.commands.plain_words import compose_plainly
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
     from torchpt.commands.render import Job
 
-__all__ = ["main", "run"]
+__all__ = ["HELP_COMPARE", "main", "run"]
 
 HELP = """\
 torchpt: a wavefront path tracer that is a PyTorch program
@@ -39,6 +41,7 @@ torchpt: a wavefront path tracer that is a PyTorch program
   torchpt render scene=cornell_box render.spp=64 out=cornell.exr    render a picture
   torchpt orbit  scene=cornell_box frames=48 out=turn.gif           turn the camera about it: .gif, .mp4
   torchpt info   scene=cornell_box                                  what the scene holds, what was built, what left out
+  torchpt compare test.exr reference.exr                            how far a picture is from its reference
 
 torchpt COMMAND --help says more. Scenes that ship:
 {scenes}
@@ -86,6 +89,8 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     with Interrupt() as interrupt:
         try:
+            if argv[:1] == ["compare"]:  # takes files, and no scene
+                return compare(argv[1:])
             arguments = parse(argv)
             if arguments.help:
                 print(_help({"render": HELP_RENDER, "orbit": HELP_ORBIT, "info": HELP_INFO}[arguments.command]), end="")

@@ -10,9 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 from torchpt import cli
 from torchpt.cli import main
+from torchpt.images import write_image
 from torchpt.paths import configs
 
 ROOT = Path(__file__).parents[2]
@@ -29,7 +31,7 @@ shapes: {ball: {type: sphere, emission: 1}}
 
 def texts() -> Iterator[tuple[str, str]]:
     """Where a command may stand, and the text."""
-    for name in ("HELP", "HELP_RENDER", "HELP_ORBIT", "HELP_INFO"):
+    for name in ("HELP", "HELP_RENDER", "HELP_ORBIT", "HELP_INFO", "HELP_COMPARE"):
         yield f"cli.{name}", getattr(cli, name)
     for page in PAGES:
         yield str(page.relative_to(ROOT)), page.read_text(encoding="utf-8")
@@ -76,6 +78,8 @@ def shrunk(words: list[str]) -> list[str]:
 
 
 def quick(command: str) -> bool:
+    if command.startswith("torchpt compare"):
+        return True
     return "--cfg" in command or any(f"scene={name}" in command.split() for name in QUICK)
 
 
@@ -85,7 +89,12 @@ TORCHPT = commands("torchpt")
 def test_there_are_commands_from_everywhere() -> None:
     where = {place for place, _ in TORCHPT}
     assert {"cli.HELP", "README.md", "docs/ibl.md", "configs/config.yaml", "configs/integrator/direct.yaml"} <= where
-    assert len(TORCHPT) > 40 and {command.split()[1] for _, command in TORCHPT} == {"render", "orbit", "info"}
+    assert len(TORCHPT) > 40 and {command.split()[1] for _, command in TORCHPT} == {
+        "render",
+        "orbit",
+        "info",
+        "compare",
+    }
 
 
 def test_every_file_in_configs_opens_with_its_command() -> None:
@@ -109,6 +118,8 @@ def test_advertised_commands_run(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my").mkdir()
     (tmp_path / "my" / "scene.yaml").write_text(SCENE)
+    for name in ("test.exr", "reference.exr"):  # what is compared
+        write_image(tmp_path / name, torch.full((12, 12, 3), 0.5), {"albedo": torch.full((12, 12, 3), 0.3)})
     words = shlex.split(command)[1:]
     renders = words[0] in ("render", "orbit") and "--cfg" not in words
     assert main(shrunk(words) if renders else words) == 0, where

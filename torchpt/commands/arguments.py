@@ -14,7 +14,7 @@ from torchpt.errors import TorchptError
 
 __all__ = ["COMMANDS", "GROUPS", "Arguments", "UsageError", "parse"]
 
-COMMANDS = ("render", "orbit", "info")
+COMMANDS = ("render", "orbit", "info", "compare")  # `compare` takes its words itself
 GROUPS = ("film", "integrator", "sampler", "render")
 PATH_KEYS = ("render.preview", "render.checkpoint")
 #: Keys of `torchpt orbit` alone.
@@ -106,7 +106,8 @@ def parse(argv: list[str]) -> Arguments:
         raise UsageError("--multirun: cannot be combined with --cfg or --hydra-help")
     if arguments.json and arguments.command != "info":
         raise UsageError(
-            f"--json: only `torchpt info` takes it; the last line of `torchpt {arguments.command}` is JSON anyway"
+            "--json: only `torchpt info` and `torchpt compare` take it; "
+            f"the last line of `torchpt {arguments.command}` is JSON anyway"
         )
     if arguments.command == "info" and "out" in taken:
         raise UsageError("out: `torchpt info` writes no picture")
