@@ -17,6 +17,7 @@ from torchpt.forward.kept import kept
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.schedule import chunks_of, lanes_for, passes
 from torchpt.forward.wave import kernels_of, looped, make_wave, surface_layers
+from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
 from torchpt.integrators.loop.schedule import Loop, Share
@@ -159,7 +160,7 @@ class Run:
 
     def result(self) -> Rendering:
         """The picture so far."""
-        image, radiant = self.film.mean().to(self.dtype), self.integrator.light
+        image, radiant, film = self.film.mean().to(self.dtype), self.integrator.light, self.settings.film
         layers = self._layers()
         if not radiant:
             shown = layers[next(iter(self.seen))]
@@ -172,7 +173,8 @@ class Run:
         pixels = self.width * self.height
         return Rendering(
             image=image,
-            layers=layers,
+            layers={name: layers[name] for name in film.aovs or self.integrator.layers},
+            guides={name: layers[name] for name in GUIDES} if film.denoise else {},
             spp=self.done // pixels,
             seconds=time.perf_counter() - self.start,
             build_seconds=self.build_seconds,
