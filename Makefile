@@ -57,9 +57,9 @@ $(VENV)/run.stamp: pyproject.toml constraints.txt | $(PY)
 	@touch $@
 
 $(VENV)/dev.stamp: $(VENV)/run.stamp
-	$(PIP) -e ".[dev,formats,video,compare]"
+	$(PIP) -e ".[dev,formats,video,compare,denoise]"
 	@touch $@
 
 $(VENV)/bench.stamp: $(VENV)/dev.stamp
-	$(PIP) -e ".[dev,formats,video,compare,bench]"
+	$(PIP) -e ".[dev,formats,video,compare,denoise,bench]"
 	@touch $@

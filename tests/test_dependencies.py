@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 #: Extras of users; the others are the developers'.
-FEATURES = ("formats", "video", "compare")
+FEATURES = ("formats", "video", "compare", "denoise")
 #: Distribution -> what it is imported as, where that is another name.
 MODULES = {"pillow": "PIL", "pyyaml": "yaml", "hydra-core": "hydra", "pycollada": "collada", "scikit-image": "skimage"}
 #: Tools of developers that nothing imports -> the words that use them.

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from torchpt import ibl
     from torchpt.bsdfs import Bsdf
     from torchpt.images import metrics, read_image, read_layers, write_image
+    from torchpt.images.denoiser import denoise
     from torchpt.rendering import render
     from torchpt.scene import Scene, load
     from torchpt.scene.from_trimesh import from_trimesh
@@ -39,6 +40,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "TorchptError",
+    "denoise",
     "from_trimesh",
     "ibl",
     "load",
@@ -53,6 +55,7 @@ __all__ = [
 _LAZY = {
     "Bsdf": "torchpt.bsdfs",
     "Scene": "torchpt.scene",
+    "denoise": "torchpt.images.denoiser",
     "from_trimesh": "torchpt.scene.from_trimesh",
     "load": "torchpt.scene",
     "read_image": "torchpt.images",

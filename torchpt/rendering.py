@@ -51,7 +51,7 @@ def render(
 
     Other arguments, all as in the scene file; ``None`` keeps the scene's own wish:
         integrator, sampler: a type or a mapping with ``type``.
-        film: a mapping.
+        film: a mapping; ``denoise`` is refused, as one picture comes back: see :func:`torchpt.denoise`.
         accel, compile, threads, max_memory: of ``render``.
         device: must be the scene's own; load the scene on the device where it is to render.
         dtype: of the lanes. float64 is for checking derivatives; the search stays float32.
@@ -75,6 +75,11 @@ def render(
         },
     }  # fmt: skip
     settings = complete(scene.description, wishes)
+    if (film or {}).get("denoise") and settings.film.denoise:
+        raise SceneError(
+            "film.denoise", True, "false: a tensor is one picture; hand it to torchpt.denoise with its layers"
+        )
+    settings = replace(settings, film=settings.film.but(denoise=False))  # the scene file's wish is about files
     scene.check(params)
     wanted = tuple(name for name, value in (params or {}).items() if value.requires_grad)
     if not (wanted or scene.weights()) or not torch.is_grad_enabled():
@@ -151,7 +156,9 @@ def _differentiable(
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:
     """Layers ``(H, W, C)`` of the first surface at one sample a pixel: a preview that is there at once."""
-    film = settings.film.but(aovs=names, filter=Described(FILTERS["box"], {}))  # one sample fills no wider filter
+    film = settings.film.but(
+        aovs=names, denoise=False, filter=Described(FILTERS["box"], {})
+    )  # one sample fills no wider filter
     quick = replace(settings, film=film, integrator=INTEGRATORS["aov"](), render=settings.render.but(spp=1))
     return render_scene(scene, quick).layers
 

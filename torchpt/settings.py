@@ -13,7 +13,7 @@ from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
 from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.spec import Choice, Other, Refused, Scalar, Valued, Whole, not_built, parameters_of, reading
+from torchpt.spec import Choice, Flag, Other, Refused, Scalar, Valued, Whole, not_built, parameters_of, reading
 from torchpt.spec.declared import Described, described, refuse_foreign, values_of
 from torchpt.spec.validate import check_keys, dotted, refuse_not_built
 
@@ -82,6 +82,7 @@ class Film(Valued):
             words=f"a list of {', '.join(LAYERS)}",
             doc="layers, kept by .exr",
         ),
+        "denoise": Flag(False, doc="a second picture beside the first, without its noise"),
         "exposure": Scalar(0.0, low=-64, high=64, words="a number of stops in -64..64", doc="of 8-bit files"),
         "tonemap": Choice("none", names=("none", "filmic", "aces", "reinhard"), doc="of 8-bit files"),
         "gamma": Other(
@@ -267,6 +268,9 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
     settings = Settings(**blocks)
     _check_pilots(settings, file)
     if not settings.integrator.light:
+        if settings.film.denoise:
+            expected = f"false where integrator is {settings.integrator.name} (it carries no light)"
+            raise SceneError("film.denoise", True, expected, None if _given(overrides, "film.denoise") else file)
         for name in settings.film.aovs:
             if LAYERS[name].light:
                 expected = f"no {name} where integrator is {settings.integrator.name} (it carries no light)"

@@ -26,6 +26,7 @@ class Rendering:
     settings: Any
     done: int
     total: int
+    denoised: torch.Tensor | None = None
 
     @property
     def complete(self) -> bool:
@@ -38,6 +39,10 @@ class Rendering:
     @property
     def layers(self) -> dict[str, torch.Tensor]:
         return {name: self.image for name in self.settings.film.aovs}
+
+    @property
+    def guides(self) -> dict[str, torch.Tensor]:
+        return {name: self.image for name in ("albedo", "normal")} if self.settings.film.denoise else {}
 
     def summary(self) -> dict[str, Any]:
         facts = {"spp": self.done, "seconds": 1.5, "paths_per_second": 2e6, "rays": 77, "nonfinite_samples": 0}

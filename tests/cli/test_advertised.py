@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,12 @@ def quick(command: str) -> bool:
     return "--cfg" in command or any(f"scene={name}" in command.split() for name in QUICK)
 
 
+def marks(command: str) -> list[pytest.MarkDecorator]:
+    """What a command needs: time, or a package that may not be there."""
+    needs = pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed (extra `denoise`)")
+    return [pytest.mark.slow] * (not quick(command)) + [needs] * ("film.denoise=true" in command)
+
+
 TORCHPT = commands("torchpt")
 
 
@@ -109,7 +116,7 @@ def test_every_file_in_configs_opens_with_its_command() -> None:
 
 @pytest.mark.parametrize(
     ("where", "command"),
-    [pytest.param(*item, marks=() if quick(item[1]) else pytest.mark.slow) for item in TORCHPT],
+    [pytest.param(*item, marks=marks(item[1])) for item in TORCHPT],
     ids=lambda value: value,
 )
 def test_advertised_commands_run(

@@ -63,6 +63,24 @@ def test_exr_layers_have_the_usual_channels(tmp_path: Path) -> None:
         assert torch.equal(back[name], layer if layer.ndim == 3 else layer[..., None]), name
 
 
+def test_alpha_is_the_pictures_own_channel_and_a_layer(tmp_path: Path) -> None:
+    image, alpha = picture(), picture(channels=1)
+    write_image(tmp_path / "a.exr", image, {"depth": picture(channels=1) * 3, "alpha": alpha})
+    assert torch.equal(read_image(tmp_path / "a.exr"), torch.cat((image, alpha), -1))  # as viewers take it
+    back = read_layers(tmp_path / "a.exr")
+    assert set(back) == {"image", "depth", "alpha"}
+    assert torch.equal(back["image"], image) and torch.equal(back["alpha"], alpha)
+    write_image(tmp_path / "b.exr", back.pop("image"), back)  # and round again
+    assert torch.equal(read_image(tmp_path / "b.exr"), read_image(tmp_path / "a.exr"))
+    write_image(tmp_path / "c.exr", torch.cat((image, alpha), -1))  # the same, said otherwise
+    assert torch.equal(read_layers(tmp_path / "c.exr")["alpha"], alpha)
+    with pytest.raises(ValueError, match="channel A"):
+        write_image(tmp_path / "d.exr", picture(channels=4), {"alpha": alpha})
+    write_image(tmp_path / "e.png", image, {"alpha": alpha})
+    assert read_image(tmp_path / "e.png").shape == (5, 7, 3)
+    assert not (tmp_path / "d.exr").exists()
+
+
 def test_hdr_has_no_negative_values(tmp_path: Path) -> None:
     image = picture() * 100
     image[0, 0] = torch.tensor([-5.0, 1.0, float("nan")])

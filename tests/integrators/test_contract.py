@@ -203,6 +203,7 @@ LAYER_ROWS = {
     "position": Shown((0.0, 0.0, 1.0)),
     "uv": Shown(None),  # the ball's pole is seen
     "object_id": Shown((1.0,)),
+    "alpha": Shown((1.0,)),
     "variance": Shown(None),
 }
 

@@ -158,3 +158,37 @@ def test_layers_see_through():
     assert abs(float(mean[0]) - 0.25) < 4 * float(error[0])
     mean, error = estimate(result.layers["depth"])
     assert abs(float(mean[0]) - 4.5) < 4 * float(error[0]) + 0.01
+
+
+def covered(description: dict[str, Any], filter: str, compiled: bool, spp: int = 64) -> torch.Tensor:
+    """The layer `alpha` of 24 x 24 pixels."""
+    from torchpt.format.description import settings
+    from torchpt.rendering import render_scene
+
+    loaded = torchpt.load(description, device="cpu")
+    film = {"width": 24, "height": 24, "filter": filter, "aovs": ["alpha"]}
+    wishes = settings(loaded.description, {"film": film, "render": {"spp": spp, "compile": compiled}})
+    return render_scene(loaded, wishes).layers["alpha"]
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_alpha_is_what_surfaces_cover(compiled):
+    disk = {"disk": {"type": "disk", "material": "dark", "transform": [{"scale": 0.1}]}}
+    alpha = covered(scene(disk, SKY, dark=black()), "box", compiled)
+    assert alpha.shape == (24, 24, 1) and float(alpha[12, 12]) == 1.0 and float(alpha[0, 0]) == 0.0
+    width = 8 * torch.tan(torch.tensor(5.0 * torch.pi / 360.0))
+    assert float(alpha.mean()) == pytest.approx(torch.pi * 0.01 / float(width) ** 2, rel=2e-3)
+    assert 10 < int(((alpha > 0) & (alpha < 1)).sum()) < 80  # the rim, in between
+    signed = covered(scene(disk, SKY, dark=black()), "mitchell", compiled)
+    assert float(signed[12, 12]) == pytest.approx(1.0, abs=0.05) and float(signed.mean()) == pytest.approx(
+        float(alpha.mean()), rel=2e-2
+    )
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_alpha_is_weighed_by_opacity(compiled):
+    ball = {"ball": {"type": "sphere", "material": black(opacity=0.3)}}
+    alpha = covered(scene(ball, SKY), "box", compiled)
+    assert float(alpha.mean()) == pytest.approx(1 - 0.7**2, abs=0.01)  # its front, or else its back
+    glass = {"ball": {"type": "sphere", "material": {"type": "dielectric"}}}
+    assert torch.equal(covered(scene(glass, SKY), "box", compiled, 2), torch.ones(24, 24, 1))

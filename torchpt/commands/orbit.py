@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -142,12 +142,12 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     start = time.perf_counter()
     with notices():
         description, wishes = described(job)
-        for key in ("preview", "aovs"):
-            group = "film" if key == "aovs" else "render"
+        for group, key in (("render", "preview"), ("film", "aovs"), ("film", "denoise")):
             if job.overrides.get(group, {}).get(key):
-                raise SceneError(
-                    f"{group}.{key}", job.overrides[group][key], "nothing: torchpt orbit writes frames only"
-                )
+                what = "nothing: torchpt orbit writes frames only"
+                if key == "denoise":
+                    what = "false: torchpt orbit writes frames as rendered (denoised one by one they flicker)"
+                raise SceneError(f"{group}.{key}", job.overrides[group][key], what)
         outs = _outputs(job)
         for path in outs:
             check_movie(path, turn.fps)
@@ -213,6 +213,9 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
                 continue
             once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
             wishes = settings(scene.description, once)
+            wishes = replace(
+                wishes, film=wishes.film.but(denoise=False)
+            )  # a scene file's wish is about `torchpt render`
             scene.params["camera.to_world"] = torch.from_numpy(pose.copy()).to(place)
             rendering = render_scene(scene, wishes, on_progress=partial(on_progress, number, totals["rays"]))
             if not rendering.complete:

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.commands import collector
+from torchpt.commands.denoised import denoise_rendering, denoised_files
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.notices import notices
 from torchpt.commands.progress import Bar
-from torchpt.errors import OutputError, SceneError
+from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
 
 __all__ = ["Job", "described", "numbered", "plain", "render"]
 
@@ -62,13 +63,15 @@ def render(job: Job, interrupt: Interrupt) -> int:
         description, wishes = described(job)
         outs = _outputs(job, wishes)
         preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
-        for path in (*outs, *(_preview_files(preview) if preview else ())):
+        previews = _preview_files(preview) if preview else []
+        denoised = denoised_files(wishes, outs, previews)
+        for path in (*outs, *previews, *denoised):
             check_writable(path)
         scene = Scene(description, device_of(wishes.render.device))
     load_seconds = time.perf_counter() - start
     if preview:
         hits = first_hit(scene, wishes)
-        for path, name in zip(_preview_files(preview), ("albedo", "normal"), strict=False):
+        for path, name in zip(previews, ("albedo", "normal"), strict=False):
             _write_layer(path, name, hits[name])
 
     with Bar(_name(job.scene)) as bar:
@@ -80,8 +83,8 @@ def render(job: Job, interrupt: Interrupt) -> int:
             return interrupt.signum is not None
 
         rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress))
-    _write_all([*outs, *((preview,) if preview else ())], rendering, wishes)
-    print(_summary(rendering, outs, load_seconds), flush=True)
+    facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)
+    print(_summary(rendering, outs, {"load_seconds": round(load_seconds, 4)} | facts), flush=True)
     if interrupt.signum is None:
         return 0
     print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far", file=sys.stderr)
@@ -136,24 +139,40 @@ def _preview_files(preview: str) -> list[str]:
     return [*(str(path.with_name(f"{path.stem}.{name}{path.suffix}")) for name in ("albedo", "normal")), preview]
 
 
-def _write_all(paths: list[str], rendering: Any, wishes: Any) -> None:
-    """Write every picture that can be written before complaining of one that cannot."""
-    failed: OutputError | None = None
+def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: Any) -> dict[str, Any]:
+    """Write every picture that can be written before complaining of one that cannot; returns what there is to tell."""
+    failed: TorchptError | None = None
+    facts: dict[str, Any] = {}
     for path in paths:
         try:
             _write(path, rendering, wishes)
         except OutputError as error:
             failed = failed or error
+    try:
+        if denoised:  # only now: what was rendered is safe
+            facts = {"denoised": _names(denoised), "denoise_seconds": round(denoise_rendering(rendering, wishes), 4)}
+    except RenderError as error:
+        raise failed or error from None
+    for path in denoised:
+        try:
+            _write_shown(path, rendering.denoised, wishes)
+        except OutputError as error:
+            failed = failed or error
     if failed is not None:
         raise failed
+    return facts
 
 
 def _write(path: str, rendering: Any, wishes: Any) -> None:
+    _write_shown(path, rendering.image, wishes, rendering.layers if _is_exr(path) else None)
+
+
+def _write_shown(path: str, image: Any, wishes: Any, layers: Any = None) -> None:
+    """Write a picture, shown as the film says."""
     from torchpt.images import write_image
 
     film = wishes.film
-    layers = rendering.layers if _is_exr(path) else None
-    write_image(path, rendering.image, layers, exposure=film.exposure, tonemap=film.tonemap, gamma=film.gamma)
+    write_image(path, image, layers, exposure=film.exposure, tonemap=film.tonemap, gamma=film.gamma)
 
 
 def _write_layer(path: str, name: str, layer: Any) -> None:
@@ -164,9 +183,13 @@ def _write_layer(path: str, name: str, layer: Any) -> None:
     write_image(path, shown, gamma=1.0 if name == "normal" else "srgb")
 
 
-def _summary(rendering: Any, outs: list[str], load_seconds: float) -> str:
+def _names(paths: list[str]) -> str | list[str]:
+    return paths[0] if len(paths) == 1 else paths
+
+
+def _summary(rendering: Any, outs: list[str], first: dict[str, Any]) -> str:
     """The last line on stdout."""
-    facts = {"out": outs[0] if len(outs) == 1 else outs, "load_seconds": round(load_seconds, 4), **rendering.summary()}
+    facts = {"out": _names(outs), **first, **rendering.summary()}
     if not rendering.complete:
         facts["complete"] = False
     return json.dumps(plain(facts), allow_nan=False)

@@ -18,6 +18,9 @@ class Rendering:
     Attributes:
         image: ``(H, W, 3)`` linear RGB.
         layers: what ``film.aovs`` asked for, each ``(H, W, C)``.
+        guides: what the denoiser looks at beside the picture, by the names of its arguments, each ``(H, W, 3)``; empty
+            without ``film.denoise``.
+        denoised: the picture without its noise ``(H, W, 3)``; None where nobody denoised it. No number here is about it.
         spp: samples a pixel that the picture holds.
         seconds: wall time.
         build_seconds: of it, for the world and its search structure.
@@ -38,6 +41,8 @@ class Rendering:
 
     image: Tensor
     layers: dict[str, Tensor] = field(default_factory=dict)
+    guides: dict[str, Tensor] = field(default_factory=dict)
+    denoised: Tensor | None = None
     spp: int = 0
     seconds: float = 0.0
     build_seconds: float = 0.0

@@ -20,6 +20,7 @@ from torchpt.forward.schedule import Span, lanes_for, pieces
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
 from torchpt.forward.wave import kernels_of, looped, make_wave, surface_layers
+from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
 from torchpt.integrators.loop.schedule import Loop, Share
@@ -257,9 +258,11 @@ class Run:
         counts = (film if radiant else next(iter(self.picture.layers.values()))).counts
         compile_seconds = 0.0 if self.loop is None else self.loop.kernels.seconds
         known = self._known() if radiant else None
+        names = self.settings.film.aovs or self.integrator.layers
         return Rendering(
             image=image,
-            layers=layers,
+            layers={name: layers[name] for name in names},
+            guides={name: layers[name] for name in GUIDES} if self.settings.film.denoise else {},
             spp=int(counts.sum()) // len(counts),
             seconds=time.perf_counter() - self.start,
             build_seconds=self.build_seconds,

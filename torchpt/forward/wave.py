@@ -12,6 +12,7 @@ from torch import Tensor
 from torchpt.cameras import Camera
 from torchpt.forward.kept import kept
 from torchpt.forward.schedule import streams_of
+from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
 from torchpt.integrators.compiled import CompiledStages, Stages
@@ -90,8 +91,8 @@ def points_of(sampler: Described) -> Points:
 
 
 def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:
-    """The layers of first surfaces that are wanted, by name."""
-    names = settings.film.aovs or settings.integrator.layers
+    """The layers of first surfaces that are wanted, by name; those for the denoiser alone come last."""
+    names = (*(settings.film.aovs or settings.integrator.layers), *(GUIDES if settings.film.denoise else ()))
     if not names:
         return {}
     from torchpt.integrators.layer import SurfaceLayer

@@ -46,7 +46,8 @@ def read_image(path: str | PathLike[str], linear: bool = False) -> Tensor:
 def read_layers(path: str | PathLike[str]) -> dict[str, Tensor]:
     """Read every layer of an EXR: name to ``(H, W, C)`` float32; the picture itself is called ``image``.
 
-    Other formats hold one layer, ``image``, as `read_image` returns it.
+    The picture's alpha channel ``A`` is a layer of its own, ``alpha``. Other formats hold one layer, ``image``, as
+    `read_image` returns it.
 
     Raises:
         AssetError: as `read_image`.
@@ -58,6 +59,9 @@ def read_layers(path: str | PathLike[str]) -> dict[str, Tensor]:
     if pixels.values.dtype.kind != "f":  # another format under this name
         return {"image": read_image(path)}
     groups = group_channels(pixels.channels)
+    image = groups.get("image", [])
+    if len(image) > 1 and pixels.channels[image[-1]] == "A":
+        groups["alpha"] = [image.pop()]
     return {name: _tensor(pixels.values[..., indices]) for name, indices in groups.items()}
 
 

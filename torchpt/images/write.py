@@ -46,7 +46,7 @@ def write_image(
         path: where to; an existing file is replaced.
         image: ``(H, W, C)`` linear, C = 1, 3 or 4 (alpha is kept by EXR and PNG).
         layers: name to ``(H, W, C)`` or ``(H, W)``; kept by ``.exr`` only. The names of `film.aovs` get the usual
-            channels: ``albedo.R/G/B normal.X/Y/Z Z position.X/Y/Z uv.U/V object_id variance.R/G/B``.
+            channels: ``albedo.R/G/B normal.X/Y/Z Z position.X/Y/Z uv.U/V object_id A variance.R/G/B``.
         exposure: stops (8-bit formats).
         tonemap: none, reinhard, aces or filmic (8-bit formats).
         gamma: ``"srgb"`` or an exponent (8-bit formats).
@@ -64,6 +64,9 @@ def write_image(
             if layer.shape[:2] != pixels.shape[:2]:
                 raise ValueError(f"layer {name!r} is {tuple(layer.shape[:2])}, the picture {tuple(pixels.shape[:2])}")
         channels = [channel for name, layer in named.items() for channel in channel_names(name, layer.shape[2])]
+        twice = sorted({channel for channel in channels if channels.count(channel) > 1})
+        if twice:
+            raise ValueError(f"two layers have the channel {twice[0]} (a picture of 4 channels has its alpha: A)")
         encode = partial(_encode_float, temporary, np.concatenate(list(named.values()), axis=2), channels)
     elif temporary.suffix == ".hdr":  # RGBE has no sign: the encoder would wrap around
         rgb = np.nan_to_num(_rgb(pixels), nan=0.0, posinf=1e30).clip(0, 1e30)

@@ -140,7 +140,7 @@ def _left_out(description: Description, world: World, settings: Settings) -> lis
         absent.append("clamp")
     if 0 <= integrator.limits.max_depth <= integrator.limits.rr_depth:
         absent.append("Russian roulette (paths end before rr_depth)")
-    if not settings.film.aovs:
+    if not settings.film.aovs and not settings.film.denoise:
         absent.append("aov layers")
     if not any(table.count for table in world.textures.tables):
         absent.append("textures (no image is read, none is computed)")
