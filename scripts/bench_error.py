@@ -72,7 +72,7 @@ def add_arguments(group: Any) -> None:
 def contest(arguments: argparse.Namespace) -> None:
     """All scenes, or those that are named; prints, keeps and draws."""
     if arguments.quick:
-        arguments.rounds, arguments.size, arguments.reference = 2, 48, 4
+        arguments.rounds, arguments.size, arguments.reference = 2, 48, 16
         arguments.budgets = [budget / 16.0 for budget in arguments.budgets]
     budgets = sorted(arguments.budgets)
     if budgets[0] <= 0.0 or len(set(budgets)) < len(budgets) or arguments.rounds < 1 or arguments.reference < 2:
@@ -87,9 +87,15 @@ def contest(arguments: argparse.Namespace) -> None:
     if arguments.again:
         found = {name: row for name, row in found.items() if name not in wanted}
     print(heading(budgets))
+    failed = []
     for name in wanted:
         if name not in found:
-            found[name] = measured(name, budgets, arguments)
+            try:
+                found[name] = measured(name, budgets, arguments)
+            except ValueError as problem:  # the next scene may do better
+                failed.append(name)
+                print(f"{name}: {problem}", flush=True)
+                continue
             if arguments.json is not None:
                 kept = {"settings": settings, "machine": bench_files.machine(), "scenes": found}
                 bench_files.write(arguments.json, kept | overall(found, budgets))
@@ -102,6 +108,8 @@ def contest(arguments: argparse.Namespace) -> None:
         from bench_plot import plot
 
         plot(shown, budgets, arguments.plot)
+    if failed:
+        raise SystemExit(f"not measured: {', '.join(failed)}")
 
 
 def measured(name: str, budgets: list[float], arguments: argparse.Namespace) -> dict[str, Any]:
@@ -120,12 +128,12 @@ def measured(name: str, budgets: list[float], arguments: argparse.Namespace) -> 
             )
         ours, theirs = references.values()
         scale = scale_of(ours, theirs)
-        judges = {who: lambda seen, own=ours if who == OURS else theirs: own.relmse(seen, scale) for who in workers}
+        judges = {who: judge(ours if who == OURS else theirs, scale) for who in workers}
         turns = rounds(workers, counts, judges, arguments.rounds, picture)
     points = {who: [point_of(turns[who][spp]) for spp in counts[who]] for who in workers}
     return {
         "curves": {who: [asdict(point) for point in line] for who, line in points.items()},
-        "at": {f"{budget:g}": compared(name, points, budget) for budget in budgets},
+        "at": {f"{budget:g}": compared(points, budget) for budget in budgets},
         "apart": between(ours, theirs),
         "means": [float(ours.mean.mean()), float(theirs.mean.mean())],
         "turns": {who: {str(spp): rows for spp, rows in row.items()} for who, row in turns.items()},
@@ -137,11 +145,13 @@ def measured(name: str, budgets: list[float], arguments: argparse.Namespace) -> 
 def calibrated(worker: Any, budgets: list[float], spp: int) -> list[int]:
     """Samples a pixel that take a quarter of the first time, and a little more than each time."""
     turn = ask(worker, spp, CALIBRATED)
-    for budget in (budgets[0], *budgets):  # the first once more: a few samples tell little
+    turn = warmed(worker, samples_in(budgets[0], turn.spp, turn.seconds))  # a few samples tell little
+    found: list[int] = []
+    for budget in budgets:
         if budget <= CALIBRATION:
             turn = warmed(worker, samples_in(AIM * budget, turn.spp, turn.seconds))
-    found = [samples_in(0.25 * budgets[0], turn.spp, turn.seconds)]
-    for budget in budgets:
+        if not found:
+            found.append(samples_in(0.25 * budget, turn.spp, turn.seconds))
         found.append(max(samples_in(AIM * budget, turn.spp, turn.seconds), found[-1] + 1))
     return found
 
@@ -158,10 +168,20 @@ def shot(worker: Any, spp: int, seed: int, file: Path) -> tuple[Turn, np.ndarray
     return turn, np.load(file, allow_pickle=False)
 
 
-#: The relMSE of a picture ``(H, W, 3)``.
-Judge = Callable[[np.ndarray], float]
-#: Turns by contender and by samples that were asked for: seconds, relMSE, samples that were taken, and whether it was cold.
+#: Facts about a picture ``(H, W, 3)``.
+Judge = Callable[[np.ndarray], dict[str, Any]]
+#: Turns by contender and by samples that were asked for: seconds, samples that were taken, whether it was cold, :func:`judge`.
 Turns = dict[str, dict[int, list[dict[str, Any]]]]
+
+
+def judge(reference: Reference, scale: np.ndarray) -> Judge:
+    """The relMSE of pictures, and what it would be without each of the reference's pictures."""
+
+    def facts(seen: np.ndarray) -> dict[str, Any]:
+        without = [lacking.relmse(seen, scale) for lacking in reference.without]
+        return {"relmse": reference.relmse(seen, scale), "without": without}
+
+    return facts
 
 
 def rounds(
@@ -175,8 +195,8 @@ def rounds(
             for who, worker in workers.items():
                 spp = counts[who][step]
                 turn, seen = shot(worker, spp, ROUNDS + seed * steps + step, picture)
-                facts = {"seconds": turn.seconds, "relmse": judges[who](seen), "spp": turn.spp, "cold": turn.cold}
-                turns[who][spp].append(facts)
+                facts = {"seconds": turn.seconds, "spp": turn.spp, "cold": turn.cold}
+                turns[who][spp].append(facts | judges[who](seen))
     return turns
 
 
@@ -184,15 +204,13 @@ def point_of(turns: list[dict[str, Any]]) -> Point:
     """What the turns of a number of samples come to; cold ones are timed only where there are no others."""
     warm = [turn["seconds"] for turn in turns if not turn["cold"]]
     seconds = warm or [turn["seconds"] for turn in turns]
-    return Point.of(turns[0]["spp"], seconds, [turn["relmse"] for turn in turns])
+    errors, without = ([turn[key] for turn in turns] for key in ("relmse", "without"))
+    return Point.of(turns[0]["spp"], seconds, errors, without)
 
 
-def compared(name: str, points: dict[str, list[Point]], budget: float) -> dict[str, Any]:
+def compared(points: dict[str, list[Point]], budget: float) -> dict[str, Any]:
     """Everyone's error at a time, and the ratio of ours to the better of theirs."""
-    try:
-        estimates = {who: at_time(line, budget) for who, line in points.items()}
-    except ValueError as problem:
-        raise SystemExit(f"{name} at {budget:g} s: {problem}") from problem
+    estimates = {who: at_time(line, budget) for who, line in points.items()}
     best = better({who: estimates[who].relmse for who in RIVALS})
     ratio = estimates[OURS].relmse / estimates[best].relmse
     return {**{who: asdict(estimate) for who, estimate in estimates.items()}, "better": best, "ratio": ratio}

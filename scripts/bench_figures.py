@@ -35,10 +35,12 @@ class Reference:
     Attributes:
         mean: ``(H, W, 3)``.
         variance: of that mean, ``(H, W, 3)``, as the pictures' spread tells.
+        without: the references that each lack one of the pictures; none of fewer than three pictures.
     """
 
     mean: np.ndarray
     variance: np.ndarray
+    without: tuple[Reference, ...] = ()
 
     @staticmethod
     def of(pictures: Sequence[np.ndarray]) -> Reference:
@@ -46,7 +48,18 @@ class Reference:
         if len(pictures) < 2:
             raise ValueError(f"a reference takes two pictures or more to know its own variance, got {len(pictures)}")
         stack = np.stack([np.asarray(picture, np.float64) for picture in pictures])
-        return Reference(stack.mean(0), stack.var(0, ddof=1) / len(stack))
+        number, mean = len(stack), stack.mean(0)
+        squares = (stack - mean) ** 2
+        total = squares.sum(0)
+        without = [
+            Reference(
+                mean + (mean - picture) / (number - 1),
+                (total - number / (number - 1) * square) / ((number - 1) * (number - 2)),
+            )
+            for picture, square in zip(stack, squares, strict=True)
+            if number > 2
+        ]
+        return Reference(mean, total / (number * (number - 1)), tuple(without))
 
     def relmse(self, picture: np.ndarray, scale: np.ndarray) -> float:
         """Of a picture that has no part in the reference, without bias by the reference's noise.
@@ -78,7 +91,7 @@ class Point:
         spp: samples a pixel.
         seconds: a picture takes, the median over rounds.
         relmse: of one picture, the mean over seeds.
-        deviation: standard error of ``relmse``; None where there was one seed.
+        deviation: standard error of ``relmse``, by its seeds and the reference's; None where there was one seed.
     """
 
     spp: int
@@ -87,10 +100,22 @@ class Point:
     deviation: float | None
 
     @staticmethod
-    def of(spp: int, seconds: Sequence[float], errors: Sequence[float]) -> Point:
-        """Of the turns with this number of samples."""
-        spread = statistics.stdev(errors) / math.sqrt(len(errors)) if len(errors) > 1 else None
-        return Point(spp, statistics.median(seconds), statistics.fmean(errors), spread)
+    def of(spp: int, seconds: Sequence[float], errors: Sequence[float], without: Sequence[Sequence[float]]) -> Point:
+        """Of the turns with this number of samples.
+
+        Args:
+            spp: samples a pixel.
+            seconds: of the turns.
+            errors: their relMSE.
+            without: by turn, the relMSE against each of :attr:`Reference.without`.
+        """
+        deviation = None
+        if len(errors) > 1:
+            means = np.asarray(without, np.float64).reshape(len(errors), -1).mean(0)
+            # The jackknife: how much each picture of the reference matters. It errs upwards (Efron and Stein, 1981).
+            reference = (len(means) - 1) * float(means.var()) if len(means) else 0.0
+            deviation = math.sqrt(statistics.variance(errors) / len(errors) + reference)
+        return Point(spp, statistics.median(seconds), statistics.fmean(errors), deviation)
 
 
 @dataclass(frozen=True)
@@ -99,7 +124,7 @@ class Estimate:
 
     Attributes:
         relmse: the error.
-        deviation: its standard error over seeds; None where there was one seed.
+        deviation: its standard error; None where there was one seed.
         spp: samples a pixel that fit, by the same line.
         within: whether times were measured on both sides.
     """
@@ -121,12 +146,12 @@ def at_time(points: Sequence[Point], seconds: float) -> Estimate:
     if len(points) < 2:
         raise ValueError(f"a line takes two points, got {len(points)}")
     line = sorted(points, key=lambda point: point.seconds)
-    if any(point.relmse <= 0.0 for point in line):
-        raise ValueError(
-            "an error is not positive once the reference's variance is subtracted: more reference pictures"
-        )
     after = min(max(bisect.bisect_left([point.seconds for point in line], seconds), 1), len(line) - 1)
     low, high = line[after - 1], line[after]
+    if low.relmse <= 0.0 or high.relmse <= 0.0:
+        raise ValueError(
+            "no error is left once the reference's variance is subtracted: it takes more reference pictures"
+        )
     weight = math.log(seconds / low.seconds) / math.log(high.seconds / low.seconds)
     relmse = math.exp((1.0 - weight) * math.log(low.relmse) + weight * math.log(high.relmse))
     deviation = None

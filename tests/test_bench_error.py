@@ -59,8 +59,10 @@ def test_beyond_the_points_the_line_goes_on_and_says_so() -> None:
 def test_errors_without_logarithm_are_refused() -> None:
     with pytest.raises(ValueError, match="two points"):
         at_time([power_law(1.0)], 1.0)
+    points = [power_law(1.0), power_law(2.0), Point(2, 4.0, -1e-6, None)]
     with pytest.raises(ValueError, match="more reference pictures"):
-        at_time([power_law(1.0), Point(2, 2.0, -1e-6, None)], 1.5)
+        at_time(points, 3.0)
+    assert at_time(points, 1.5).within, "others do not matter"
 
 
 def test_the_variance_of_the_reference_is_subtracted() -> None:
@@ -82,6 +84,32 @@ def test_the_variance_of_the_reference_is_subtracted() -> None:
         Reference.of([mean])
 
 
+def test_the_deviation_knows_of_the_reference() -> None:
+    """Over many references the error varies no more than it says, nor much less; most of it the reference makes."""
+    mean = np.full((16, 16, 3), 1.0)
+    scale = mean**2 + RELMSE_FLOOR
+    found = []
+    for seed in range(200):
+        reference = Reference.of(list(noisy(6, mean, 0.3, 3 * seed)))
+        pictures = noisy(5, mean, 0.02, 3 * seed + 1)
+        turns = [bench_error.judge(reference, scale)(picture) for picture in pictures]
+        rows = [[turn[key] for turn in turns] for key in ("relmse", "without")]
+        found.append(Point.of(4, [1.0], *rows))
+    told = float(np.mean([point.deviation or 0.0 for point in found]))
+    spread = float(np.std([point.relmse for point in found], ddof=1))
+    assert 0.9 * spread < told < 2.0 * spread
+    by_seeds = Point.of(4, [1.0], *[[0.1, 0.2], [[], []]])
+    assert by_seeds.deviation == pytest.approx(0.05)
+
+
+def test_references_without_one_picture_are_those_of_the_others() -> None:
+    pictures = list(noisy(5, np.full((3, 2, 3), 1.0), 0.3, 5))
+    for number, lacking in enumerate(Reference.of(pictures).without):
+        direct = Reference.of(pictures[:number] + pictures[number + 1 :])
+        assert np.allclose(lacking.mean, direct.mean) and np.allclose(lacking.variance, direct.variance)
+    assert Reference.of(pictures[:2]).without == ()
+
+
 def test_both_sides_are_divided_by_the_same() -> None:
     assert bench_figures.FLOOR == RELMSE_FLOOR
     a, b = (Reference(np.full((2, 2, 3), value), np.zeros((2, 2, 3))) for value in (1.0, 3.0))
@@ -96,14 +124,14 @@ def test_the_ratio_is_to_the_better_of_the_two_at_that_time() -> None:
         who: [power_law(t, 0.02, slope) for t in times]
         for who, slope in zip(bench_error.RIVALS, (-1, -1.5), strict=True)
     }
-    assert bench_error.compared("scene", points, 0.5)["better"] == bench_error.RIVALS[0]
-    late = bench_error.compared("scene", points, 16.0)
+    assert bench_error.compared(points, 0.5)["better"] == bench_error.RIVALS[0]
+    late = bench_error.compared(points, 16.0)
     assert late["better"] == MULTIJITTER and late["ratio"] == pytest.approx(0.5 * 16**0.3)
 
 
 def test_cold_turns_are_scored_but_not_timed() -> None:
     rows = [
-        {"seconds": s, "relmse": e, "spp": 8, "cold": cold}
+        {"seconds": s, "relmse": e, "spp": 8, "cold": cold, "without": []}
         for s, e, cold in ((9.0, 3.0, True), (1.0, 1.0, False), (1.2, 2.0, False))
     ]
     point = bench_error.point_of(rows)
@@ -145,7 +173,7 @@ def row(ratio: float, multijitter: float = 0.02) -> dict[str, Any]:
     points |= {
         who: [power_law(t, f) for t in times] for who, f in zip(bench_error.RIVALS, (0.04, multijitter), strict=True)
     }
-    at = {f"{budget:g}": bench_error.compared("scene", points, budget) for budget in bench_error.BUDGETS}
+    at = {f"{budget:g}": bench_error.compared(points, budget) for budget in bench_error.BUDGETS}
     return {
         "curves": {who: [vars(point) for point in line] for who, line in points.items()},
         "at": at, "apart": 1e-6, "means": [0.5, 0.5],
