@@ -245,7 +245,7 @@ def lines(name: str, row: dict[str, Any]) -> list[str]:
             cells += f"{error:11.4f}{outside}" + (f"±{1e3 * spread:7.4f}" if spread is not None else " " * 8)
         made.append(f"{name if not made else '':22s}{budget:>6s}{cells}{at['ratio']:8.3f}")
     if not all(at[who]["within"] for at in row["at"].values() for who in (OURS, *RIVALS)):
-        made.append("    *: beyond the times measured, along the same line")
+        made.append("    *: beyond the times measured, as one over the time")
     ours, theirs = row["means"]
     made.append(f"    references: {ours:.5f} and {theirs:.5f} in the mean, {1e3 * row['apart']:.4f} apart")
     return made

@@ -138,7 +138,7 @@ class Estimate:
 def at_time(points: Sequence[Point], seconds: float) -> Estimate:
     """The error at a time, on the straight line in logarithms through the two nearest points that bracket it.
 
-    Beyond the first or last point the line through the two nearest is extended.
+    Beyond the first or last point the error goes on from there as one over the time, as that of independent samples does.
 
     Raises:
         ValueError: fewer than two points, or an error that is not positive: its reference was too noisy.
@@ -146,6 +146,12 @@ def at_time(points: Sequence[Point], seconds: float) -> Estimate:
     if len(points) < 2:
         raise ValueError(f"a line takes two points, got {len(points)}")
     line = sorted(points, key=lambda point: point.seconds)
+    nearest = line[0] if seconds < line[0].seconds else line[-1]
+    within = line[0].seconds <= seconds <= line[-1].seconds
+    if not within and nearest.relmse > 0.0:
+        longer = seconds / nearest.seconds
+        deviation = None if nearest.deviation is None else nearest.deviation / longer
+        return Estimate(nearest.relmse / longer, deviation, nearest.spp * longer, within)
     after = min(max(bisect.bisect_left([point.seconds for point in line], seconds), 1), len(line) - 1)
     low, high = line[after - 1], line[after]
     if low.relmse <= 0.0 or high.relmse <= 0.0:
@@ -159,7 +165,7 @@ def at_time(points: Sequence[Point], seconds: float) -> Estimate:
         shares = ((1.0 - weight) * low.deviation / low.relmse, weight * high.deviation / high.relmse)
         deviation = relmse * math.hypot(*shares)
     spp = math.exp((1.0 - weight) * math.log(low.spp) + weight * math.log(high.spp))
-    return Estimate(relmse, deviation, spp, low.seconds <= seconds <= high.seconds)
+    return Estimate(relmse, deviation, spp, within)
 
 
 def better(errors: Mapping[str, float]) -> str:

@@ -49,11 +49,12 @@ def test_only_the_two_points_that_bracket_the_time_count() -> None:
     assert half.deviation == pytest.approx(0.5 * np.hypot(0.5 * 0.1, 0.5 * 0.4))
 
 
-def test_beyond_the_points_the_line_goes_on_and_says_so() -> None:
-    points = [power_law(seconds) for seconds in (1.0, 4.0, 15.0)]
-    for seconds in (0.5, 16.0):
+def test_beyond_the_points_the_error_goes_on_as_one_over_the_time_and_says_so() -> None:
+    points = [power_law(seconds) for seconds in (1.0, 1.001, 4.0, 15.0)]  # a line through the first two would be steep
+    for seconds, near in ((0.5, points[0]), (16.0, points[-1])):
         found = at_time(points, seconds)
-        assert found.relmse == pytest.approx(0.02 * seconds**-1.2) and not found.within
+        assert found.relmse == pytest.approx(near.relmse * near.seconds / seconds) and not found.within
+        assert found.deviation == pytest.approx(0.1 * found.relmse)
 
 
 def test_errors_without_logarithm_are_refused() -> None:
