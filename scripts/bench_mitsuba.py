@@ -1,4 +1,4 @@
-"""Throughput beside Mitsuba 3 in the same run: ``python scripts/bench_mitsuba.py [scenes] [--json FILE] [--markdown]``.
+"""Throughput or error beside Mitsuba 3: ``python scripts/bench_mitsuba.py [scenes] [--error] [--json FILE] [--markdown]``.
 
 Both render the same ten scenes, those of ``configs/scene`` under :func:`mitsuba_scene.nearest`: 256 x 256, 64 samples a pixel,
 max_depth 8, rr_depth 5, box filter. Every contender is a process of its own that has loaded and warmed up; they render in
@@ -9,6 +9,8 @@ they are apart (from five rounds on); ``compare_mitsuba.py`` looks closer.
 Light that passes an opacity or ``null`` counts as a bounce in Mitsuba only, and Mitsuba's shadow rays stop there. At equal
 max_depth it traces less in such scenes, and less light arrives: 0.3 % in ``material_row``, next to nothing in the others.
 
+``--error`` compares the error of pictures that take as long: see ``bench_error.py``.
+
 ``--busy`` compares a quiet machine with one where two other processes are busy, ``--scaling`` one thread with two (or
 ``--threads``), both on the Cornell box. Needs the extra ``bench``; the bunny and the teapot need ``$TORCHPT_ASSETS``, else
 their stand-ins are rendered.
@@ -17,47 +19,27 @@ their stand-ins are rendered.
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
-import json
 import math
-import os
-import platform
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-#: Scenes of few primitives, and of meshes or many lights.
-SIMPLE = ("cornell_box", "veach_mis", "material_row", "cornell_transmissive")
-MESHES = ("cornell_bunny", "env_teapot", "studio", "many_lights", "clutter", "shapes_and_maps")
-GROUPS = {"simple": SIMPLE, "meshes": MESHES, "all": (*SIMPLE, *MESHES)}
-SCENES = GROUPS["all"]
-DEPTH = 8
-OURS, LLVM, SCALAR = "torchpt", "llvm_ad_rgb", "scalar_rgb"
+import bench_error
+import bench_files
+from bench_figures import GROUPS, SCENES, geometric_means
+from bench_workers import DEPTH, LLVM, OURS, SCALAR, Contender, Turn, Workers, ask, replaced, started
+
 #: Processes that disturb.
 BUSY = 2
 #: Rounds from which on they tell how much means vary.
 ENOUGH = 5
-
-Turn = Callable[[], dict[str, Any]]
-
-
-@dataclass(frozen=True)
-class Contender:
-    """A renderer, and how many threads it may use; None: as many as it likes."""
-
-    engine: str
-    threads: int | None = None
-
-    def __str__(self) -> str:
-        return self.engine if self.threads is None else f"{self.engine}, {self.threads} threads"
 
 
 @dataclass
@@ -87,11 +69,11 @@ def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", help=f"of {', '.join(SCENES)}")
-    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--rounds", "--seeds", type=int, default=7, help="each with another seed")
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--spp", type=int, default=64)
     parser.add_argument("--threads", type=int, help="of every contender; by default as many as it likes")
-    parser.add_argument("--sampler", default="sobol", help="ours; Mitsuba's is independent")
+    parser.add_argument("--sampler", help="ours, by default the program's own; Mitsuba's is independent")
     parser.add_argument("--compile", default="auto", choices=("auto", "on", "off"), help="off: eager")
     parser.add_argument("--scalar", action="store_true", help=f"{SCALAR} too")
     parser.add_argument("--quick", action="store_true", help="one round of small pictures: that it works, no more")
@@ -99,13 +81,13 @@ def main() -> None:
     parser.add_argument("--scaling", action="store_true", help="one thread beside two, or --threads")
     parser.add_argument("--json", type=Path, metavar="FILE", help="where the figures go")
     parser.add_argument("--markdown", action="store_true", help="print a Markdown table as well")
-    parser.add_argument("--worker", nargs=2, metavar=("SCENE", "ENGINE"), help=argparse.SUPPRESS)
+    parser.add_argument("--error", action="store_true", help="the error of pictures that take as long")
+    bench_error.add_arguments(parser.add_argument_group("with --error"))
     arguments = parser.parse_args()
     if arguments.quick:
         arguments.rounds, arguments.size, arguments.spp = 1, 64, 4
-    if arguments.worker:
-        scene, engine = arguments.worker
-        serve(scene, engine, arguments)
+    if arguments.error:
+        bench_error.contest(arguments)
     elif arguments.busy:
         busy(arguments)
     elif arguments.scaling:
@@ -117,13 +99,13 @@ def main() -> None:
 def race(arguments: argparse.Namespace) -> None:
     """All scenes, ours beside Mitsuba's."""
     rivals = (LLVM, SCALAR) if arguments.scalar else (LLVM,)
-    contenders = [Contender(engine, arguments.threads) for engine in (OURS, *rivals)]
+    contenders = entered((OURS, *rivals), arguments)
     found: dict[str, Any] = {}
     overall: dict[str, dict[str, float]] = {}
     print(f"{'Mpaths/s':22s}{OURS:>9s}" + "".join(f"{rival:>13s}   ratio" for rival in rivals) + "    means, z")
     for scene in arguments.scenes or SCENES:
         with started(scene, contenders, arguments) as workers:
-            records = compete(workers, arguments.rounds)
+            records = compete(workers, arguments)
         ours, *others = records.values()
         found[scene] = {
             "torchpt": vars(ours) | {"rate": ours.rate},
@@ -166,15 +148,6 @@ def deviate(ours: list[list[float]], theirs: list[list[float]]) -> float | None:
     return max(found, key=abs)
 
 
-def geometric_means(figures: dict[str, float]) -> dict[str, float]:
-    """Of the groups that are complete; figures by scene."""
-    return {
-        group: math.exp(statistics.fmean(math.log(figures[name]) for name in names))
-        for group, names in GROUPS.items()
-        if set(names) <= set(figures)
-    }
-
-
 def markdown(found: dict[str, Any], rivals: tuple[str, ...]) -> str:
     """The table for the documentation, with geometric means of the groups that are complete."""
     lines = ["| scene | torchpt |" + "".join(f" `{rival}` | ratio |" for rival in rivals)]
@@ -191,16 +164,17 @@ def markdown(found: dict[str, Any], rivals: tuple[str, ...]) -> str:
 
 def busy(arguments: argparse.Namespace) -> None:
     """How much slower everyone is beside busy processes."""
-    contenders = [Contender(engine, arguments.threads) for engine in (OURS, LLVM)]
+    contenders = entered((OURS, LLVM), arguments)
     found: dict[str, Any] = {}
     for scene in arguments.scenes or ("cornell_box",):
         with started(scene, contenders, arguments) as workers:
             quiet, slowed = ({name: Record() for name in workers} for _ in range(2))
+            seeds = count(1)
             for _ in range(arguments.rounds):
                 for name, worker in workers.items():
-                    note(quiet[name], ask(worker))
+                    note(quiet[name], ask(worker, arguments.spp, next(seeds)))
                     with spinning(BUSY):
-                        note(slowed[name], ask(worker))
+                        note(slowed[name], ask(worker, arguments.spp, next(seeds)))
         found[scene] = {}
         for name, record in quiet.items():
             ratios = [b / a for a, b in zip(record.rates, slowed[name].rates, strict=True)]
@@ -213,11 +187,12 @@ def busy(arguments: argparse.Namespace) -> None:
 def scaling(arguments: argparse.Namespace) -> None:
     """One thread beside several."""
     several = arguments.threads or 2
-    contenders = [Contender(engine, threads) for engine in (OURS, LLVM) for threads in (1, several)]
+    pairs = [(engine, threads) for engine in (OURS, LLVM) for threads in (1, several)]
+    contenders = [entered((engine,), arguments, threads)[0] for engine, threads in pairs]
     found: dict[str, Any] = {}
     for scene in arguments.scenes or ("cornell_box",):
         with started(scene, contenders, arguments) as workers:
-            records = list(compete(workers, arguments.rounds).values())
+            records = list(compete(workers, arguments).values())
         found[scene] = {}
         for engine, one, more in zip((OURS, LLVM), records[::2], records[1::2], strict=True):
             gain = statistics.median(b / a for a, b in zip(one.rates, more.rates, strict=True))
@@ -231,11 +206,9 @@ def save(arguments: argparse.Namespace, facts: dict[str, Any]) -> None:
     """Write what is known so far, and how it came about."""
     if arguments.json is None:
         return
-    versions = {name: importlib.metadata.version(name) for name in ("torch", "mitsuba")}
-    machine = {"cores": os.cpu_count(), "architecture": platform.machine(), **versions}
     names = ("rounds", "size", "spp", "threads", "sampler", "compile")
     settings = {name: getattr(arguments, name) for name in names} | {"max_depth": DEPTH, "rr_depth": 5}
-    arguments.json.write_text(json.dumps({"settings": settings, "machine": machine, **facts}, indent=1) + "\n")
+    bench_files.write(arguments.json, {"settings": settings, "machine": bench_files.machine(), **facts})
 
 
 @contextmanager
@@ -251,137 +224,25 @@ def spinning(number: int) -> Iterator[None]:
             other.wait()
 
 
-@contextmanager
-def started(
-    scene: str, contenders: list[Contender], arguments: argparse.Namespace
-) -> Iterator[dict[str, subprocess.Popen[str]]]:
-    """Processes by name that have loaded and warmed up, and render once for every line they read."""
-    workers: dict[str, subprocess.Popen[str]] = {}
-    try:
-        for contender in contenders:
-            wishes = {"size": arguments.size, "spp": arguments.spp, "sampler": arguments.sampler}
-            wishes |= {"compile": arguments.compile, "threads": contender.threads}
-            given = [f"--{key}={value}" for key, value in wishes.items() if value is not None]
-            command = [sys.executable, __file__, *given, "--worker", scene, contender.engine]
-            worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-            workers[str(contender)] = worker
-            if answer(worker) is None:
-                raise SystemExit(f"{contender} on {scene} did not start")
-        yield workers
-    finally:
-        for worker in workers.values():
-            assert worker.stdin is not None
-            worker.stdin.close()
-            worker.wait()
+def entered(engines: tuple[str, ...], arguments: argparse.Namespace, threads: int | None = None) -> list[Contender]:
+    """Contenders with the threads and the sampler that are asked for."""
+    samplers = {OURS: arguments.sampler}
+    return [Contender(engine, threads or arguments.threads, samplers.get(engine)) for engine in engines]
 
 
-def compete(workers: dict[str, subprocess.Popen[str]], rounds: int) -> dict[str, Record]:
+def compete(workers: Workers, arguments: argparse.Namespace) -> dict[str, Record]:
     """Rounds in which all take their turn."""
     records = {name: Record() for name in workers}
-    for _ in range(rounds):
+    for seed in range(1, 1 + arguments.rounds):
         for name, worker in workers.items():
-            note(records[name], ask(worker))
+            note(records[name], ask(worker, arguments.spp, seed))
     return records
 
 
-def note(record: Record, turn: dict[str, Any]) -> None:
+def note(record: Record, turn: Turn) -> None:
     """Add a turn to a record."""
-    record.rates.append(turn["rate"])
-    record.means.append(turn["mean"])
-
-
-def answer(worker: subprocess.Popen[str]) -> dict[str, Any] | None:
-    """The next JSON of a worker; libraries may write lines of their own in between."""
-    assert worker.stdout is not None
-    return next((json.loads(line) for line in worker.stdout if line.startswith("{")), None)
-
-
-def ask(worker: subprocess.Popen[str]) -> dict[str, Any]:
-    """One turn of a worker."""
-    assert worker.stdin is not None
-    worker.stdin.write("go\n")
-    worker.stdin.flush()
-    turn = answer(worker)
-    if turn is None:
-        raise SystemExit("a contender ended before its turn")
-    return turn
-
-
-def serve(scene: str, engine: str, arguments: argparse.Namespace) -> None:
-    """The worker: warm up, then answer each line on stdin with the JSON of a turn."""
-    turn = torchpt(scene, arguments) if engine == OURS else mitsuba(scene, engine, arguments)
-    turn()
-    print("\n" + json.dumps({"ready": 1}), flush=True)
-    for _ in sys.stdin:
-        print("\n" + json.dumps(turn()), flush=True)
-
-
-def timed(shoot: Callable[[int], Any], arguments: argparse.Namespace) -> Turn:
-    """Turns of a renderer of pictures ``(H, W, 3)`` by seed."""
-    import numpy as np
-
-    seeds, paths = count(1), arguments.size**2 * arguments.spp
-
-    def turn() -> dict[str, Any]:
-        seed = next(seeds)
-        begin = time.perf_counter()
-        picture = shoot(seed)
-        seconds = time.perf_counter() - begin
-        return {"rate": paths / seconds / 1e6, "mean": np.asarray(picture, np.float64).mean((0, 1)).tolist()}
-
-    return turn
-
-
-def wishes(scene: Any, arguments: argparse.Namespace) -> Any:
-    """Complete settings of a render."""
-    from torchpt.format.description import settings
-
-    blocks = {
-        "film": {"width": arguments.size, "height": arguments.size, "filter": "box"},
-        "integrator": {"type": "path", "max_depth": DEPTH, "rr_depth": 5},
-        "sampler": arguments.sampler,
-        "render": {"spp": arguments.spp, "compile": arguments.compile, "threads": arguments.threads or "auto"},
-    }
-    return settings(scene.description, blocks)
-
-
-def replaced(name: str) -> dict[str, str]:
-    """What stands in place of something that Mitsuba lacks."""
-    from mitsuba_scene import replacements
-
-    return replacements(name)
-
-
-def mitsuba(name: str, variant: str, arguments: argparse.Namespace) -> Turn:
-    """Turns of Mitsuba's."""
-    drjit: Any = importlib.import_module("drjit")
-    import numpy as np
-    from mitsuba_scene import convert, load_mitsuba, nearest
-
-    module = load_mitsuba(variant)
-    if arguments.threads is not None:
-        drjit.set_thread_count(arguments.threads)
-    scene = nearest(name)
-    given = wishes(scene, arguments)
-    with tempfile.TemporaryDirectory() as folder:
-        theirs = module.load_dict(convert(module, scene, given, Path(folder)))
-    return timed(lambda seed: np.asarray(module.render(theirs, spp=arguments.spp, seed=seed)), arguments)
-
-
-def torchpt(name: str, arguments: argparse.Namespace) -> Turn:
-    """Turns of torchpt's."""
-    from mitsuba_scene import nearest
-
-    from torchpt.rendering import render_scene
-
-    scene = nearest(name)
-    given = wishes(scene, arguments)
-
-    def shoot(seed: int) -> Any:
-        drawn = given.render.model_copy(update={"seed": seed})
-        return render_scene(scene, given.model_copy(update={"render": drawn})).image.numpy()
-
-    return timed(shoot, arguments)
+    record.rates.append(turn.rate)
+    record.means.append(turn.mean)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from bench_mitsuba import DEPTH, SCENES
+from bench_figures import SCENES
+from bench_workers import DEPTH
 from mitsuba_scene import convert, find_llvm, lets_pass, load_mitsuba, nearest
 from torch import Tensor
 

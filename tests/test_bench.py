@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import bench_figures
+import bench_workers
 import numpy as np
 import pytest
 import torch
@@ -119,12 +121,11 @@ def test_deviates_of_equal_and_of_unequal_pictures(scripts):
     assert bench_mitsuba.deviate(*means) == pytest.approx(compare_mitsuba.worst(same.whole), rel=1e-6)
 
 
-def test_means_are_of_complete_groups(scripts):
-    _, _, bench_mitsuba = scripts
-    assert set(bench_mitsuba.SCENES) == {name for group in bench_mitsuba.GROUPS.values() for name in group}
-    assert len(bench_mitsuba.SCENES) == 10
-    ratios = dict.fromkeys(bench_mitsuba.SIMPLE, 2.0) | {"cornell_box": 0.5, "clutter": 9.0}
-    assert bench_mitsuba.geometric_means(ratios) == {"simple": pytest.approx(2**0.5)}
+def test_means_are_of_complete_groups():
+    assert set(bench_figures.SCENES) == {name for group in bench_figures.GROUPS.values() for name in group}
+    assert len(bench_figures.SCENES) == 10
+    ratios = dict.fromkeys(bench_figures.SIMPLE, 2.0) | {"cornell_box": 0.5, "clutter": 9.0}
+    assert bench_figures.geometric_means(ratios) == {"simple": pytest.approx(2**0.5)}
 
 
 @pytest.mark.mitsuba
@@ -142,13 +143,18 @@ def test_both_render_the_same(scripts, name):
 
 
 @pytest.mark.mitsuba
-def test_a_turn_of_the_benchmark(scripts):
-    _, _, bench_mitsuba = scripts
-    given = argparse.Namespace(size=16, spp=2, sampler="sobol", compile="off", threads=1)
-    ours, theirs = (
-        bench_mitsuba.torchpt("cornell_box", given),
-        bench_mitsuba.mitsuba("cornell_box", "scalar_rgb", given),
+@pytest.mark.parametrize(("engine", "sampler", "taken"), [
+    ("torchpt", None, 7), ("scalar_rgb", None, 7), ("scalar_rgb", "multijitter", 8),
+])  # fmt: skip
+def test_a_turn_of_the_benchmark(engine, sampler, taken, tmp_path):
+    given = argparse.Namespace(
+        scene="cornell_box", engine=engine, sampler=sampler, size=16, spp=2, compile="off", threads=1
     )
-    for turn in (ours(), theirs()):
-        assert turn["rate"] > 0
-        assert np.shape(turn["mean"]) == (3,)
+    shoot = (bench_workers.torchpt if engine == "torchpt" else bench_workers.mitsuba)(given)
+    turn = bench_workers.timed(shoot, 16, 7, 1, str(tmp_path / "picture.npy"))
+    assert turn["spp"] == taken and turn["seconds"] > 0
+    assert turn["rate"] == pytest.approx(16 * 16 * taken / turn["seconds"] / 1e6)
+    picture = np.load(tmp_path / "picture.npy", allow_pickle=False)
+    assert picture.shape == (16, 16, 3)
+    assert turn["mean"] == pytest.approx(picture.mean((0, 1)), rel=1e-5)
+    assert not np.array_equal(picture, shoot(7, 2)[0])

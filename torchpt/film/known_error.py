@@ -4,8 +4,8 @@ A pilot's first value A is sampled as every pixel is, its second value B by othe
 mean of A's variance, whatever sampler made them. relMSE divides it by ``r² + 0.01`` with the true radiance r; the median of A,
 B and the mean of the eight pixels around stands for it.
 
-Where few pixels carry the error (caustics, edges of bright lights) pilots say little: they meet few such pixels or none, and two
-values do not tell r. So some pixels are looked at again, by several more streams that are no part of the picture:
+Where few pixels carry the error (caustics, edges of bright lights) pilots say little: they meet few such pixels or none, and
+two values do not tell r. So some pixels are looked at again, by several more streams that are no part of the picture:
 
 - *suspects*: the pixels that stand out most from their second brightest neighbour, wherever they are. Of each the error that
   the picture really has is then known, so what sparkles in the picture is counted and not guessed.
