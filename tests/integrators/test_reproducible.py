@@ -156,7 +156,7 @@ class _Recorder(TorchDispatchMode):
 def test_the_audit_covers_what_waves_use(monkeypatch):
     recorder, radiance = _Recorder(), Wave.radiance
 
-    def recorded(self: Wave, *span: int) -> Any:
+    def recorded(self: Wave, *span: Any) -> Any:
         with recorder:
             return radiance(self, *span)
 

@@ -8,7 +8,7 @@ render hold to them, the compiled loop and tensor operations; how near the two a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ import torchpt
 from torchpt.film import FILTERS
 from torchpt.format.description import settings
 from torchpt.forward import BYTES_PER_LANE
+from torchpt.forward.stopping import Stop
 from torchpt.integrators.loop import schedule
 from torchpt.rendering import Rendering, render_scene
 from torchpt.samplers import KINDS as SAMPLERS
@@ -177,9 +178,9 @@ def same(a: Rendering, b: Rendering) -> bool:
     )
 
 
-def sample_by_sample(spp: int, randomizations: int) -> Iterator[tuple[int, int]]:
+def one_by_one(self: Stop, taken: int) -> int:
     """Passes of one sample each."""
-    yield from ((sample, 1) for sample in range(spp))
+    return int(taken < self.render.spp)
 
 
 @pytest.fixture
@@ -196,8 +197,7 @@ def test_the_same_bits(scene_of, monkeypatch, name, mode):
     for column, changed in COLUMNS[mode].items():
         assert same(shot(scene, wish, mode, **changed), whole), column
     with monkeypatch.context() as patched:
-        for where in ("schedule", "run"):
-            patched.setattr(f"torchpt.forward.{where}.passes", sample_by_sample)
+        patched.setattr(Stop, "step", one_by_one)
         assert same(shot(scene, wish, mode), whole), "passes"
     part = shot(scene, wish, mode, {"crop": [4, 2, 11, 9]})
     assert torch.equal(part.image, whole.image[2:11, 4:15]), "crop"

@@ -12,7 +12,8 @@ two values do not tell r. So some pixels are looked at again, by several more st
 - *doubtful pilots*: those whose two values differ most, for the r that theirs is divided by.
 
 The interval is that of the mean over pilots, symmetric in its logarithm, as errors are squares and lean to the right. It is
-called heavy-tailed where one pilot has a large part of the variance: then it is not to be trusted.
+called heavy-tailed where one pilot has a large part of the variance, or suspects most of the error: then the interval is not to
+be trusted.
 """
 
 from __future__ import annotations
@@ -41,13 +42,15 @@ __all__ = [
 FEWEST = 8
 #: Share of the variance that one pilot may have before the interval is called heavy-tailed.
 HEAVY = 0.2
+#: Part of the error that suspects may have before it is called so too.
+FEW = 0.5
 #: One of so many pixels is a suspect, one of so many pilots doubtful.
 SUSPECTS, DOUBTFUL = 512, 32
 #: Streams that they are looked at again by.
 STREAMS = 8
 #: Further values may all miss a light that few samples meet: r is taken for no less than this part of a pilot's mean, or of a
 #: suspect's value.
-BRIGHTER, BRIGHTEST = 4.0, 16.0
+BRIGHTER, BRIGHTEST = 4.0, 64.0
 
 
 @dataclass(frozen=True)
@@ -126,19 +129,19 @@ class Again:
     spare: Tensor
 
 
-def to_look_at(picture: Tensor, pilots: Pilots, b: Tensor) -> tuple[Tensor, Tensor]:
+def to_look_at(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Which pixels are to be looked at again: suspects, and doubtful pilots; places ``(m,)`` on the picture.
 
     Args:
-        picture: first values ``(H, W, C)`` float64.
+        picture: ``(H, W, C)`` float64.
         pilots: n of them.
-        b: their second values ``(n, C)``.
+        a: their first values ``(n, C)``.
+        b: their second values.
     """
-    standing, flat = _standing_out(picture, picture).reshape(-1), picture.reshape(-1, picture.shape[2])
-    count = max(len(flat) // SUSPECTS, 1)
-    suspects = standing.topk(min(count, len(flat))).indices.sort().values
+    standing = _standing_out(picture, picture).reshape(-1)
+    count = max(len(standing) // SUSPECTS, 1)
+    suspects = standing.topk(min(count, len(standing))).indices.sort().values
     rest = ~torch.isin(pilots.places, suspects)
-    a = flat[pilots.places]
     low = torch.minimum(a, b).clamp_min(0.0)
     doubt = ((a - b).square() / (low.square() + RELMSE_FLOOR)).mean(1) * rest
     count = min(max(len(pilots) // DOUBTFUL, 4), int(rest.sum()))
@@ -146,16 +149,17 @@ def to_look_at(picture: Tensor, pilots: Pilots, b: Tensor) -> tuple[Tensor, Tens
 
 
 def known_error(
-    picture: Tensor, pilots: Pilots, b: Tensor, spare: Tensor | None, counted: bool, again: Again | None
+    picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool, again: Again | None
 ) -> KnownError | None:
     """The error that a picture knows.
 
     Args:
-        picture: first values of all pixels ``(H, W, C)`` float64, on the CPU.
+        picture: ``(H, W, C)`` float64, on the CPU.
         pilots: n of them.
-        b: their second values ``(n, C)``.
+        a: their first values ``(n, C)``.
+        b: their second values.
         spare: an estimate of the variance of ``b`` where it is not that of first values.
-        counted: whether second values are part of the picture that the error is of, as half of each pilot.
+        counted: whether second values are part of the picture, as half of each pilot.
         again: what was looked at again; None: nothing yet.
 
     Returns:
@@ -165,20 +169,18 @@ def known_error(
         return None
     flat, near = picture.reshape(-1, picture.shape[2]), around(picture).reshape(-1, picture.shape[2])
     places = pilots.places
-    first = _first_part(flat[places], b, spare)
-    sure, rest = 0.0, torch.ones(len(pilots), dtype=torch.bool)
+    first = _first_part(a, b, spare)
+    sure, unsure, rest = 0.0, 0.0, torch.ones(len(pilots), dtype=torch.bool)
     suspects = places[:0]
     if again is not None:
         suspects = again.places[: again.suspects]
-        seen = _really(flat[suspects], again.mean[: again.suspects], again.spare[: again.suspects])
-        half = torch.where(torch.isin(suspects, places), 0.5, 1.0) if counted else torch.ones(len(suspects))
-        sure, rest = float((seen * half).sum()), ~torch.isin(places, suspects)
+        sure, unsure = _really(flat[suspects], again.mean[: again.suspects], again.spare[: again.suspects])
+        rest = ~torch.isin(places, suspects)
         # A second value that would be a suspect itself tells of others like it, which are counted already.
         least = float(_standing_out(picture, picture).reshape(-1)[suspects].min()) if len(suspects) else math.inf
         bright = _standing_out(picture, _with(picture, places, b)).reshape(-1)[places] > least
         b = torch.where(bright[:, None], near[places], b)
-    a, beside = flat[places], near[places]
-    share = error_at(a, b, beside)
+    share = error_at(a, b, near[places])
     if again is not None:
         doubtful = {int(place): k for k, place in enumerate(again.places[again.suspects :], again.suspects)}
         at = [k for k, place in enumerate(places.tolist()) if place in doubtful]
@@ -193,7 +195,8 @@ def known_error(
     weight = pilots.weight[rest] / pilots.weight[rest].sum()
     mean = float((weight * share).sum())
     parts = weight * (share - mean) * part
-    return _with_interval(sure / pixels + mean * part, parts)
+    total = sure / pixels + mean * part
+    return _with_interval(total, parts, unsure / pixels**2, sure / pixels > FEW * total)
 
 
 def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
@@ -227,21 +230,38 @@ def _with(picture: Tensor, places: Tensor, values: Tensor) -> Tensor:
     return changed.view(picture.shape)
 
 
-def _really(values: Tensor, mean: Tensor, spare: Tensor) -> Tensor:
-    """The squared error that pixels have, over ``r² + 0.01``, from the mean of further values and its variance."""
-    radiance = torch.maximum(mean.abs(), values.abs() / BRIGHTEST)
-    return (((values - mean).square() - spare) / (radiance.square() + RELMSE_FLOOR)).mean(1)
+def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
+    """The squared error that pixels have, over ``r² + 0.01``, in all, and the variance of that.
+
+    Args:
+        values: of the picture ``(m, C)``.
+        mean: of further values.
+        spare: its variance.
+    """
+    radiance, apart = torch.maximum(mean.abs(), values.abs() / BRIGHTEST), values - mean
+    below = radiance.square() + RELMSE_FLOOR
+    share = (apart.square() - spare) / below
+    # To the first order in the mean: channels move together, so their deviations add up.
+    slope = (2 * apart.abs() + 2 * radiance * share.abs()) / below
+    return float(share.mean(1).sum()), float((slope * spare.sqrt()).mean(1).square().sum())
 
 
-def _with_interval(mean: float, parts: Tensor) -> KnownError:
-    """The estimate with its interval; ``parts`` are the pilots' deviations, whose sum of squares is its variance."""
+def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool) -> KnownError:
+    """The estimate with its interval.
+
+    Args:
+        mean: the estimate.
+        parts: the pilots' deviations, whose sum of squares is their variance.
+        unsure: variance from suspects.
+        few: whether suspects carry most of the error.
+    """
     count = len(parts)
     if not mean > 0.0 or not math.isfinite(mean):
         return KnownError(mean, (0.0, 0.0) if mean == 0.0 and count >= FEWEST else None, not math.isfinite(mean))
     if count < FEWEST:
         return KnownError(mean, None, True)
-    total = float(parts.square().sum())
-    heavy = total > 0.0 and float(parts.square().max()) > HEAVY * total
+    total = float(parts.square().sum()) + unsure
+    heavy = few or (total > 0.0 and float(parts.square().max()) > HEAVY * total)
     factor = math.exp(min(_quantile(count - 1) * math.sqrt(total) / mean, 300.0))
     return KnownError(mean, (mean / factor, mean * factor), heavy)
 

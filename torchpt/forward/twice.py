@@ -57,16 +57,18 @@ class Twice:
             values = torch.stack(plate.film.streams()).cpu()
             assert plate.places is not None
             again = Again(plate.places, suspects, values.mean(0), values.var(0) / len(values))
-        return known_error(film.mean().cpu(), self.pilots, self._second(), self._spare(), self.counted, again)
+        picture, first = self.picture(film).cpu(), self._first(film)
+        return known_error(picture, self.pilots, first, self._second(), self._spare(), self.counted, again)
 
     def look_again(self, film: Film) -> list[tuple[Plate, int, int]]:
         """What is to be sampled for the picture to know its error better, once it is finished."""
         if not len(self.pilots):
             return []
-        suspects, doubtful = to_look_at(film.mean().cpu(), self.pilots, self._second())
+        picture, first = self.picture(film).cpu(), self._first(film)
+        suspects, doubtful = to_look_at(picture, self.pilots, first, self._second())
         places = torch.cat((suspects, doubtful))
-        first = self.plate.streams.first + self.plate.streams.count
-        plate = Plate(Film(len(places), 1, STREAMS, film.counts.device), {}, Streams(first, STREAMS), places)
+        streams = Streams(self.plate.streams.first + self.plate.streams.count, STREAMS)
+        plate = Plate(Film(len(places), 1, STREAMS, film.counts.device), {}, streams, places)
         self.third = plate, len(suspects)
         samples = round(float(film.counts.double().mean()))
         return [(plate, 0, STREAMS * samples)]
@@ -75,8 +77,10 @@ class Twice:
         """RelMSE as the pilots alone tell it."""
         if not len(self.pilots):
             return None
-        first = film.values()[self.pilots.places.to(film.counts.device)].cpu()
-        return pilots_alone(self.pilots, first, self._second(), self._spare(), self.counted)
+        return pilots_alone(self.pilots, self._first(film), self._second(), self._spare(), self.counted)
+
+    def _first(self, film: Film) -> Tensor:
+        return film.values()[self.pilots.places.to(film.counts.device)].cpu()
 
     def _second(self) -> Tensor:
         return self.plate.film.values().cpu()

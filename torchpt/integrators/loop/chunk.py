@@ -45,13 +45,13 @@ LANES = CAPACITY - WIDTH
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive pixels of a plate, and consecutive samples of each."""
+    """Consecutive pixels of a plate (None: of the picture), and consecutive samples of each."""
 
-    plate: Plate
     first_pixel: int
     pixels: int
     first_sample: int
     samples: int
+    plate: Plate | None = None
 
 
 class Worker:
@@ -114,7 +114,8 @@ class Worker:
 
     def start(self, chunk: Chunk) -> None:
         """Say which samples are next."""
-        wave, streams = self.wave, chunk.plate.streams
+        wave, plate = self.wave, chunk.plate
+        streams = wave.sampler.streams if plate is None else plate.streams
         x, y, width, _ = wave.crop
         point, turn = divmod(chunk.first_sample, streams.count)
         self.calls.place[:] = np.array(
@@ -127,7 +128,7 @@ class Worker:
 
     def _generate(self, chunk: Chunk, arena: Memory, other: Memory, lists: list[Memory] | None = None) -> None:
         """Camera rays of a chunk in ``arena``; ``other`` holds the numbers of chosen pixels until then."""
-        count, places = chunk.pixels * chunk.samples, chunk.plate.places
+        count, places = chunk.pixels * chunk.samples, None if chunk.plate is None else chunk.plate.places
         source = arena
         if places is not None:
             chosen = places[chunk.first_pixel : chunk.first_pixel + chunk.pixels].numpy().astype(np.int32)

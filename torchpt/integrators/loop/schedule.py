@@ -124,11 +124,11 @@ class Loop:
         try:
             step = max(self.lanes // size, 1)
             for sample in range(first, first + count, step):
-                chunk = Chunk(plate, start, size, sample, min(step, first + count - sample))
+                chunk = Chunk(start, size, sample, min(step, first + count - sample), plate)
                 if self.kernels.wave.limits is not None:
-                    self._radiance(worker, chunk, share)
+                    self._radiance(worker, chunk, plate, share)
                 if plate.layers:
-                    self._layers(worker, chunk, share)
+                    self._layers(worker, chunk, plate, share)
                 share.samples += size * chunk.samples
         except Halted:
             pass  # what was added so far counts
@@ -137,30 +137,29 @@ class Loop:
                 self._workers.append(worker)
         return share
 
-    def _radiance(self, worker: Worker, chunk: Chunk, share: Share) -> None:
+    def _radiance(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
         tally = worker.trace(chunk)
         share.tally.rays += tally.rays
         share.tally.truncated += tally.truncated
         values = worker.slots.floats
         used = values[:, : chunk.pixels * chunk.samples]
         before = _total(used) if self.clamp is not None else 0.0
-        bad = self._deposit(worker, values, chunk, chunk.plate.film, 3, self.clamp)
+        bad = self._deposit(worker, values, chunk, plate.film, 3, self.clamp)
         share.bad += bad
         if self.clamp is not None:
             share.light = share.light[0] + before, share.light[1] + _total(used)
         if bad and self.strict:
-            raise self._not_finite(used, chunk)
+            raise self._not_finite(used, chunk, plate)
 
-    def _layers(self, worker: Worker, chunk: Chunk, share: Share) -> None:
-        layers = chunk.plate.layers
-        names = tuple(layers)
+    def _layers(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
+        names = tuple(plate.layers)
         share.tally.rays += worker.layers(chunk, names)
         assert worker.shown is not None
         first = 0
         for name in names:
             channels = len(LAYERS[name].channels)
             values = worker.shown.floats[first : first + channels]
-            self._deposit(worker, values, chunk, layers[name], channels, None)
+            self._deposit(worker, values, chunk, plate.layers[name], channels, None)
             first += channels
 
     def _deposit(
@@ -192,13 +191,13 @@ class Loop:
             film.keep_first(values[:, :n], chunk.first_pixel)
         return int(counters[0])
 
-    def _not_finite(self, used: np.ndarray, chunk: Chunk) -> RenderError:
+    def _not_finite(self, used: np.ndarray, chunk: Chunk, plate: Plate) -> RenderError:
         place = int(np.flatnonzero(~np.isfinite(used).all(0))[0])
         sample, pixel = divmod(place, chunk.pixels)
         x0, y0, width, _ = self.kernels.wave.crop
         pixel += chunk.first_pixel
-        if chunk.plate.places is not None:
-            pixel = int(chunk.plate.places[pixel])
+        if plate.places is not None:
+            pixel = int(plate.places[pixel])
         x, y = pixel % width + x0, pixel // width + y0
         return RenderError(f"integrator.strict: sample {chunk.first_sample + sample} of pixel ({x}, {y}) is not finite")
 

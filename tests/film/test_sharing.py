@@ -1,0 +1,51 @@
+"""How adaptive sampling shares samples out."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchpt.film.sharing import shared_out, smoothed
+
+PIXELS = torch.full((100,), 16)
+
+
+def counts(n: int) -> torch.Tensor:
+    return torch.full((100,), n)
+
+
+def test_even_errors_share_evenly():
+    assert (shared_out(torch.ones(100).double(), counts(16), PIXELS, 64.0) == 64).all()
+    assert (shared_out(torch.zeros(100).double(), counts(16), PIXELS, 64.0) == 64).all()
+
+
+def test_samples_go_with_the_root_of_the_variance():
+    error = torch.ones(100).double()
+    error[:50] = 4.0
+    aims = shared_out(error, counts(64), PIXELS, 192.0)
+    assert (aims[:50] == 256).all() and (aims[50:] == 128).all()
+
+
+def test_none_loses_samples_and_none_leaps():
+    g = torch.Generator().manual_seed(1)
+    error, have = (
+        (10 * torch.randn(100, generator=g, dtype=torch.float64)).exp(),
+        16 * torch.randint(1, 9, (100,), generator=g),
+    )
+    aims = shared_out(error, have, PIXELS, 150.0)
+    assert (aims >= have).all() and (aims <= 4 * have + 16).all() and (aims % 16 == 0).all()
+    assert float(aims.double().mean()) == pytest.approx(150.0, rel=0.05)
+
+
+def test_bad_estimates_do_no_harm():
+    error = torch.full((100,), -1.0).double()
+    assert (shared_out(error, counts(32), PIXELS, 64.0) == 64).all()
+
+
+def test_smoothing_keeps_a_constant_and_asks_the_known_alone():
+    values, known = torch.full((9, 7, 1), 3.0).double(), torch.ones(9, 7, 1, dtype=torch.bool)
+    values[4, 4], known[4, 4] = 1e9, False
+    torch.testing.assert_close(smoothed(values, known), torch.full((9, 7, 1), 3.0).double())
+    lonely = torch.zeros(9, 7, 1, dtype=torch.bool)
+    lonely[0, 0] = True
+    assert (smoothed(values, lonely) == 3.0).all()  # the mean where nothing near is known

@@ -1,0 +1,161 @@
+"""When renders end: by samples, by seconds, by error; and what that does to the picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from trials import film_of
+
+import torchpt
+from torchpt.errors import SceneError
+from torchpt.format.description import settings
+from torchpt.forward.stopping import Stop
+from torchpt.rendering import Rendering, render_scene
+from torchpt.settings import Render
+from torchpt.spec.declared import values_of
+
+
+@pytest.fixture(scope="module")
+def box() -> torchpt.Scene:
+    return torchpt.load("cornell_box", device="cpu")
+
+
+def shot(scene: torchpt.Scene, film: Any = None, sampler: Any = "sobol", **render: Any) -> Rendering:
+    wishes = {"film": {"filter": "box", **(film or film_of(32))}, "sampler": sampler, "render": render}
+    return render_scene(scene, settings(scene.description, wishes))
+
+
+def rule(**wishes: Any) -> Stop:
+    return Stop(Render(**values_of(Render, wishes, "render", None).values))
+
+
+# -- the rules
+
+
+def steps(stop: Stop, pace: float, error: Any = None) -> list[int]:
+    """Passes until the end, with every sample of the picture taking ``pace`` seconds."""
+    taken, out = 0, []
+    while size := stop.step(taken):
+        out.append(size)
+        taken += size
+        stop.told(taken, pace * taken, None if error is None else error(taken))
+    return out
+
+
+def test_passes_double_where_only_samples_end_a_render():
+    assert steps(rule(spp=300), 1.0) == [1, 1, 2, 4, 8, 16, 32, 64, 64, 64, 44]
+
+
+def test_blocks_of_sixteen_under_a_time_limit():
+    found = steps(rule(spp=10_000, time_limit=10.0), 0.05)
+    assert found[:6] == [1, 1, 2, 4, 8, 16] and set(found[5:-4]) == {16}
+    assert 0.97 * 10.0 <= sum(found) * 0.05 <= 1.03 * 10.0
+    starts = [sum(found[:k]) for k in range(len(found))]
+    assert all(start % size == 0 for start, size in zip(starts[1:], found[1:], strict=True))
+
+
+@pytest.mark.parametrize(("pace", "samples"), [(0.4, 25), (3.0, 3), (60.0, 1)])
+def test_slow_scenes_end_by_whole_samples(pace, samples):
+    stop = rule(spp=1000, time_limit=10.0)
+    assert sum(steps(stop, pace)) == samples and stop.reason == "time_limit"
+
+
+def test_an_error_ends_it_soon_after_it_is_reached():
+    for target in (0.03, 0.004, 0.0007):
+        stop = rule(spp=100_000, target_error=target)
+        taken = sum(steps(stop, 0.01, lambda n: 1.0 / n))
+        assert stop.reason == "target_error" and 1.0 / target <= taken <= 1.25 / target + 1
+
+
+def test_the_first_rule_ends_it():
+    stop = rule(spp=20, time_limit=10.0, target_error=1e-9)
+    assert sum(steps(stop, 0.01, lambda n: 1.0 / n)) == 20 and stop.reason == "spp"
+
+
+# -- pictures
+
+
+@pytest.mark.parametrize("compile", ["on", "off"])
+def test_a_stopped_picture_is_that_of_its_samples(box, compile):
+    film = film_of(16) if compile == "off" else None
+    stopped = shot(box, film, spp=4096, target_error=0.02, compile=compile)
+    assert stopped.stopped_by == "target_error" and stopped.complete and 2 <= stopped.spp < 200
+    again = shot(box, film, spp=stopped.spp, pilots=True, compile=compile)
+    assert torch.equal(again.image, stopped.image) and again.relmse == stopped.relmse
+
+
+def test_a_time_limit(box):
+    shot(box, spp=16)  # what is compiled is there
+    stopped = shot(box, spp=1_000_000, time_limit=0.5)
+    assert stopped.stopped_by == "time_limit" and stopped.complete
+    assert 0.3 < stopped.render_seconds < 2.0  # longer on a busy machine: the long form is stricter
+    assert torch.equal(shot(box, spp=stopped.spp).image, stopped.image)
+
+
+def test_no_time_at_all_still_gives_a_picture(box):
+    stopped = shot(box, spp=1000, time_limit=1e-9)
+    assert stopped.spp == 1 and torch.equal(stopped.image, shot(box, spp=1).image)
+
+
+def test_pilots_are_the_mean_of_two_values(box):
+    with_pilots, without = shot(box, spp=8, pilots=True), shot(box, spp=8)
+    other = (with_pilots.image != without.image).any(2)
+    assert 0 < int(other.sum()) <= 64 and without.relmse is None and with_pilots.relmse is not None
+    assert with_pilots.paths > without.paths * 17 / 16 - 1
+
+
+def test_what_cannot_be_is_refused(box):
+    for key, wishes in {
+        "render.pilots": {"render": {"pilots": False, "target_error": 0.1}},
+        "film.aovs": {"film": {"aovs": ["variance"]}, "render": {"target_error": 0.1}},
+        "sampler.adaptive": {"sampler": {"type": "stratified", "adaptive": True}},
+        "render.target_error": {"integrator": "aov", "render": {"target_error": 0.1}},
+        "render.time_limit": {"render": {"time_limit": 0}},
+    }.items():
+        with pytest.raises(SceneError) as error:
+            settings(box.description, wishes)
+        assert error.value.key == key
+
+
+# -- adaptive
+
+
+def test_adaptive_is_the_same_on_any_number_of_threads(box):
+    wish = {"type": "sobol", "adaptive": True}
+    one, two = (shot(box, sampler=wish, spp=64, threads=n) for n in (1, 2))
+    assert torch.equal(one.image, two.image) and one.relmse == two.relmse
+    assert one.spp == pytest.approx(64, abs=8) and one.complete
+    few = shot(box, sampler=wish, spp=64, max_memory=200_000)
+    assert torch.equal(few.image, one.image)
+
+
+def test_adaptive_with_layers_and_a_crop(box):
+    wish = {"type": "independent", "adaptive": True}
+    found = shot(box, {**film_of(40, 24), "crop": [3, 2, 21, 17], "aovs": ["depth", "albedo"]}, wish, spp=48)
+    assert found.image.shape == (17, 21, 3) and torch.isfinite(found.image).all()
+    plain = shot(box, {**film_of(40, 24), "crop": [3, 2, 21, 17], "aovs": ["depth", "albedo"]}, "independent", spp=48)
+    assert torch.allclose(found.layers["depth"], plain.layers["depth"], rtol=0.2)
+
+
+@pytest.mark.parametrize("wish", [{"target_error": 0.05}, {"sampler": {"type": "sobol", "adaptive": True}}])
+@pytest.mark.parametrize("seeds", [200, pytest.param(2000, marks=pytest.mark.slow)])
+def test_no_bias(box, wish, seeds):
+    """The mean over seeds of renders that end by their error, or share samples by it, is that of plain ones."""
+    film, sampler = film_of(8), wish.get("sampler", "sobol")
+    rest = {key: value for key, value in wish.items() if key != "sampler"}
+    spp = 64 if not rest else 256
+    found, ended = [], set()
+    for seed in range(seeds):
+        one = shot(box, film, sampler, spp=spp, seed=seed, threads=1, **rest)
+        found.append(one.image.double())
+        ended.add(one.spp)
+    plain = torch.stack([shot(box, film, spp=64, seed=10**6 + seed, threads=1).image.double() for seed in range(seeds)])
+    images = torch.stack(found)
+    apart = images.mean(0) - plain.mean(0)
+    z = apart / ((images.var(0) + plain.var(0)) / seeds).sqrt()
+    assert len(ended) > 3 or not rest
+    assert float(z.abs().max()) < 4.8 and float(z.square().mean()) < 1.6
+    whole = apart.mean() / ((images.mean((1, 2, 3)).var() + plain.mean((1, 2, 3)).var()) / seeds).sqrt()
+    assert abs(float(whole)) < 3.5
