@@ -19,14 +19,14 @@ __all__ = ["HELP", "converge", "raw_study"]
 
 HELP = """\
 torchpt converge scene=NAME|[A,B] [out=FOLDER] [key=value|key=[a,b] ...]
-torchpt converge study=FILE.yaml [key=value ...]
+torchpt converge study=NAME|FILE.yaml [key=value ...]
 
   Error against run time: several independent runs of every combination of settings at growing samples a pixel, each timed
   without set-up, compared with a reference. A list makes an axis of the grid: sampler=[independent,sobol].
   scene=      a file ending in .yaml, or a scene that ships, or a list of them:
 {scenes}
   out=        the folder of report.html, report.json, plots/ and runs/; SCENE_converge where nothing is said
-  study=      a YAML file with the same keys; words of the command line win over it
+  study=      a YAML file with the same keys, or a study that ships (samplers); words of the command line win over it
   spp=        samples a pixel of each step                                                   [4,16,64,256]
   seeds=      independent runs of each step                                                  5
   seed=       the seeds of all runs follow from it                                           0
@@ -51,8 +51,7 @@ def raw_study(words: Mapping[str, str]) -> tuple[dict[str, Any], str | None]:
     """
     from torchpt.reports.study import read_study
 
-    file = words.get("study")
-    raw = read_study(file) if file is not None else {}
+    raw, file = read_study(words["study"]) if "study" in words else ({}, None)
     for key, text in words.items():
         if key == "study":
             continue

@@ -25,6 +25,8 @@ __all__ = ["Line", "Step", "Topic", "analyse", "check_files", "common_levels"]
 
 #: Of the least error of a scene: a reference that is noisier than this share of it is worth a word.
 _NOISY = 0.5
+#: How far a line is followed: the logarithm of a ratio of times to the first step's.
+_FARTHEST = math.log(1e6)
 
 
 @dataclass
@@ -185,7 +187,9 @@ def _line(curve: Curve, truth: Truth, names: tuple[str, ...]) -> Line:
     for spp, runs in curve.steps.items():
         images = [run.image() for run in runs]
         steps.append(_step(spp, runs, images, truth, names, film))
-    verdict = bias_of(images, truth)  # of the largest step
+    last, told = steps[-1], truth.told
+    more = told["spp"] * told["seeds"] / ((last.spp or 1) * len(images)) if told["made"] else 0.0
+    verdict = bias_of(images, truth, more)
     settings = curve.job.facts["settings"]
     return Line(curve.variant.label, steps, truth, settings=settings, bias=verdict.plain())
 
@@ -242,7 +246,8 @@ def _picture(extra: Extra, size: tuple[int, int]) -> Tensor:
 
 
 def common_levels(lines: Sequence[Line], main: str) -> tuple[float, ...]:
-    """An error that all measured curves come down to: the least of the worst of them."""
+    """An error that all curves without bias come down to: the least of the worst of them."""
+    lines = [line for line in lines if not (line.bias and line.bias["biased"])] or lines
     least = [min((e.mean for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0) for line in lines]
     return (float(f"{max(least):.2g}"),) if least and max(least) > 0 else ()
 
@@ -259,9 +264,10 @@ def _fits(line: Line, main: str, targets: Sequence[float]) -> None:
         told: dict[str, Any] = {"error": target, "seconds": None}
         if found is not None:
             place, beyond = found
+            inside = abs(place.mean - math.log(line.steps[0].seconds)) < _FARTHEST
             if beyond and floor >= target:  # it never gets there
                 told["never"] = True
-            else:
+            elif inside or not beyond:
                 bounds = [None if x is None else _exp(x) for x in (place.mean, place.low, place.high)]
                 told |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
         line.times.append(told)

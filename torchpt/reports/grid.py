@@ -74,6 +74,8 @@ def variants_of(settings: Mapping[str, Any], file: str | None) -> list[Variant]:
     wide = tuple(key for key, values in axes.items() if len(values) > 1)
     found = [{**settings, **dict(zip(axes, chosen, strict=True))} for chosen in product(*axes.values())]
     labels = _labels([flat({key: item[key] for key in wide}) for item in found])
+    if len(set(labels)) < len(labels):
+        raise SceneError(wide[0], settings[wide[0]], "settings that differ in more than how they are written", file)
     return [Variant(label, item, wide) for label, item in zip(labels, found, strict=True)]
 
 

@@ -14,7 +14,6 @@ from torchpt.reports import words
 from torchpt.reports.analysis import Line, Topic
 from torchpt.reports.pictures import Sheet
 from torchpt.reports.plots import COLOURS, NAMES
-from torchpt.reports.statistics import Estimate
 from torchpt.reports.study import Study
 
 __all__ = ["Figure", "page"]
@@ -52,7 +51,7 @@ def page(
 def _scene(study: Study, topic: Topic, sheet: Sheet | None, plots: dict[str, Figure]) -> dict[str, Any]:
     names = study.asked["metrics"]
     columns = ["Setting", *(f"Time to {NAMES[names[0]]} {words.number(target, 2)}" for target in topic.targets)]
-    columns += [f"{NAMES[names[0]]} at most samples", "Slope over samples", "Efficiency", "Bias", "Not finite"]
+    columns += [f"{NAMES[names[0]]} at the end", "Slope over samples", "Efficiency", "Bias", "Not finite"]
     return {
         "name": topic.name,
         "about": _about(topic),
@@ -80,8 +79,8 @@ def _about(topic: Topic) -> str:
     )
 
 
-def _cell(text: str, small: str = "", tone: str = "") -> dict[str, str]:
-    return {"text": text, "small": small, "tone": tone}
+def _cell(text: str, *small: str, tone: str = "") -> dict[str, Any]:
+    return {"text": text, "small": [line for line in small if line], "tone": tone}
 
 
 def _row(topic: Topic, line: Line, index: int, main: str) -> dict[str, Any]:
@@ -94,47 +93,46 @@ def _row(topic: Topic, line: Line, index: int, main: str) -> dict[str, Any]:
     cells.append(_efficiency_cell(topic, line))
     cells.append(_bias_cell(line))
     bad = sum(step.nonfinite for step in line.steps)
-    cells.append(_cell(words.count(bad), "", "bad" if bad else ""))
+    cells.append(_cell(words.count(bad), tone="bad" if bad else ""))
     colour = COLOURS[index % len(COLOURS)]
     return {"label": line.label, "mark": _MARKS[index % len(_MARKS)], "colour": colour, "cells": cells}
 
 
-def _time_cell(topic: Topic, line: Line, number: int) -> dict[str, str]:
+def _time_cell(topic: Topic, line: Line, number: int) -> dict[str, Any]:
     told, first = line.times[number], topic.lines[0].times[number]
     if told.get("never"):
-        return _cell("never", "its bias is larger", "bad")
+        return _cell("never", "its bias is larger", tone="bad")
     if told["seconds"] is None:
-        return _cell("–")
-    small = words.interval(Estimate(told["seconds"], told["low"], told["high"]))
-    parts = [f"{small} s" if small else "", "extrapolated" if told["extrapolated"] else ""]
+        return _cell("–", "too far to tell" if line.by_seconds else "")
+    parts = [words.span(told["low"], told["high"]), "extrapolated" if told["extrapolated"] else ""]
     if line is not topic.lines[0] and first["seconds"]:
         ratio = first["seconds"] / told["seconds"]
-        parts.insert(0, f"{words.times(max(ratio, 1 / ratio))} {'faster' if ratio >= 1 else 'slower'} than the first")
-    return _cell(words.seconds(told["seconds"]), " · ".join(part for part in parts if part))
+        parts.insert(0, f"{words.times(max(ratio, 1 / ratio))} {'faster' if ratio >= 1 else 'slower'}")
+    return _cell(words.seconds(told["seconds"]), *parts)
 
 
-def _efficiency_cell(topic: Topic, line: Line) -> dict[str, str]:
+def _efficiency_cell(topic: Topic, line: Line) -> dict[str, Any]:
     found, first = line.steps[-1].efficiency(), topic.lines[0].steps[-1].efficiency()
     if found is None:
         return _cell("–")
-    ratio = f"{words.times(found.mean / first.mean)} the first" if first and line is not topic.lines[0] else ""
-    return _cell(words.number(found.mean), ratio or words.interval(found))
+    ratio = f"{words.times(found.mean / first.mean)} that of the first" if first and line is not topic.lines[0] else ""
+    return _cell(words.number(found.mean), words.interval(found), ratio)
 
 
-def _bias_cell(line: Line) -> dict[str, str]:
+def _bias_cell(line: Line) -> dict[str, Any]:
     if line.bias is None:
         return _cell("–", "one picture")
     share = f"light {100 * line.bias['share']:+.2g} %".replace("-", "−")
     if line.bias["biased"]:
-        return _cell("biased", f"{share}, p {_chance(line.bias['chance'])}", "bad")
-    return _cell("none found", f"{share}, p {_chance(line.bias['chance'])}", "good")
+        return _cell("biased", share, f"p {_chance(line.bias['chance'])}", tone="bad")
+    return _cell("none found", share, f"p {_chance(line.bias['chance'])}", tone="good")
 
 
 def _chance(value: float) -> str:
     return "< 0.0001" if value < 1e-4 else f"= {value:.2g}"
 
 
-def _step_row(line: Line, step: Any, names: Sequence[str]) -> list[dict[str, str]]:
+def _step_row(line: Line, step: Any, names: Sequence[str]) -> list[dict[str, Any]]:
     cells = [
         _cell(line.label),
         _cell("–" if step.spp is None else words.count(step.spp)),

@@ -101,6 +101,7 @@ def encoded(figure: Any) -> tuple[bytes, bytes]:
     png, svg = BytesIO(), BytesIO()
     with matplotlib.rc_context(_STYLE):
         figure.savefig(png, format="png", dpi=200)
+        figure.set_layout_engine("none")  # it is laid out: once is enough
         figure.savefig(svg, format="svg", metadata={"Date": None})
     return png.getvalue(), svg.getvalue()
 
@@ -130,7 +131,10 @@ def _draw(axes: Any, line: Line, measure: str, over: str, index: int, labelled: 
     x, mean, low, high = (list(values) for values in zip(*points, strict=True))
     label = line.label + _slope(line, over) if labelled else None
     axes.plot(x, mean, color=colour, linestyle=dash, marker=mark, markersize=5, linewidth=1.6, label=label)
-    axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
+    if x == sorted(x):
+        axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
+    else:  # times so short that more samples took less
+        axes.vlines(x, low, high, color=colour, alpha=0.5)
     floor = line.bias["squared"] if line.bias and line.bias["biased"] and measure == "relmse" else 0.0
     if floor > 0:
         axes.axhline(floor, color=colour, linewidth=1.0, linestyle=(0, (1, 2)))

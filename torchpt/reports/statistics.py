@@ -33,7 +33,7 @@ def t_quantile(freedom: float, level: float = _LEVEL) -> float:
     low, high = 0.0, 1.0
     while f_tail(high * high, 1.0, freedom) > 1 - level:
         low, high = high, 2 * high
-    for _ in range(60):
+    while high - low > 1e-9 * high:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if f_tail(middle * middle, 1.0, freedom) > 1 - level else (low, middle)
     return 0.5 * (low + high)
@@ -163,4 +163,4 @@ def _combined(levels: Sequence[Level], parts: Sequence[float]) -> float | None:
     if total == 0:
         return 0.0
     freedom = total**2 / math.fsum(s * s / v.freedom for s, v in zip(shares, levels, strict=True))
-    return t_quantile(freedom) * math.sqrt(total)
+    return t_quantile(round(freedom, 1)) * math.sqrt(total)

@@ -5,12 +5,14 @@ The same keys stand on the command line and in a study file; any other key there
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
+from torchpt import paths
 from torchpt.errors import SceneError
 from torchpt.format.yaml_file import plain, read_yaml
 from torchpt.images.metrics import METRICS
@@ -18,7 +20,7 @@ from torchpt.reports.grid import Variant, blocks_of, flat, variants_of
 from torchpt.spec import Other, Refused, Valued, Whole, parameters_of
 from torchpt.spec.declared import values_of
 
-__all__ = ["ERRORS", "MEASURES", "OWN_KEYS", "Extra", "Plan", "Reference", "Study", "read_study", "study_of"]
+__all__ = ["ERRORS", "MEASURES", "OWN_KEYS", "RECORDS", "Extra", "Plan", "Reference", "Study", "read_study", "study_of"]
 
 #: What a curve can show, in the order of tables. `relmse_trimmed` is of this room until all measures have it.
 MEASURES = tuple(dict.fromkeys(("relmse", "relmse_trimmed", *METRICS)))
@@ -127,6 +129,8 @@ class Reference(Valued):
 
 
 OWN_KEYS = (*Asked.parameters, "scene", "reference")
+#: For the tables of the docs.
+RECORDS = {"study": Asked, "reference": Reference}
 
 
 @dataclass(frozen=True)
@@ -176,33 +180,52 @@ class Study:
         return blocks_of({**own, "integrator.clamp": None, **self.reference.settings}, self.file)
 
 
-def read_study(path: str) -> dict[str, Any]:
-    """The keys of a study file; files that it names start at its own folder.
+def read_study(name: str) -> tuple[dict[str, Any], str]:
+    """The keys of a study file, and its path; files that it names start at its own folder.
+
+    Args:
+        name: of a study in ``configs/study/``, or a path ending in ``.yaml``.
 
     Raises:
         SceneError: no such file, no valid YAML, no mapping.
     """
-    raw = plain(read_yaml(Path(path), path))
+    shipped = {path.stem: str(path) for path in sorted((paths.configs() / "study").glob("*.yaml"))}
+    if not name.endswith((".yaml", ".yml")) and name not in shipped:
+        raise SceneError("study", name, f"one of {', '.join(shipped)}, or a path ending in .yaml")
+    path = shipped.get(name, name)
+    if not Path(path).is_file():
+        raise SceneError("study", path, "a study file that is there")
+    raw = read_yaml(Path(path), path)
     if not isinstance(raw, dict):
         raise SceneError("study", raw, "a mapping of keys such as scene, spp, sampler", path)
+    raw = plain(raw, path)
     base = Path(path).parent
 
-    def placed(name: Any) -> Any:
-        return str(base / name) if isinstance(name, str) else name
+    def placed(file: Any) -> Any:
+        return str(base / file) if isinstance(file, str) else file
+
+    def named(scene: Any) -> Any:
+        return placed(scene) if str(scene).endswith((".yaml", ".yml")) else scene
 
     if "scene" in raw:
-        found = [placed(name) if str(name).endswith((".yaml", ".yml")) else name for name in _list(raw["scene"])]
-        raw["scene"] = found
+        raw["scene"] = [named(scene) for scene in _list(raw["scene"])]
     reference = raw.get("reference")
     if isinstance(reference, str):
         raw["reference"] = placed(reference)
-    elif isinstance(reference, Mapping) and isinstance(reference.get("file"), Mapping | str):
+    elif isinstance(reference, Mapping) and "file" in reference:
         files = reference["file"]
-        files = {k: placed(v) for k, v in files.items()} if isinstance(files, Mapping) else placed(files)
+        files = {named(k): placed(v) for k, v in files.items()} if isinstance(files, Mapping) else placed(files)
         raw["reference"] = {**reference, "file": files}
     if isinstance(raw.get("extra"), list):
-        raw["extra"] = [{**x, "file": placed(x.get("file"))} if isinstance(x, Mapping) else x for x in raw["extra"]]
-    return raw
+        raw["extra"] = [_extra_placed(item, placed, named) for item in raw["extra"]]
+    return raw, path
+
+
+def _extra_placed(item: Any, placed: Callable[[Any], Any], named: Callable[[Any], Any]) -> Any:
+    if not isinstance(item, Mapping):
+        return item
+    scene = {"scene": named(item["scene"])} if "scene" in item else {}
+    return {**item, "file": placed(item.get("file")), **scene}
 
 
 def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
@@ -217,6 +240,11 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
             "scene", raw.get("scene"), "the name of a scene, a path ending in .yaml, or a list of them", file
         )
     asked = values_of(Asked, {key: raw[key] for key in Asked.parameters if key in raw}, "", file, "a study")
+    if "flip" in asked["metrics"] and find_spec("flip_evaluator") is None:
+        if "metrics" in asked.given:
+            expected = "measures that are there (flip: pip install 'torchpt-renderer[compare]')"
+            raise SceneError("metrics", list(asked["metrics"]), expected, file)
+        asked.values["metrics"] = tuple(name for name in asked["metrics"] if name != "flip")
     settings: dict[str, Any] = {}
     for key, value in raw.items():
         if key not in OWN_KEYS and not key.startswith("reference."):

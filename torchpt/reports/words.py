@@ -6,7 +6,7 @@ import math
 
 from torchpt.reports.statistics import Estimate
 
-__all__ = ["count", "interval", "number", "seconds", "times"]
+__all__ = ["count", "interval", "number", "seconds", "span", "times"]
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -54,3 +54,11 @@ def count(value: int) -> str:
 def interval(found: Estimate) -> str:
     """The bounds of an estimate; empty where there are none."""
     return "" if found.low is None or found.high is None else f"{number(found.low)} … {number(found.high)}"
+
+
+def span(low: float | None, high: float | None) -> str:
+    """Two durations in one unit; empty where they are not known."""
+    if low is None or high is None:
+        return ""
+    unit, name = (1e-3, "ms") if high < 1 else (1.0, "s")
+    return f"{number(low / unit)} … {number(high / unit)} {name}"
