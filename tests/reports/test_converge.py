@@ -69,6 +69,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.chdir(place)
         extra = "extra=[{name: theirs, seconds: 0.5, file: theirs.exr}]"
         assert main(["converge", *WORDS, extra, "title=Tests & <others>"]) == 0
+    shutil.copytree(
+        place / "study", place / "first", ignore=shutil.ignore_patterns("runs")
+    )  # tests write the other anew
     return place
 
 
@@ -83,7 +86,7 @@ def facts(folder: Path) -> dict[str, Any]:
 
 
 def test_the_report_says_what_the_runs_came_to(folder: Path) -> None:
-    (scene,) = facts(folder / "study")["scenes"]
+    (scene,) = facts(folder / "first")["scenes"]
     curves = {curve["label"]: curve for curve in scene["curves"]}
     assert list(curves) == [
         "no clamp, independent",
@@ -110,14 +113,14 @@ def test_the_report_says_what_the_runs_came_to(folder: Path) -> None:
 
 
 def test_the_page_is_one_file_that_asks_for_nothing(folder: Path) -> None:
-    text = (folder / "study" / "report.html").read_text()
+    text = (folder / "first" / "report.html").read_text()
     assert "<script" not in text and "Tests &amp; &lt;others&gt;" in text
     assert all(source.startswith("data:image/") for source in re.findall(r'(?:src|href)="([^"]*)"', text))
     bare = re.sub(r'"data:[^"]*"', "", text)
     assert not re.search(r"https?:|url\(|@import", bare)
     for words in ("biased", "none found", "theirs", "At equal time", "Where the error is"):
         assert words in bare
-    plots = sorted(path.name for path in (folder / "study" / "plots").iterdir())
+    plots = sorted(path.name for path in (folder / "first" / "plots").iterdir())
     assert plots == [f"s_{name}.{kind}" for name in ("measures", "seconds", "spp") for kind in ("png", "svg")]
 
 
@@ -125,7 +128,7 @@ def test_a_finished_study_renders_nothing_and_a_larger_one_what_is_new(
     there: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     renders = Renders(monkeypatch)
-    before = facts(there / "study")["scenes"][0]["curves"][:4]
+    before = facts(there / "first")["scenes"][0]["curves"][:4]
     assert main(["converge", *WORDS, "metrics=[relmse,mse]"]) == 0 and renders.seen == []
     summary = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert [curve["biased"] for curve in summary["scenes"][0]["curves"]] == [False, False, True, True]
@@ -155,7 +158,7 @@ def test_a_signal_keeps_what_is_done(
     assert main(["converge", *words]) == 0 and (there / "stopped" / "report.html").exists()
     again = [seed for _, seed in renders.seen[first:]]
     assert len(again) == 25 + 12, "runs that were missing, and one that is thrown away for each turn of a setting"
-    whole, resumed = (facts(there / name)["scenes"][0]["curves"] for name in ("study", "stopped"))
+    whole, resumed = (facts(there / name)["scenes"][0]["curves"] for name in ("first", "stopped"))
     for one, other in zip(whole, resumed, strict=False):
         assert [s["errors"]["mse"] for s in one["steps"]] == [s["errors"]["mse"] for s in other["steps"]]
 
@@ -199,7 +202,7 @@ def test_a_browser_opens_it_without_a_word(folder: Path) -> None:
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("no Chromium is installed")
-    page = folder / "study" / "report.html"
+    page = folder / "first" / "report.html"
     words = [
         "--headless=new",
         "--no-sandbox",

@@ -25,6 +25,11 @@ __all__ = ["Line", "Step", "Topic", "analyse", "check_files", "common_levels"]
 
 #: Of the least error of a scene: a reference that is noisier than this share of it is worth a word.
 _NOISY = 0.5
+#: Measures that take longer than many a run, and hardly differ from one to the next: of the first run of a step only, but
+#: where curves show them.
+_DEAR = ("flip",)
+#: Runs of fewer seconds are mostly beginning and end.
+_SHORT = 0.05
 #: How far a line is followed: the logarithm of a ratio of times to the first step's.
 _FARTHEST = math.log(1e6)
 
@@ -36,7 +41,7 @@ class Step:
     Attributes:
         spp: samples a pixel; None where an extra does not say.
         seconds: the median of its runs.
-        errors: measure to the value of each run.
+        errors: measure to the value of each run; of some measures only the first run's.
         nonfinite: samples that were NaN or infinite.
         variance: of a pixel, relative to ``ref² + 0.01``; each run's part, whose mean it is.
         pictures: makes the picture of each run.
@@ -172,6 +177,7 @@ def analyse(study: Study, measured: Measured) -> Topic:
     topic = Topic(measured.name, [], first.job.wishes.film)
     for curve in measured.curves:
         topic.lines.append(_line(curve, truth_of(curve), names))
+    # What is made of runs, such as a denoised form of each, would be lines of their own here: never steps of these.
     topic.lines += _extra_lines(study, measured, truth_of(first), names)
     main = names[0]
     topic.targets = list(study.asked["target"] or common_levels(topic.lines, main))
@@ -197,13 +203,14 @@ def _line(curve: Curve, truth: Truth, names: tuple[str, ...]) -> Line:
 def _step(
     spp: int, runs: Sequence[Run], images: Sequence[Tensor], truth: Truth, names: tuple[str, ...], film: Any
 ) -> Step:
-    found = [measures(image, truth, names, film) for image in images]
+    cheap = tuple(name for name in names if name not in _DEAR or name == names[0])
+    found = [measures(image, truth, cheap if index else names, film) for index, image in enumerate(images)]
     mean, count = torch.stack(list(images)).mean(0), len(images)
     spread = [float(((image - mean).square() * truth.weight).mean()) * count / (count - 1) for image in images]
     return Step(
         spp,
         median(run.seconds for run in runs),
-        {name: [item[name] for item in found] for name in names},
+        {name: [item[name] for item in found if name in item] for name in names},
         sum(run.facts["nonfinite_samples"] for run in runs),
         spread,
         [run.image for run in runs],
@@ -285,6 +292,12 @@ def _notes(topic: Topic, main: str) -> list[str]:
         notes.append(
             f"The reference is noisy: its own relMSE is {noise:.2g}, the least error here {least:.2g}. "
             "A larger reference.spp or reference.seeds narrows the bands."
+        )
+    shortest = min(step.seconds for line in topic.lines if line.measured for step in line.steps)
+    if shortest < _SHORT:
+        notes.append(
+            f"The shortest runs take {1e3 * shortest:.2g} ms, of which a part is the same for any number of samples: "
+            "slopes over seconds come out too steep. A larger film, or steps of more samples, tell more."
         )
     told = topic.lines[0].truth.told
     if not told["made"] and not told["variance"]:

@@ -26,6 +26,7 @@ _TAKEN = {
     "render.preview": "nothing: a study keeps every picture in its folder",
     "render.checkpoint": "nothing: a study that was stopped resumes by itself",
     "render.resume": "nothing: a study that was stopped resumes by itself",
+    "film.denoise": "nothing: a denoised picture belongs to a curve of its own, never to that of the samples",
     "film.aovs": "nothing: a study compares pictures without layers",
 }
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from torchpt.errors import SceneError
 from torchpt.format.description import Description, read_description, settings
+from torchpt.forward.kept import Kept, kept
 from torchpt.rendering import Progress, Rendering, render_scene
 from torchpt.reports.grid import Variant
 from torchpt.reports.store import Run, Store, name_of
@@ -50,12 +51,14 @@ class Job:
         wishes: complete; spp and seed are set for each run.
         facts: what runs depend on, beside spp and seed.
         purpose: ``run`` or ``reference``: their seeds never meet.
+        left: what its runs left for the next one: its kernels, while those of another setting are in the scene's hands.
     """
 
     scene: Scene
     wishes: Settings
     facts: dict[str, Any]
     purpose: str
+    left: Kept | None = None
 
     @property
     def pixels(self) -> int:
@@ -178,6 +181,7 @@ def measure(
         run = store.get(name)
         if run is None:
             if job is not latest:  # what it leaves is there for the runs that follow
+                _turn(latest, job)
                 _render(job, min(study.asked["spp"][0], spp), seed, clock, counts=False)
                 latest = job
             rendering = None if clock.stop else _render(job, spp, seed, clock)
@@ -185,6 +189,15 @@ def measure(
                 raise Stopped(sum(store.get(other) is not None for other in set(names)), len(set(names)))
             run = store.put(name, rendering.image, _told(job, spp, seed, rendering))
         place.append(run)
+
+
+def _turn(latest: Job | None, job: Job) -> None:
+    """Another setting's turn: a scene keeps the kernels of its latest render only, and making them anew takes seconds."""
+    if latest is not None:
+        latest.left = replace(kept(latest.scene))
+    if job.left is not None:
+        keeper = kept(job.scene)
+        keeper.kernels, keeper.first, keeper.dark = job.left.kernels, job.left.first, job.left.dark
 
 
 Wanted = tuple[Job, int, int, list[Run]]

@@ -50,20 +50,34 @@ def page(
 
 def _scene(study: Study, topic: Topic, sheet: Sheet | None, plots: dict[str, Figure]) -> dict[str, Any]:
     names = study.asked["metrics"]
-    columns = ["Setting", *(f"Time to {NAMES[names[0]]} {words.number(target, 2)}" for target in topic.targets)]
-    columns += [f"{NAMES[names[0]]} at the end", "Slope over samples", "Efficiency", "Bias", "Not finite"]
+    main, most = NAMES[names[0]], words.count(study.asked["spp"][-1])
+    columns = ["Setting", *(f"Time to {main} {words.number(target, 2)}" for target in topic.targets)]
+    columns += [f"{main} at {most} samples", "Slope over samples", "Efficiency", "Bias", "Not finite"]
     return {
         "name": topic.name,
         "about": _about(topic),
+        "headline": _headline(topic, main),
         "notes": topic.notes,
         "columns": columns,
         "rows": [_row(topic, line, index, names[0]) for index, line in enumerate(topic.lines)],
-        "plots": [_plot(plots[over], f"{NAMES[names[0]]} over {over}") for over in ("seconds", "spp") if over in plots],
+        "plots": [_plot(plots[over], f"{main} over {over}") for over in ("seconds", "spp") if over in plots],
         "overview": _plot(plots["measures"], "all measures over seconds") if "measures" in plots else None,
         "sheet": None if sheet is None else _sheet(sheet, names[0]),
         "step_columns": ["Setting", "Samples", "Time", *(NAMES[name] for name in names), "Efficiency"],
         "step_rows": [_step_row(line, step, names) for line in topic.lines for step in line.steps],
     }
+
+
+def _headline(topic: Topic, main: str) -> str:
+    """Who is first, and by how much, among settings without bias."""
+    able = [line for line in topic.lines if line.measured and not (line.bias and line.bias["biased"])]
+    timed = sorted((line.times[-1]["seconds"], line.label) for line in able if line.times and line.times[-1]["seconds"])
+    if len(timed) < 2:
+        return ""
+    (least, first), (_, second), (most, last) = timed[0], timed[1], timed[-1]
+    text = f"{first} comes to {main} {words.number(topic.targets[-1], 2)} first, in {words.seconds(least)}: "
+    text += f"{words.times(timed[1][0] / least)} as fast as {second}"
+    return f"{text}." if len(timed) == 2 else f"{text}, {words.times(most / least)} as fast as {last}."
 
 
 def _about(topic: Topic) -> str:
@@ -210,7 +224,7 @@ def _method(study: Study) -> list[str]:
         "without loading, building and compiling; a run that is thrown away goes before. Settings took turns.",
         "Errors are means over the runs, times medians. Bands and intervals are 95 %, Student's t of the logarithm. From "
         "relMSE, its trimmed form (without the 0.1 % of pixels that are furthest off) and MSE the reference's own variance is "
-        "taken off; the other measures include it. PSNR and SSIM look at what a screen shows.",
+        "taken off; the other measures include it. PSNR and SSIM look at what a screen shows. HDR-FLIP is that of a step's first run.",
         "A slope is that of the straight line through the logarithms of error and samples; −1 is what independent samples "
         "give. The time to an error is read from the line over seconds, marked where that lies beyond the runs. Efficiency is "
         "1 / (variance × seconds) at the largest step, the variance relative to the reference's square + 0.01.",

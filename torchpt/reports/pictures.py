@@ -117,9 +117,9 @@ def _scale(maps: Sequence[Tensor]) -> tuple[float, float]:
     if not len(values):
         return 1e-4, 1.0
     ordered = values.sort().values
-    low, top = (float(ordered[int(share * (len(ordered) - 1))]) for share in (0.05, 0.995))
+    low, top = (float(ordered[int(share * (len(ordered) - 1))]) for share in (0.1, 0.995))
     floor, ceiling = math.floor(low), math.ceil(top)
-    return 10.0 ** max(floor, ceiling - 6), 10.0 ** max(ceiling, floor + 1)
+    return 10.0 ** max(floor, ceiling - 4), 10.0 ** max(ceiling, floor + 1)
 
 
 def _coloured(errors: Tensor, scale: tuple[float, float]) -> np.ndarray:

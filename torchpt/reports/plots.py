@@ -30,8 +30,8 @@ NAMES = {
     "flip": "HDR-FLIP",
 }
 _STYLE: dict[str, Any] = {
-    "font.size": 10.0,
-    "axes.titlesize": 11.0,
+    "font.size": 11.0,
+    "axes.titlesize": 12.0,
     "axes.linewidth": 0.8,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -60,7 +60,7 @@ def curves(topic: Topic, measure: str, over: str) -> Any:
     with matplotlib.rc_context(_STYLE):
         lines = [line for line in topic.lines if over == "seconds" or all(step.spp for step in line.steps)]
         rows = len(lines) + (1 if over == "spp" else 0)
-        figure = Figure(figsize=(4.9, 3.4 + 0.21 * rows), layout="constrained")
+        figure = Figure(figsize=(4.9, 3.4 + 0.23 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         for index, line in enumerate(topic.lines):
@@ -69,8 +69,13 @@ def curves(topic: Topic, measure: str, over: str) -> Any:
         if over == "spp":
             _guide(axes, lines, measure)
         _finish(axes, measure, over)
+        if over == "spp":
+            steps = sorted({step.spp for line in lines for step in line.steps if step.spp})
+            if len(steps) <= 8:
+                axes.set_xticks(steps, labels=[f"{n:,}".replace(",", " ") for n in steps])
+                axes.minorticks_off()
         axes.set_title(f"{NAMES[measure]} over {'seconds' if over == 'seconds' else 'samples a pixel'}", loc="left")
-        figure.legend(loc="outside lower left", fontsize=9.0)
+        figure.legend(loc="outside lower left", fontsize=10.0)
     return figure
 
 
@@ -91,7 +96,7 @@ def overview(topic: Topic, measures: Sequence[str]) -> Any:
             _finish(axes, measure, "seconds")
             axes.set_title(NAMES[measure], loc="left", fontsize=10.0)
             axes.set_ylabel("")
-        figure.legend(loc="outside lower left", fontsize=9.0)
+        figure.legend(loc="outside lower left", fontsize=10.0)
     return figure
 
 
@@ -144,7 +149,7 @@ def _draw(axes: Any, line: Line, measure: str, over: str, index: int, labelled: 
 
 def _slope(line: Line, over: str) -> str:
     found = line.by_seconds if over == "seconds" else line.by_spp
-    return "" if found is None else f"   slope {found.slope.mean:.2f}".replace("-", "−")
+    return "" if found is None or found.slope.low is None else f"   slope {found.slope.mean:.2f}".replace("-", "−")
 
 
 def _guide(axes: Any, lines: Sequence[Line], measure: str) -> None:

@@ -104,7 +104,7 @@ class Fit:
     def reach(self, y: float) -> tuple[Estimate, bool] | None:
         """Where the line comes down to ``y``, with its interval; whether that lies beyond the levels.
 
-        None where the line does not fall.
+        None where the line does not fall. Without an interval where chance alone may have made it fall.
         """
         slope = self.slope.mean
         if not slope < 0:
@@ -113,7 +113,8 @@ class Fit:
         x = self.middle[0] + away
         share = 1.0 / len(self.levels)
         parts = [-(share + away * c) / slope for c in _pulls(self.levels)]  # derivative by each y
-        spread = _combined(self.levels, parts)
+        falls = self.slope.high is not None and self.slope.high < 0  # else the line may never come down there
+        spread = _combined(self.levels, parts) if falls else None
         beyond = not self.levels[0].x <= x <= self.levels[-1].x
         if spread is None:
             return Estimate(x), beyond
