@@ -253,8 +253,9 @@ def _picture(extra: Extra, size: tuple[int, int]) -> Tensor:
 
 
 def common_levels(lines: Sequence[Line], main: str) -> tuple[float, ...]:
-    """An error that all curves without bias come down to: the least of the worst of them."""
-    lines = [line for line in lines if not (line.bias and line.bias["biased"])] or lines
+    """An error that all measured curves without bias come down to: the least of the worst of them."""
+    measured = [line for line in lines if line.measured]
+    lines = [line for line in measured if not (line.bias and line.bias["biased"])] or measured
     least = [min((e.mean for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0) for line in lines]
     return (float(f"{max(least):.2g}"),) if least and max(least) > 0 else ()
 

@@ -63,10 +63,11 @@ def measures(image: Tensor, truth: Truth, names: tuple[str, ...], film: Any) -> 
         film: how a screen shows it (exposure, tonemap, gamma): what PSNR and SSIM look at.
     """
     found: dict[str, float] = {}
+    plain = shown = image, truth.image
+    if set(_SHOWN) & set(names):
+        shown = colour.display(image, film.exposure, film.tonemap, film.gamma), truth.shown(film)
     for name in names:
-        pair = image, truth.image
-        if name in _SHOWN:
-            pair = tuple(colour.display(x, film.exposure, film.tonemap, film.gamma) for x in pair)
+        pair = shown if name in _SHOWN else plain
         try:
             found[name] = _SQUARED[name](image, truth) if name in _SQUARED else metrics.METRICS[name](*pair)
         except ValueError:

@@ -224,7 +224,8 @@ def _method(study: Study) -> list[str]:
         "without loading, building and compiling; a run that is thrown away goes before. Settings took turns.",
         "Errors are means over the runs, times medians. Bands and intervals are 95 %, Student's t of the logarithm. From "
         "relMSE, its trimmed form (without the 0.1 % of pixels that are furthest off) and MSE the reference's own variance is "
-        "taken off; the other measures include it. PSNR and SSIM look at what a screen shows. HDR-FLIP is that of a step's first run.",
+        "taken off; the other measures include it. PSNR and SSIM look at what a screen shows. HDR-FLIP "
+        "is that of a step's first run.",
         "A slope is that of the straight line through the logarithms of error and samples; −1 is what independent samples "
         "give. The time to an error is read from the line over seconds, marked where that lies beyond the runs. Efficiency is "
         "1 / (variance × seconds) at the largest step, the variance relative to the reference's square + 0.01.",

@@ -143,8 +143,9 @@ def _draw(axes: Any, line: Line, measure: str, over: str, index: int, labelled: 
     floor = line.bias["squared"] if line.bias and line.bias["biased"] and measure == "relmse" else 0.0
     if floor > 0:
         axes.axhline(floor, color=colour, linewidth=1.0, linestyle=(0, (1, 2)))
-        place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
-        axes.annotate("bias", (1.0, floor), fontsize=8, color=colour, **place)
+        if not axes.texts:  # said once
+            place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
+            axes.annotate("bias", (1.0, floor), fontsize=9, color=colour, **place)
 
 
 def _slope(line: Line, over: str) -> str:

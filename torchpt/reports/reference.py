@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpt.errors import AssetError
-from torchpt.images import read_layers
+from torchpt.images import colour, read_layers
 from torchpt.reports.store import Run
 
 __all__ = ["FLOOR", "Truth", "from_file", "from_runs"]
@@ -35,10 +36,22 @@ class Truth:
     runs: tuple[Tensor, ...]
     told: dict[str, Any]
 
-    @property
+    @cached_property
     def weight(self) -> Tensor:
         """Of a squared error that becomes relative: ``1 / (ref² + 0.01)``."""
         return 1.0 / (self.image.square() + FLOOR)
+
+    def shown(self, film: Any) -> Tensor:
+        """As a screen shows it; the latest is kept."""
+        key = (film.exposure, film.tonemap, film.gamma)
+        if key not in self._shown:
+            self._shown.clear()
+            self._shown[key] = colour.display(self.image, *key)
+        return self._shown[key]
+
+    @cached_property
+    def _shown(self) -> dict[tuple[Any, ...], Tensor]:
+        return {}
 
     @property
     def noise(self) -> float:
