@@ -21,7 +21,7 @@ __all__ = ["Panel", "Sheet", "hardest", "sheet_of", "step_near"]
 #: Widest map, in pixels; larger ones are means over squares.
 _WIDE = 400
 #: A crop is so much of the smaller side, within these bounds in pixels.
-_PART, _LEAST, _MOST = 4, 16, 112
+_PART, _LEAST, _MOST = 5, 16, 64  # 64 pixels are shown at three times their size or more
 
 
 @dataclass

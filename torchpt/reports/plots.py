@@ -92,7 +92,7 @@ def overview(topic: Topic, measures: Sequence[str]) -> Any:
         for place, measure in enumerate(measures):
             axes = figure.add_subplot(rows, 2, place + 1)
             for index, line in enumerate(topic.lines):
-                _draw(axes, line, measure, "seconds", index, labelled=place == 0)
+                _draw(axes, line, measure, "seconds", index, slopes=False if place == 0 else None)
             _finish(axes, measure, "seconds")
             axes.set_title(NAMES[measure], loc="left", fontsize=10.0)
             axes.set_ylabel("")
@@ -127,14 +127,15 @@ def _points(line: Line, measure: str, over: str) -> list[tuple[float, float, flo
     return points
 
 
-def _draw(axes: Any, line: Line, measure: str, over: str, index: int, labelled: bool = True) -> None:
+def _draw(axes: Any, line: Line, measure: str, over: str, index: int, slopes: bool | None = True) -> None:
+    """One curve; named in the legend with its slope, without it, or (None) not at all."""
     colour, mark = COLOURS[index % len(COLOURS)], _MARKS[index % len(_MARKS)]
     dash = _DASHES[(index // len(COLOURS) + index) % len(_DASHES)] if line.measured else ":"
     points = _points(line, measure, over)
     if not points:
         return
     x, mean, low, high = (list(values) for values in zip(*points, strict=True))
-    label = line.label + _slope(line, over) if labelled else None
+    label = None if slopes is None else line.label + (_slope(line, over) if slopes else "")
     axes.plot(x, mean, color=colour, linestyle=dash, marker=mark, markersize=5, linewidth=1.6, label=label)
     if x == sorted(x):
         axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
