@@ -32,6 +32,7 @@ TABLES = {
     "layers": ("torchpt.integrators", "LAYERS"),
     "settings": ("torchpt.settings", "RECORDS"),
     "shapes": ("torchpt.shapes", "KINDS"),
+    "studies": ("torchpt.reports.study", "RECORDS"),
     "textures": ("torchpt.textures", "KINDS"),
 }
 

@@ -23,6 +23,8 @@ from torchpt.commands import collector, keys
 from torchpt.commands.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.commands.compare import HELP as HELP_COMPARE
 from torchpt.commands.compare import compare
+from torchpt.commands.converge import HELP as HELP_CONVERGE
+from torchpt.commands.converge import converge
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.orbit import HELP as HELP_ORBIT
 from torchpt.commands.plain_words import compose_plainly
@@ -42,6 +44,7 @@ torchpt: a wavefront path tracer that is a PyTorch program
   torchpt orbit  scene=cornell_box frames=48 out=turn.gif           turn the camera about it: .gif, .mp4
   torchpt info   scene=cornell_box                                  what the scene holds, what was built, what left out
   torchpt compare test.exr reference.exr                            how far a picture is from its reference
+  torchpt converge scene=cornell_box sampler=[independent,sobol]    error against run time, as a report
 
 torchpt COMMAND --help says more. Scenes that ship:
 {scenes}
@@ -71,6 +74,8 @@ torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
   {keys}
 """
 
+_HELPS = {"render": HELP_RENDER, "orbit": HELP_ORBIT, "info": HELP_INFO, "converge": HELP_CONVERGE}
+
 
 def run() -> None:
     """The console script."""
@@ -93,8 +98,10 @@ def main(argv: list[str] | None = None) -> int:
                 return compare(argv[1:])
             arguments = parse(argv)
             if arguments.help:
-                print(_help({"render": HELP_RENDER, "orbit": HELP_ORBIT, "info": HELP_INFO}[arguments.command]), end="")
+                print(_help(_HELPS[arguments.command]), end="")
                 return 0
+            if arguments.command == "converge":
+                return _converge(arguments, interrupt)
             if not arguments.scenes and not arguments.only_shows:
                 ship = ", ".join(keys.options("scene"))
                 raise UsageError(f"scene: expected scene=NAME or scene=FILE.yaml; scenes that ship: {ship}")
@@ -105,6 +112,13 @@ def main(argv: list[str] | None = None) -> int:
             return interrupted.exit_code
         except MemoryError:
             return _refuse("not enough memory: a smaller film, or render.max_memory, needs less")
+
+
+def _converge(arguments: Arguments, interrupt: Interrupt) -> int:
+    if not {"scene", "study"} & arguments.study.keys():
+        ship = ", ".join(keys.options("scene"))
+        raise UsageError(f"scene: expected scene=NAME, scene=FILE.yaml or study=FILE.yaml; scenes that ship: {ship}")
+    return converge(arguments.study, interrupt)
 
 
 def _refuse(line: str) -> int:

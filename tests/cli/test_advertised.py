@@ -22,6 +22,11 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 #: Settings by which a render takes no time, in place of what a command says.
 SMALL = {"film.width": "8", "film.height": "6", "render.spp": "2", "render.compile": "off"}
+#: The same for `torchpt converge`; what a command says itself stays where it is smaller.
+SMALL_STUDY = {
+    "film.width": "12", "film.height": "12", "spp": "[1,2]", "seeds": "2", "reference.spp": "4", "reference.seeds": "2",
+    "metrics": "[relmse,mse]", "render.compile": "off",
+}  # fmt: skip
 #: Scenes that load and render in no time; of the others the commands are slow.
 QUICK = ("my/scene.yaml", "cornell_box", "cornell_spheres", "games101", "env_teapot")
 SCENE = """\
@@ -32,7 +37,7 @@ shapes: {ball: {type: sphere, emission: 1}}
 
 def texts() -> Iterator[tuple[str, str]]:
     """Where a command may stand, and the text."""
-    for name in ("HELP", "HELP_RENDER", "HELP_ORBIT", "HELP_INFO", "HELP_COMPARE"):
+    for name in ("HELP", "HELP_RENDER", "HELP_ORBIT", "HELP_INFO", "HELP_COMPARE", "HELP_CONVERGE"):
         yield f"cli.{name}", getattr(cli, name)
     for page in PAGES:
         yield str(page.relative_to(ROOT)), page.read_text(encoding="utf-8")
@@ -66,7 +71,9 @@ def commands(program: str) -> list[tuple[str, str]]:
 
 def shrunk(words: list[str]) -> list[str]:
     """The words of a command for a film of a few pixels; sweeps keep how many values they have."""
-    left, made = dict(SMALL), []
+    left, made = dict(SMALL_STUDY if words[0] == "converge" else SMALL), []
+    if words[0] == "converge":
+        words = [word for word in words if word.partition("=")[0] not in left]
     if words[0] == "orbit":
         left["frames"] = "2"
     for word in words:
@@ -101,12 +108,16 @@ def test_there_are_commands_from_everywhere() -> None:
         "orbit",
         "info",
         "compare",
+        "converge",
     }
 
 
 def test_every_file_in_configs_opens_with_its_command() -> None:
     for path in configs().rglob("*.yaml"):
         (command, *_) = spans(path.name, path.read_text(encoding="utf-8").splitlines()[0])
+        if path.parent.name == "study":
+            assert command == f"torchpt converge study={path.stem}"
+            continue
         assert command.startswith("torchpt render scene="), path
         if path.parent.name == "scene":
             assert f"scene={path.stem} " in command
@@ -128,12 +139,12 @@ def test_advertised_commands_run(
     for name in ("test.exr", "reference.exr"):  # what is compared
         write_image(tmp_path / name, torch.full((12, 12, 3), 0.5), {"albedo": torch.full((12, 12, 3), 0.3)})
     words = shlex.split(command)[1:]
-    renders = words[0] in ("render", "orbit") and "--cfg" not in words
+    renders = words[0] in ("render", "orbit", "converge") and "--cfg" not in words
     assert main(shrunk(words) if renders else words) == 0, where
     captured = capfd.readouterr()
     assert captured.out
     if renders:
-        files = [path for path in tmp_path.iterdir() if path.is_file()]
+        files = [path for path in tmp_path.rglob("*") if path.is_file() and path.parent.name != "my"]
         assert files and all(path.stat().st_size for path in files)
 
 

@@ -19,7 +19,6 @@ def test_one_a_block(film):
     blocks = {(x // 4, y // 4) for x, y in at(pilots, width)}
     assert len(blocks) == len(pilots) == -(-width // 4) * -(-height // 4)
     assert float(pilots.weight.sum()) == width * height
-    rows, columns = pilots.block
     for place, row, column in zip(pilots.places.tolist(), *pilots.block.tolist(), strict=True):
         assert (place // width // 4, place % width // 4) == (row, column)
 

@@ -14,7 +14,7 @@ from torchpt.errors import TorchptError
 
 __all__ = ["COMMANDS", "GROUPS", "Arguments", "UsageError", "parse"]
 
-COMMANDS = ("render", "orbit", "info", "compare")  # `compare` takes its words itself
+COMMANDS = ("render", "orbit", "info", "converge", "compare")  # `compare` takes its words itself
 GROUPS = ("film", "integrator", "sampler", "render")
 PATH_KEYS = ("render.preview", "render.checkpoint")
 #: Keys of `torchpt orbit` alone.
@@ -50,6 +50,7 @@ class Arguments:
         outs: pictures to write, as given; empty where nothing was said.
         paths: values of the keys in `PATH_KEYS`.
         turn: values of the keys in `TURN_KEYS`, as written.
+        study: of `converge` all words by key, as written: its lists are axes, which Hydra has no part in.
         overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``.
         options: what Hydra gets besides, such as ``--multirun`` or ``--cfg job``.
         multirun: whether this is a sweep.
@@ -62,6 +63,7 @@ class Arguments:
     outs: list[str] = field(default_factory=list)
     paths: dict[str, str | None] = field(default_factory=dict)
     turn: dict[str, str] = field(default_factory=dict)
+    study: dict[str, str] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
     options: list[str] = field(default_factory=list)
     multirun: bool = False
@@ -83,6 +85,8 @@ def parse(argv: list[str]) -> Arguments:
     if not argv or argv[0] not in COMMANDS:
         raise UsageError(f"{argv[0] if argv else 'no command'}: expected one of the commands {', '.join(COMMANDS)}")
     arguments = Arguments(argv[0])
+    if arguments.command == "converge":
+        return _study(arguments, argv[1:])
     taken: dict[str, str] = {}
     words = iter(argv[1:])
     for word in words:
@@ -119,6 +123,27 @@ def parse(argv: list[str]) -> Arguments:
     arguments.overrides = [sweep if word == "scene" else word for word in arguments.overrides]
     if len(arguments.scenes) < 2:
         arguments.overrides = [word for word in arguments.overrides if word != sweep]
+    return arguments
+
+
+def _study(arguments: Arguments, words: list[str]) -> Arguments:
+    """The words of `torchpt converge`."""
+    for word in words:
+        key, equals, value = word.partition("=")
+        if word in ("--help", "-h"):
+            arguments.help = True
+        elif word in ("--multirun", "-m"):
+            raise UsageError(f"{word}: `torchpt converge` takes lists without it, such as sampler=[independent,sobol]")
+        elif word.startswith("-"):
+            raise UsageError(f"{word}: unknown option; `torchpt converge` knows --help")
+        elif not equals or not re.match(r"[A-Za-z_][\w.]*\Z", key) or "_target_" in key:
+            raise UsageError(f"{word}: expected key=value, for example sampler=[independent,sobol]")
+        elif key in arguments.study:
+            raise UsageError(f"{key}: given twice, as {arguments.study[key]!r} and {value!r}")
+        elif not value:
+            raise UsageError(f"{key}: expected a value, got nothing")
+        else:
+            arguments.study[key] = value
     return arguments
 
 

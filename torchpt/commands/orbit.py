@@ -6,7 +6,6 @@ on where it was.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import sys
@@ -299,6 +298,7 @@ class Frames:
 
 def _facts(scene: Scene, wishes: Any, turn: Turn) -> dict[str, Any]:
     """What frames depend on, by dotted name: the turn, the settings, and a digest of the scene."""
+    from torchpt.scene.digest import digest
     from torchpt.spec.declared import Described
 
     facts: dict[str, Any] = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
@@ -313,18 +313,4 @@ def _facts(scene: Scene, wishes: Any, turn: Turn) -> dict[str, Any]:
             stack += [(f"{name}.{key}" if name else str(key), inside) for key, inside in value.items()]
         else:
             facts[name] = plain(value) if isinstance(value, int | float | None) else str(value)
-    return {**{name: facts[name] for name in sorted(facts) if name not in _FREE}, "scene": _digest(scene)}
-
-
-def _digest(scene: Scene) -> str:
-    """Of all that the scene was made of, files included."""
-    digest = hashlib.blake2b(digest_size=12)
-    told = scene.description
-    digest.update(repr((told.camera, told.textures, told.materials, told.shapes, told.lights)).encode())
-    for name, value in scene.params.items():
-        digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
-    for part in scene.built.parts:
-        for array in (part.faces, part.normals, part.uvs, part.colors):
-            if array is not None:
-                digest.update(array.tobytes())
-    return digest.hexdigest()
+    return {**{name: facts[name] for name in sorted(facts) if name not in _FREE}, "scene": digest(scene)}

@@ -1,0 +1,313 @@
+"""What the runs of a study come to: errors, slopes, times to an error, efficiency, bias. All that the report says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.errors import AssetError
+from torchpt.images import read_image
+from torchpt.reports.bias import bias_of
+from torchpt.reports.errors import measures
+from torchpt.reports.measure import Curve, Measured, film_size
+from torchpt.reports.reference import Truth, from_file, from_runs
+from torchpt.reports.statistics import Estimate, Fit, estimate, fit
+from torchpt.reports.store import Run
+from torchpt.reports.study import ERRORS, Extra, Study
+
+__all__ = ["Line", "Step", "Topic", "analyse", "check_files", "common_levels"]
+
+#: Of the least error of a scene: a reference that is noisier than this share of it is worth a word.
+_NOISY = 0.5
+#: Measures that take longer than many a run, and hardly differ from one to the next: of the first run of a step only, but
+#: where curves show them.
+_DEAR = ("flip",)
+#: Runs of fewer seconds are mostly beginning and end.
+_SHORT = 0.05
+#: How far a line is followed: the logarithm of a ratio of times to the first step's.
+_FARTHEST = math.log(1e6)
+
+
+@dataclass
+class Step:
+    """The runs of one number of samples.
+
+    Attributes:
+        spp: samples a pixel; None where an extra does not say.
+        seconds: the median of its runs.
+        errors: measure to the value of each run; of some measures only the first run's.
+        nonfinite: samples that were NaN or infinite.
+        variance: of a pixel, relative to ``ref² + 0.01``; each run's part, whose mean it is.
+        pictures: makes the picture of each run.
+        times: of each run, in seconds.
+        seeds: of each run.
+    """
+
+    spp: int | None
+    seconds: float
+    errors: dict[str, list[float]]
+    nonfinite: int
+    variance: list[float] = field(default_factory=list)
+    pictures: list[Any] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+    seeds: list[int] = field(default_factory=list)
+
+    def estimate(self, name: str) -> Estimate:
+        """The mean over runs of a measure."""
+        return estimate(self.errors[name], positive=name in ERRORS)
+
+    def efficiency(self) -> Estimate | None:
+        """``1 / (variance x seconds)``."""
+        if len(self.variance) < 2:
+            return None
+        spread = estimate(self.variance)
+        bounds = (1.0 / (x * self.seconds) if x else None for x in (spread.mean, spread.high, spread.low))
+        middle, low, high = bounds
+        return None if middle is None else Estimate(middle, low, high)
+
+
+@dataclass
+class Line:
+    """A curve of the report.
+
+    Attributes:
+        label: what it is called.
+        steps: in the order of time.
+        truth: what it is compared with.
+        measured: whether these are runs of a study; else pictures that others made.
+        settings: complete, of a study's runs.
+        by_spp: the line through its errors over samples.
+        by_seconds: the same over seconds.
+        bias: the verdict of the bias test.
+        times: error to where the curve reaches it.
+    """
+
+    label: str
+    steps: list[Step]
+    truth: Truth
+    measured: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    by_spp: Fit | None = None
+    by_seconds: Fit | None = None
+    bias: dict[str, Any] | None = None
+    times: list[dict[str, Any]] = field(default_factory=list)
+
+    def plain(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "label": self.label,
+            "measured": self.measured,
+            "settings": self.settings,
+            "reference": {**self.truth.told, "relmse": self.truth.noise},
+            "slope_over_spp": asdict(self.by_spp.slope) if self.by_spp else None,
+            "slope_over_seconds": asdict(self.by_seconds.slope) if self.by_seconds else None,
+            "bias": self.bias,
+            "times": self.times,
+            "nonfinite_samples": sum(step.nonfinite for step in self.steps),
+            "steps": [_step_plain(step) for step in self.steps],
+        }
+
+
+def _step_plain(step: Step) -> dict[str, Any]:
+    efficiency = step.efficiency()
+    return {
+        "spp": step.spp,
+        "seconds": step.seconds,
+        "seconds_of_runs": step.times,
+        "seeds": step.seeds,
+        "nonfinite_samples": step.nonfinite,
+        "variance": math.fsum(step.variance) / len(step.variance) if step.variance else None,
+        "efficiency": asdict(efficiency) if efficiency else None,
+        "errors": {name: {**asdict(step.estimate(name)), "runs": values} for name, values in step.errors.items()},
+    }
+
+
+@dataclass
+class Topic:
+    """A scene of the report.
+
+    Attributes:
+        name: as it was asked for.
+        lines: the curves.
+        film: how a screen shows its pictures.
+        targets: errors whose times are told.
+        notes: what a reader should know.
+    """
+
+    name: str
+    lines: list[Line]
+    film: Any
+    targets: list[float] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def check_files(study: Study, prepared: Sequence[Measured]) -> None:
+    """Read the files of references and extras once, before anything is rendered.
+
+    Raises:
+        AssetError: one that cannot be used.
+    """
+    for measured in prepared:
+        for size in {film_size(curve.job.wishes) for curve in measured.curves}:
+            if measured.name in study.reference.files:
+                from_file(study.reference.files[measured.name], size)
+        for extra in study.extras:
+            if extra.scene == measured.name:
+                _picture(extra, film_size(measured.curves[0].job.wishes))
+
+
+def analyse(study: Study, measured: Measured) -> Topic:
+    """All figures of one scene."""
+    names, first = study.asked["metrics"], measured.curves[0]
+    truths: dict[str, Truth] = {}
+
+    def truth_of(curve: Curve) -> Truth:
+        key = str(curve.truths[0].file) if curve.truths else repr(film_size(curve.job.wishes))
+        if key not in truths:
+            file = study.reference.files.get(measured.name, "")
+            truths[key] = from_runs(curve.truths) if curve.truths else from_file(file, film_size(curve.job.wishes))
+        return truths[key]
+
+    topic = Topic(measured.name, [], first.job.wishes.film)
+    for curve in measured.curves:
+        topic.lines.append(_line(curve, truth_of(curve), names))
+    # What is made of runs, such as a denoised form of each, would be lines of their own here: never steps of these.
+    topic.lines += _extra_lines(study, measured, truth_of(first), names)
+    main = names[0]
+    topic.targets = list(study.asked["target"] or common_levels(topic.lines, main))
+    for line in topic.lines:
+        _fits(line, main, topic.targets)
+    topic.notes = _notes(topic, main)
+    return topic
+
+
+def _line(curve: Curve, truth: Truth, names: tuple[str, ...]) -> Line:
+    film, steps = curve.job.wishes.film, []
+    images: list[Tensor] = []
+    for spp, runs in curve.steps.items():
+        images = [run.image() for run in runs]
+        steps.append(_step(spp, runs, images, truth, names, film))
+    last, told = steps[-1], truth.told
+    more = told["spp"] * told["seeds"] / ((last.spp or 1) * len(images)) if told["made"] else 0.0
+    verdict = bias_of(images, truth, more)
+    settings = curve.job.facts["settings"]
+    return Line(curve.variant.label, steps, truth, settings=settings, bias=verdict.plain())
+
+
+def _step(
+    spp: int, runs: Sequence[Run], images: Sequence[Tensor], truth: Truth, names: tuple[str, ...], film: Any
+) -> Step:
+    cheap = tuple(name for name in names if name not in _DEAR or name == names[0])
+    found = [measures(image, truth, cheap if index else names, film) for index, image in enumerate(images)]
+    mean, count = torch.stack(list(images)).mean(0), len(images)
+    spread = [float(((image - mean).square() * truth.weight).mean()) * count / (count - 1) for image in images]
+    return Step(
+        spp,
+        median(run.seconds for run in runs),
+        {name: [item[name] for item in found if name in item] for name in names},
+        sum(run.facts["nonfinite_samples"] for run in runs),
+        spread,
+        [run.image for run in runs],
+        [run.seconds for run in runs],
+        [run.facts["seed"] for run in runs],
+    )
+
+
+def _extra_lines(study: Study, measured: Measured, truth: Truth, names: tuple[str, ...]) -> list[Line]:
+    """Other renderers' pictures: those of one name are one curve, of one time one step."""
+    film, lines = measured.curves[0].job.wishes, {}
+    for extra in sorted(study.extras, key=lambda extra: extra.seconds):
+        if extra.scene != measured.name:
+            continue
+        image = _picture(extra, film_size(film))
+        found = measures(torch.nan_to_num(image, 0.0, 0.0, 0.0), truth, names, film.film)
+        bad = int((~torch.isfinite(image)).any(-1).sum())
+        line = lines.setdefault(extra.name, Line(extra.name, [], truth, measured=False))
+        step = next((s for s in line.steps if s.seconds == extra.seconds and s.spp == extra.spp), None)
+        if step is None:
+            step = Step(extra.spp, extra.seconds, {name: [] for name in names}, 0)
+            line.steps.append(step)
+        for name in names:
+            step.errors[name].append(found[name])
+        step.nonfinite += bad
+        step.times.append(extra.seconds)
+        step.pictures.append(lambda extra=extra: _picture(extra, film_size(film)))
+    return list(lines.values())
+
+
+def _picture(extra: Extra, size: tuple[int, int]) -> Tensor:
+    image = read_image(extra.file)
+    image = image.expand(-1, -1, 3) if image.shape[2] == 1 else image[..., :3]
+    high, wide = image.shape[:2]
+    if image.shape[2] != 3 or (wide, high) != size:
+        raise AssetError(
+            extra.file, f"expected a picture of {size[0]} x {size[1]} pixels as the film is, got {wide} x {high}"
+        )
+    return image.double()
+
+
+def common_levels(lines: Sequence[Line], main: str) -> tuple[float, ...]:
+    """An error that all measured curves without bias come down to: the least of the worst of them."""
+    measured = [line for line in lines if line.measured]
+    lines = [line for line in measured if not (line.bias and line.bias["biased"])] or measured
+    least = [min((e.mean for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0) for line in lines]
+    return (float(f"{max(least):.2g}"),) if least and max(least) > 0 else ()
+
+
+def _fits(line: Line, main: str, targets: Sequence[float]) -> None:
+    """Slopes over samples and seconds, and when the curve reaches each target."""
+    values = [step.errors[main] for step in line.steps]
+    if all(step.spp for step in line.steps):
+        line.by_spp = fit([float(step.spp or 0) for step in line.steps], values)
+    line.by_seconds = fit([step.seconds for step in line.steps], values)
+    floor = line.bias["squared"] if line.bias and line.bias["biased"] else 0.0
+    for target in targets:
+        found = line.by_seconds.reach(math.log(target)) if line.by_seconds else None
+        told: dict[str, Any] = {"error": target, "seconds": None}
+        if found is not None:
+            place, beyond = found
+            inside = abs(place.mean - math.log(line.steps[0].seconds)) < _FARTHEST
+            if beyond and floor >= target:  # it never gets there
+                told["never"] = True
+            elif inside or not beyond:
+                bounds = [None if x is None else _exp(x) for x in (place.mean, place.low, place.high)]
+                told |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
+        line.times.append(told)
+
+
+def _exp(x: float) -> float | None:
+    return math.exp(x) if x < 700 else None
+
+
+def _notes(topic: Topic, main: str) -> list[str]:
+    notes = []
+    least = min((e.mean for line in topic.lines for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0)
+    noise = max(line.truth.noise for line in topic.lines)
+    if main.startswith("relmse") and noise > _NOISY * least:
+        notes.append(
+            f"The reference is noisy: its own relMSE is {noise:.2g}, the least error here {least:.2g}. "
+            "A larger reference.spp or reference.seeds narrows the bands."
+        )
+    shortest = min(step.seconds for line in topic.lines if line.measured for step in line.steps)
+    if shortest < _SHORT:
+        notes.append(
+            f"The shortest runs take {1e3 * shortest:.2g} ms, of which a part is the same for any number of samples: "
+            "slopes over seconds come out too steep. A larger film, or steps of more samples, tell more."
+        )
+    told = topic.lines[0].truth.told
+    if not told["made"] and not told["variance"]:
+        notes.append(
+            "The reference file says nothing of its variance, so it is taken to be exact; its noise counts as error."
+        )
+    drowned = [line.label for line in topic.lines if any(s.estimate(main).mean <= 0 for s in line.steps)]
+    if drowned:
+        notes.append(
+            f"Some steps lie below what the reference can tell and are left out of curves: {', '.join(drowned)}."
+        )
+    return notes

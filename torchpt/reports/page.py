@@ -1,0 +1,252 @@
+"""The report as one file: every picture inside, no script, nothing asked of any server."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from torchpt.reports import words
+from torchpt.reports.analysis import Line, Topic
+from torchpt.reports.pictures import Sheet
+from torchpt.reports.plots import COLOURS, NAMES
+from torchpt.reports.study import Study
+
+__all__ = ["Figure", "page"]
+
+#: As the curves' marks are drawn.
+_MARKS = "●■▲◆▼✚✖★"
+#: Name -> PNG and SVG.
+Figure = tuple[bytes, bytes]
+
+
+def page(
+    study: Study, topics: Sequence[Topic], sheets: Sequence[Sheet | None], plots: Sequence[dict[str, Figure]], made: str
+) -> str:
+    """The text of ``report.html``.
+
+    Args:
+        study: what was asked.
+        topics: a scene each.
+        sheets: their pictures.
+        plots: their figures: ``seconds``, ``spp`` (where there is one) and ``measures``.
+        made: when and on what.
+    """
+    template = (Path(__file__).parent / "report.html").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
+    return environment.from_string(template).render(
+        title=study.asked["title"],
+        made=made,
+        ramp=_ramp(),
+        scenes=[_scene(study, *parts) for parts in zip(topics, sheets, plots, strict=True)],
+        method=_method(study),
+        settings=_settings(topics),
+    )
+
+
+def _scene(study: Study, topic: Topic, sheet: Sheet | None, plots: dict[str, Figure]) -> dict[str, Any]:
+    names = study.asked["metrics"]
+    main, most = NAMES[names[0]], words.count(study.asked["spp"][-1])
+    columns = ["Setting", *(f"Time to {main} {words.number(target, 2)}" for target in topic.targets)]
+    columns += [f"{main} at {most} samples", "Slope over samples", "Efficiency", "Bias", "Not finite"]
+    return {
+        "name": topic.name,
+        "about": _about(topic),
+        "headline": _headline(topic, main),
+        "notes": topic.notes,
+        "columns": columns,
+        "rows": [_row(topic, line, index, names[0]) for index, line in enumerate(topic.lines)],
+        "plots": [_plot(plots[over], f"{main} over {over}") for over in ("seconds", "spp") if over in plots],
+        "overview": _plot(plots["measures"], "all measures over seconds") if "measures" in plots else None,
+        "sheet": None if sheet is None else _sheet(sheet, names[0]),
+        "step_columns": ["Setting", "Samples", "Time", *(NAMES[name] for name in names), "Efficiency"],
+        "step_rows": [_step_row(line, step, names) for line in topic.lines for step in line.steps],
+    }
+
+
+def _headline(topic: Topic, main: str) -> str:
+    """Who is first, and by how much, among settings without bias."""
+    able = [line for line in topic.lines if line.measured and not (line.bias and line.bias["biased"])]
+    timed = sorted((line.times[-1]["seconds"], line.label) for line in able if line.times and line.times[-1]["seconds"])
+    if len(timed) < 2:
+        return ""
+    (least, first), (_, second), (most, last) = timed[0], timed[1], timed[-1]
+    text = f"{first} comes to {main} {words.number(topic.targets[-1], 2)} first, in {words.seconds(least)}: "
+    text += f"{words.times(timed[1][0] / least)} as fast as {second}"
+    return f"{text}." if len(timed) == 2 else f"{text}, {words.times(most / least)} as fast as {last}."
+
+
+def _about(topic: Topic) -> str:
+    truth = topic.lines[0].truth
+    high, wide = truth.image.shape[:2]
+    size = f"{wide} × {high} pixels."
+    if not truth.told["made"]:
+        return f"{size} Reference: {truth.told['file']}."
+    told, spp = truth.told, words.count(truth.told["spp"])
+    return (
+        f"{size} Reference: the mean of {told['seeds']} independent runs of {spp} samples a pixel "
+        f"({words.seconds(told['seconds'])} in all); its own relMSE, {words.number(truth.noise, 2)}, is taken off."
+    )
+
+
+def _cell(text: str, *small: str, tone: str = "") -> dict[str, Any]:
+    return {"text": text, "small": [line for line in small if line], "tone": tone}
+
+
+def _row(topic: Topic, line: Line, index: int, main: str) -> dict[str, Any]:
+    cells = [_time_cell(topic, line, number) for number in range(len(topic.targets))]
+    last = line.steps[-1]
+    found = last.estimate(main)
+    cells.append(_cell(words.number(found.mean), words.interval(found)))
+    slope = line.by_spp.slope if line.by_spp else None
+    cells.append(_cell("–") if slope is None else _cell(words.number(slope.mean), words.interval(slope)))
+    cells.append(_efficiency_cell(topic, line))
+    cells.append(_bias_cell(line))
+    bad = sum(step.nonfinite for step in line.steps)
+    cells.append(_cell(words.count(bad), tone="bad" if bad else ""))
+    colour = COLOURS[index % len(COLOURS)]
+    return {"label": line.label, "mark": _MARKS[index % len(_MARKS)], "colour": colour, "cells": cells}
+
+
+def _time_cell(topic: Topic, line: Line, number: int) -> dict[str, Any]:
+    told, first = line.times[number], topic.lines[0].times[number]
+    if told.get("never"):
+        return _cell("never", "its bias is larger", tone="bad")
+    if told["seconds"] is None:
+        return _cell("–", "too far to tell" if line.by_seconds else "")
+    parts = [words.span(told["low"], told["high"]), "extrapolated" if told["extrapolated"] else ""]
+    if line is not topic.lines[0] and first["seconds"]:
+        ratio = first["seconds"] / told["seconds"]
+        parts.insert(0, f"{words.times(max(ratio, 1 / ratio))} {'faster' if ratio >= 1 else 'slower'}")
+    return _cell(words.seconds(told["seconds"]), *parts)
+
+
+def _efficiency_cell(topic: Topic, line: Line) -> dict[str, Any]:
+    found, first = line.steps[-1].efficiency(), topic.lines[0].steps[-1].efficiency()
+    if found is None:
+        return _cell("–")
+    ratio = f"{words.times(found.mean / first.mean)} that of the first" if first and line is not topic.lines[0] else ""
+    return _cell(words.number(found.mean), words.interval(found), ratio)
+
+
+def _bias_cell(line: Line) -> dict[str, Any]:
+    if line.bias is None:
+        return _cell("–", "one picture")
+    share = f"light {100 * line.bias['share']:+.2g} %".replace("-", "−")
+    if line.bias["biased"]:
+        return _cell("biased", share, f"p {_chance(line.bias['chance'])}", tone="bad")
+    return _cell("none found", share, f"p {_chance(line.bias['chance'])}", tone="good")
+
+
+def _chance(value: float) -> str:
+    return "< 0.0001" if value < 1e-4 else f"= {value:.2g}"
+
+
+def _step_row(line: Line, step: Any, names: Sequence[str]) -> list[dict[str, Any]]:
+    cells = [
+        _cell(line.label),
+        _cell("–" if step.spp is None else words.count(step.spp)),
+        _cell(words.seconds(step.seconds)),
+    ]
+    for name in names:
+        found = step.estimate(name)
+        cells.append(_cell(words.number(found.mean), words.interval(found)))
+    efficiency = step.efficiency()
+    return [
+        *cells,
+        _cell("–") if efficiency is None else _cell(words.number(efficiency.mean), words.interval(efficiency)),
+    ]
+
+
+def _sheet(sheet: Sheet, main: str) -> dict[str, Any]:
+    x, y, wide, high = sheet.place
+    across, down = sheet.size
+    frame = "; ".join(
+        f"{name}: {100 * part / whole:.3f}%"
+        for name, part, whole in (
+            ("left", x, across),
+            ("top", y, down),
+            ("width", wide, across),
+            ("height", high, down),
+        )
+    )
+    panels = []
+    for panel in sheet.panels:
+        samples = "" if panel.step.spp is None else f"{words.count(panel.step.spp)} samples, "
+        error = f"{NAMES[main]} {words.number(panel.step.errors[main][0])}"
+        panels.append(
+            {
+                "label": panel.line.label,
+                "caption": f"{samples}{words.seconds(panel.step.times[0])}, {error}",
+                "crop": _data(panel.crop, "png"),
+                "errors": _data(panel.errors, "png"),
+            }
+        )
+    return {
+        "about": f"Of every setting the run nearest to {words.seconds(sheet.seconds)}, where errors are largest: "
+        f"{wide} × {high} pixels, enlarged. Times are told, since steps of samples do not meet exactly.",
+        "whole": _data(sheet.whole, "png"),
+        "crop": _data(sheet.crop, "png"),
+        "side": 3 * wide,
+        "frame": frame,
+        "panels": panels,
+        "low": words.number(sheet.scale[0], 1),
+        "top": words.number(sheet.scale[1], 1),
+    }
+
+
+def _plot(figure: Figure, alt: str) -> dict[str, Any]:
+    """The vector form, with the size in pixels that keeps its place while it loads."""
+    text = figure[1].decode()
+    wide, high = (float(text.partition(f'{name}="')[2].partition("pt")[0]) for name in ("width", "height"))
+    return {"data": _data(figure[1], "svg+xml"), "alt": alt, "width": round(wide), "height": round(high)}
+
+
+def _data(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _ramp() -> str:
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return ", ".join(to_hex(colormaps["inferno"](k / 8)) for k in range(9))
+
+
+def _method(study: Study) -> list[str]:
+    seeds, steps = study.asked["seeds"], ", ".join(map(words.count, study.asked["spp"]))
+    return [
+        f"Each step ({steps} samples a pixel) was run {seeds} times with independent seeds. Times are those of sampling, "
+        "without loading, building and compiling; a run that is thrown away goes before. Settings took turns.",
+        "Errors are means over the runs, times medians. Bands and intervals are 95 %, Student's t of the logarithm. From "
+        "relMSE, its trimmed form (without the 0.1 % of pixels that are furthest off) and MSE the reference's own variance is "
+        "taken off; the other measures include it. PSNR and SSIM look at what a screen shows. HDR-FLIP "
+        "is that of a step's first run.",
+        "A slope is that of the straight line through the logarithms of error and samples; −1 is what independent samples "
+        "give. The time to an error is read from the line over seconds, marked where that lies beyond the runs. Efficiency is "
+        "1 / (variance × seconds) at the largest step, the variance relative to the reference's square + 0.01.",
+        "Bias: the mean of the runs of the largest step differs from the reference by more than the spread of both explains, "
+        "with a chance of less than 0.1 % otherwise. A dotted line is the error at which such a curve ends.",
+    ]
+
+
+def _settings(topics: Sequence[Topic]) -> str:
+    """What ran, as a scene file would state it."""
+    import yaml
+
+    shown: dict[str, Any] = {}
+    for topic in topics:
+        shown[topic.name] = {line.label: _listed(line.settings) for line in topic.lines if line.measured}
+    return yaml.safe_dump(shown, sort_keys=False, allow_unicode=True, width=100)
+
+
+def _listed(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _listed(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_listed(item) for item in value]
+    return value if not isinstance(value, float) or math.isfinite(value) else str(value)

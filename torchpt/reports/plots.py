@@ -1,0 +1,195 @@
+"""The curves: error over seconds and over samples, with 95 % bands; PNG and SVG.
+
+Colours are those of Okabe and Ito (2008), which all kinds of sight tell apart; marks and dashes differ too, so that a print
+without colours can be read.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from io import BytesIO
+from typing import Any
+
+from torchpt.reports.analysis import Line, Topic
+from torchpt.reports.study import ERRORS
+
+__all__ = ["COLOURS", "NAMES", "curves", "encoded", "overview"]
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D1F")
+_MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
+_DASHES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
+#: How measures are written.
+NAMES = {
+    "relmse": "relMSE",
+    "relmse_trimmed": "relMSE, 0.1 % trimmed",
+    "mse": "MSE",
+    "smape": "SMAPE",
+    "psnr": "PSNR (dB)",
+    "ssim": "SSIM",
+    "flip": "HDR-FLIP",
+}
+_STYLE: dict[str, Any] = {
+    "font.size": 11.0,
+    "axes.titlesize": 12.0,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#d8d8d8",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "svg.hashsalt": "torchpt",  # the same figures, the same file
+    "svg.fonttype": "path",
+}
+
+
+def _matplotlib() -> Any:
+    """Matplotlib without a window and without its global state."""
+    os.environ.setdefault("MPLBACKEND", "agg")
+    import matplotlib
+
+    return matplotlib
+
+
+def curves(topic: Topic, measure: str, over: str) -> Any:
+    """One figure: a measure over ``seconds`` or ``spp``, of every curve that has it."""
+    matplotlib = _matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(_STYLE):
+        lines = [line for line in topic.lines if over == "seconds" or all(step.spp for step in line.steps)]
+        rows = len(lines) + (1 if over == "spp" else 0)
+        figure = Figure(figsize=(4.9, 3.4 + 0.23 * rows), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        for index, line in enumerate(topic.lines):
+            if line in lines:
+                _draw(axes, line, measure, over, index)
+        if over == "spp":
+            _guide(axes, lines, measure)
+        _finish(axes, measure, over)
+        if over == "spp":
+            steps = sorted({step.spp for line in lines for step in line.steps if step.spp})
+            if len(steps) <= 8:
+                axes.set_xticks(steps, labels=[f"{n:,}".replace(",", " ") for n in steps])
+                axes.minorticks_off()
+        axes.set_title(f"{NAMES[measure]} over {'seconds' if over == 'seconds' else 'samples a pixel'}", loc="left")
+        figure.legend(loc="outside lower left", fontsize=10.0)
+    return figure
+
+
+def overview(topic: Topic, measures: Sequence[str]) -> Any:
+    """All measures over seconds, small, in one figure."""
+    matplotlib = _matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(_STYLE):
+        rows = -(-len(measures) // 2)
+        figure = Figure(figsize=(7.2, 2.3 * rows + 0.21 * len(topic.lines)), layout="constrained")
+        FigureCanvasAgg(figure)
+        for place, measure in enumerate(measures):
+            axes = figure.add_subplot(rows, 2, place + 1)
+            for index, line in enumerate(topic.lines):
+                _draw(axes, line, measure, "seconds", index, slopes=False if place == 0 else None)
+            _finish(axes, measure, "seconds")
+            axes.set_title(NAMES[measure], loc="left", fontsize=10.0)
+            axes.set_ylabel("")
+        figure.legend(loc="outside lower left", fontsize=10.0)
+    return figure
+
+
+def encoded(figure: Any) -> tuple[bytes, bytes]:
+    """The figure as PNG and as SVG."""
+    matplotlib = _matplotlib()
+    png, svg = BytesIO(), BytesIO()
+    with matplotlib.rc_context(_STYLE):
+        figure.savefig(png, format="png", dpi=200)
+        figure.set_layout_engine("none")  # it is laid out: once is enough
+        figure.savefig(svg, format="svg", metadata={"Date": None})
+    return png.getvalue(), svg.getvalue()
+
+
+def _points(line: Line, measure: str, over: str) -> list[tuple[float, float, float, float]]:
+    """x, mean, lower and upper bound of the steps that can be shown."""
+    points = []
+    for step in line.steps:
+        found, x = step.estimate(measure), step.seconds if over == "seconds" else step.spp
+        if (
+            x
+            and found.mean == found.mean
+            and abs(found.mean) != float("inf")
+            and (found.mean > 0 or measure not in ERRORS)
+        ):
+            low = found.mean if found.low is None else found.low
+            points.append((float(x), found.mean, low, found.mean if found.high is None else found.high))
+    return points
+
+
+def _draw(axes: Any, line: Line, measure: str, over: str, index: int, slopes: bool | None = True) -> None:
+    """One curve; named in the legend with its slope, without it, or (None) not at all."""
+    colour, mark = COLOURS[index % len(COLOURS)], _MARKS[index % len(_MARKS)]
+    dash = _DASHES[(index // len(COLOURS) + index) % len(_DASHES)] if line.measured else ":"
+    points = _points(line, measure, over)
+    if not points:
+        return
+    x, mean, low, high = (list(values) for values in zip(*points, strict=True))
+    label = None if slopes is None else line.label + (_slope(line, over) if slopes else "")
+    axes.plot(x, mean, color=colour, linestyle=dash, marker=mark, markersize=5, linewidth=1.6, label=label)
+    if x == sorted(x):
+        axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
+    else:  # times so short that more samples took less
+        axes.vlines(x, low, high, color=colour, alpha=0.5)
+    floor = line.bias["squared"] if line.bias and line.bias["biased"] and measure == "relmse" else 0.0
+    if floor > 0:
+        axes.axhline(floor, color=colour, linewidth=1.0, linestyle=(0, (1, 2)))
+        if not axes.texts:  # said once
+            place = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "bottom"}
+            axes.annotate("bias", (1.0, floor), fontsize=9, color=colour, **place)
+
+
+def _slope(line: Line, over: str) -> str:
+    found = line.by_seconds if over == "seconds" else line.by_spp
+    return "" if found is None or found.slope.low is None else f"   slope {found.slope.mean:.2f}".replace("-", "−")
+
+
+def _guide(axes: Any, lines: Sequence[Line], measure: str) -> None:
+    """How an unbiased estimate of independent samples falls."""
+    points = [point for line in lines for point in _points(line, measure, "spp")]
+    if measure not in ("relmse", "mse", "relmse_trimmed") or not points:
+        return
+    left, right = min(x for x, *_ in points), max(x for x, *_ in points)
+    top = max(mean for x, mean, *_ in points if x == left)
+    axes.plot(
+        [left, right],
+        [top, top * left / right],
+        color="#777777",
+        linewidth=0.9,
+        linestyle=":",
+        label="1 / samples",
+        zorder=1,
+    )
+
+
+def _finish(axes: Any, measure: str, over: str) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    if measure in ERRORS:
+        axes.set_yscale("log")
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    low, high = axes.get_xlim()
+    if high / low < 20:
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(plain)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    low, high = axes.get_ylim()
+    if measure in ERRORS:
+        if high / low < 30:
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(plain)
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.grid(True, which="major")
+    axes.set_axisbelow(True)
+    axes.set_xlabel("seconds, without set-up" if over == "seconds" else "samples a pixel")

@@ -1,0 +1,286 @@
+"""What a study asks: scenes, a grid of settings, the steps of its curves, a reference, and what to make of them.
+
+The same keys stand on the command line and in a study file; any other key there is a setting of the renderer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, ClassVar
+
+from torchpt import paths
+from torchpt.errors import SceneError
+from torchpt.format.yaml_file import plain, read_yaml
+from torchpt.images.metrics import METRICS
+from torchpt.reports.grid import Variant, blocks_of, flat, variants_of
+from torchpt.spec import Other, Refused, Valued, Whole, parameters_of
+from torchpt.spec.declared import values_of
+
+__all__ = ["ERRORS", "MEASURES", "OWN_KEYS", "RECORDS", "Extra", "Plan", "Reference", "Study", "read_study", "study_of"]
+
+#: What a curve can show, in the order of tables. `relmse_trimmed` is of this room until all measures have it.
+MEASURES = tuple(dict.fromkeys(("relmse", "relmse_trimmed", *METRICS)))
+#: Of them, those that fall toward 0: what slopes and times to an error are of.
+ERRORS = tuple(name for name in MEASURES if name not in ("psnr", "ssim"))
+_MOST_STEPS = 64
+
+
+def _list(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list | tuple) else [value]
+
+
+def _steps(value: Any) -> tuple[int, ...]:
+    steps = _list(value)
+    if not 2 <= len(steps) <= _MOST_STEPS or not all(type(n) is int and 1 <= n <= 2**30 for n in steps):
+        raise Refused("a list of two or more growing numbers of samples a pixel, such as [4, 16, 64]")
+    if any(a >= b for a, b in pairwise(steps)):
+        raise Refused("numbers of samples a pixel that grow, such as [4, 16, 64]")
+    return tuple(steps)
+
+
+def _metrics(value: Any) -> tuple[str, ...]:
+    names = _list(value)
+    for index, name in enumerate(names):
+        if name not in MEASURES or name in names[:index]:
+            raise Refused(f"a list of different ones of {', '.join(MEASURES)}", name)
+    if not names or names[0] not in ERRORS:
+        raise Refused(f"a list whose first is an error, which the curves show: one of {', '.join(ERRORS)}")
+    return tuple(names)
+
+
+def _targets(value: Any) -> tuple[float, ...]:
+    levels = _list(value)
+    for level in levels:
+        if isinstance(level, bool) or not isinstance(level, int | float) or not 0 < level < 1e12:
+            raise Refused("errors > 0, one or a list", level)
+    return tuple(sorted({float(level) for level in levels}, reverse=True))
+
+
+@dataclass(frozen=True)
+class Extra:
+    """Somebody else's picture.
+
+    Attributes:
+        name: of the curve that it belongs to.
+        seconds: that it took.
+        file: where it is.
+        scene: what it shows.
+        spp: samples a pixel, where that is known.
+    """
+
+    name: str
+    seconds: float
+    file: str
+    scene: str
+    spp: int | None = None
+
+
+def _extras(value: Any) -> tuple[dict[str, Any], ...]:
+    known = ("name", "seconds", "file", "scene", "spp")
+    expected = "a list of {name, seconds, file}, each perhaps with scene and spp"
+    for index, item in enumerate(_list(value)):
+        if not isinstance(item, Mapping) or not {"name", "seconds", "file"} <= item.keys() <= set(known):
+            raise Refused(expected, item, (index,))
+        seconds, spp = item["seconds"], item.get("spp")
+        if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds < 1e9:
+            raise Refused("seconds > 0", seconds, (index, "seconds"))
+        if spp is not None and (type(spp) is not int or spp < 1):
+            raise Refused("a whole number >= 1", spp, (index, "spp"))
+        for key in ("name", "file"):
+            if not isinstance(item[key], str) or not item[key].strip():
+                raise Refused("text", item[key], (index, key))
+    return tuple(dict(item) for item in _list(value))
+
+
+class Asked(Valued):
+    """The keys that are the study's own, beside ``scene`` and ``reference``."""
+
+    parameters: ClassVar = {
+        "spp": Other((4, 16, 64, 256), reader=_steps, words="growing numbers", doc="samples a pixel of each step"),
+        "seeds": Whole(5, low=2, high=1000, doc="independent runs of each step"),
+        "seed": Whole(0, high=2**63 - 1, doc="the seeds of all runs follow from it"),
+        "metrics": Other(
+            ("relmse", "relmse_trimmed", "mse", "smape", "psnr", "ssim", "flip"),
+            reader=_metrics,
+            words="names of measures",
+            doc="what is measured; curves show the first",
+        ),
+        "target": Other(
+            None, reader=_targets, words="errors > 0", doc="of the first measure: the time to reach them is told"
+        ),
+        "extra": Other(
+            (), reader=_extras, words="a list of {name, seconds, file}", doc="other renderers' pictures, linear"
+        ),
+        "title": Other("Error against run time", reader=str, words="text", doc="of the page"),
+    }
+
+
+class Reference(Valued):
+    """How the reference is made, where it is no file."""
+
+    parameters: ClassVar = {
+        "spp": Whole(None, low=1, doc="samples a pixel of each of its runs; 4 times the largest step"),
+        "seeds": Whole(8, low=2, high=1000, doc="independent runs that it is the mean of"),
+    }
+
+
+OWN_KEYS = (*Asked.parameters, "scene", "reference")
+#: For the tables of the docs.
+RECORDS = {"study": Asked, "reference": Reference}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a reference comes about: of files, or by runs.
+
+    Attributes:
+        files: scene to file; empty where it is made.
+        spp: of each run.
+        seeds: how many runs.
+        settings: by dotted key, over those that all variants share.
+    """
+
+    files: dict[str, str]
+    spp: int
+    seeds: int
+    settings: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study, checked as far as it can be without its scenes.
+
+    Attributes:
+        scenes: names or paths.
+        variants: the grid.
+        asked: spp, seeds, seed, metrics, target, title.
+        extras: other renderers' pictures.
+        reference: how it comes about.
+        file: the study file.
+    """
+
+    scenes: tuple[str, ...]
+    variants: tuple[Variant, ...]
+    asked: Any
+    extras: tuple[Extra, ...]
+    reference: Plan
+    file: str | None = None
+
+    def overrides(self, variant: Variant) -> dict[str, dict[str, Any]]:
+        """The variant's settings by block."""
+        return blocks_of(variant.settings, self.file)
+
+    def truth(self, variant: Variant) -> dict[str, dict[str, Any]]:
+        """The settings of a variant's reference by block: what all share, its own film, no clamp; then what was asked."""
+        own = {k: v for k, v in variant.settings.items() if k not in variant.axes or k.partition(".")[0] == "film"}
+        return blocks_of({**own, "integrator.clamp": None, **self.reference.settings}, self.file)
+
+
+def read_study(name: str) -> tuple[dict[str, Any], str]:
+    """The keys of a study file, and its path; files that it names start at its own folder.
+
+    Args:
+        name: of a study in ``configs/study/``, or a path ending in ``.yaml``.
+
+    Raises:
+        SceneError: no such file, no valid YAML, no mapping.
+    """
+    shipped = {path.stem: str(path) for path in sorted((paths.configs() / "study").glob("*.yaml"))}
+    if not name.endswith((".yaml", ".yml")) and name not in shipped:
+        raise SceneError("study", name, f"one of {', '.join(shipped)}, or a path ending in .yaml")
+    path = shipped.get(name, name)
+    if not Path(path).is_file():
+        raise SceneError("study", path, "a study file that is there")
+    raw = read_yaml(Path(path), path)
+    if not isinstance(raw, dict):
+        raise SceneError("study", raw, "a mapping of keys such as scene, spp, sampler", path)
+    raw = plain(raw, path)
+    base = Path(path).parent
+
+    def placed(file: Any) -> Any:
+        return str(base / file) if isinstance(file, str) else file
+
+    def named(scene: Any) -> Any:
+        return placed(scene) if str(scene).endswith((".yaml", ".yml")) else scene
+
+    if "scene" in raw:
+        raw["scene"] = [named(scene) for scene in _list(raw["scene"])]
+    reference = raw.get("reference")
+    if isinstance(reference, str):
+        raw["reference"] = placed(reference)
+    elif isinstance(reference, Mapping) and "file" in reference:
+        files = reference["file"]
+        files = {named(k): placed(v) for k, v in files.items()} if isinstance(files, Mapping) else placed(files)
+        raw["reference"] = {**reference, "file": files}
+    if isinstance(raw.get("extra"), list):
+        raw["extra"] = [_extra_placed(item, placed, named) for item in raw["extra"]]
+    return raw, path
+
+
+def _extra_placed(item: Any, placed: Callable[[Any], Any], named: Callable[[Any], Any]) -> Any:
+    if not isinstance(item, Mapping):
+        return item
+    scene = {"scene": named(item["scene"])} if "scene" in item else {}
+    return {**item, "file": placed(item.get("file")), **scene}
+
+
+def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
+    """A study of its keys, as a file and the command line give them.
+
+    Raises:
+        SceneError: a key or value that is not accepted.
+    """
+    scenes = tuple(_list(raw.get("scene") or []))
+    if not scenes or not all(isinstance(name, str) for name in scenes) or len(set(scenes)) < len(scenes):
+        raise SceneError(
+            "scene", raw.get("scene"), "the name of a scene, a path ending in .yaml, or a list of them", file
+        )
+    asked = values_of(Asked, {key: raw[key] for key in Asked.parameters if key in raw}, "", file, "a study")
+    if "flip" in asked["metrics"] and find_spec("flip_evaluator") is None:
+        if "metrics" in asked.given:
+            expected = "measures that are there (flip: pip install 'torchpt-renderer[compare]')"
+            raise SceneError("metrics", list(asked["metrics"]), expected, file)
+        asked.values["metrics"] = tuple(name for name in asked["metrics"] if name != "flip")
+    settings: dict[str, Any] = {}
+    for key, value in raw.items():
+        if key not in OWN_KEYS and not key.startswith("reference."):
+            settings |= flat({key: value})
+    variants = tuple(variants_of(settings, file))
+    extras = []
+    for index, item in enumerate(asked["extra"]):
+        scene = item.get("scene", scenes[0] if len(scenes) == 1 else None)
+        if scene not in scenes:
+            raise SceneError(f"extra.{index}.scene", scene, f"one of {', '.join(scenes)}", file)
+        if item["name"] in {variant.label for variant in variants}:
+            raise SceneError(f"extra.{index}.name", item["name"], "a name that no curve has", file)
+        extras.append(Extra(item["name"], float(item["seconds"]), item["file"], scene, item.get("spp")))
+    plan = _plan(raw.get("reference"), scenes, asked["spp"][-1], file)
+    return Study(scenes, variants, asked.values, tuple(extras), plan, file)
+
+
+def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> Plan:
+    """The reference: a file's name, or a mapping with ``file``, or one with ``spp``, ``seeds`` and settings."""
+    if raw is None or isinstance(raw, str):
+        raw = {} if raw is None else {"file": raw}
+    if not isinstance(raw, Mapping):
+        raise SceneError("reference", raw, "a file, or a mapping with spp, seeds and settings", file)
+    files = raw.get("file")
+    if files is not None:
+        if other := next((key for key in raw if key != "file"), None):
+            raise SceneError(f"reference.{other}", raw[other], "nothing where reference.file is given", file)
+        files = {scenes[0]: files} if isinstance(files, str) and len(scenes) == 1 else files
+        if not isinstance(files, Mapping) or set(files) != set(scenes):
+            raise SceneError("reference.file", files, f"a file for each of {', '.join(scenes)}", file)
+        return Plan(dict(files), 0, 0, {})
+    own = {key: value for key, value in raw.items() if key in parameters_of(Reference)}
+    made = values_of(Reference, own, "reference", file, "a reference")
+    settings = flat({key: value for key, value in raw.items() if key not in own})
+    for key, value in settings.items():
+        if isinstance(value, list) and key != "film.crop":
+            raise SceneError(f"reference.{key}", value, "one value: there is one reference", file)
+    variants_of(settings, file)  # refuses what is no setting
+    return Plan({}, made["spp"] or 4 * most, made["seeds"], settings)
