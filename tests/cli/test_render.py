@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchpt.cli import main
-from torchpt.images import read_image, read_layers
+from torchpt.images import read_header, read_image, read_layers
 from torchpt.images.colour import TONEMAPS
 
 from .conftest import SCENE, Renderer
@@ -42,6 +42,7 @@ def test_the_last_line_is_json(folder: Path, renderer: Renderer, capsys: pytest.
     }
     assert captured.err == ""  # no progress bar where stderr is no terminal
     assert files(folder) == {"a.exr"}
+    assert read_header("a.exr") == {"spp": 4, "relmse": 0.125, "relmse_low": 0.0625}
 
 
 def test_settings_reach_the_renderer(folder: Path, renderer: Renderer) -> None:

@@ -11,7 +11,7 @@ __all__ = ["Samples"]
 
 
 class Samples(FilmLayer):
-    """How many samples of light the pixel is a mean of: more where `sampler.adaptive` took them, and twice as many of a pilot."""
+    """How many samples of light the pixel is a mean of: `sampler.adaptive` says where; a pilot may hold twice as many."""
 
     name = "samples"
     channels = ("samples",)
