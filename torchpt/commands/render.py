@@ -18,7 +18,7 @@ from torchpt.commands.notices import notices
 from torchpt.commands.progress import Bar
 from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
 
-__all__ = ["Job", "described", "numbered", "plain", "render"]
+__all__ = ["Job", "described", "knowing", "numbered", "plain", "render"]
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     start = time.perf_counter()
     with notices():
         description, wishes = described(job)
+        wishes = knowing(wishes)
         outs = _outputs(job, wishes)
         preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
         previews = _preview_files(preview) if preview else []
@@ -105,6 +106,12 @@ def described(job: Job) -> tuple[Any, Any]:
         own = {key: value for key, value in getattr(description, group).items() if block.get(key, key) is not None}
         description = replace(description, **{group: own})
     return description, settings(description, job.overrides)
+
+
+def knowing(wishes: Any) -> Any:
+    """Settings of a picture that a command writes: ``render.pilots: auto`` is true there, as its summary tells the error."""
+    render = wishes.render
+    return replace(wishes, render=render.but(pilots=True)) if render.pilots == "auto" else wishes
 
 
 def _keeping(interrupt: Interrupt, work: Callable[[], Any]) -> Any:
