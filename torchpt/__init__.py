@@ -22,7 +22,8 @@ from torchpt.errors import (
 if TYPE_CHECKING:
     from torchpt import ibl
     from torchpt.bsdfs import Bsdf
-    from torchpt.images import metrics, read_image, read_layers, write_image
+    from torchpt.forward import Rendering
+    from torchpt.images import metrics, read_header, read_image, read_layers, write_image
     from torchpt.images.denoiser import denoise
     from torchpt.rendering import render
     from torchpt.scene import Scene, load
@@ -37,6 +38,7 @@ __all__ = [
     "NotBuiltError",
     "OutputError",
     "RenderError",
+    "Rendering",
     "Scene",
     "SceneError",
     "TorchptError",
@@ -45,6 +47,7 @@ __all__ = [
     "ibl",
     "load",
     "metrics",
+    "read_header",
     "read_image",
     "read_layers",
     "render",
@@ -54,10 +57,12 @@ __all__ = [
 # public name -> the module that has it
 _LAZY = {
     "Bsdf": "torchpt.bsdfs",
+    "Rendering": "torchpt.forward",
     "Scene": "torchpt.scene",
     "denoise": "torchpt.images.denoiser",
     "from_trimesh": "torchpt.scene.from_trimesh",
     "load": "torchpt.scene",
+    "read_header": "torchpt.images",
     "read_image": "torchpt.images",
     "read_layers": "torchpt.images",
     "render": "torchpt.rendering",

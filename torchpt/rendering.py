@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, TypedDict, Unpack, overload
 
 import torch
 from torch import Tensor
@@ -14,14 +14,44 @@ from torchpt import adjoint as adjoints
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
+from torchpt.images.denoiser import check_denoiser, denoise
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.scene import Scene
 from torchpt.settings import FILTERS, Settings
 from torchpt.spec.declared import Described
 
-__all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene"]
+__all__ = ["Progress", "Rendering", "Wishes", "first_hit", "render", "render_scene"]
 
 
+class Wishes(TypedDict, total=False):
+    """The other arguments of :func:`render`, for type checkers."""
+
+    spp: int | None
+    seed: int | None
+    integrator: str | Mapping[str, Any] | None
+    sampler: str | Mapping[str, Any] | None
+    film: Mapping[str, Any] | None
+    params: Mapping[str, Tensor] | None
+    time_limit: float | None
+    target_error: float | None
+    pilots: bool | str | None
+    accel: str | None
+    compile: str | bool | None
+    threads: int | str | None
+    max_memory: int | str | None
+    device: str | torch.device | None
+    dtype: torch.dtype
+    adjoint: str | None
+    seed_grad: int | None
+    spp_grad: int | None
+
+
+@overload
+def render(scene: Scene, *, full: Literal[False] = False, **wishes: Unpack[Wishes]) -> Tensor: ...
+@overload
+def render(scene: Scene, *, full: Literal[True], **wishes: Unpack[Wishes]) -> Rendering: ...
+@overload
+def render(scene: Scene, *, full: bool, **wishes: Unpack[Wishes]) -> Tensor | Rendering: ...
 def render(
     scene: Scene,
     *,
@@ -31,6 +61,10 @@ def render(
     sampler: str | Mapping[str, Any] | None = None,
     film: Mapping[str, Any] | None = None,
     params: Mapping[str, Tensor] | None = None,
+    full: bool = False,
+    time_limit: float | None = None,
+    target_error: float | None = None,
+    pilots: bool | str | None = None,
     accel: str | None = None,
     compile: str | bool | None = None,
     threads: int | str | None = None,
@@ -40,56 +74,69 @@ def render(
     adjoint: str | None = None,
     seed_grad: int | None = None,
     spp_grad: int | None = None,
-) -> Tensor:
+) -> Tensor | Rendering:
     """Render a scene to linear RGB ``(H, W, 3)`` on the scene's device; differentiable in ``params``.
 
     Main arguments:
         scene: from :func:`torchpt.load`.
-        spp: samples a pixel.
+        spp: samples a pixel; the most of them where ``time_limit`` or ``target_error`` may end it.
         seed: any integer from 0; the same seed gives the same picture.
         params: tensors in place of ``scene.params`` by dotted name. Where one requires gradients, so does the picture.
+        full: True returns a :class:`torchpt.Rendering`: picture, layers, error, counts and seconds as one object.
 
     Other arguments, all as in the scene file; ``None`` keeps the scene's own wish:
         integrator, sampler: a type or a mapping with ``type``.
-        film: a mapping; ``denoise`` is refused, as one picture comes back: see :func:`torchpt.denoise`.
+        film: a mapping; ``denoise`` needs ``full``: a tensor is one picture (see :func:`torchpt.denoise`).
+        time_limit, target_error: seconds of sampling, and a relMSE, that end the render.
+        pilots: True: the picture knows its error (``relmse`` of a ``full`` one), by one pixel of 16 sampled twice; ``auto``:
+            where ``target_error`` or ``sampler.adaptive`` ask for it.
         accel, compile, threads, max_memory: of ``render``.
         device: must be the scene's own; load the scene on the device where it is to render.
         dtype: of the lanes. float64 is for checking derivatives; the search stays float32.
         adjoint: how gradients are taken: ``autograd`` (the default) runs each chunk of pixels again under a tape in the
             backward pass, so memory is that of a chunk.
-        seed_grad, spp_grad: of the backward pass. By default it draws samples of its own, as many as the forward pass:
+        seed_grad, spp_grad: of the backward pass. By default it draws samples of its own, as many as the forward pass took:
             shared samples would bias the gradient of a squared loss. Visibility edges that move (silhouettes, shadow
             edges) are not differentiated; see docs/gradients.md.
 
     Raises:
         SceneError: a setting or parameter that is not accepted.
-        RenderError: a device or compiler that is not there.
+        RenderError: a device, compiler or denoiser that is not there.
     """
     _check(scene, device, dtype, adjoint, {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1)})
-    wishes = {
-        "film": film,
-        "integrator": integrator,
-        "sampler": sampler,
-        "render": {
-            "spp": spp, "seed": seed, "accel": accel, "compile": compile, "threads": threads, "max_memory": max_memory,
-        },
+    given = {
+        "spp": spp, "seed": seed, "accel": accel, "compile": compile, "threads": threads, "max_memory": max_memory,
+        "time_limit": time_limit, "target_error": target_error, "pilots": pilots,
     }  # fmt: skip
+    wishes = {"film": film, "integrator": integrator, "sampler": sampler, "render": given}
     settings = complete(scene.description, wishes)
-    if (film or {}).get("denoise") and settings.film.denoise:
-        raise SceneError(
-            "film.denoise", True, "false: a tensor is one picture; hand it to torchpt.denoise with its layers"
-        )
-    settings = replace(settings, film=settings.film.but(denoise=False))  # the scene file's wish is about files
+    if not full:
+        settings = _of_one_picture(settings, film)
+    elif settings.film.denoise:
+        check_denoiser()
     scene.check(params)
     wanted = tuple(name for name, value in (params or {}).items() if value.requires_grad)
     if not (wanted or scene.weights()) or not torch.is_grad_enabled():
-        return render_scene(scene, settings, params=params, dtype=dtype).image
-    backward = settings.render.but(
-        seed=settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad,
-        spp=settings.render.spp if spp_grad is None else spp_grad,
-    )
-    again = replace(settings, render=backward)
-    return _differentiable(scene, settings, again, params or {}, wanted, dtype, adjoint or "autograd")
+        rendering = render_scene(scene, settings, params=params, dtype=dtype)
+    else:
+        backward = {"seed": settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad, "spp": spp_grad}
+        rendering = _differentiable(scene, settings, backward, params or {}, wanted, dtype, adjoint or "autograd")
+    if settings.film.denoise:
+        with limited_threads(settings.render.threads):
+            rendering.denoised = denoise(rendering.image.detach(), **rendering.guides)
+    return rendering if full else rendering.image
+
+
+def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
+    """Settings of a render that returns a tensor; a scene file's wish to denoise is about files.
+
+    Raises:
+        SceneError: the caller's own wish to denoise.
+    """
+    if (film or {}).get("denoise") and settings.film.denoise:
+        expected = "false, or full=True: a tensor is one picture; hand it to torchpt.denoise with its layers"
+        raise SceneError("film.denoise", True, expected)
+    return replace(settings, film=settings.film.but(denoise=False))
 
 
 def _check(
@@ -123,13 +170,16 @@ def _same(wish: str | torch.device, own: torch.device) -> bool:
 def _differentiable(
     scene: Scene,
     settings: Settings,
-    again: Settings,
+    backward: Mapping[str, int | None],
     params: Mapping[str, Tensor],
     wanted: tuple[str, ...],
     dtype: torch.dtype,
     adjoint: str,
-) -> Tensor:
-    """The picture on a tape from the parameters ``wanted``; the backward pass renders ``again``."""
+) -> Rendering:
+    """A rendering whose picture is on a tape from the parameters ``wanted``.
+
+    ``backward`` has the backward pass's own seed and samples a pixel; None: as many as the forward pass took.
+    """
     if not settings.integrator.light:
         radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
         raise SceneError("integrator.type", settings.integrator.name, f"one of {radiant} where gradients are wanted")
@@ -142,16 +192,24 @@ def _differentiable(
             stacklevel=3,
         )
     fixed = {name: value for name, value in params.items() if name not in wanted}
+    made: list[Rendering] = []
+    taken: list[int] = []
 
     def forward(*tensors: Tensor) -> Tensor:
         given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
-        return render_scene(scene, settings, params=given, dtype=dtype).image
+        made.append(render_scene(scene, settings, params=given, dtype=dtype))
+        return made[-1].image
 
     def chunks(*tensors: Tensor) -> Iterator[adjoints.Chunk]:
         given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
+        spp = taken[0] if backward["spp"] is None else backward["spp"]
+        again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
         return adjoints.chunks(scene, again, given, wanted, dtype, attached)
 
-    return adjoints.KINDS[adjoint](forward, chunks, tuple(params[name] for name in wanted), scene.weights())
+    image = adjoints.KINDS[adjoint](forward, chunks, tuple(params[name] for name in wanted), scene.weights())
+    rendering = made.pop()  # the tape keeps the closures, which are not to keep pictures
+    taken.append(max(rendering.spp, 1))
+    return replace(rendering, image=image)
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:

@@ -44,8 +44,18 @@ class Rendering:
     def guides(self) -> dict[str, torch.Tensor]:
         return {name: self.image for name in ("albedo", "normal")} if self.settings.film.denoise else {}
 
+    def header(self) -> dict[str, Any]:
+        return {"spp": self.done, "relmse": 0.125, "relmse_low": 0.0625}
+
     def summary(self) -> dict[str, Any]:
-        facts = {"spp": self.done, "seconds": 1.5, "paths_per_second": 2e6, "rays": 77, "nonfinite_samples": 0}
+        facts = {
+            "spp": self.done,
+            "load_seconds": 0.25,
+            "seconds": 1.5,
+            "paths_per_second": 2e6,
+            "rays": 77,
+            "nonfinite_samples": 0,
+        }
         return {**facts, "mean": self.image.mean((0, 1)), "relmse": float("nan")}
 
 

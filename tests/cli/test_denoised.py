@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchpt.cli import main
 from torchpt.errors import RenderError
-from torchpt.images import denoiser, read_image, read_layers
+from torchpt.images import denoiser, read_header, read_image, read_layers
 
 from .conftest import SCENE, Renderer
 
@@ -51,6 +51,8 @@ def test_both_pictures_are_written_and_named(
     assert facts["denoise_seconds"] >= 0 and facts["mean"] == [1, 1, 1]  # of the picture as rendered
     assert halved == [("albedo", "normal")]
     assert set(read_layers("a.exr")) == {"image", "depth"} and set(read_layers("a.denoised.exr")) == {"image"}
+    assert read_header("a.exr") == {"spp": 4, "relmse": 0.125, "relmse_low": 0.0625}
+    assert read_header("a.denoised.exr") == {"spp": 4, "denoised": 1}  # whose error nobody knows
     assert torch.equal(read_image("a.exr"), 2 * read_image("a.denoised.exr"))
     assert torch.allclose(read_image("b.c.denoised.png", linear=True), torch.tensor(0.5), atol=2e-3)  # shown alike
 

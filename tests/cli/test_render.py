@@ -4,12 +4,13 @@ import json
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from torchpt.cli import main
-from torchpt.images import read_image, read_layers
+from torchpt.images import read_header, read_image, read_layers
 from torchpt.images.colour import TONEMAPS
 
 from .conftest import SCENE, Renderer
@@ -21,7 +22,7 @@ def files(folder: Path) -> set[str]:
     return set(os.listdir(folder)) - {"s.yaml"}
 
 
-def summary(capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+def summary(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
@@ -42,6 +43,22 @@ def test_the_last_line_is_json(folder: Path, renderer: Renderer, capsys: pytest.
     }
     assert captured.err == ""  # no progress bar where stderr is no terminal
     assert files(folder) == {"a.exr"}
+    assert read_header("a.exr") == {"spp": 4, "relmse": 0.125, "relmse_low": 0.0625}
+
+
+def test_the_summary_and_the_header_tell_the_error(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lamp = "shapes: {lamp: {type: sphere, center: [2, 2, -2], radius: 0.5, emission: 5}, "
+    (folder / "s.yaml").write_text(SCENE.replace("shapes: {", lamp))
+    assert main(["render", "scene=s.yaml", "out=a.exr", "film.width=48", "film.height=32"]) == 0
+    facts, header = summary(capsys), read_header("a.exr")
+    found = (facts["relmse"], *facts["relmse_interval"])
+    assert found == pytest.approx([header[name] for name in ("relmse", "relmse_low", "relmse_high")], rel=1e-6)
+    assert 0 < found[1] < found[0] < found[2]
+    timed = [f"{part}_seconds" for part in ("load", "build", "compile", "render")]
+    assert {name: facts[name] for name in timed} == {name: pytest.approx(header[name], abs=1e-4) for name in timed}
+    assert facts["spp"] == header["spp"] == 4 and header["scene"] == "s"
+    assert main(["render", "scene=s.yaml", "out=b.exr", "render.pilots=false"]) == 0
+    assert summary(capsys)["relmse"] is None and "relmse" not in read_header("b.exr")
 
 
 def test_settings_reach_the_renderer(folder: Path, renderer: Renderer) -> None:

@@ -182,7 +182,7 @@ def test_a_library_that_does_not_run_here_is_said_in_one_line(monkeypatch: pytes
 
 
 def test_a_render_in_python_is_one_picture(scene: torchpt.Scene) -> None:
-    with pytest.raises(SceneError, match=r"film.denoise: expected false: .*torchpt\.denoise"):
+    with pytest.raises(SceneError, match=r"film.denoise: expected false, or full=True: .*torchpt\.denoise"):
         torchpt.render(scene, film={"denoise": True})
     with pytest.raises(SceneError, match="film.denoise: expected true or false, got 'yes'"):
         torchpt.render(scene, film={"denoise": "yes"})

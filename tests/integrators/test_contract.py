@@ -205,6 +205,7 @@ LAYER_ROWS = {
     "object_id": Shown((1.0,)),
     "alpha": Shown((1.0,)),
     "variance": Shown(None),
+    "samples": Shown((4.0,)),
 }
 
 

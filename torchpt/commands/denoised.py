@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 from torchpt.errors import OutputError
 
-__all__ = ["beside", "denoise_rendering", "denoised_files"]
-
-
-def beside(path: str) -> str:
-    """``a.exr`` as ``a.denoised.exr``."""
-    file = Path(path)
-    return str(file.with_name(f"{file.stem}.denoised{file.suffix}"))
+__all__ = ["denoise_rendering", "denoised_files"]
 
 
 def denoised_files(wishes: Any, outs: list[str], others: list[str]) -> list[str]:
@@ -26,6 +19,7 @@ def denoised_files(wishes: Any, outs: list[str], others: list[str]) -> list[str]
     """
     if not wishes.film.denoise:
         return []
+    from torchpt.forward.files import beside
     from torchpt.images.denoiser import check_denoiser
 
     check_denoiser()

@@ -22,7 +22,7 @@ from torchpt.commands import collector
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.notices import notices
 from torchpt.commands.progress import Bar
-from torchpt.commands.render import Job, described, numbered, plain
+from torchpt.commands.render import Job, described, knowing, numbered, plain
 from torchpt.errors import OutputError, SceneError
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
             if frames.has(number):
                 continue
             once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
-            wishes = settings(scene.description, once)
+            wishes = knowing(settings(scene.description, once))  # a frame is what `torchpt render` gives
             wishes = replace(
                 wishes, film=wishes.film.but(denoise=False)
             )  # a scene file's wish is about `torchpt render`

@@ -18,7 +18,7 @@ from torchpt.commands.notices import notices
 from torchpt.commands.progress import Bar
 from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
 
-__all__ = ["Job", "described", "numbered", "plain", "render"]
+__all__ = ["Job", "described", "knowing", "numbered", "plain", "render"]
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
         TorchptError: bad input, found before anything is rendered wherever that is possible.
         Interrupted: a signal came while there was no picture to keep.
     """
+    from torchpt.forward.files import write_rendered
     from torchpt.images import check_writable
     from torchpt.rendering import first_hit, render_scene
     from torchpt.scene.scene import Scene, device_of
@@ -61,6 +62,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     start = time.perf_counter()
     with notices():
         description, wishes = described(job)
+        wishes = knowing(wishes)
         outs = _outputs(job, wishes)
         preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
         previews = _preview_files(preview) if preview else []
@@ -68,7 +70,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
         for path in (*outs, *previews, *denoised):
             check_writable(path)
         scene = Scene(description, device_of(wishes.render.device))
-    load_seconds = time.perf_counter() - start
+    scene.load_seconds = time.perf_counter() - start
     if preview:
         hits = first_hit(scene, wishes)
         for path, name in zip(previews, ("albedo", "normal"), strict=False):
@@ -79,12 +81,12 @@ def render(job: Job, interrupt: Interrupt) -> int:
         def on_progress(state: Any) -> bool:
             bar.update(state.done, state.total, state.rays, state.seconds)
             if preview and state.pass_finished and state.done < state.total:
-                _write(preview, state.snapshot(), wishes)
+                write_rendered(preview, state.snapshot(), wishes.film)
             return interrupt.signum is not None
 
         rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress))
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)
-    print(_summary(rendering, outs, {"load_seconds": round(load_seconds, 4)} | facts), flush=True)
+    print(_summary(rendering, outs, facts), flush=True)
     if interrupt.signum is None:
         return 0
     print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far", file=sys.stderr)
@@ -109,6 +111,12 @@ def described(job: Job) -> tuple[Any, Any]:
     if wishes.render.pilots == "auto":
         wishes = replace(wishes, render=wishes.render.but(pilots="variance" not in wishes.film.aovs))
     return description, wishes
+
+
+def knowing(wishes: Any) -> Any:
+    """Settings of a picture that a command writes: ``render.pilots: auto`` is true there, as its summary tells the error."""
+    render = wishes.render
+    return replace(wishes, render=render.but(pilots=True)) if render.pilots == "auto" else wishes
 
 
 def _keeping(interrupt: Interrupt, work: Callable[[], Any]) -> Any:
@@ -146,11 +154,13 @@ def _preview_files(preview: str) -> list[str]:
 
 def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: Any) -> dict[str, Any]:
     """Write every picture that can be written before complaining of one that cannot; returns what there is to tell."""
+    from torchpt.forward.files import write_denoised, write_rendered
+
     failed: TorchptError | None = None
     facts: dict[str, Any] = {}
     for path in paths:
         try:
-            _write(path, rendering, wishes)
+            write_rendered(path, rendering, wishes.film)
         except OutputError as error:
             failed = failed or error
     try:
@@ -160,24 +170,12 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: An
         raise failed or error from None
     for path in denoised:
         try:
-            _write_shown(path, rendering.denoised, wishes)
+            write_denoised(path, rendering, wishes.film)
         except OutputError as error:
             failed = failed or error
     if failed is not None:
         raise failed
     return facts
-
-
-def _write(path: str, rendering: Any, wishes: Any) -> None:
-    _write_shown(path, rendering.image, wishes, rendering.layers if _is_exr(path) else None)
-
-
-def _write_shown(path: str, image: Any, wishes: Any, layers: Any = None) -> None:
-    """Write a picture, shown as the film says."""
-    from torchpt.images import write_image
-
-    film = wishes.film
-    write_image(path, image, layers, exposure=film.exposure, tonemap=film.tonemap, gamma=film.gamma)
 
 
 def _write_layer(path: str, name: str, layer: Any) -> None:

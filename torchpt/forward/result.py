@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from os import PathLike
 from typing import Any
 
 from torch import Tensor
 
+from torchpt.settings import Settings
+
 __all__ = ["Progress", "Rendering"]
 
 
-@dataclass
+@dataclass(repr=False, eq=False)
 class Rendering:
-    """A picture and how it came about.
+    """A picture and how it came about; ``torchpt.render(scene, full=True)`` gives one, and notebooks show it.
+
+    ``rendering["rgb"]`` is the picture, and ``rendering["depth"]`` the layer of that name; ``dict(rendering)`` has all of them.
 
     Attributes:
-        image: ``(H, W, 3)`` linear RGB.
+        image: ``(H, W, 3)`` linear RGB; alone of all it carries gradients, where they are wanted.
         layers: what ``film.aovs`` asked for, each ``(H, W, C)``.
         guides: what the denoiser looks at beside the picture, by the names of its arguments, each ``(H, W, 3)``; empty
             without ``film.denoise``.
         denoised: the picture without its noise ``(H, W, 3)``; None where nobody denoised it. No number here is about it.
         spp: samples a pixel that the picture holds.
-        seconds: wall time.
-        build_seconds: of it, for the world and its search structure.
+        seconds: wall time, loading apart.
+        load_seconds: for reading the scene and its files; 0 where nobody took the time.
+        build_seconds: of ``seconds``, for the world and its search structure.
         compile_seconds: of it, for compiling.
         render_seconds: of it, for sampling.
         paths: camera samples traced.
@@ -37,6 +44,8 @@ class Rendering:
         stopped_by: the rule that ended it: spp, time_limit or target_error; "" where it was ended from outside.
         complete: whether a rule ended it.
         eager: stages that ran as tensor operations although kernels were wanted, and why.
+        scene: name of the scene; "" where it came as a mapping.
+        settings: what it was rendered with, complete.
     """
 
     image: Tensor
@@ -45,6 +54,7 @@ class Rendering:
     denoised: Tensor | None = None
     spp: int = 0
     seconds: float = 0.0
+    load_seconds: float = 0.0
     build_seconds: float = 0.0
     compile_seconds: float = 0.0
     render_seconds: float = 0.0
@@ -59,11 +69,120 @@ class Rendering:
     stopped_by: str = ""
     complete: bool = True
     eager: tuple[str, ...] = ()
+    scene: str = ""
+    settings: Settings | None = None
+
+    @property
+    def variance(self) -> Tensor | None:
+        """The variance of each pixel ``(H, W, 3)``; None where ``film.aovs`` does not ask for it."""
+        return self.layers.get("variance")
+
+    def __getitem__(self, name: str) -> Tensor:
+        """The picture (``rgb``) or a layer, by name.
+
+        Raises:
+            KeyError: a layer that ``film.aovs`` did not ask for.
+        """
+        if name == "rgb":
+            return self.image
+        if name not in self.layers:
+            raise KeyError(f"{name}: expected one of {', '.join(self)}; film.aovs asks for more")
+        return self.layers[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of the picture and its layers."""
+        return iter(("rgb", *self.layers))
+
+    def __contains__(self, name: object) -> bool:
+        return name in tuple(self)
+
+    def __len__(self) -> int:
+        return 1 + len(self.layers)
+
+    def keys(self) -> tuple[str, ...]:
+        """Names of the picture and its layers."""
+        return tuple(self)
+
+    def write(self, path: str | PathLike[str]) -> None:
+        """Write it as ``torchpt render`` does: whole or not at all, shown as ``film`` says.
+
+        An ``.exr`` keeps the layers, and the facts of :meth:`header`. Where there is a denoised picture it lies beside it, as
+        ``NAME.denoised.exr``.
+
+        Args:
+            path: where to, ending in ``.exr .hdr .png .jpg .jpeg .ppm``.
+
+        Raises:
+            OutputError: an ending that is not written, or a place that cannot be written.
+        """
+        from torchpt.forward.files import beside, write_denoised, write_rendered
+        from torchpt.settings import Film
+
+        film = Film() if self.settings is None else self.settings.film
+        write_rendered(path, self, film)
+        if self.denoised is not None:
+            write_denoised(beside(path), self, film)
+
+    def header(self) -> dict[str, str | int | float]:
+        """What the header of an EXR file says of it, by name; :func:`torchpt.read_header` reads it back."""
+        from torchpt import __version__
+
+        low, high = self.relmse_interval or (None, None)
+        facts: dict[str, str | int | float | None] = {
+            "version": __version__,
+            "scene": self.scene if self.scene.isprintable() else None,
+            "spp": self.spp,
+            "relmse": self.relmse,
+            "relmse_low": low,
+            "relmse_high": high,
+            "heavy_tailed": 1 if self.heavy_tailed else None,
+            "load_seconds": self.load_seconds,
+            "build_seconds": self.build_seconds,
+            "compile_seconds": self.compile_seconds,
+            "render_seconds": self.render_seconds,
+            "rays": self.rays,
+            "nonfinite_samples": self.nonfinite_samples,
+            "truncated_paths": self.truncated_paths or None,
+            "clamped": self.clamped,
+            "stopped_by": self.stopped_by,
+            "complete": int(self.complete),
+        }
+        if self.settings is not None:
+            facts |= {
+                "seed": self.settings.render.seed,
+                "integrator": self.settings.integrator.name,
+                "sampler": self.settings.sampler.name,
+            }
+        return {
+            name: value
+            for name, value in facts.items()
+            if value is not None and value != "" and (isinstance(value, str) or math.isfinite(value))
+        }
+
+    def __repr__(self) -> str:
+        from torchpt.forward.notebook import table_of
+
+        facts = table_of(self)
+        size = facts.pop("size")
+        return f"Rendering({size}; {'; '.join(f'{name}: {value}' for name, value in facts.items())})"
+
+    def _repr_png_(self) -> bytes:
+        """The picture in a notebook."""
+        from torchpt.forward.notebook import png_of
+
+        return png_of(self.image, None if self.settings is None else self.settings.film)
+
+    def _repr_html_(self) -> str:
+        """The picture and what is known of it, in a notebook."""
+        from torchpt.forward.notebook import html_of
+
+        return html_of(self)
 
     def summary(self) -> dict[str, Any]:
         """The facts as plain values, ready for JSON."""
         facts: dict[str, Any] = {
             "spp": self.spp,
+            "load_seconds": round(self.load_seconds, 4),
             "build_seconds": round(self.build_seconds, 4),
             "compile_seconds": round(self.compile_seconds, 4),
             "render_seconds": round(self.render_seconds, 4),
@@ -71,7 +190,7 @@ class Rendering:
             "paths_per_second": round(self.paths / max(self.render_seconds, 1e-9)),
             "rays": self.rays,
             "nonfinite_samples": self.nonfinite_samples,
-            "mean": [float(x) for x in self.image.double().mean((0, 1))],
+            "mean": [float(x) for x in self.image.detach().double().mean((0, 1))],
             "relmse": self.relmse,
             "relmse_interval": None if self.relmse_interval is None else list(self.relmse_interval),
         }

@@ -46,6 +46,7 @@ class Run:
     ) -> None:
         self.start = time.perf_counter()
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
+        self.name, self.load_seconds = scene.name, scene.load_seconds
         self.wave = make_wave(scene, settings, params, dtype)
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
@@ -265,6 +266,7 @@ class Run:
             guides={name: layers[name] for name in GUIDES} if self.settings.film.denoise else {},
             spp=int(counts.sum()) // len(counts),
             seconds=time.perf_counter() - self.start,
+            load_seconds=self.load_seconds,
             build_seconds=self.build_seconds,
             compile_seconds=compile_seconds,
             render_seconds=self.seconds_of_sampling(),
@@ -279,6 +281,8 @@ class Run:
             stopped_by=self.stop.reason,
             complete=bool(self.stop.reason) and not self.ended,
             eager=tuple(self.eager),
+            scene=self.name,
+            settings=self.settings,
         )
 
     def _known(self) -> KnownError | None:
@@ -292,12 +296,14 @@ class Run:
     def _layers(self) -> dict[str, Tensor]:
         """The layers so far: those of first surfaces, and those that the film makes."""
         layers = {}
+        film = self.picture.film
+        counts = film.counts if self.twice is None else self.twice.counts(film)
         for name, layer in self.seen.items():
-            film = self.picture.layers[name]
-            values = film.mean() * (self.unit if layer.length else 1.0) if layer.averaged else film.first()
+            seen = self.picture.layers[name]
+            values = seen.mean() * (self.unit if layer.length else 1.0) if layer.averaged else seen.first()
             layers[name] = values.to(self.dtype)
         for name in self.settings.film.aovs:
             if name not in self.seen:
                 made: Any = LAYERS[name]  # a FilmLayer
-                layers[name] = made.of(self.picture.film).to(self.dtype)
+                layers[name] = made.of(film, counts).to(self.dtype)
         return layers

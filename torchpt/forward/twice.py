@@ -47,6 +47,13 @@ class Twice:
         values[places] += share * (second.values() - values[places])
         return values.reshape(film.height, film.width, -1)
 
+    def counts(self, film: Film) -> Tensor:
+        """Samples that each pixel of the picture holds ``(pixels,)`` int64."""
+        counts = film.counts
+        if self.counted and len(self.pilots):
+            counts[self.pilots.places.to(counts.device)] += self.plate.film.counts
+        return counts
+
     def known(self, film: Film) -> KnownError | None:
         """What the picture knows of its error."""
         if not len(self.pilots) or int(self.plate.film.counts.min()) == 0:

@@ -1,6 +1,7 @@
 """Pictures: files in and out, colour, and how far one is from another."""
 
 from torchpt.images.decode import EncodedImage
+from torchpt.images.header import read_header
 from torchpt.images.read import read_image, read_layers
 from torchpt.images.texels import Texels, has_alpha, read_texels
 from torchpt.images.write import check_writable, write_image
@@ -10,6 +11,7 @@ __all__ = [
     "Texels",
     "check_writable",
     "has_alpha",
+    "read_header",
     "read_image",
     "read_layers",
     "read_texels",

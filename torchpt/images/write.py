@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import secrets
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from io import BytesIO
@@ -21,6 +22,7 @@ from torch import Tensor
 
 from torchpt.errors import OutputError
 from torchpt.images.colour import display
+from torchpt.images.header import Fact, checked_header, put_header
 from torchpt.images.layers import channel_names
 
 __all__ = ["WRITABLE", "check_writable", "place_of", "reason_of", "temporary_beside", "write_image"]
@@ -35,6 +37,7 @@ def write_image(
     exposure: float = 0.0,
     tonemap: str = "none",
     gamma: str | float = "srgb",
+    header: Mapping[str, Fact] | None = None,
 ) -> None:
     """Write a picture in the format that the file's ending names.
 
@@ -46,17 +49,20 @@ def write_image(
         path: where to; an existing file is replaced.
         image: ``(H, W, C)`` linear, C = 1, 3 or 4 (alpha is kept by EXR and PNG).
         layers: name to ``(H, W, C)`` or ``(H, W)``; kept by ``.exr`` only. The names of `film.aovs` get the usual
-            channels: ``albedo.R/G/B normal.X/Y/Z Z position.X/Y/Z uv.U/V object_id A variance.R/G/B``.
+            channels: ``albedo.R/G/B normal.X/Y/Z Z position.X/Y/Z uv.U/V object_id A variance.R/G/B
+            samples``.
         exposure: stops (8-bit formats).
         tonemap: none, reinhard, aces or filmic (8-bit formats).
         gamma: ``"srgb"`` or an exponent (8-bit formats).
+        header: facts by name (letters, digits and _), each printable text or a number; kept by ``.exr`` only, as attributes
+            ``torchpt:NAME``, and read by :func:`torchpt.read_header`.
 
     Raises:
         OutputError: an ending that is not written, or a place that cannot be written.
-        ValueError: an image or layer of another shape.
+        ValueError: an image or layer of another shape, a header that no file could hold.
     """
     destination = place_of(path)
-    pixels = _pixels("image", image)
+    pixels, facts = _pixels("image", image), checked_header(header or {})
     temporary = temporary_beside(destination)
     if temporary.suffix == ".exr":
         named = {"image": pixels} | {name: _pixels(name, layer) for name, layer in (layers or {}).items()}
@@ -67,10 +73,10 @@ def write_image(
         twice = sorted({channel for channel in channels if channels.count(channel) > 1})
         if twice:
             raise ValueError(f"two layers have the channel {twice[0]} (a picture of 4 channels has its alpha: A)")
-        encode = partial(_encode_float, temporary, np.concatenate(list(named.values()), axis=2), channels)
+        encode = partial(_encode_float, temporary, np.concatenate(list(named.values()), axis=2), channels, facts)
     elif temporary.suffix == ".hdr":  # RGBE has no sign: the encoder would wrap around
         rgb = np.nan_to_num(_rgb(pixels), nan=0.0, posinf=1e30).clip(0, 1e30)
-        encode = partial(_encode_float, temporary, rgb, ["R", "G", "B"])
+        encode = partial(_encode_float, temporary, rgb, ["R", "G", "B"], {})
     else:
         levels = _levels(pixels, temporary.suffix == ".png", exposure, tonemap, gamma)
         encode = partial(_encode_integer, temporary, levels)
@@ -150,7 +156,7 @@ def _rgb(pixels: np.ndarray) -> np.ndarray:
     return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
 
 
-def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str]) -> None:
+def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str], facts: dict[str, Fact]) -> None:
     import OpenImageIO as oiio
 
     height, width, count = pixels.shape
@@ -158,6 +164,7 @@ def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str]) -> N
     spec.channelnames = channels
     if temporary.suffix == ".exr":
         spec.attribute("compression", "zip")
+        put_header(spec, facts)
     encoder = oiio.ImageOutput.create("picture" + temporary.suffix)
     if encoder is None or not encoder.open(str(temporary), spec):
         raise OSError(encoder.geterror() if encoder else oiio.geterror())

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 KINDS: Kinds[Integrator] = Kinds("torchpt.integrators.kinds", ("path", "direct", "aov", "ibl"))
 #: The layers of pictures.
 LAYERS: Kinds[Layer] = Kinds(
-    "torchpt.integrators.layers", ("albedo", "normal", "depth", "position", "uv", "object_id", "alpha", "variance")
+    "torchpt.integrators.layers",
+    ("albedo", "normal", "depth", "position", "uv", "object_id", "alpha", "variance", "samples"),
 )
 
 __all__ = ["KINDS", "LAYERS"]

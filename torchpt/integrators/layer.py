@@ -77,6 +77,11 @@ class FilmLayer(Layer):
     """A layer that the film makes of its sums of radiance."""
 
     @classmethod
-    def of(cls, film: Film) -> Tensor:
-        """The layer ``(H, W, C)`` float64."""
+    def of(cls, film: Film, counts: Tensor) -> Tensor:
+        """The layer ``(H, W, C)`` float64.
+
+        Args:
+            film: sums of radiance.
+            counts: samples that each pixel of the picture holds ``(pixels,)``; of a pilot both of its values.
+        """
         raise NotImplementedError

@@ -5,7 +5,9 @@ from __future__ import annotations
 import difflib
 import os
 import threading
+import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,9 +52,12 @@ def load(
         AssetError: a file that it names is missing or malformed.
         RenderError: the device is not there.
     """
+    start = time.perf_counter()
     description = read_description(source, bsdfs)
     chosen = device_of(settings(description).render.device if device is None else device)
-    return Scene(description, chosen, tuple((bsdfs or {}).values()))
+    scene = Scene(description, chosen, tuple((bsdfs or {}).values()))
+    scene.load_seconds = time.perf_counter() - start
+    return scene
 
 
 def device_of(name: str | torch.device) -> torch.device:
@@ -75,6 +80,7 @@ class Scene:
         description: what was read.
         device: where its tensors live.
         own_models: BSDFs that the caller wrote.
+        load_seconds: that reading it took, its files included; 0 where nobody took the time.
         params: every tensor by dotted name (``materials.*``, ``shapes.*``, ``lights.*``, ``camera.*``): colours ``(3,)``,
             vertices ``(V, 3)`` in the mesh's own space, poses ``(4, 4)``. Changing one in place takes effect at the
             next render (which refuses places that no scene file could hold); to differentiate, hand replacements to
@@ -83,6 +89,7 @@ class Scene:
 
     def __init__(self, description: Description, device: torch.device, own_models: tuple[Bsdf, ...] = ()) -> None:
         settle()
+        self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
         self._built: Built = build_parts(description)
         # Geometry far from the origin would lose its detail in float32 before it can be moved there.
@@ -104,6 +111,11 @@ class Scene:
         """Tensors of the caller's own models that want gradients."""
         found = {id(weight): weight for model in self.own_models for weight in model.weights() if weight.requires_grad}
         return tuple(found.values())
+
+    @property
+    def name(self) -> str:
+        """Of its file, without folder and ending; "" of a mapping."""
+        return Path(self.description.file or "").stem
 
     @property
     def built(self) -> Built:

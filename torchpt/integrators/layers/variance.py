@@ -19,7 +19,7 @@ class Variance(FilmLayer):
     light = True
 
     @classmethod
-    def of(cls, film: Film) -> Tensor:
+    def of(cls, film: Film, counts: Tensor) -> Tensor:
         """See :class:`FilmLayer`."""
         variance = film.variance()
         return torch.full_like(film.mean(), torch.inf) if variance is None else variance
