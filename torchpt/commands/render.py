@@ -96,8 +96,6 @@ def render(job: Job, interrupt: Interrupt) -> int:
 def described(job: Job) -> tuple[Any, Any]:
     """The description and the complete settings of a job; a null given on the command line unsets the scene's own wish.
 
-    A picture of the command line knows its error, unless told otherwise.
-
     Raises:
         TorchptError: a scene or setting that cannot be used.
     """
@@ -107,10 +105,7 @@ def described(job: Job) -> tuple[Any, Any]:
     for group, block in job.overrides.items():
         own = {key: value for key, value in getattr(description, group).items() if block.get(key, key) is not None}
         description = replace(description, **{group: own})
-    wishes = settings(description, job.overrides)
-    if wishes.render.pilots == "auto":
-        wishes = replace(wishes, render=wishes.render.but(pilots="variance" not in wishes.film.aovs))
-    return description, wishes
+    return description, settings(description, job.overrides)
 
 
 def knowing(wishes: Any) -> Any:
