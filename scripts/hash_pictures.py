@@ -58,8 +58,9 @@ def variants() -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 def picture(scene: Any, compiled: bool, settings: dict[str, Any]) -> str:
     """Digest of a picture, or the error that takes its place."""
+    keys: dict[str, Any] = {"spp": 4, "seed": 7, **settings}
     try:
-        return digest(torchpt.render(scene, compile=compiled, **{"spp": 4, "seed": 7, **settings}))
+        return digest(torchpt.render(scene, compile=compiled, **keys))
     except TorchptError as error:
         return type(error).__name__
 
