@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 
 from torchpt.film.sharing import shared_out, smoothed
@@ -16,7 +15,7 @@ def counts(n: int) -> torch.Tensor:
 
 def test_even_errors_share_evenly():
     assert (shared_out(torch.ones(100).double(), counts(16), PIXELS, 64.0) == 64).all()
-    assert (shared_out(torch.zeros(100).double(), counts(16), PIXELS, 64.0) == 64).all()
+    assert (shared_out(torch.zeros(100).double(), counts(16), PIXELS, 32.0) == 32).all()
 
 
 def test_samples_go_with_the_root_of_the_variance():
@@ -26,15 +25,18 @@ def test_samples_go_with_the_root_of_the_variance():
     assert (aims[:50] == 256).all() and (aims[50:] == 128).all()
 
 
-def test_none_loses_samples_and_none_leaps():
+def test_numbers_are_doubled_within_what_there_is():
     g = torch.Generator().manual_seed(1)
     error, have = (
-        (10 * torch.randn(100, generator=g, dtype=torch.float64)).exp(),
-        16 * torch.randint(1, 9, (100,), generator=g),
+        (3 * torch.randn(100, generator=g, dtype=torch.float64)).exp(),
+        16 << torch.randint(0, 4, (100,), generator=g),
     )
-    aims = shared_out(error, have, PIXELS, 150.0)
-    assert (aims >= have).all() and (aims <= 4 * have + 16).all() and (aims % 16 == 0).all()
-    assert float(aims.double().mean()) == pytest.approx(150.0, rel=0.05)
+    mean = 2.0 * float(have.double().mean())
+    aims = shared_out(error, have, PIXELS, mean)
+    assert set((aims / have).tolist()) == {1.0, 2.0, 4.0}
+    assert 0.9 * mean <= float(aims.double().mean()) <= mean
+    ratio = (error * have).sqrt()
+    assert float(ratio[aims == 4 * have].mean()) > float(ratio[aims == have].mean())
 
 
 def test_bad_estimates_do_no_harm():

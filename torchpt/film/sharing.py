@@ -2,7 +2,8 @@
 
 A pixel of n samples whose relative variance is ``e`` has ``s = sqrt(e n)`` a sample; for so many samples in all the sum of
 ``s² / n`` over pixels is least where n goes with s. What ``e`` is, pilots say, one a block, smoothed over blocks nearby.
-Other pixels are not asked, so none of them owes its number of samples to its own value.
+Other pixels are not asked, so none of them owes its number of samples to its own value. Numbers are powers of two times the
+first one, as Sobol' points are at their best there.
 """
 
 from __future__ import annotations
@@ -12,8 +13,6 @@ from torch import Tensor
 
 __all__ = ["shared_out", "smoothed"]
 
-#: Samples come in blocks of so many, at multiples of it.
-BLOCK = 16
 #: No block of pixels takes more than this many times its samples at once: it is known by few pilots.
 GROWTH = 4
 #: Errors below this part of the mean count as much: what no pilot has met yet may be there all the same.
@@ -40,13 +39,13 @@ def smoothed(values: Tensor, known: Tensor) -> Tensor:
 
 
 def shared_out(error: Tensor, counts: Tensor, pixels: Tensor, mean: float) -> Tensor:
-    """Samples a pixel that blocks are to have ``(B,)`` int64, none fewer than they have.
+    """Samples a pixel that blocks are to have ``(B,)`` int64: those they have, twice or four times as many.
 
     Args:
         error: relative variance of the pixels of each block ``(B,)`` float64, at its present number of samples.
         counts: that number ``(B,)`` int64.
         pixels: of each block ``(B,)``.
-        mean: samples a pixel over the picture that there are to be.
+        mean: samples a pixel over the picture that there are to be, at most.
     """
     positive = error.clamp_min(0.0)
     floor = FLOOR * (positive * pixels).sum() / pixels.sum()
@@ -62,5 +61,13 @@ def shared_out(error: Tensor, counts: Tensor, pixels: Tensor, mean: float) -> Te
             low = middle
         else:
             high = middle
-    wanted = torch.minimum(torch.maximum(have, low * need), most)
-    return torch.maximum(counts, ((wanted - have) / BLOCK).round().long() * BLOCK + counts)
+    wanted = torch.minimum(torch.maximum(have, low * need), most) / have
+    doubled = wanted.log2().add(1e-9).floor().clamp(0, 2).long()
+    aims = counts << doubled
+    # What is left goes to those that are furthest below what they want, as far as it reaches.
+    order = (wanted / (1 << doubled)).argsort(descending=True, stable=True)
+    order = order[doubled[order] < 2]
+    spent = ((aims * pixels)[order]).cumsum(0)
+    left = total - float((aims * pixels).sum())
+    aims[order[spent <= left]] *= 2
+    return aims
