@@ -45,7 +45,7 @@ HEAVY = 0.2
 #: Part of the error that suspects may have before it is called so too.
 FEW = 0.5
 #: One of so many pixels is a suspect, one of so many pilots doubtful.
-SUSPECTS, DOUBTFUL = 512, 32
+SUSPECTS, DOUBTFUL = 1024, 64
 #: Streams that they are looked at again by.
 STREAMS = 8
 #: Further values may all miss a light that few samples meet: r is taken for no less than this part of a pilot's mean, or of a
