@@ -16,6 +16,8 @@ __all__ = ["Stop"]
 
 #: What of ``render.time_limit`` may be left over or exceeded.
 SLACK = 0.03
+#: Samples from which on an error may end a render: of fewer it is little more than a guess.
+FEWEST = 4
 
 
 @dataclass
@@ -50,7 +52,7 @@ class Stop:
         done = {"spp": taken / self.render.spp}
         if self.render.time_limit is not None:
             done["time_limit"] = seconds / self.render.time_limit
-        if self.render.target_error is not None and error is not None:
+        if self.render.target_error is not None and error is not None and taken >= FEWEST:
             done["target_error"] = self.render.target_error / error if error > 0.0 else 1.0
         self.share = min(max(done.values()), 1.0)
         for rule, share in done.items():
