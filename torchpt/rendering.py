@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -15,13 +14,12 @@ from torchpt import adjoint as adjoints
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
-from torchpt.images import denoiser
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.scene import Scene
 from torchpt.settings import FILTERS, Settings
 from torchpt.spec.declared import Described
 
-__all__ = ["Progress", "Rendering", "denoise_rendering", "first_hit", "render", "render_scene"]
+__all__ = ["Progress", "Rendering", "first_hit", "render", "render_scene"]
 
 
 def render(
@@ -187,15 +185,3 @@ def render_scene(
     """
     with torch.no_grad(), limited_threads(settings.render.threads):
         return Run(scene, settings, params, dtype).go(on_progress)
-
-
-def denoise_rendering(rendering: Rendering, settings: Settings) -> float:
-    """Give a rendering of ``film.denoise`` its denoised picture, on as many threads as it had; returns the seconds it took.
-
-    Raises:
-        RenderError: the denoiser failed.
-    """
-    start = time.perf_counter()
-    with limited_threads(settings.render.threads):
-        rendering.denoised = denoiser.denoise(rendering.image, **rendering.guides)
-    return time.perf_counter() - start

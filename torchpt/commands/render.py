@@ -142,7 +142,7 @@ def _preview_files(preview: str) -> list[str]:
 
 def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: Any) -> dict[str, Any]:
     """Write every picture that can be written before complaining of one that cannot; returns what there is to tell."""
-    from torchpt.rendering import denoise_rendering
+    from torchpt.forward.denoising import denoise_rendering
 
     failed: TorchptError | None = None
     facts: dict[str, Any] = {}

@@ -17,9 +17,10 @@ from typing import Any
 
 from torchpt.errors import SceneError
 from torchpt.format.description import Description, overridden, read_description
+from torchpt.forward.denoising import denoise_rendering
 from torchpt.forward.kept import Kept, kept
 from torchpt.images.denoiser import check_denoiser, denoiser_version
-from torchpt.rendering import Progress, Rendering, denoise_rendering, render_scene
+from torchpt.rendering import Progress, Rendering, render_scene
 from torchpt.reports.grid import Variant
 from torchpt.reports.store import Run, Store, name_of
 from torchpt.reports.study import Study
@@ -235,8 +236,11 @@ def _wanted(study: Study, prepared: list[Measured]) -> list[Wanted]:
     for measured in prepared:
         for number in range(study.asked["seeds"]):
             for curve in measured.curves:
-                for job, steps in ((curve.job, curve.steps), (curve.denoised, curve.denoised_steps)):
-                    for spp in study.asked["spp"] if job is not None else ():
+                pairs = [(curve.job, curve.steps)]
+                if curve.denoised is not None:
+                    pairs.append((curve.denoised, curve.denoised_steps))
+                for job, steps in pairs:
+                    for spp in study.asked["spp"]:
                         seed = seed_of(study.asked["seed"], "run", spp, number)
                         found.append((job, spp, seed, steps.setdefault(spp, [])))
         shared: dict[str, Job] = {}

@@ -224,8 +224,8 @@ def _method(study: Study) -> list[str]:
     """What a reader must know to trust the figures."""
     seeds, steps = study.asked["seeds"], ", ".join(map(words.count, study.asked["spp"]))
     denoised = (
-        "Denoised curves, of loose dashes and hollow marks, show the pictures of the same runs, denoised by what first surfaces are "
-        "like (albedo and normals). Their times are those of the runs with these layers, and of denoising."
+        "Denoised curves, of loose dashes and hollow marks, show the pictures of the same runs, denoised by what first "
+        "surfaces are like (albedo and normals). Their times are those of the runs with these layers, and of denoising."
     )
     return [
         f"Each step ({steps} samples a pixel) was run {seeds} times with independent seeds. Times are those of sampling, "
