@@ -94,6 +94,16 @@ def test_equal_and_black_pictures_are_unbiased_and_a_glow_is_not() -> None:
     assert not bias_of([grey, grey * (1 + 1e-7)], Truth(grey, black, (), {})).biased
 
 
+def test_a_part_that_is_black_in_all_says_nothing() -> None:
+    """As behind a scene without a sky."""
+    runs, truth, more = case("gaussian", 3)
+    keep = torch.ones(SIDE, SIDE, 1, dtype=torch.float64)
+    keep[:9] = 0.0
+    black = Truth(truth.image * keep, truth.variance * keep, tuple(run * keep for run in truth.runs), {})
+    found = bias_of([run * keep for run in runs], black, more)
+    assert not found.biased and 0.0 < found.chance <= 1.0
+
+
 def test_tiles_part_the_picture() -> None:
     image = torch.arange(7 * 5 * 2, dtype=torch.float64).reshape(7, 5, 2)
     assert torch.equal(tiles(image, 1)[:, 0], image.mean((0, 1)))

@@ -35,6 +35,7 @@ torchpt converge study=NAME|FILE.yaml [key=value ...]
   metrics=    of relmse relmse_trimmed mse smape psnr ssim flip; curves show the first       all
   target=     errors whose times are told, such as [0.01,0.001]                              one that all curves reach
   extra=      others' pictures beside ours: [{{name: theirs, seconds: 12.5, file: theirs.exr}}]
+  denoise=    true: beside every curve a second one, of its runs' denoised pictures            false
   title=      of the page
   {keys}
 
@@ -138,6 +139,7 @@ def converge(words: Mapping[str, str], interrupt: Interrupt) -> int:
                 "curves": [
                     {
                         "label": line.label,
+                        "denoised": line.of is not None,
                         "slope": line.by_spp.slope.mean if line.by_spp else None,
                         "times": line.times,
                         "biased": line.bias["biased"] if line.bias else None,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 from torchpt.errors import OutputError
 
-__all__ = ["denoise_rendering", "denoised_files"]
+__all__ = ["denoised_files"]
 
 
 def denoised_files(wishes: Any, outs: list[str], others: list[str]) -> list[str]:
@@ -27,18 +26,3 @@ def denoised_files(wishes: Any, outs: list[str], others: list[str]) -> list[str]
         if beside(path) in (*outs, *others):
             raise OutputError(beside(path), f"is where the denoised picture of {path} goes; choose another name")
     return [beside(path) for path in outs]
-
-
-def denoise_rendering(rendering: Any, wishes: Any) -> float:
-    """Give a rendering its denoised picture; returns the seconds that it took.
-
-    Raises:
-        RenderError: the denoiser failed.
-    """
-    from torchpt.forward import limited_threads
-    from torchpt.images.denoiser import denoise
-
-    start = time.perf_counter()
-    with limited_threads(wishes.render.threads):
-        rendering.denoised = denoise(rendering.image, **rendering.guides)
-    return time.perf_counter() - start

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.commands import collector
-from torchpt.commands.denoised import denoise_rendering, denoised_files
+from torchpt.commands.denoised import denoised_files
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.notices import notices
 from torchpt.commands.progress import Bar
@@ -99,13 +99,9 @@ def described(job: Job) -> tuple[Any, Any]:
     Raises:
         TorchptError: a scene or setting that cannot be used.
     """
-    from torchpt.format.description import read_description, settings
+    from torchpt.format.description import overridden, read_description
 
-    description = read_description(job.scene)
-    for group, block in job.overrides.items():
-        own = {key: value for key, value in getattr(description, group).items() if block.get(key, key) is not None}
-        description = replace(description, **{group: own})
-    return description, settings(description, job.overrides)
+    return overridden(read_description(job.scene), job.overrides)
 
 
 def knowing(wishes: Any) -> Any:
@@ -149,6 +145,7 @@ def _preview_files(preview: str) -> list[str]:
 
 def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: Any) -> dict[str, Any]:
     """Write every picture that can be written before complaining of one that cannot; returns what there is to tell."""
+    from torchpt.forward.denoising import denoise_rendering
     from torchpt.forward.files import write_denoised, write_rendered
 
     failed: TorchptError | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,7 +23,7 @@ from torchpt.spec.declared import Described, described
 from torchpt.spec.validate import check_keys
 from torchpt.textures import KINDS as TEXTURES
 
-__all__ = ["ASSETS", "Description", "read_description", "scene_names", "settings"]
+__all__ = ["ASSETS", "Description", "overridden", "read_description", "scene_names", "settings"]
 
 ASSETS = "$TORCHPT_ASSETS"
 _KEYS = ("version", "camera", *BLOCKS, "textures", "materials", "shapes", "lights")
@@ -153,6 +153,25 @@ def settings(description: Description, overrides: Mapping[str, Any] | None = Non
     """
     blocks = {name: getattr(description, name) for name in BLOCKS}
     return run_settings.merge(blocks, overrides or {}, description.file)
+
+
+def overridden(description: Description, overrides: Mapping[str, Mapping[str, Any]]) -> tuple[Description, Settings]:
+    """The description and the complete settings where a null among the overrides unsets the scene's own wish.
+
+    Args:
+        description: of the scene.
+        overrides: by block, as `settings` takes them.
+
+    Returns:
+        The description without the wishes that were unset, and the settings.
+
+    Raises:
+        SceneError: key such as ``render.spp``.
+    """
+    for block, given in overrides.items():
+        own = {key: value for key, value in getattr(description, block).items() if given.get(key, key) is not None}
+        description = replace(description, **{block: own})
+    return description, settings(description, overrides)
 
 
 def _describe(raw: dict[str, Any], types: Mapping[str, Kind], file: str | None, base: Path) -> Description:

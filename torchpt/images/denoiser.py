@@ -7,6 +7,7 @@ as the library's manual advises for final frames. Features seen in mirrors and t
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from torchpt.errors import RenderError
 
-__all__ = ["GUIDES", "check_denoiser", "denoise"]
+__all__ = ["GUIDES", "check_denoiser", "denoise", "denoiser_version"]
 
 #: The layers that the denoiser looks at beside the picture.
 GUIDES = ("albedo", "normal")
@@ -35,6 +36,11 @@ def check_denoiser() -> None:
         RenderError: the package is not installed, or its library does not run on this machine.
     """
     _library()
+
+
+def denoiser_version() -> str:
+    """What denoised pictures depend on beside what they are made of: the package, whose wheel holds the library."""
+    return f"pyoidn {version('pyoidn')}"
 
 
 def denoise(image: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None) -> Tensor:

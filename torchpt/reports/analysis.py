@@ -15,7 +15,8 @@ from torchpt.errors import AssetError
 from torchpt.images import read_image
 from torchpt.reports.bias import bias_of
 from torchpt.reports.errors import measures
-from torchpt.reports.measure import Curve, Measured, film_size
+from torchpt.reports.grid import denoised_label
+from torchpt.reports.measure import Curve, Job, Measured, film_size
 from torchpt.reports.reference import Truth, from_file, from_runs
 from torchpt.reports.statistics import Estimate, Fit, estimate, fit
 from torchpt.reports.store import Run
@@ -82,6 +83,8 @@ class Line:
         truth: what it is compared with.
         measured: whether these are runs of a study; else pictures that others made.
         settings: complete, of a study's runs.
+        of: the curve whose runs' pictures these are, denoised; else None. They are guesses: no slope, no efficiency.
+        look: number of its colour and mark; that of ``of`` where there is one.
         by_spp: the line through its errors over samples.
         by_seconds: the same over seconds.
         bias: the verdict of the bias test.
@@ -93,16 +96,29 @@ class Line:
     truth: Truth
     measured: bool = True
     settings: Mapping[str, Any] = field(default_factory=dict)
+    of: Line | None = None
+    look: int = 0
     by_spp: Fit | None = None
     by_seconds: Fit | None = None
     bias: dict[str, Any] | None = None
     times: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def estimates(self) -> bool:
+        """Whether these are what a renderer of a study gave: neither others' pictures nor denoised ones."""
+        return self.measured and self.of is None
+
+    @property
+    def floor(self) -> float:
+        """The error at which the curve ends; 0 where no bias was found. That of a denoised one still falls with samples."""
+        return self.bias["squared"] if self.estimates and self.bias and self.bias["biased"] else 0.0
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "label": self.label,
             "measured": self.measured,
+            "denoised": self.of is not None,
             "settings": self.settings,
             "reference": {**self.truth.told, "relmse": self.truth.noise},
             "slope_over_spp": asdict(self.by_spp.slope) if self.by_spp else None,
@@ -176,9 +192,16 @@ def analyse(study: Study, measured: Measured) -> Topic:
 
     topic = Topic(measured.name, [], first.job.wishes.film)
     for curve in measured.curves:
-        topic.lines.append(_line(curve, truth_of(curve), names))
-    # What is made of runs, such as a denoised form of each, would be lines of their own here: never steps of these.
+        line = _line(curve.variant.label, curve.job, curve.steps, truth_of(curve), names)
+        topic.lines.append(line)
+        if curve.denoised is not None:
+            label = denoised_label(line.label)
+            topic.lines.append(_line(label, curve.denoised, curve.denoised_steps, line.truth, names, line))
     topic.lines += _extra_lines(study, measured, truth_of(first), names)
+    for look, line in enumerate(line for line in topic.lines if line.of is None):
+        line.look = look
+    for line in topic.lines:
+        line.look = line.look if line.of is None else line.of.look
     main = names[0]
     topic.targets = list(study.asked["target"] or common_levels(topic.lines, main))
     for line in topic.lines:
@@ -187,17 +210,25 @@ def analyse(study: Study, measured: Measured) -> Topic:
     return topic
 
 
-def _line(curve: Curve, truth: Truth, names: tuple[str, ...]) -> Line:
-    film, steps = curve.job.wishes.film, []
+def _line(
+    label: str,
+    job: Job,
+    steps_of: Mapping[int, Sequence[Run]],
+    truth: Truth,
+    names: tuple[str, ...],
+    of: Line | None = None,
+) -> Line:
+    film, steps = job.wishes.film, []
     images: list[Tensor] = []
-    for spp, runs in curve.steps.items():
+    for spp, runs in steps_of.items():
         images = [run.image() for run in runs]
         steps.append(_step(spp, runs, images, truth, names, film))
+        if of is not None:
+            steps[-1].variance = []  # a guess that varies little is not better for it
     last, told = steps[-1], truth.told
     more = told["spp"] * told["seeds"] / ((last.spp or 1) * len(images)) if told["made"] else 0.0
     verdict = bias_of(images, truth, more)
-    settings = curve.job.facts["settings"]
-    return Line(curve.variant.label, steps, truth, settings=settings, bias=verdict.plain())
+    return Line(label, steps, truth, settings=job.facts["settings"], of=of, bias=verdict.plain())
 
 
 def _step(
@@ -254,31 +285,34 @@ def _picture(extra: Extra, size: tuple[int, int]) -> Tensor:
 
 def common_levels(lines: Sequence[Line], main: str) -> tuple[float, ...]:
     """An error that all measured curves without bias come down to: the least of the worst of them."""
-    measured = [line for line in lines if line.measured]
+    measured = [line for line in lines if line.estimates]
     lines = [line for line in measured if not (line.bias and line.bias["biased"])] or measured
     least = [min((e.mean for s in line.steps if (e := s.estimate(main)).mean > 0), default=0.0) for line in lines]
     return (float(f"{max(least):.2g}"),) if least and max(least) > 0 else ()
 
 
 def _fits(line: Line, main: str, targets: Sequence[float]) -> None:
-    """Slopes over samples and seconds, and when the curve reaches each target."""
+    """Slopes over samples and seconds, and when the curve reaches each target: of denoised ones only within their runs."""
     values = [step.errors[main] for step in line.steps]
     if all(step.spp for step in line.steps):
         line.by_spp = fit([float(step.spp or 0) for step in line.steps], values)
     line.by_seconds = fit([step.seconds for step in line.steps], values)
-    floor = line.bias["squared"] if line.bias and line.bias["biased"] else 0.0
     for target in targets:
         found = line.by_seconds.reach(math.log(target)) if line.by_seconds else None
         told: dict[str, Any] = {"error": target, "seconds": None}
         if found is not None:
             place, beyond = found
             inside = abs(place.mean - math.log(line.steps[0].seconds)) < _FARTHEST
-            if beyond and floor >= target:  # it never gets there
+            if beyond and line.of is not None:  # no line tells how a guess goes on
+                pass
+            elif beyond and line.floor >= target:  # it never gets there
                 told["never"] = True
             elif inside or not beyond:
                 bounds = [None if x is None else _exp(x) for x in (place.mean, place.low, place.high)]
                 told |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
         line.times.append(told)
+    if line.of is not None:
+        line.by_spp = line.by_seconds = None
 
 
 def _exp(x: float) -> float | None:
@@ -306,6 +340,11 @@ def _notes(topic: Topic, main: str) -> list[str]:
             "The reference file says nothing of its variance, so it is taken to be exact; its noise counts as error."
         )
     drowned = [line.label for line in topic.lines if any(s.estimate(main).mean <= 0 for s in line.steps)]
+    if any(line.of is not None for line in topic.lines):
+        notes.append(
+            "Denoised pictures are guesses: they are biased by an amount that falls with samples by no known law. So their "
+            "curves have no slope and no efficiency, and no time to an error beyond their runs."
+        )
     if drowned:
         notes.append(
             f"Some steps lie below what the reference can tell and are left out of curves: {', '.join(drowned)}."

@@ -123,6 +123,7 @@ def _compared(own: Tensor, reference: Tensor, known: Tensor, freedom: float, mor
     spread = own.var(0) / count + rounding
     total = spread + known
     freedoms = total.square() / (spread.square() / (count - 1.0) + known.square() / freedom).clamp_min(1e-300)
+    freedoms = freedoms.clamp_min(min(count - 1.0, freedom))  # never less; black in all, it would be 0 of 0
     return _Side(own.mean(0) - reference, total, freedoms, 1.0 / (reference.square() + FLOOR))
 
 

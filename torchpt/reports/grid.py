@@ -13,7 +13,7 @@ from torchpt.format.yaml_file import read_yaml
 from torchpt.settings import BLOCKS
 from torchpt.spec.validate import check_keys
 
-__all__ = ["Variant", "blocks_of", "flat", "variants_of"]
+__all__ = ["Variant", "blocks_of", "denoised_label", "flat", "variants_of"]
 
 #: Settings whose value is a list: of these only a list of lists is an axis.
 _LISTS = ("film.crop",)
@@ -26,7 +26,7 @@ _TAKEN = {
     "render.preview": "nothing: a study keeps every picture in its folder",
     "render.checkpoint": "nothing: a study that was stopped resumes by itself",
     "render.resume": "nothing: a study that was stopped resumes by itself",
-    "film.denoise": "nothing: a denoised picture belongs to a curve of its own, never to that of the samples",
+    "film.denoise": "denoise=true, which gives denoised pictures curves of their own",
     "film.aovs": "nothing: a study compares pictures without layers",
 }
 
@@ -44,6 +44,11 @@ class Variant:
     label: str
     settings: dict[str, Any]
     axes: tuple[str, ...]
+
+
+def denoised_label(label: str) -> str:
+    """What the curve of a variant's denoised pictures is called."""
+    return f"{label}, denoised"
 
 
 def flat(raw: Mapping[str, Any]) -> dict[str, Any]:

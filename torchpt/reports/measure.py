@@ -3,6 +3,9 @@
 Every step of a curve has independent runs with seeds of their own. Settings take turns, one seed after the other, so that a
 machine that slows down slows all of them. Whenever they change, a run that is thrown away comes first: what it compiles and
 builds is no run's time.
+
+For the denoised pictures of a curve its runs are rendered once more, by the same seeds and with the layers that the denoiser
+looks at: the picture under the noise is the same to the bit, and the curve's own times are without those layers.
 """
 
 from __future__ import annotations
@@ -13,8 +16,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from torchpt.errors import SceneError
-from torchpt.format.description import Description, read_description, settings
+from torchpt.format.description import Description, overridden, read_description
+from torchpt.forward.denoising import denoise_rendering
 from torchpt.forward.kept import Kept, kept
+from torchpt.images.denoiser import check_denoiser, denoiser_version
 from torchpt.rendering import Progress, Rendering, render_scene
 from torchpt.reports.grid import Variant
 from torchpt.reports.store import Run, Store, name_of
@@ -75,6 +80,8 @@ class Curve:
         variant: its settings.
         job: how it is run.
         steps: spp to its runs.
+        denoised: how the runs are rendered that are denoised; None where none are wanted.
+        denoised_steps: spp to those runs, whose pictures are the denoised ones.
         reference: how its reference is made; None where that is a file.
         truths: the runs of the reference.
     """
@@ -82,6 +89,8 @@ class Curve:
     variant: Variant
     job: Job
     steps: dict[int, list[Run]] = field(default_factory=dict)
+    denoised: Job | None = None
+    denoised_steps: dict[int, list[Run]] = field(default_factory=dict)
     reference: Job | None = None
     truths: list[Run] = field(default_factory=list)
 
@@ -115,8 +124,10 @@ def prepare(study: Study) -> list[Measured]:
     """Load the scenes and check every setting, before anything is rendered.
 
     Raises:
-        TorchptError: a scene or setting that cannot be used.
+        TorchptError: a scene or setting that cannot be used; a denoiser that is wanted and not there.
     """
+    if study.asked["denoise"]:
+        check_denoiser()
     found = []
     for name in study.scenes:
         description = read_description(name)
@@ -124,6 +135,8 @@ def prepare(study: Study) -> list[Measured]:
         curves = []
         for variant in study.variants:
             curve = Curve(variant, _job(description, study.overrides(variant), loaded, "run"))
+            if study.asked["denoise"]:
+                curve.denoised = _denoised(curve.job)
             if not study.reference.files:
                 curve.reference = _job(description, study.truth(variant), loaded, "reference")
             curves.append(curve)
@@ -137,10 +150,8 @@ def _job(
     loaded: dict[str, tuple[Scene, str]],
     purpose: str,
 ) -> Job:
-    for group, block in overrides.items():  # a null unsets the scene's own wish
-        own = {key: value for key, value in getattr(description, group).items() if block.get(key, key) is not None}
-        description = replace(description, **{group: own})
-    wishes = settings(description, overrides)
+    description, wishes = overridden(description, overrides)
+    wishes = replace(wishes, film=wishes.film.but(denoise=False, aovs=()))  # such wishes of a scene are about files
     if not wishes.integrator.light:
         raise SceneError("integrator.type", wishes.integrator.name, "an integrator that carries light")
     device = str(device_of(wishes.render.device))
@@ -148,10 +159,22 @@ def _job(
         scene = Scene(description, device_of(device))
         loaded[device] = scene, digest(scene)
     scene, named = loaded[device]
+    return Job(scene, wishes, {"scene": named, "device": device, "settings": _told_settings(wishes)}, purpose)
+
+
+def _told_settings(wishes: Settings) -> dict[str, Any]:
+    """The settings that runs depend on."""
     told = wishes.plain()
     for group, keys in _FREE.items():
         told[group] = {key: value for key, value in told[group].items() if key not in keys}
-    return Job(scene, wishes, {"scene": named, "device": device, "settings": told}, purpose)
+    return told
+
+
+def _denoised(job: Job) -> Job:
+    """The same runs with the layers that the denoiser looks at."""
+    wishes = replace(job.wishes, film=job.wishes.film.but(denoise=True))
+    facts = {**job.facts, "settings": _told_settings(wishes), "denoiser": denoiser_version()}
+    return Job(job.scene, wishes, facts, job.purpose)
 
 
 def measure(
@@ -182,12 +205,16 @@ def measure(
         if run is None:
             if job is not latest:  # what it leaves is there for the runs that follow
                 _turn(latest, job)
-                _render(job, min(study.asked["spp"][0], spp), seed, clock, counts=False)
+                thrown = _render(job, min(study.asked["spp"][0], spp), seed, clock, counts=False)
+                if not clock.stop:
+                    _denoise(job, thrown)  # its first time takes longer too
                 latest = job
             rendering = None if clock.stop else _render(job, spp, seed, clock)
             if rendering is None or not rendering.complete:
                 raise Stopped(sum(store.get(other) is not None for other in set(names)), len(set(names)))
-            run = store.put(name, rendering.image, _told(job, spp, seed, rendering))
+            denoising = _denoise(job, rendering)
+            picture = rendering.image if rendering.denoised is None else rendering.denoised
+            run = store.put(name, picture, _told(job, spp, seed, rendering, denoising))
         place.append(run)
 
 
@@ -209,9 +236,13 @@ def _wanted(study: Study, prepared: list[Measured]) -> list[Wanted]:
     for measured in prepared:
         for number in range(study.asked["seeds"]):
             for curve in measured.curves:
-                for spp in study.asked["spp"]:
-                    seed = seed_of(study.asked["seed"], "run", spp, number)
-                    found.append((curve.job, spp, seed, curve.steps.setdefault(spp, [])))
+                pairs = [(curve.job, curve.steps)]
+                if curve.denoised is not None:
+                    pairs.append((curve.denoised, curve.denoised_steps))
+                for job, steps in pairs:
+                    for spp in study.asked["spp"]:
+                        seed = seed_of(study.asked["seed"], "run", spp, number)
+                        found.append((job, spp, seed, steps.setdefault(spp, [])))
         shared: dict[str, Job] = {}
         for curve in measured.curves:
             if curve.reference is None:
@@ -235,13 +266,19 @@ def _render(job: Job, spp: int, seed: int, clock: _Clock, counts: bool = True) -
     return rendering
 
 
-def _told(job: Job, spp: int, seed: int, rendering: Rendering) -> dict[str, Any]:
+def _denoise(job: Job, rendering: Rendering) -> float | None:
+    """Denoise where that is wanted; returns the seconds that it took."""
+    return denoise_rendering(rendering, job.wishes) if job.wishes.film.denoise else None
+
+
+def _told(job: Job, spp: int, seed: int, rendering: Rendering, denoising: float | None) -> dict[str, Any]:
     set_up = rendering.build_seconds + rendering.compile_seconds
     seconds = getattr(rendering, "render_seconds", None) or max(rendering.seconds - set_up, 1e-9)
     return {
         "spp": spp,
         "seed": seed,
-        "seconds": seconds,
+        "seconds": seconds + (denoising or 0.0),
+        "denoise_seconds": denoising,
         "set_up": set_up,
         "rays": rendering.rays,
         "nonfinite_samples": rendering.nonfinite_samples,

@@ -20,6 +20,7 @@ __all__ = ["Figure", "page"]
 
 #: As the curves' marks are drawn.
 _MARKS = "●■▲◆▼✚✖★"
+_HOLLOW = "○□△◇▽✛✕☆"
 #: Name -> PNG and SVG.
 Figure = tuple[bytes, bytes]
 
@@ -59,7 +60,7 @@ def _scene(study: Study, topic: Topic, sheet: Sheet | None, plots: dict[str, Fig
         "headline": _headline(topic, main),
         "notes": topic.notes,
         "columns": columns,
-        "rows": [_row(topic, line, index, names[0]) for index, line in enumerate(topic.lines)],
+        "rows": [_row(topic, line, names[0]) for line in topic.lines],
         "plots": [_plot(plots[over], f"{main} over {over}") for over in ("seconds", "spp") if over in plots],
         "overview": _plot(plots["measures"], "all measures over seconds") if "measures" in plots else None,
         "sheet": None if sheet is None else _sheet(sheet, names[0]),
@@ -70,7 +71,7 @@ def _scene(study: Study, topic: Topic, sheet: Sheet | None, plots: dict[str, Fig
 
 def _headline(topic: Topic, main: str) -> str:
     """Who is first, and by how much, among settings without bias."""
-    able = [line for line in topic.lines if line.measured and not (line.bias and line.bias["biased"])]
+    able = [line for line in topic.lines if line.estimates and not (line.bias and line.bias["biased"])]
     timed = sorted((line.times[-1]["seconds"], line.label) for line in able if line.times and line.times[-1]["seconds"])
     if len(timed) < 2:
         return ""
@@ -97,7 +98,7 @@ def _cell(text: str, *small: str, tone: str = "") -> dict[str, Any]:
     return {"text": text, "small": [line for line in small if line], "tone": tone}
 
 
-def _row(topic: Topic, line: Line, index: int, main: str) -> dict[str, Any]:
+def _row(topic: Topic, line: Line, main: str) -> dict[str, Any]:
     cells = [_time_cell(topic, line, number) for number in range(len(topic.targets))]
     last = line.steps[-1]
     found = last.estimate(main)
@@ -108,8 +109,8 @@ def _row(topic: Topic, line: Line, index: int, main: str) -> dict[str, Any]:
     cells.append(_bias_cell(line))
     bad = sum(step.nonfinite for step in line.steps)
     cells.append(_cell(words.count(bad), tone="bad" if bad else ""))
-    colour = COLOURS[index % len(COLOURS)]
-    return {"label": line.label, "mark": _MARKS[index % len(_MARKS)], "colour": colour, "cells": cells}
+    colour, marks = COLOURS[line.look % len(COLOURS)], _MARKS if line.of is None else _HOLLOW
+    return {"label": line.label, "mark": marks[line.look % len(marks)], "colour": colour, "cells": cells}
 
 
 def _time_cell(topic: Topic, line: Line, number: int) -> dict[str, Any]:
@@ -117,7 +118,7 @@ def _time_cell(topic: Topic, line: Line, number: int) -> dict[str, Any]:
     if told.get("never"):
         return _cell("never", "its bias is larger", tone="bad")
     if told["seconds"] is None:
-        return _cell("–", "too far to tell" if line.by_seconds else "")
+        return _cell("–", "too far to tell" if line.by_seconds else "beyond its runs" if line.of else "")
     parts = [words.span(told["low"], told["high"]), "extrapolated" if told["extrapolated"] else ""]
     if line is not topic.lines[0] and first["seconds"]:
         ratio = first["seconds"] / told["seconds"]
@@ -139,6 +140,8 @@ def _bias_cell(line: Line) -> dict[str, Any]:
     share = f"light {100 * line.bias['share']:+.2g} %".replace("-", "−")
     if line.bias["biased"]:
         return _cell("biased", share, f"p {_chance(line.bias['chance'])}", tone="bad")
+    if line.of is not None:
+        return _cell("none found", share, f"p {_chance(line.bias['chance'])}", "a guess all the same")
     return _cell("none found", share, f"p {_chance(line.bias['chance'])}", tone="good")
 
 
@@ -218,7 +221,12 @@ def _ramp() -> str:
 
 
 def _method(study: Study) -> list[str]:
+    """What a reader must know to trust the figures."""
     seeds, steps = study.asked["seeds"], ", ".join(map(words.count, study.asked["spp"]))
+    denoised = (
+        "Denoised curves, of loose dashes and hollow marks, show the pictures of the same runs, denoised by what first "
+        "surfaces are like (albedo and normals). Their times are those of the runs with these layers, and of denoising."
+    )
     return [
         f"Each step ({steps} samples a pixel) was run {seeds} times with independent seeds. Times are those of sampling, "
         "without loading, building and compiling; a run that is thrown away goes before. Settings took turns.",
@@ -231,6 +239,7 @@ def _method(study: Study) -> list[str]:
         "1 / (variance × seconds) at the largest step, the variance relative to the reference's square + 0.01.",
         "Bias: the mean of the runs of the largest step differs from the reference by more than the spread of both explains, "
         "with a chance of less than 0.1 % otherwise. A dotted line is the error at which such a curve ends.",
+        *((denoised,) if study.asked["denoise"] else ()),
     ]
 
 
@@ -240,7 +249,7 @@ def _settings(topics: Sequence[Topic]) -> str:
 
     shown: dict[str, Any] = {}
     for topic in topics:
-        shown[topic.name] = {line.label: _listed(line.settings) for line in topic.lines if line.measured}
+        shown[topic.name] = {line.label: _listed(line.settings) for line in topic.lines if line.estimates}
     return yaml.safe_dump(shown, sort_keys=False, allow_unicode=True, width=100)
 
 

@@ -80,7 +80,10 @@ def hardest(errors: Tensor, side: int) -> tuple[int, int]:
 
 
 def sheet_of(topic: Topic) -> Sheet | None:
-    """The pictures of all curves that have the first one's film, at the longest time that each of them has."""
+    """The pictures of all curves that have the first one's film, at the longest time that each of them has.
+
+    Denoised ones have no say in where the crop lies.
+    """
     truth, film = topic.lines[0].truth, topic.film
     lines = [line for line in topic.lines if line.truth.image.shape == truth.image.shape]
     seconds = min(line.steps[-1].seconds for line in lines)
@@ -89,7 +92,8 @@ def sheet_of(topic: Topic) -> Sheet | None:
     maps = [error_map(image, line.truth) for image, line in zip(images, lines, strict=True)]
     high, wide = maps[0].shape
     side = min(max(min(high, wide) // _PART, _LEAST), _MOST, high, wide)
-    x, y = hardest(torch.stack(maps).mean(0), side)
+    rendered = [found for found, line in zip(maps, lines, strict=True) if line.of is None]
+    x, y = hardest(torch.stack(rendered).mean(0), side)
     smaller = [_reduced(found) for found in maps]
     scale = _scale(smaller)
     panels = [

@@ -19,6 +19,8 @@ __all__ = ["COLOURS", "NAMES", "curves", "encoded", "overview"]
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D1F")
 _MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 _DASHES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
+#: Of denoised pictures, whose marks are hollow and whose colour is that of the curve that they are made of.
+_DENOISED = (0, (4, 4))
 #: How measures are written.
 NAMES = {
     "relmse": "relMSE",
@@ -63,9 +65,9 @@ def curves(topic: Topic, measure: str, over: str) -> Any:
         figure = Figure(figsize=(4.9, 3.4 + 0.23 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        for index, line in enumerate(topic.lines):
+        for line in topic.lines:
             if line in lines:
-                _draw(axes, line, measure, over, index)
+                _draw(axes, line, measure, over)
         if over == "spp":
             _guide(axes, lines, measure)
         _finish(axes, measure, over)
@@ -91,8 +93,8 @@ def overview(topic: Topic, measures: Sequence[str]) -> Any:
         FigureCanvasAgg(figure)
         for place, measure in enumerate(measures):
             axes = figure.add_subplot(rows, 2, place + 1)
-            for index, line in enumerate(topic.lines):
-                _draw(axes, line, measure, "seconds", index, slopes=False if place == 0 else None)
+            for line in topic.lines:
+                _draw(axes, line, measure, "seconds", slopes=False if place == 0 else None)
             _finish(axes, measure, "seconds")
             axes.set_title(NAMES[measure], loc="left", fontsize=10.0)
             axes.set_ylabel("")
@@ -127,21 +129,24 @@ def _points(line: Line, measure: str, over: str) -> list[tuple[float, float, flo
     return points
 
 
-def _draw(axes: Any, line: Line, measure: str, over: str, index: int, slopes: bool | None = True) -> None:
+def _draw(axes: Any, line: Line, measure: str, over: str, slopes: bool | None = True) -> None:
     """One curve; named in the legend with its slope, without it, or (None) not at all."""
-    colour, mark = COLOURS[index % len(COLOURS)], _MARKS[index % len(_MARKS)]
-    dash = _DASHES[(index // len(COLOURS) + index) % len(_DASHES)] if line.measured else ":"
+    look, inside = line.look, "auto" if line.of is None else "white"
+    colour, mark = COLOURS[look % len(COLOURS)], _MARKS[look % len(_MARKS)]
+    dash: Any = _DASHES[(look // len(COLOURS) + look) % len(_DASHES)] if line.measured else ":"
+    dash = dash if line.of is None else _DENOISED
     points = _points(line, measure, over)
     if not points:
         return
     x, mean, low, high = (list(values) for values in zip(*points, strict=True))
     label = None if slopes is None else line.label + (_slope(line, over) if slopes else "")
-    axes.plot(x, mean, color=colour, linestyle=dash, marker=mark, markersize=5, linewidth=1.6, label=label)
+    style = {"color": colour, "linestyle": dash, "linewidth": 1.6}
+    axes.plot(x, mean, marker=mark, markersize=5, markerfacecolor=inside, label=label, **style)
     if x == sorted(x):
         axes.fill_between(x, low, high, color=colour, alpha=0.16, linewidth=0)
     else:  # times so short that more samples took less
         axes.vlines(x, low, high, color=colour, alpha=0.5)
-    floor = line.bias["squared"] if line.bias and line.bias["biased"] and measure == "relmse" else 0.0
+    floor = line.floor if measure == "relmse" else 0.0
     if floor > 0:
         axes.axhline(floor, color=colour, linewidth=1.0, linestyle=(0, (1, 2)))
         if not axes.texts:  # said once
@@ -156,7 +161,7 @@ def _slope(line: Line, over: str) -> str:
 
 def _guide(axes: Any, lines: Sequence[Line], measure: str) -> None:
     """How an unbiased estimate of independent samples falls."""
-    points = [point for line in lines for point in _points(line, measure, "spp")]
+    points = [point for line in lines if line.of is None for point in _points(line, measure, "spp")]
     if measure not in ("relmse", "mse", "relmse_trimmed") or not points:
         return
     left, right = min(x for x, *_ in points), max(x for x, *_ in points)

@@ -16,8 +16,8 @@ from torchpt import paths
 from torchpt.errors import SceneError
 from torchpt.format.yaml_file import plain, read_yaml
 from torchpt.images.metrics import METRICS
-from torchpt.reports.grid import Variant, blocks_of, flat, variants_of
-from torchpt.spec import Other, Refused, Valued, Whole, parameters_of
+from torchpt.reports.grid import Variant, blocks_of, denoised_label, flat, variants_of
+from torchpt.spec import Flag, Other, Refused, Valued, Whole, parameters_of
 from torchpt.spec.declared import values_of
 
 __all__ = ["ERRORS", "MEASURES", "OWN_KEYS", "RECORDS", "Extra", "Plan", "Reference", "Study", "read_study", "study_of"]
@@ -115,6 +115,7 @@ class Asked(Valued):
         "extra": Other(
             (), reader=_extras, words="a list of {name, seconds, file}", doc="other renderers' pictures, linear"
         ),
+        "denoise": Flag(False, doc="beside every curve a second one, of the denoised pictures of its runs"),
         "title": Other("Error against run time", reader=str, words="text", doc="of the page"),
     }
 
@@ -157,7 +158,7 @@ class Study:
     Attributes:
         scenes: names or paths.
         variants: the grid.
-        asked: spp, seeds, seed, metrics, target, title.
+        asked: spp, seeds, seed, metrics, target, denoise, title.
         extras: other renderers' pictures.
         reference: how it comes about.
         file: the study file.
@@ -250,12 +251,14 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
         if key not in OWN_KEYS and not key.startswith("reference."):
             settings |= flat({key: value})
     variants = tuple(variants_of(settings, file))
+    labels = {variant.label for variant in variants}
+    labels |= {denoised_label(label) for label in labels if asked["denoise"]}
     extras = []
     for index, item in enumerate(asked["extra"]):
         scene = item.get("scene", scenes[0] if len(scenes) == 1 else None)
         if scene not in scenes:
             raise SceneError(f"extra.{index}.scene", scene, f"one of {', '.join(scenes)}", file)
-        if item["name"] in {variant.label for variant in variants}:
+        if item["name"] in labels:
             raise SceneError(f"extra.{index}.name", item["name"], "a name that no curve has", file)
         extras.append(Extra(item["name"], float(item["seconds"]), item["file"], scene, item.get("spp")))
     plan = _plan(raw.get("reference"), scenes, asked["spp"][-1], file)

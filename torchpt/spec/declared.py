@@ -32,6 +32,10 @@ class Described:
     values: dict[str, Any]
     given: frozenset[str] = frozenset()
 
+    def __repr__(self) -> str:
+        """The same in every process, as names of scenes are made of it: a set's own order is not."""
+        return f"Described({self.kind!r}, {self.values!r}, {sorted(self.given)!r})"
+
     @property
     def name(self) -> str:
         """Its ``type``."""
