@@ -26,7 +26,7 @@ def noisy(radiance: Tensor, sparkle: float, generator: torch.Generator) -> Tenso
     values = radiance * (wide - 0.5 * 0.15**2).exp()[..., None]
     if sparkle:
         bright = torch.rand(radiance.shape[:2], generator=generator, dtype=torch.float64) < sparkle
-        height = 20.0 * torch.rand(radiance.shape[:2], generator=generator, dtype=torch.float64)
+        height = 10.0 * torch.rand(radiance.shape[:2], generator=generator, dtype=torch.float64)
         values = values + torch.where(bright, height, 0.0)[..., None]
     return values
 
@@ -34,7 +34,7 @@ def noisy(radiance: Tensor, sparkle: float, generator: torch.Generator) -> Tenso
 def known(radiance: Tensor, sparkle: float, seed: int) -> tuple[KnownError, float]:
     """The estimate, and what is true of the same picture."""
     g = torch.Generator().manual_seed(seed)
-    mean = radiance + 10.0 * sparkle
+    mean = radiance + 5.0 * sparkle
     picture, whole = noisy(radiance, sparkle, g), (SIDE, SIDE)
     pilots = pilots_of(seed, whole, (0, 0, *whole))
     flat = picture.view(-1, 3)
@@ -52,24 +52,25 @@ def known(radiance: Tensor, sparkle: float, seed: int) -> tuple[KnownError, floa
 @pytest.mark.parametrize(("sparkle", "bias"), [(0.0, 0.03), (1e-3, 0.15)])
 def test_it_is_right_in_the_mean(sparkle, bias):
     radiance = scene(torch.Generator())
-    pairs = [known(radiance, sparkle, seed) for seed in range(24)]
+    pairs = [known(radiance, sparkle, seed) for seed in range(16)]
     estimated, true = (sum(values) / len(values) for values in ([e.relmse for e, _ in pairs], [t for _, t in pairs]))
     assert estimated == pytest.approx(true, rel=bias)
 
 
+@pytest.mark.parametrize("repeats", [50, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("sparkle", [0.0, 2e-5])
-def test_the_interval_holds(sparkle):
+def test_the_interval_holds(sparkle, repeats):
     """Where it is not called heavy-tailed; sparkles are in one picture of six."""
     radiance = scene(torch.Generator())
     held, heavy = 0, 0
-    for seed in range(200):
+    for seed in range(repeats):
         estimate, true = known(radiance, sparkle, seed)
         heavy += estimate.heavy_tailed
         if not estimate.heavy_tailed:
             assert estimate.interval is not None
             held += estimate.interval[0] <= true <= estimate.interval[1]
-    assert heavy < (20 if sparkle == 0 else 60)
-    assert 0.88 <= held / (200 - heavy) <= 0.995
+    assert heavy < repeats * (0.1 if sparkle == 0 else 0.3)
+    assert 0.88 <= held / (repeats - heavy) <= (1.0 if repeats < 200 else 0.995)
 
 
 def test_an_error_of_few_pixels_is_called_heavy_tailed():
@@ -104,7 +105,7 @@ def test_a_sparkle_is_known_wherever_it_is():
     assert 33 * SIDE + 50 in suspects.tolist()
     again = Again(suspects, len(suspects), radiance.reshape(-1, 3)[suspects], torch.zeros(len(suspects), 3))
     estimate = known_error(a, pilots, b, b, None, False, again)
-    assert estimate is not None and estimate.relmse == pytest.approx(29.5**2 / (0.25 + 0.01) / SIDE**2, rel=0.01)
+    assert estimate is not None and estimate.relmse == pytest.approx(29.5**2 / ((30 / 32) ** 2 + 0.01) / SIDE**2, rel=0.01)
 
 
 def test_pilots_alone_ask_no_other_pixel():

@@ -50,7 +50,7 @@ SUSPECTS, DOUBTFUL = 1024, 64
 STREAMS = 8
 #: Further values may all miss a light that few samples meet: r is taken for no less than this part of a pilot's mean, or of a
 #: suspect's value.
-BRIGHTER, BRIGHTEST = 4.0, 64.0
+BRIGHTER, BRIGHTEST = 4.0, 32.0
 
 
 @dataclass(frozen=True)
