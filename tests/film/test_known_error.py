@@ -105,7 +105,9 @@ def test_a_sparkle_is_known_wherever_it_is():
     assert 33 * SIDE + 50 in suspects.tolist()
     again = Again(suspects, len(suspects), radiance.reshape(-1, 3)[suspects], torch.zeros(len(suspects), 3))
     estimate = known_error(a, pilots, b, b, None, False, again)
-    assert estimate is not None and estimate.relmse == pytest.approx(29.5**2 / ((30 / 32) ** 2 + 0.01) / SIDE**2, rel=0.01)
+    assert estimate is not None and estimate.relmse == pytest.approx(
+        29.5**2 / ((30 / 32) ** 2 + 0.01) / SIDE**2, rel=0.01
+    )
 
 
 def test_pilots_alone_ask_no_other_pixel():

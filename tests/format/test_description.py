@@ -168,9 +168,7 @@ def test_bad_input_is_one_line_that_names_the_key(name: str) -> None:
 
 
 LATER: dict[str, tuple[dict[str, Any], str]] = {
-    "adaptive": (scene(sampler={"adaptive": True}), "sampler.adaptive"),
     "integrator": (scene(integrator={"type": "bdpt"}), "integrator.type"),
-    "time limit": (scene(render={"time_limit": 10}), "render.time_limit"),
     "resume": (scene(render={"resume": True}), "render.resume"),
 }
 

@@ -203,6 +203,6 @@ def test_a_floor_to_the_horizon():
     truth = taken(plain, "on", spp=1024, seed=9).image
     once = [taken(loaded, "on", spp=4).image for loaded in (plain, faded)]
     errors = [float((image - truth)[10:15].square().mean()) for image in once]
-    assert errors[1] < 0.7 * errors[0], errors
+    assert errors[1] < 0.8 * errors[0], errors
     many = taken(faded, "on", spp=256, seed=5).image
     assert float((many - truth)[10:].mean().abs()) < 2e-3

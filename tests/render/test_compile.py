@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from typing import Any
 
 import pytest
 import torch
@@ -31,9 +32,9 @@ def passes(monkeypatch) -> list[int]:
     taken: list[int] = []
     kept = Loop.run
 
-    def noted(self: Loop, first: int, count: int, each: object) -> bool:
-        taken.append(count)
-        return kept(self, first, count, each)  # type: ignore[arg-type]
+    def noted(self: Loop, spans: Any, each: Any) -> bool:
+        taken.append(spans[0][2])
+        return kept(self, spans, each)
 
     monkeypatch.setattr(Loop, "run", noted)
     return taken

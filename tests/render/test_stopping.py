@@ -178,8 +178,8 @@ def test_no_bias(box, way, seeds):
     others = z[0]
     assert float(others.abs().max()) < 5.0 and float(others.square().mean()) < 1.5
     if way == "adaptive":
-        enough = counts[1] > 5
-        assert float(z[1][enough].square().mean()) < 2.0
+        enough = counts[1] > 5  # of few values the spread is little known
+        assert float(z[1][enough].square().mean()) < (1.6 if seeds > 1000 else 3.0)
     else:
         assert len(ended) >= 4 and 2 <= min(ended) and max(ended) <= 64
         deviation = torch.sqrt(((squares / counts.clamp_min(1)) - found.square()).clamp_min(0.0))[0].mean()

@@ -11,7 +11,7 @@ from torch import Tensor
 from trials import SIGNIFICANCE, grid_cells, uniform_p, z_limit
 
 from torchpt.errors import SceneError
-from torchpt.samplers import KINDS, Dimension, Draws, Sampler, points_of, salts
+from torchpt.samplers import ADAPTIVE, KINDS, Dimension, Draws, Sampler, points_of, salts
 from torchpt.spec import parameters_of
 from torchpt.spec.declared import described
 
@@ -39,13 +39,15 @@ def drawn(kind: str, key: Tensor) -> Tensor:
 @KIND
 def test_what_is_declared(kind):
     parameters = parameters_of(KINDS[kind])
-    assert set(parameters) == {field.name for field in fields(KINDS[kind])}
+    assert set(parameters) - set(ADAPTIVE) == {field.name for field in fields(KINDS[kind])}
+    assert (set(ADAPTIVE) <= set(parameters)) != KINDS[kind].needs_count
     for key, spec in parameters.items():
         assert spec.doc, key
         for value in values_outside(spec):
             with pytest.raises(SceneError, match=rf"sampler\.{key}"):
                 described("sampler", KINDS, {"type": kind, key: value}, "sampler", None)
-    assert points_of(kind) == KINDS[kind](**described("sampler", KINDS, {"type": kind}, "sampler", None).values)
+    values = described("sampler", KINDS, {"type": kind}, "sampler", None).values
+    assert points_of(kind) == KINDS[kind](**{key: value for key, value in values.items() if key not in ADAPTIVE})
     if KINDS[kind].needs_count:
         with pytest.raises(ValueError, match="must know their number"):
             Sampler(kind, 0, 2, 1)

@@ -65,7 +65,7 @@ def test_the_picture_is_that_of_explicit_copies(flat, accel):
     # computed of a mesh that is then stretched unevenly are not those of the stretched mesh.
     apart = (layers[0] - layers[1]).abs()
     assert float((apart < 1e-4).float().mean()) > (0.98 if flat else 0.6)
-    assert float((layers[0].mean() - layers[1].mean()).abs()) < (2e-4 if flat else 5e-3)
+    assert float((layers[0].mean() - layers[1].mean()).abs()) < (2e-4 if flat else 6e-3)
     assert layers[0].std() > 0.05
 
 

@@ -216,6 +216,8 @@ def _picture(path: str, layer: str | None) -> tuple[str, Tensor]:
     Raises:
         AssetError: a file that cannot be read or has no such layer.
     """
+    import torch
+
     from torchpt.images import read_layers
 
     layers = read_layers(path)
@@ -225,6 +227,8 @@ def _picture(path: str, layer: str | None) -> tuple[str, Tensor]:
     if wanted not in layers:
         what = f"has no layer {wanted!r}" if layer else "has no picture among its layers; choose one with layer="
         raise AssetError(path, f"{what}; it has {', '.join(layers)}")
+    if layer is None and "alpha" in layers and layers[wanted].shape[2] == 3:
+        return wanted, torch.cat((layers[wanted], layers["alpha"]), 2)
     return wanted, layers[wanted]
 
 

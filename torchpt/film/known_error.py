@@ -26,6 +26,7 @@ from torch import Tensor
 
 from torchpt.film.pilots import Pilots
 from torchpt.film.sums import RELMSE_FLOOR
+from torchpt.math.threads import sum_all
 
 __all__ = [
     "STREAMS",
@@ -108,8 +109,8 @@ def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, cou
     at = tuple(pilots.block)
     grid[at], known[at] = (a + b) / 2, True
     share = error_at(a, b, around(grid, known)[at]).mean(1) * _first_part(a, b, spare)
-    pixels = float(pilots.weight.sum())
-    return float((share * pilots.weight).sum()) / pixels * (1.0 - 0.5 * len(pilots) / pixels if counted else 1.0)
+    pixels = float(sum_all(pilots.weight))
+    return float(sum_all(share * pilots.weight)) / pixels * (1.0 - 0.5 * len(pilots) / pixels if counted else 1.0)
 
 
 @dataclass(frozen=True)
@@ -192,8 +193,8 @@ def known_error(
         return None
     pixels = len(flat)
     part = (pixels - len(suspects)) / pixels * (1.0 - 0.5 * len(pilots) / pixels if counted else 1.0)
-    weight = pilots.weight[rest] / pilots.weight[rest].sum()
-    mean = float((weight * share).sum())
+    weight = pilots.weight[rest] / sum_all(pilots.weight[rest])
+    mean = float(sum_all(weight * share))
     parts = weight * (share - mean) * part
     total = sure / pixels + mean * part
     return _with_interval(total, parts, unsure / pixels**2, sure / pixels > FEW * total)
@@ -208,7 +209,7 @@ def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
     if spare is None:
         return 1.0
     scale = 1.0 / (((a + b) / 2).square() + RELMSE_FLOOR)
-    both, second = (float((x * scale).clamp_max(1.0).sum()) for x in ((a - b).square(), spare))
+    both, second = (float(sum_all((x * scale).clamp_max(1.0))) for x in ((a - b).square(), spare))
     return 2.0 * min(max(1.0 - second / both, 1 / 3), 0.5) if both > 0.0 else 1.0
 
 
@@ -243,7 +244,7 @@ def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
     share = (apart.square() - spare) / below
     # To the first order in the mean: channels move together, so their deviations add up.
     slope = (2 * apart.abs() + 2 * radiance * share.abs()) / below
-    return float(share.mean(1).sum()), float((slope * spare.sqrt()).mean(1).square().sum())
+    return float(sum_all(share.mean(1))), float(sum_all((slope * spare.sqrt()).mean(1).square()))
 
 
 def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool) -> KnownError:
@@ -260,7 +261,7 @@ def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool) -> Know
         return KnownError(mean, (0.0, 0.0) if mean == 0.0 and count >= FEWEST else None, not math.isfinite(mean))
     if count < FEWEST:
         return KnownError(mean, None, True)
-    total = float(parts.square().sum()) + unsure
+    total = float(sum_all(parts.square())) + unsure
     heavy = few or (total > 0.0 and float(parts.square().max()) > HEAVY * total)
     factor = math.exp(min(_quantile(count - 1) * math.sqrt(total) / mean, 300.0))
     return KnownError(mean, (mean / factor, mean * factor), heavy)

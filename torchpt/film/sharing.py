@@ -11,6 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchpt.math.threads import sum_all
+
 __all__ = ["shared_out", "smoothed"]
 
 #: No block of pixels takes more than this many times its samples at once: it is known by few pilots.
@@ -34,7 +36,7 @@ def smoothed(values: Tensor, known: Tensor) -> Tensor:
     there = known.to(values.dtype)
     weight = spread(there)
     total = spread(values * there)
-    mean = (values * there).sum() / there.sum().clamp_min(1.0)
+    mean = sum_all(values * there) / sum_all(there).clamp_min(1.0)
     return torch.where(weight > 0, total / weight.clamp_min(1e-30), mean)
 
 
@@ -48,16 +50,16 @@ def shared_out(error: Tensor, counts: Tensor, pixels: Tensor, mean: float) -> Te
         mean: samples a pixel over the picture that there are to be, at most.
     """
     positive = error.clamp_min(0.0)
-    floor = FLOOR * (positive * pixels).sum() / pixels.sum()
+    floor = FLOOR * sum_all(positive * pixels) / sum_all(pixels.double())
     need = (positive.clamp_min(floor) * counts).sqrt()
     have, most = counts.double(), (GROWTH * counts).double()
-    total = mean * float(pixels.sum())
+    total = mean * float(sum_all(pixels.double()))
     if not bool((need > 0).any()):
         need = torch.ones_like(need)
     low, high = 0.0, float((most / need.clamp_min(1e-30)).max())
     for _ in range(60):  # the number of samples a unit of need at which they come to the total
         middle = 0.5 * (low + high)
-        if float((torch.minimum(torch.maximum(have, middle * need), most) * pixels).sum()) < total:
+        if float(sum_all(torch.minimum(torch.maximum(have, middle * need), most) * pixels)) < total:
             low = middle
         else:
             high = middle
