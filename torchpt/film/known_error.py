@@ -139,14 +139,27 @@ def to_look_at(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[T
         a: their first values ``(n, C)``.
         b: their second values.
     """
-    standing = _standing_out(picture, picture).reshape(-1)
-    count = max(len(standing) // SUSPECTS, 1)
-    suspects = standing.topk(min(count, len(standing))).indices.sort().values
+    suspects = _suspects(picture)
     rest = ~torch.isin(pilots.places, suspects)
     low = torch.minimum(a, b).clamp_min(0.0)
     doubt = ((a - b).square() / (low.square() + RELMSE_FLOOR)).mean(1) * rest
     count = min(max(len(pilots) // DOUBTFUL, 4), int(rest.sum()))
     return suspects, pilots.places[doubt.topk(count).indices.sort().values]
+
+
+def _suspects(picture: Tensor) -> Tensor:
+    """The pixels that stand out most, of those that are brighter than seven of their neighbours."""
+    bright = picture.sum(2)
+    padded = torch.nn.functional.pad(bright, (1, 1, 1, 1), value=-math.inf)
+    height, width = bright.shape
+    brighter = torch.zeros(height, width, dtype=torch.int8)
+    for dy in range(3):
+        for dx in range(3):
+            brighter += padded[dy : dy + height, dx : dx + width] > bright
+    few = (brighter.reshape(-1) <= 1).nonzero()[:, 0]
+    standing = _standing_out(picture.reshape(-1, picture.shape[2])[few], _neighbours(picture, few))
+    count = max(bright.numel() // SUSPECTS, 1)
+    return few[standing.topk(min(count, len(few))).indices].sort().values
 
 
 def known_error(
@@ -168,8 +181,9 @@ def known_error(
     """
     if not len(pilots):
         return None
-    flat, near = picture.reshape(-1, picture.shape[2]), around(picture).reshape(-1, picture.shape[2])
-    places = pilots.places
+    flat, places = picture.reshape(-1, picture.shape[2]), pilots.places
+    others = _neighbours(picture, places)
+    near = others.mean(0)
     first = _first_part(a, b, spare)
     sure, unsure, rest = 0.0, 0.0, torch.ones(len(pilots), dtype=torch.bool)
     suspects = places[:0]
@@ -178,10 +192,9 @@ def known_error(
         sure, unsure = _really(flat[suspects], again.mean[: again.suspects], again.spare[: again.suspects])
         rest = ~torch.isin(places, suspects)
         # A second value that would be a suspect itself tells of others like it, which are counted already.
-        least = float(_standing_out(picture, picture).reshape(-1)[suspects].min()) if len(suspects) else math.inf
-        bright = _standing_out(picture, _with(picture, places, b)).reshape(-1)[places] > least
-        b = torch.where(bright[:, None], near[places], b)
-    share = error_at(a, b, near[places])
+        least = _standing_out(flat[suspects], _neighbours(picture, suspects)).min() if len(suspects) else math.inf
+        b = torch.where((_standing_out(b, others) > least)[:, None], near, b)
+    share = error_at(a, b, near)
     if again is not None:
         doubtful = {int(place): k for k, place in enumerate(again.places[again.suspects :], again.suspects)}
         at = [k for k, place in enumerate(places.tolist()) if place in doubtful]
@@ -213,22 +226,19 @@ def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
     return 2.0 * min(max(1.0 - second / both, 1 / 3), 0.5) if both > 0.0 else 1.0
 
 
-def _standing_out(picture: Tensor, values: Tensor) -> Tensor:
-    """By how much ``values (H, W, C)`` exceed the second brightest of eight neighbours, relative to their mean ``(H, W)``."""
-    height, width, _ = picture.shape
-    padded = torch.nn.functional.pad(picture.movedim(2, 0)[None], (1, 1, 1, 1), mode="replicate")[0].movedim(0, 2)
-    others = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3) if (x, y) != (1, 1)]
-    largest = second = torch.full_like(picture, -math.inf)
-    for other in others:
-        largest, second = torch.maximum(largest, other), torch.maximum(second, torch.minimum(largest, other))
-    near = torch.stack(others).mean(0)
-    return ((values - second).clamp_min(0.0).square() / (near.square() + RELMSE_FLOOR)).mean(2)
+def _neighbours(picture: Tensor, places: Tensor) -> Tensor:
+    """The eight neighbours ``(8, n, C)`` of pixels; beyond the edge the nearest pixel stands for them."""
+    height, width, channels = picture.shape
+    x, y = places % width, torch.div(places, width, rounding_mode="floor")
+    steps = [(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dx or dy]
+    at = [(y + dy).clamp(0, height - 1) * width + (x + dx).clamp(0, width - 1) for dx, dy in steps]
+    return picture.reshape(-1, channels)[torch.stack(at)]
 
 
-def _with(picture: Tensor, places: Tensor, values: Tensor) -> Tensor:
-    changed = picture.reshape(-1, picture.shape[2]).clone()
-    changed[places] = values
-    return changed.view(picture.shape)
+def _standing_out(values: Tensor, others: Tensor) -> Tensor:
+    """By how much ``values (n, C)`` exceed the second brightest of ``others (8, n, C)``, relative to their mean ``(n,)``."""
+    second = others.topk(2, 0).values[1]
+    return ((values - second).clamp_min(0.0).square() / (others.mean(0).square() + RELMSE_FLOOR)).mean(1)
 
 
 def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
