@@ -297,7 +297,6 @@ class Run:
         """The layers so far: those of first surfaces, and those that the film makes."""
         layers = {}
         film = self.picture.film
-        counts = film.counts if self.twice is None else self.twice.counts(film)
         for name, layer in self.seen.items():
             seen = self.picture.layers[name]
             values = seen.mean() * (self.unit if layer.length else 1.0) if layer.averaged else seen.first()
@@ -305,5 +304,6 @@ class Run:
         for name in self.settings.film.aovs:
             if name not in self.seen:
                 made: Any = LAYERS[name]  # a FilmLayer
+                counts = film.counts if self.twice is None else self.twice.counts(film)
                 layers[name] = made.of(film, counts).to(self.dtype)
         return layers

@@ -87,7 +87,7 @@ class Twice:
         return pilots_alone(self.pilots, self._first(film), self._second(), self._spare(), self.counted)
 
     def _first(self, film: Film) -> Tensor:
-        return film.values()[self.pilots.places.to(film.counts.device)].cpu()
+        return film.taken(self.pilots.places.to(film.sums.device)).values().cpu()
 
     def _second(self) -> Tensor:
         return self.plate.film.values().cpu()
