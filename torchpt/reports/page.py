@@ -70,13 +70,19 @@ def _scene(study: Study, topic: Topic, sheet: Sheet | None, plots: dict[str, Fig
 
 
 def _headline(topic: Topic, main: str) -> str:
-    """Who is first, and by how much, among settings without bias."""
+    """Who is first, and by how much, among settings without bias; or that the runs do not tell."""
     able = [line for line in topic.lines if line.estimates and not (line.bias and line.bias["biased"])]
-    timed = sorted((line.times[-1]["seconds"], line.label) for line in able if line.times and line.times[-1]["seconds"])
+    lines = sorted(
+        (line for line in able if line.times and line.times[-1]["seconds"]), key=lambda line: line.times[-1]["seconds"]
+    )
+    timed = [(line.times[-1]["seconds"], line.label) for line in lines]
     if len(timed) < 2:
         return ""
     (least, first), (_, second), (most, last) = timed[0], timed[1], timed[-1]
-    text = f"{first} comes to {main} {words.number(topic.targets[-1], 2)} first, in {words.seconds(least)}: "
+    aim, (high, low) = words.number(topic.targets[-1], 2), (lines[0].times[-1]["high"], lines[1].times[-1]["low"])
+    if high is None or low is None or high >= low:
+        return f"Which comes to {main} {aim} first, {first} or {second}, these runs do not tell: more would."
+    text = f"{first} comes to {main} {aim} first, in {words.seconds(least)}: "
     text += f"{words.times(timed[1][0] / least)} as fast as {second}"
     return f"{text}." if len(timed) == 2 else f"{text}, {words.times(most / least)} as fast as {last}."
 
