@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchpt.forward import BYTES_PER_LANE, chunks_of, lanes_for, limited_threads, make_wave, rebound
+from torchpt.forward import BYTES_PER_LANE, lanes_for, limited_threads, make_wave, pieces, rebound
 from torchpt.forward.schedule import Span
 from torchpt.scene import Scene
 from torchpt.settings import Settings
@@ -134,5 +134,5 @@ def chunks(
         return values.sum(1) / settings.render.spp
 
     with limited_threads(settings.render.threads):  # while whoever asked for the chunks differentiates them
-        for first, count, sample, samples in chunks_of(settings, lanes, pixels):
+        for first, count, sample, samples in pieces(lanes, pixels, 0, settings.render.spp):
             yield Chunk(first, count, partial(radiance, (first, count, sample, samples)))

@@ -133,7 +133,7 @@ def test_second_values_of_another_variance():
 
 def test_what_lies_around():
     values = torch.arange(12.0, dtype=torch.float64).view(3, 4, 1)
-    near = around(values)
+    near = around(values, torch.ones(3, 4, dtype=torch.bool))
     assert float(near[1, 1, 0]) == pytest.approx(5.0) and float(near[0, 0, 0]) == pytest.approx((1 + 4 + 5) / 3)
     known_ones = torch.zeros(3, 4, dtype=torch.bool)
     known_ones[0, 1] = True

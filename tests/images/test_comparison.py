@@ -112,10 +112,7 @@ def test_colours_of_numbers() -> None:
     assert colours[5].tolist() == colours[6].tolist() == list(NOT_FINITE)
 
 
-def test_our_colours_are_magma() -> None:
-    matplotlib = pytest.importorskip("matplotlib")
+def test_the_brighter_the_further_off() -> None:
     values = torch.linspace(0, 1, 256)
-    theirs = torch.tensor(matplotlib.colormaps["magma"](values.numpy())[:, :3]).float()
-    assert float((false_colour(values, 1.0) - theirs).abs().max()) < 0.01
     light = false_colour(values, 1.0) @ torch.tensor([0.2126, 0.7152, 0.0722])
-    assert bool((light.diff() > 0).all())  # the brighter, the further off
+    assert bool((light.diff() > 0).all())

@@ -201,8 +201,10 @@ def test_a_floor_to_the_horizon():
     floor["shapes"]["floor"]["material"]["reflectance"]["filter"] = "fade"
     faded = torchpt.load(floor, "cpu")
     truth = taken(plain, "on", spp=1024, seed=9).image
-    once = [taken(loaded, "on", spp=4).image for loaded in (plain, faded)]
-    errors = [float((image - truth)[10:15].square().mean()) for image in once]
-    assert errors[1] < 0.8 * errors[0], errors
+    errors = [
+        sum(float((taken(loaded, "on", spp=4, seed=seed).image - truth)[10:15].square().mean()) for seed in range(6))
+        for loaded in (plain, faded)
+    ]
+    assert errors[1] < 0.7 * errors[0], errors
     many = taken(faded, "on", spp=256, seed=5).image
     assert float((many - truth)[10:].mean().abs()) < 2e-3

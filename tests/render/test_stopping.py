@@ -140,6 +140,14 @@ def test_adaptive_with_layers_and_a_crop(box):
     assert torch.allclose(found.layers["depth"], plain.layers["depth"], rtol=0.2)
 
 
+@pytest.mark.parametrize("size", [(1, 1), (4, 4), (9, 5)])
+@pytest.mark.parametrize("spp", [8, 20, 40, 100])
+def test_adaptive_pictures_of_a_few_blocks_are_complete(box, size, spp):
+    """Samples of a block can only be doubled: what is left over is not an interrupted render."""
+    found = shot(box, film_of(*size), {"type": "sobol", "adaptive": True}, spp=spp)
+    assert found.complete and found.stopped_by == "spp" and min(16, spp) <= found.spp <= spp
+
+
 def pilots_at(seed: int, side: int) -> torch.Tensor:
     mask = torch.zeros(side * side, dtype=torch.bool)
     mask[pilots_of(seed, (side, side), (0, 0, side, side)).places] = True

@@ -221,13 +221,13 @@ def test_errors_of_zsobol_are_blue():
 
     def energies(kind: str, spp: int) -> tuple[float, float]:
         plain = blurred = 0.0
-        for seed in range(3):
+        for seed in range(12):
             error = (shoot(scene, spp, seed, kind, {"type": "direct"}, film).image.double() - truth)[..., 0]
             plain += float(error.square().mean())
             blurred += float(torch.nn.functional.avg_pool2d(error[None, None], 4, 1).square().mean())
         return plain, blurred
 
-    for spp, most in ((1, 0.65), (2, 0.85), (4, 0.9)):
+    for spp, most in ((1, 0.65), (2, 0.75), (4, 0.9)):
         (plain, blurred), (white, white_blurred) = energies("zsobol", spp), energies("sobol", spp)
         assert blurred < most * white_blurred
         assert 0.7 < plain / white < 1.4

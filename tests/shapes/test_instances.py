@@ -57,15 +57,14 @@ def described(explicit: bool, **mesh: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("flat", [True, False])
 def test_the_picture_is_that_of_explicit_copies(flat, accel):
     scenes = [torchpt.load(described(explicit, face_normals=flat), "cpu") for explicit in (False, True)]
-    layers = []
-    for scene in scenes:
-        image = torchpt.render(scene, spp=16, seed=5, accel=accel)
-        layers.append(image)
+    layers, more = (
+        [torchpt.render(scene, spp=spp, seed=5, accel=accel) for scene in scenes] for spp in (16, 64)
+    )  # pixel by pixel, and their mean
     # The same numbers meet the same surfaces: a sample differs only where rounding turns it across an edge. Smooth normals
     # computed of a mesh that is then stretched unevenly are not those of the stretched mesh.
     apart = (layers[0] - layers[1]).abs()
     assert float((apart < 1e-4).float().mean()) > (0.98 if flat else 0.6)
-    assert float((layers[0].mean() - layers[1].mean()).abs()) < (2e-4 if flat else 6e-3)
+    assert float((more[0].mean() - more[1].mean()).abs()) < (2e-4 if flat else 5e-3)
     assert layers[0].std() > 0.05
 
 

@@ -34,6 +34,7 @@ __all__ = [
     "KnownError",
     "around",
     "error_at",
+    "error_by_pilots",
     "known_error",
     "pilots_alone",
     "to_look_at",
@@ -69,13 +70,13 @@ class KnownError:
     heavy_tailed: bool
 
 
-def around(values: Tensor, known: Tensor | None = None) -> Tensor:
-    """The mean of the eight neighbours of each pixel ``(H, W, C)``, of those that there are (and are ``known (H, W)``).
+def around(values: Tensor, known: Tensor) -> Tensor:
+    """The mean of the eight neighbours of each place ``(H, W, C)``, of those that are ``known (H, W)``.
 
-    Where a pixel has none its own value stands.
+    Where one has none its own value stands.
     """
     height, width, _ = values.shape
-    there = values.new_ones(height, width) if known is None else known.to(values.dtype)
+    there = known.to(values.dtype)
     total, count = torch.zeros_like(values), torch.zeros_like(there)
     padded = torch.nn.functional.pad((values * there[..., None]), (0, 0, 1, 1, 1, 1))
     marks = torch.nn.functional.pad(there, (1, 1, 1, 1))
@@ -99,16 +100,18 @@ def error_at(a: Tensor, b: Tensor, near: Tensor) -> Tensor:
     return (a - b).square() / 2 / (radiance.square() + RELMSE_FLOOR)
 
 
-def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> float:
-    """By the pilots alone, so that no other pixel has a say: the relMSE that decisions are made by.
-
-    What lies around is the mean of the pilots around.
-    """
+def error_by_pilots(pilots: Pilots, a: Tensor, b: Tensor) -> Tensor:
+    """:func:`error_at` with the mean of the pilots around for what lies around, mean of the channels ``(n,)``."""
     grid = a.new_zeros(*pilots.blocks, a.shape[1])
     known = torch.zeros(pilots.blocks, dtype=torch.bool)
     at = tuple(pilots.block)
     grid[at], known[at] = (a + b) / 2, True
-    share = error_at(a, b, around(grid, known)[at]).mean(1) * _first_part(a, b, spare)
+    return error_at(a, b, around(grid, known)[at]).mean(1)
+
+
+def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> float:
+    """By the pilots alone, so that no other pixel has a say: the relMSE that decisions are made by."""
+    share = error_by_pilots(pilots, a, b) * _first_part(a, b, spare)
     pixels = float(sum_all(pilots.weight))
     return float(sum_all(share * pilots.weight)) / pixels * (1.0 - 0.5 * len(pilots) / pixels if counted else 1.0)
 
@@ -118,7 +121,7 @@ class Again:
     """Pixels that were looked at again.
 
     Attributes:
-        places: which pixels of the picture ``(m,)`` int64; suspects first.
+        places: which pixels of the picture ``(m,)`` int64; suspects first, then pilots in their order.
         suspects: how many of them are suspects; the others are pilots.
         mean: of their further values ``(m, C)``.
         spare: the variance of that mean.
@@ -196,10 +199,8 @@ def known_error(
         b = torch.where((_standing_out(b, others) > least)[:, None], near, b)
     share = error_at(a, b, near)
     if again is not None:
-        doubtful = {int(place): k for k, place in enumerate(again.places[again.suspects :], again.suspects)}
-        at = [k for k, place in enumerate(places.tolist()) if place in doubtful]
-        mean = again.mean[[doubtful[int(places[k])] for k in at]]
-        radiance = torch.maximum(mean.abs(), ((a[at] + b[at]) / 2 / BRIGHTER).abs())
+        at = torch.isin(places, again.places[again.suspects :])  # in the order of the pilots, both
+        radiance = torch.maximum(again.mean[again.suspects :].abs(), ((a[at] + b[at]) / 2 / BRIGHTER).abs())
         share[at] = (a[at] - b[at]).square() / 2 / (radiance.square() + RELMSE_FLOOR)
     share = share.mean(1)[rest] * first
     if not len(share):

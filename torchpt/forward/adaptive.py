@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchpt.film import Film, Pilots
-from torchpt.film.known_error import around, error_at
+from torchpt.film.known_error import error_by_pilots
 from torchpt.film.pilots import BLOCK
 from torchpt.film.sharing import shared_out, smoothed
 from torchpt.forward.twice import Twice
@@ -37,7 +37,7 @@ class Shares:
 
     def spans(self, picture: Plate, twice: Twice, mean: float) -> list[tuple[Plate, int, int]]:
         """What is to be sampled for the picture to have ``mean`` samples a pixel: plates of pixels with as many samples."""
-        device = picture.film.counts.device
+        device = picture.film.sums.device
         counts = self._of_blocks(picture.film.counts.cpu())
         aims = shared_out(self._errors(twice), counts, self.pixels, mean)
         spans: list[tuple[Plate, int, int]] = []
@@ -45,11 +45,11 @@ class Shares:
         pilot_blocks = self.block[self.pilots.places]
         for have, aim in kinds.T.tolist():
             chosen = (counts == have) & (aims == aim)
-            places = chosen[self.block].nonzero()[:, 0]
-            spans.append((self._part(picture, places.to(device), places), have, aim - have))
+            places = chosen[self.block].nonzero()[:, 0].to(device)
+            spans.append((self._part(picture, places, places), have, aim - have))
             seconds = chosen[pilot_blocks].nonzero()[:, 0]
             if len(seconds):
-                part = self._part(twice.plate, seconds.to(device), self.pilots.places[seconds])
+                part = self._part(twice.plate, seconds.to(device), self.pilots.places[seconds].to(device))
                 spans.append((part, have, aim - have))
         return spans
 
@@ -76,11 +76,7 @@ class Shares:
     def _errors(self, twice: Twice) -> Tensor:
         """Relative variance of the pixels of each block, up to a factor: second values alone are asked."""
         a, b = (x.cpu() for x in twice.plate.film.streams())
+        errors, known = a.new_zeros(*self.pilots.blocks, 1), torch.zeros(*self.pilots.blocks, 1, dtype=torch.bool)
         at = tuple(self.pilots.block)
-        grid = a.new_zeros(*self.pilots.blocks, a.shape[1])
-        known = torch.zeros(*self.pilots.blocks, 1, dtype=torch.bool)
-        grid[at], known[at] = (a + b) / 2, True
-        near = around(grid, known[..., 0])[at]
-        errors = a.new_zeros(*self.pilots.blocks, 1)
-        errors[at] = error_at(a, b, near).mean(1, keepdim=True)
+        errors[at], known[at] = error_by_pilots(self.pilots, a, b)[:, None], True
         return smoothed(errors, known).reshape(-1)

@@ -137,10 +137,13 @@ class Run:
         shares = Shares(self.twice.pilots, self.picture.film)
         mean = float(taken)
         while self.stop.going(mean):
-            aim = min(2.0 * mean, float(self.settings.render.spp))
-            aim = mean + self.stop.affordable(aim - mean)
-            spans = shares.spans(self.picture, self.twice, aim)
-            whole = bool(spans) and self._take(spans)
+            wish = min(2.0 * mean, float(self.settings.render.spp)) - mean
+            more = self.stop.affordable(wish)
+            spans = shares.spans(self.picture, self.twice, mean + more)
+            if not spans:  # no block's samples can be doubled within what is left
+                self.stop.reason = "spp" if more == wish else "time_limit"
+                break
+            whole = self._take(spans)
             shares.put_back()
             if not whole:
                 break
@@ -245,9 +248,10 @@ class Run:
         """The picture so far."""
         radiant, film = self.integrator.light, self.picture.film
         layers = self._layers()
+        known = None
         if radiant:
             values = film.mean() if self.twice is None else self.twice.picture(film)
-            image = values.to(self.dtype)
+            image, known = values.to(self.dtype), self._known(values)
         else:
             shown = layers[next(iter(self.seen))]
             blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
@@ -258,7 +262,6 @@ class Run:
             clamped = 1.0 - after / before if before > 0 else 0.0
         counts = (film if radiant else next(iter(self.picture.layers.values()))).counts
         compile_seconds = 0.0 if self.loop is None else self.loop.kernels.seconds
-        known = self._known() if radiant else None
         names = self.settings.film.aovs or self.integrator.layers
         return Rendering(
             image=image,
@@ -285,11 +288,11 @@ class Run:
             settings=self.settings,
         )
 
-    def _known(self) -> KnownError | None:
+    def _known(self, picture: Tensor) -> KnownError | None:
         """The picture's own error."""
         film = self.picture.film
         if self.twice is not None:
-            return self.twice.known(film)
+            return self.twice.known(film, picture)
         relmse = film.relmse()
         return None if relmse is None else KnownError(relmse, None, False)
 

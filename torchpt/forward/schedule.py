@@ -1,4 +1,4 @@
-"""How a picture is cut: passes over its samples, chunks of its pixels, lanes of a wave."""
+"""How a pass over samples is cut: chunks of pixels, lanes of a wave. How long passes are, ``stopping.py`` says."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 from torchpt.settings import Settings
 
-__all__ = ["BLOCK", "BYTES_PER_LANE", "LANES", "Span", "chunks_of", "lanes_for", "passes", "pieces", "streams_of"]
+__all__ = ["BLOCK", "BYTES_PER_LANE", "LANES", "LARGEST_PASS", "Span", "lanes_for", "pieces", "streams_of"]
 
 #: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
 LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
@@ -33,16 +33,6 @@ def streams_of(settings: Settings) -> int:
     return min(spp, 4 if spp >= MANY_SAMPLES else 2) if "variance" in settings.film.aovs else 1
 
 
-def passes(spp: int, streams: int) -> Iterator[tuple[int, int]]:
-    """First sample and number of samples of each pass; sizes double and depend on ``spp`` alone."""
-    first, size = 0, streams
-    while first < spp:
-        count = min(size, spp - first)
-        yield first, count
-        first += count
-        size = min(2 * size, LARGEST_PASS) if first > streams else size
-
-
 def pieces(lanes: int, pixels: int, first: int, count: int) -> Iterator[Span]:
     """Samples ``first .. first + count`` of all pixels in chunks of so many lanes: they split pixels, never samples' order."""
     batch = max(min(count, lanes), 1)
@@ -59,9 +49,3 @@ def lanes_for(settings: Settings, device: torch.device, per_lane: int = BYTES_PE
     if settings.render.max_memory is not None:
         lanes = min(lanes, max(settings.render.max_memory // per_lane, 1))
     return lanes
-
-
-def chunks_of(settings: Settings, lanes: int, pixels: int) -> Iterator[Span]:
-    """All samples of all pixels, pass by pass."""
-    for first, count in passes(settings.render.spp, streams_of(settings)):
-        yield from pieces(lanes, pixels, first, count)

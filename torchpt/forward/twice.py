@@ -40,7 +40,7 @@ class Twice:
         """The picture ``(H, W, 3)`` in float64."""
         if not self.counted or not len(self.pilots):
             return film.mean()
-        places, second = self.pilots.places.to(film.counts.device), self.plate.film
+        places, second = self.plate.places, self.plate.film
         values, first = film.values(), film.counts[places].double()
         again = second.counts.double()
         share = (again / (first + again).clamp_min(1.0))[:, None]
@@ -51,11 +51,11 @@ class Twice:
         """Samples that each pixel of the picture holds ``(pixels,)`` int64."""
         counts = film.counts
         if self.counted and len(self.pilots):
-            counts[self.pilots.places.to(counts.device)] += self.plate.film.counts
+            counts[self.plate.places] += self.plate.film.counts
         return counts
 
-    def known(self, film: Film) -> KnownError | None:
-        """What the picture knows of its error."""
+    def known(self, film: Film, picture: Tensor) -> KnownError | None:
+        """What the picture, :meth:`picture` of the film, knows of its error."""
         if not len(self.pilots) or int(self.plate.film.counts.min()) == 0:
             return None
         again = None
@@ -63,9 +63,9 @@ class Twice:
             plate, suspects = self.third
             values = torch.stack(plate.film.streams()).cpu()
             assert plate.places is not None
-            again = Again(plate.places, suspects, values.mean(0), values.var(0) / len(values))
-        picture, first = self.picture(film).cpu(), self._first(film)
-        return known_error(picture, self.pilots, first, self._second(), self._spare(), self.counted, again)
+            again = Again(plate.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
+        first = self._first(film)
+        return known_error(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
 
     def look_again(self, film: Film) -> list[tuple[Plate, int, int]]:
         """What is to be sampled for the picture to know its error better, once it is finished."""
@@ -73,9 +73,9 @@ class Twice:
             return []
         picture, first = self.picture(film).cpu(), self._first(film)
         suspects, doubtful = to_look_at(picture, self.pilots, first, self._second())
-        places = torch.cat((suspects, doubtful))
+        places = torch.cat((suspects, doubtful)).to(film.sums.device)
         streams = Streams(self.plate.streams.first + self.plate.streams.count, STREAMS)
-        plate = Plate(Film(len(places), 1, STREAMS, film.counts.device), {}, streams, places)
+        plate = Plate(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
         self.third = plate, len(suspects)
         samples = round(float(film.counts.double().mean()))
         return [(plate, 0, STREAMS * samples)]
@@ -87,7 +87,8 @@ class Twice:
         return pilots_alone(self.pilots, self._first(film), self._second(), self._spare(), self.counted)
 
     def _first(self, film: Film) -> Tensor:
-        return film.taken(self.pilots.places.to(film.sums.device)).values().cpu()
+        assert self.plate.places is not None
+        return film.taken(self.plate.places).values().cpu()
 
     def _second(self) -> Tensor:
         return self.plate.film.values().cpu()
@@ -105,5 +106,5 @@ def second_values(wave: Wave, settings: Settings, device: torch.device) -> Twice
     film = settings.film
     pilots = pilots_of(settings.render.seed, (film.width, film.height), wave.crop)
     streams = Streams(wave.sampler.randomizations, 2 if settings.adaptive else 1)
-    sums = Film(max(len(pilots), 0), 1, streams.count, device)
-    return Twice(pilots, Plate(sums, {}, streams, pilots.places), not settings.adaptive)
+    sums = Film(len(pilots), 1, streams.count, device)
+    return Twice(pilots, Plate(sums, {}, streams, pilots.places.to(device)), not settings.adaptive)

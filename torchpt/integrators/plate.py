@@ -20,7 +20,7 @@ class Plate:
         film: sums of radiance.
         layers: sums of layers of first surfaces, by name.
         streams: where their samples come from.
-        places: which pixels of the picture they are ``(n,)`` int64, row by row; None: all.
+        places: which pixels of the picture they are ``(n,)`` int64, row by row, where the lanes live; None: all.
     """
 
     film: Film

@@ -63,7 +63,7 @@ class Wave:
         x0, y0, width, _ = self.crop
         place = torch.arange(first_pixel, first_pixel + pixels, device=device)
         if plate is not None and plate.places is not None:
-            place = plate.places[first_pixel : first_pixel + pixels].to(device)
+            place = plate.places[first_pixel : first_pixel + pixels]
         x, y = place % width + x0, place // width + y0
         # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
         pixel = (y * self.camera.resolution[0] + x).repeat(samples)

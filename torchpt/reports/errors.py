@@ -23,7 +23,7 @@ _TRIMMED = 1e-3
 
 def error_map(image: Tensor, truth: Truth) -> Tensor:
     """``(x - r)² / (r² + 0.01)``, the mean of the channels: ``(H, W)``."""
-    return ((image - truth.image).square() * truth.weight).mean(-1)
+    return metrics.error_map("relmse", image, truth.image)
 
 
 def relmse(image: Tensor, truth: Truth) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 
 import jinja2
 
+from torchpt.images.false_colour import MAP
 from torchpt.reports import words
 from torchpt.reports.analysis import Line, Topic
 from torchpt.reports.pictures import Sheet
@@ -223,7 +224,7 @@ def _ramp() -> str:
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
-    return ", ".join(to_hex(colormaps["inferno"](k / 8)) for k in range(9))
+    return ", ".join(to_hex(colormaps[MAP](k / 8)) for k in range(9))
 
 
 def _method(study: Study) -> list[str]:

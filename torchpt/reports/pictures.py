@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpt.images import colour
+from torchpt.images.false_colour import false_colour
 from torchpt.reports.analysis import Line, Step, Topic
 from torchpt.reports.errors import error_map
 
@@ -127,12 +128,10 @@ def _scale(maps: Sequence[Tensor]) -> tuple[float, float]:
 
 
 def _coloured(errors: Tensor, scale: tuple[float, float]) -> np.ndarray:
-    """A map in colours that also order by lightness, for every kind of sight and for print."""
-    from matplotlib import colormaps
-
+    """A map in colours, by the logarithm."""
     low, top = (math.log10(x) for x in scale)
     level = (errors.clamp_min(1e-30).log10() - low) / (top - low)
-    return (colormaps["inferno"](level.clamp(0, 1).numpy())[..., :3] * 255 + 0.5).astype(np.uint8)
+    return (false_colour(level, 1.0).numpy() * 255 + 0.5).astype(np.uint8)
 
 
 def _png(levels: np.ndarray) -> bytes:

@@ -45,8 +45,8 @@ class Streams:
     count: int = 1
 
 
-#: Streams beside those of the picture that a sampler has seeds for.
-SPARE = 16
+#: Streams beside those of the picture that a sampler has seeds for: two of second values, eight that look again.
+SPARE = 10
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What triangles and rectangles share: texture coordinates that are affine over the primitive."""
+"""What flat primitives share: a pose's axes, and texture coordinates that are affine over the primitive."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ from torch import Tensor
 
 from torchpt.shapes.primitive import Corners, Triple
 
-__all__ = ["corner_moves", "unit_uvs"]
+__all__ = ["axes_of", "corner_moves", "unit_uvs"]
+
+
+def axes_of(pose: Tensor) -> tuple[Tensor, Tensor, Tensor, bool]:
+    """Where a pose ``(3, 4)`` puts the origin, x and y ``(3, 1)`` each, and whether it mirrors.
+
+    Then x and y are exchanged: the shape still faces where its own +z goes, as in Mitsuba.
+    """
+    linear, move = pose.split((3, 1), 1)
+    x, y = linear[:, 0:1], linear[:, 1:2]
+    mirrored = bool(torch.linalg.det(linear.detach()) < 0)
+    return (move, y, x, True) if mirrored else (move, x, y, False)
 
 
 def unit_uvs(corners: Corners) -> Triple:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchpt.math.vectors import take
 from torchpt.records import Interaction, World
 from torchpt.shapes.primitive import Corners, Place, Primitive
+from torchpt.shapes.primitives._affine import axes_of
 from torchpt.shapes.quadrics import polar
 
 if TYPE_CHECKING:
@@ -28,11 +29,7 @@ class Disk(Primitive):
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, vertices: Tensor | None) -> Corners:
         """See :class:`Primitive`."""
-        linear, move = pose.split((3, 1), 1)
-        x, y = linear[:, 0:1], linear[:, 1:2]
-        mirrored = bool(torch.linalg.det(linear.detach()) < 0)
-        if mirrored:
-            x, y = y, x  # it still faces where its own +z goes, as in Mitsuba
+        move, x, y, mirrored = axes_of(pose)
         p1, p2 = move + x, move + y
         return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), mirrored=mirrored)
 

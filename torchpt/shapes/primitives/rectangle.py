@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchpt.shapes.primitive import Corners, Primitive, Triple
-from torchpt.shapes.primitives._affine import corner_moves, unit_uvs
+from torchpt.shapes.primitives._affine import axes_of, corner_moves, unit_uvs
 
 if TYPE_CHECKING:
     from torchpt.scene.parts import Part
@@ -24,11 +24,7 @@ class Rectangle(Primitive):
     @classmethod
     def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, vertices: Tensor | None) -> Corners:
         """See :class:`Primitive`: Mitsuba's unit shape [-1, 1]^2 from its lower corner."""
-        linear, move = pose.split((3, 1), 1)
-        x, y = linear[:, 0:1], linear[:, 1:2]
-        mirrored = bool(torch.linalg.det(linear.detach()) < 0)
-        if mirrored:
-            x, y = y, x  # it still faces where its own +z goes, as in Mitsuba
+        move, x, y, mirrored = axes_of(pose)
         x, y = 2.0 * x, 2.0 * y
         p0 = move - 0.5 * (x + y)
         return Corners(p0.to(dtype), (p0 + x).to(dtype), (p0 + y).to(dtype), mirrored=mirrored)
