@@ -10,14 +10,15 @@ The seconds of a number of samples are the median over rounds, its error the mea
 on the straight line in logarithms between the two numbers that bracket it. ``multijitter`` rounds samples up: those that it
 takes are what is timed and scored. The first turn of a number is left out of its seconds, as Mitsuba may compile for it.
 
-The reference: each renderer has its own, the mean of more pictures by other seeds, and the variance of that mean is subtracted.
-So it is noise that is compared, and divided by the same on both sides: the square of the mean of both references, plus 0.01. A
-common reference would add what the renderers differ by to the error of one of them: light that passes an opacity or ``null``
-is a bounce in Mitsuba only, which makes its ``material_row`` 0.3 % darker, and its Cornell box is 0.05 to 0.09 % darker for a
-reason not known. How far the two references are apart, both variances subtracted, stands below the errors, so that it is seen
-where it matters.
+The reference: each renderer has its own, the mean of its pictures of the longest time (Mitsuba's by ``multijitter``), and the
+variance of that mean is subtracted. Each of these pictures is held against the mean of the others. So it is noise that is
+compared, and divided by the same on both sides: the square of the mean of both references, plus 0.01. A common reference
+would add what the renderers differ by to the error of one of them: light that passes an opacity or ``null`` is a bounce in
+Mitsuba only, which makes its ``material_row`` 0.3 % darker, and its Cornell box is 0.05 to 0.09 % darker for a reason not
+known. How far the two references are apart, both variances subtracted, stands below the errors, so that it is seen where it
+matters.
 
-A long run: a scene takes 3 contenders x rounds x 22 s and two references, ten scenes some 100 minutes at 7 rounds and 80 at 5.
+A long run: a scene takes 3 contenders x rounds x 23 s, ten scenes some 90 minutes at 7 rounds and 65 at 5.
 ``--json FILE`` keeps each scene as it is done, and the next run with the same file goes on from there, or only prints and
 draws; ``--again`` measures scenes anew, as after a change of the program. ``--quick`` only shows that it works.
 """
@@ -27,7 +28,6 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -57,14 +57,15 @@ BUDGETS = (1.0, 4.0, 16.0)
 AIM = 1.08
 #: What the speed is measured by, at most: more is foretold, as it takes as long as a round.
 CALIBRATION = 5.0
-#: Seeds are apart: of the calibration, of rounds and of references.
-CALIBRATED, ROUNDS, REFERENCES = 1, 1_000_000, 2_000_000
+#: Seeds are apart: of the calibration and of rounds.
+CALIBRATED, ROUNDS = 1, 1_000_000
+#: Rounds it takes at least: each picture is held against two others.
+FEWEST = 3
 
 
 def add_arguments(group: Any) -> None:
     """Those that only this benchmark has."""
     group.add_argument("--budgets", type=float, nargs="+", default=BUDGETS, metavar="SECONDS", help="1 4 16 by default")
-    group.add_argument("--reference", type=int, default=16, help="pictures in each reference, of the middle time")
     group.add_argument("--again", action="store_true", help="measure anew what the file of --json holds")
     group.add_argument("--plot", type=Path, metavar="FILE", help="draw error against time (.svg, .png)")
 
@@ -72,15 +73,15 @@ def add_arguments(group: Any) -> None:
 def contest(arguments: argparse.Namespace) -> None:
     """All scenes, or those that are named; prints, keeps and draws."""
     if arguments.quick:
-        arguments.rounds, arguments.size, arguments.reference = 2, 48, 16
+        arguments.rounds, arguments.size = FEWEST, 48
         arguments.budgets = [budget / 16.0 for budget in arguments.budgets]
     budgets = sorted(arguments.budgets)
-    if budgets[0] <= 0.0 or len(set(budgets)) < len(budgets) or arguments.rounds < 1 or arguments.reference < 2:
-        raise SystemExit("--budgets: different times above 0; --rounds: 1 or more; --reference: 2 or more")
+    if budgets[0] <= 0.0 or len(set(budgets)) < len(budgets) or arguments.rounds < FEWEST:
+        raise SystemExit(f"--budgets: different times above 0; --rounds: {FEWEST} or more")
     wanted = arguments.scenes or SCENES
     if unknown := [name for name in wanted if name not in SCENES]:
         raise SystemExit(f"{unknown[0]}: not one of {', '.join(SCENES)}")
-    names = ("rounds", "size", "reference", "threads", "sampler", "compile")
+    names = ("rounds", "size", "threads", "sampler", "compile")
     settings = {name: getattr(arguments, name) for name in names}
     settings |= {"budgets": budgets, "max_depth": DEPTH, "rr_depth": 5}
     found = bench_files.resumed(arguments.json, settings, arguments.again)
@@ -120,16 +121,14 @@ def measured(name: str, budgets: list[float], arguments: argparse.Namespace) -> 
         picture = Path(folder) / "picture.npy"
         workers = dict(zip((OURS, *RIVALS), started_workers.values(), strict=True))
         counts = {who: calibrated(worker, budgets, arguments.spp) for who, worker in workers.items()}
-        references: dict[str, Reference] = {}
-        for who in (OURS, REFEREE):
-            spp = counts[who][1 + len(budgets) // 2]
-            references[who] = Reference.of(
-                [shot(workers[who], spp, REFERENCES + seed, picture)[1] for seed in range(arguments.reference)]
-            )
-        ours, theirs = references.values()
-        scale = scale_of(ours, theirs)
-        judges = {who: judge(ours if who == OURS else theirs, scale) for who in workers}
-        turns = rounds(workers, counts, judges, arguments.rounds, picture)
+        turns, pictures = rounds(workers, counts, arguments.rounds, picture)
+    ours, theirs = (Reference.of(pictures[who][counts[who][-1]]) for who in (OURS, REFEREE))
+    scale = scale_of(ours, theirs)
+    for who, row in turns.items():
+        for spp, taken in row.items():
+            part = spp == counts[who][-1] and who in (OURS, REFEREE)
+            facts = judged(ours if who == OURS else theirs, scale, pictures[who][spp], part)
+            turns[who][spp] = [turn | more for turn, more in zip(taken, facts, strict=True)]
     points = {who: [point_of(turns[who][spp]) for spp in counts[who]] for who in workers}
     return {
         "curves": {who: [asdict(point) for point in line] for who, line in points.items()},
@@ -168,36 +167,47 @@ def shot(worker: Any, spp: int, seed: int, file: Path) -> tuple[Turn, np.ndarray
     return turn, np.load(file, allow_pickle=False)
 
 
-#: Facts about a picture ``(H, W, 3)``.
-Judge = Callable[[np.ndarray], dict[str, Any]]
-#: Turns by contender and by samples that were asked for: seconds, samples that were taken, whether it was cold, :func:`judge`.
+#: Turns by contender and by samples that were asked for: seconds, samples that were taken, whether it was cold, :func:`judged`.
 Turns = dict[str, dict[int, list[dict[str, Any]]]]
+#: Pictures ``(H, W, 3)`` by contender and by samples that were asked for.
+Pictures = dict[str, dict[int, list[np.ndarray]]]
 
 
-def judge(reference: Reference, scale: np.ndarray) -> Judge:
-    """The relMSE of pictures, and what it would be without each of the reference's pictures."""
+def judged(reference: Reference, scale: np.ndarray, pictures: list[np.ndarray], part: bool) -> list[dict[str, Any]]:
+    """The relMSE of pictures, and what it would be without each of the reference's pictures.
 
-    def facts(seen: np.ndarray) -> dict[str, Any]:
-        without = [lacking.relmse(seen, scale) for lacking in reference.without]
-        return {"relmse": reference.relmse(seen, scale), "without": without}
+    Args:
+        reference: of the renderer.
+        scale: what squared errors are divided by.
+        pictures: to be judged.
+        part: whether they are those that the reference is made of. Each is then held against the others; as one that errs
+            much hardly moves these errors, their spread alone tells how sure their mean is.
+    """
+    if part:
+        pairs = zip(reference.without, pictures, strict=True)
+        return [{"relmse": others.relmse(seen, scale), "without": []} for others, seen in pairs]
+    return [
+        {
+            "relmse": reference.relmse(seen, scale),
+            "without": [lacking.relmse(seen, scale) for lacking in reference.without],
+        }
+        for seen in pictures
+    ]
 
-    return facts
 
-
-def rounds(
-    workers: Workers, counts: dict[str, list[int]], judges: dict[str, Judge], number: int, picture: Path
-) -> Turns:
+def rounds(workers: Workers, counts: dict[str, list[int]], number: int, picture: Path) -> tuple[Turns, Pictures]:
     """Rounds in which all contenders take their turn at each time, with another seed each."""
     turns: Turns = {who: {spp: [] for spp in row} for who, row in counts.items()}
+    pictures: Pictures = {who: {spp: [] for spp in row} for who, row in counts.items()}
     steps = len(next(iter(counts.values())))
     for seed in range(number):
         for step in range(steps):
             for who, worker in workers.items():
                 spp = counts[who][step]
                 turn, seen = shot(worker, spp, ROUNDS + seed * steps + step, picture)
-                facts = {"seconds": turn.seconds, "spp": turn.spp, "cold": turn.cold}
-                turns[who][spp].append(facts | judges[who](seen))
-    return turns
+                turns[who][spp].append({"seconds": turn.seconds, "spp": turn.spp, "cold": turn.cold})
+                pictures[who][spp].append(seen)
+    return turns, pictures
 
 
 def point_of(turns: list[dict[str, Any]]) -> Point:

@@ -155,9 +155,7 @@ def at_time(points: Sequence[Point], seconds: float) -> Estimate:
     after = min(max(bisect.bisect_left([point.seconds for point in line], seconds), 1), len(line) - 1)
     low, high = line[after - 1], line[after]
     if low.relmse <= 0.0 or high.relmse <= 0.0:
-        raise ValueError(
-            "no error is left once the reference's variance is subtracted: it takes more reference pictures"
-        )
+        raise ValueError("no error is left once the reference's variance is subtracted: it takes more rounds")
     weight = math.log(seconds / low.seconds) / math.log(high.seconds / low.seconds)
     relmse = math.exp((1.0 - weight) * math.log(low.relmse) + weight * math.log(high.relmse))
     deviation = None

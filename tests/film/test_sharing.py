@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
-from torchpt.film.sharing import shared_out, smoothed
+from torchpt.film.sharing import foreseen, shared_out
 
 PIXELS = torch.full((100,), 16)
 
@@ -44,10 +45,30 @@ def test_bad_estimates_do_no_harm():
     assert (shared_out(error, counts(32), PIXELS, 64.0) == 64).all()
 
 
-def test_smoothing_keeps_a_constant_and_asks_the_known_alone():
-    values, known = torch.full((9, 7, 1), 3.0).double(), torch.ones(9, 7, 1, dtype=torch.bool)
+def test_a_constant_is_kept_and_the_known_alone_are_asked():
+    values, known = torch.full((9, 7), 3.0).double(), torch.ones(9, 7, dtype=torch.bool)
     values[4, 4], known[4, 4] = 1e9, False
-    torch.testing.assert_close(smoothed(values, known), torch.full((9, 7, 1), 3.0).double())
-    lonely = torch.zeros(9, 7, 1, dtype=torch.bool)
+    torch.testing.assert_close(foreseen(values, known), torch.full((9, 7), 3.0).double())
+    lonely = torch.zeros(9, 7, dtype=torch.bool)
     lonely[0, 0] = True
-    assert (smoothed(values, lonely) == 3.0).all()  # the mean where nothing near is known
+    assert (foreseen(values, lonely) == 3.0).all()  # the mean where nothing near is known
+
+
+def test_errors_that_gather_are_followed_and_those_that_do_not_are_shared():
+    g = torch.Generator().manual_seed(2)
+    known = torch.ones(60, 60, dtype=torch.bool)
+    noise = torch.rand(60, 60, generator=g).double()
+    edge = noise.clone()
+    edge[28:30] *= 100.0
+    found = foreseen(edge, known)
+    assert float(found[28:30].mean()) > 20 * float(found[:20].mean())
+    assert float(found.mean()) == pytest.approx(float(edge.mean()), rel=0.1)
+    rare = noise.clone()
+    rare[torch.rand(60, 60, generator=g) < 0.01] = 100.0
+    found = foreseen(rare, known)
+    assert float(found.mean()) == pytest.approx(float(rare.mean()), rel=0.1)
+    assert float(found.max()) < 3 * float(found.min())
+    half = noise.clone()  # ordinary noise of which one side has more
+    half[:, :30] *= 4.0
+    found = foreseen(half, known)
+    assert float(found[:, :28].mean()) == pytest.approx(4 * float(found[:, 32:].mean()), rel=0.2)

@@ -63,7 +63,9 @@ def materials(folder: Path, mitsuba: Any) -> dict[str, tuple[dict[str, Any], dic
         return {"type": "image", "path": str(folder / name), **more}
 
     def theirs(name: str, **more: Any) -> dict[str, Any]:
-        return {"type": "bitmap", "filename": str(folder / name), "raw": True, **more}
+        # Handed over in memory: the threads by which Mitsuba's OpenEXR reads files sometimes wait for each other for ever.
+        pixels = np.ascontiguousarray(torchpt.read_image(folder / name).numpy())
+        return {"type": "bitmap", "bitmap": mitsuba.Bitmap(pixels), "raw": True, **more}
 
     moved = to_uv().translate(UV["translate"]).rotate(UV["rotate"]).scale(UV["scale"])
     plain = {"type": "diffuse", "reflectance": theirs("colour.exr")}

@@ -32,6 +32,8 @@ def test_bits_are_those_of_the_tensor_form(kind, n):
         salt = torch.tensor(name, dtype=torch.int32)
         assert torch.equal(draw(points, 1, key, name), points.draw_1d(key, salt)[None])
         assert torch.equal(draw(points, 2, key, name), points.draw_2d(key, salt))
+        if points.joint:
+            assert torch.equal(draw(points, 2, key, name, further=True), points.draw_further(key, salt))
 
 
 @pytest.mark.parametrize("kind", KERNELS)
@@ -57,3 +59,7 @@ def test_draws_are_the_kinds(kind):
     roulette, bsdf = int(Dimension.ROULETTE), int(Dimension.BSDF)
     assert torch.equal(draws.one(Dimension.ROULETTE), points_of(kind).draw_1d(key, names[roulette]))
     assert torch.equal(draws.two(Dimension.BSDF), points_of(kind).draw_2d(key, names[bsdf]))
+    light = points_of(kind).draw_2d(key, names[int(Dimension.LIGHT)])
+    if points_of(kind).joint:  # the direction that led from the first vertex to the second
+        light = points_of(kind).draw_further(key, salts(1, CPU)[bsdf])
+    assert torch.equal(draws.two(Dimension.LIGHT), light)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ import torch
 from trials import SIGNIFICANCE, film_of, grid_cells, shoot, uniform_p
 
 import torchpt
-from torchpt.samplers import Dimension, Sampler, points_of, salts, scrambling
+from torchpt.samplers import Dimension, Draws, Sampler, points_of, salts, scrambling
 
 CPU = torch.device("cpu")
 sobol = points_of("sobol")
@@ -18,19 +20,63 @@ sobol = points_of("sobol")
 def points(number: int, seed: int = 0, pixel: int = 0, depth: int = 1, dimension: Dimension = Dimension.BSDF):
     """``(2, number)`` points of one pixel."""
     key = Sampler("sobol", seed).key(torch.full((number,), pixel), torch.arange(number))
-    return sobol.draw_2d(key, salts(depth, CPU)[int(dimension)])
+    return Draws("sobol", key, salts(depth, CPU)).two(dimension)
 
 
 @pytest.mark.parametrize("power", range(13))
 @pytest.mark.parametrize("seed", [0, 1, 77])
-def test_it_is_a_net_in_all_elementary_intervals(power, seed):
+@pytest.mark.parametrize("dimension", [Dimension.BSDF, Dimension.LIGHT])
+def test_it_is_a_net_in_all_elementary_intervals(power, seed, dimension):
     """A (0, m, 2)-net: each interval of area 2^-m with sides of powers of two holds exactly one of 2^m points."""
-    u = points(1 << power, seed, pixel=seed * 31 + 5).double()
+    u = points(1 << power, seed, pixel=seed * 31 + 5, dimension=dimension).double()
     for k in range(power + 1):
         column = (u[0] * (1 << k)).long()
         row = (u[1] * (1 << (power - k))).long()
         cells = column * (1 << (power - k)) + row
         assert torch.equal(cells.sort().values, torch.arange(1 << power)), k
+
+
+@pytest.mark.parametrize("digits", range(7))
+@pytest.mark.parametrize("depth", [1, 2, 5])
+def test_light_is_stratified_with_what_led_there(digits, depth):
+    """A (0, m, 4)-net in base 4, of the light's numbers and those of the pixel or of the direction before."""
+    n, first = 1 << 2 * digits, (1 << 2 * digits) * 3  # any aligned part of the sequence
+    led = Dimension.PIXEL, 0
+    if depth > 1:
+        led = Dimension.BSDF, depth - 1
+    before = points(first + n, 5, 12, led[1], led[0])
+    u = torch.cat((before, points(first + n, 5, 12, depth, Dimension.LIGHT)))[:, first:].double()
+    for sides in itertools.product(range(digits + 1), repeat=4):
+        if sum(sides) == digits:
+            cell = torch.zeros(n, dtype=torch.int64)
+            for axis, side in zip(u, sides, strict=True):
+                cell = cell * 4**side + (axis * 4**side).long()
+            assert torch.equal(cell.sort().values, torch.arange(n)), sides
+
+
+def test_third_and_fourth_coordinates_are_niederreiters():
+    """Over the field of four elements: row i, column j of the generator of ``a`` is ``C(j, i) a^(j - i)``."""
+    product = [[0, 0, 0, 0], [0, 1, 2, 3], [0, 2, 3, 1], [0, 3, 1, 2]]  # 2 is w, 3 is w + 1 = w²
+
+    def coordinate(index: int, a: int) -> int:
+        digits, found = [index >> 2 * j & 3 for j in range(16)], 0
+        for i in range(16):
+            total = 0
+            for j in range(i, 16):
+                power = 1
+                for _ in range(j - i):
+                    power = product[power][a]
+                total ^= product[digits[j]][power] if math.comb(j, i) % 2 else 0
+            found |= total << 2 * i
+        return found
+
+    # W of the code turns (low, high) into (high, low + high): the digit is low + high w, and so is its multiplication.
+    index = [*range(300), 12_345_678, 2**31 - 1]
+    lanes = torch.tensor(index, dtype=torch.int64).to(torch.int32)
+    third, fourth = (f(lanes).tolist() for f in (scrambling.third_dimension, scrambling.fourth_dimension))
+    assert [x & 0xFFFFFFFF for x in third] == [coordinate(i, 2) for i in index]
+    bits = [coordinate(i, 3) for i in index]
+    assert [x & 0xFFFFFFFF for x in fourth] == [x ^ (x >> 1 & 0x55555555) for x in bits]
 
 
 @pytest.mark.parametrize("power", [1, 4, 7, 10])
@@ -97,12 +143,13 @@ def test_padded_dimensions_are_decorrelated(power):
     pixel = torch.arange(pixels).repeat_interleave(n)
     key = Sampler("sobol", 21).key(pixel, torch.arange(n).repeat(pixels))
     drawn = [
-        sobol.draw_2d(key, salts(depth, CPU)[int(d)])[axis]
+        Draws("sobol", key, salts(depth, CPU)).two(d)[axis]
         for depth, d, axis in (
             (1, Dimension.BSDF, 0),
             (1, Dimension.LIGHT, 0),
             (1, Dimension.LIGHT, 1),
             (2, Dimension.BSDF, 0),
+            (2, Dimension.LIGHT, 1),
             (5, Dimension.BSDF, 1),
         )
     ]
@@ -117,7 +164,7 @@ def test_padded_dimensions_are_decorrelated(power):
         assert abs(r) < 4.5, (
             a,
             b,
-        )  # 27 comparisons, 2 sizes: 1e-3 in all is 4.3, and estimated variances are a little off
+        )  # 34 comparisons, 2 sizes: 1e-3 in all is 4.3, and estimated variances are a little off
         # One point a pixel: pixels are independent, so cells are counted as chi-square has it.
         cells = grid_cells(together[:, :: n + 1 if n < pixels else n] + 0.5, 8)
         assert uniform_p(cells, 64) > SIGNIFICANCE / len(pairs), (a, b)
@@ -154,6 +201,7 @@ def test_golden_values():
     salt = salts(2, CPU)
     assert sobol.draw_1d(key, salt[6]).tolist() == GOLDEN_1D
     assert sobol.draw_2d(key, salt[5]).tolist() == GOLDEN_2D
+    assert sobol.draw_further(key, salt[5]).tolist() == GOLDEN_FURTHER
 
 
 GOLDEN_KEY = [[-243300574, -802353018, -1162944142], [0, 1, 255]]
@@ -161,6 +209,10 @@ GOLDEN_1D = [0.4664114713668823, 0.6570622324943542, 0.32438111305236816]
 GOLDEN_2D = [
     [0.10253113508224487, 0.9393109083175659, 0.5581554174423218],
     [0.4157901406288147, 0.2794380784034729, 0.1803293228149414],
+]
+GOLDEN_FURTHER = [
+    [0.8844265937805176, 0.5105987191200256, 0.6316094398498535],
+    [0.4383094906806946, 0.6402947902679443, 0.4410426616668701],
 ]
 
 

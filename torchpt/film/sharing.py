@@ -1,7 +1,7 @@
 """How adaptive sampling shares samples out: more for blocks of pixels whose error falls most by them.
 
 A pixel of n samples whose relative variance is ``e`` has ``s = sqrt(e n)`` a sample; for so many samples in all the sum of
-``s² / n`` over pixels is least where n goes with s. What ``e`` is, pilots say, one a block, smoothed over blocks nearby.
+``s² / n`` over pixels is least where n goes with s. What ``e`` is, pilots say, one a block (:func:`foreseen`).
 Other pixels are not asked, so none of them owes its number of samples to its own value. Numbers are powers of two times the
 first one, as Sobol' points are at their best there.
 """
@@ -13,29 +13,53 @@ from torch import Tensor
 
 from torchpt.math.threads import sum_all
 
-__all__ = ["shared_out", "smoothed"]
+__all__ = ["foreseen", "shared_out"]
 
 #: No block of pixels takes more than this many times its samples at once: it is known by few pilots.
 GROWTH = 4
 #: Errors below this part of the mean count as much: what no pilot has met yet may be there all the same.
 FLOOR = 0.05
+#: Errors up to this quantile are taken as what pilots around have, too.
+ORDINARY = 0.95
 
 
-def smoothed(values: Tensor, known: Tensor) -> Tensor:
-    """Means ``(R, C)`` over 5 x 5 blocks with binomial weights, of the blocks that are ``known``; the mean of all elsewhere."""
+def foreseen(errors: Tensor, known: Tensor) -> Tensor:
+    """What blocks are expected to have of an error ``(R, C)`` that single pilots tell, where blocks are ``known (R, C)``.
+
+    Most pilots tell of the noise around them. The few large ones may be an edge, or rare samples that are as likely elsewhere:
+    where they gathered by chance, samples would be taken from where the next ones will be. So what errors have above the 95th
+    percentile is believed only as far as the pilots around foretell it, by regression; the rest of it all blocks share.
+    """
+    body = torch.minimum(errors, errors[known].quantile(ORDINARY))
+    tail = torch.where(known, errors - body, 0.0)
+    mean = sum_all(tail) / sum_all(known.double())
+    told = _smoothed(tail, known, own=False) - mean
+    apart = torch.where(known, told, 0.0)
+    below = float(sum_all(apart.square()))
+    trust = min(max(float(sum_all(apart * (tail - mean))) / below, 0.0), 1.0) if below > 0.0 else 0.0
+    return _smoothed(body, known) + mean + trust * (_smoothed(tail, known) - mean)
+
+
+def _smoothed(values: Tensor, known: Tensor, own: bool = True) -> Tensor:
+    """Means ``(R, C)`` over 5 x 5 blocks with binomial weights, of the blocks that are ``known``; the mean of all elsewhere.
+
+    Without ``own`` a block has no part in its own mean.
+    """
     kernel = torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0], dtype=values.dtype)
 
     def spread(x: Tensor) -> Tensor:
         for axis in (0, 1):
-            wide = torch.nn.functional.pad(x, (0, 0, 0, 0, 2, 2) if axis == 0 else (0, 0, 2, 2))
+            wide = torch.nn.functional.pad(x, (2, 2, 0, 0) if axis else (0, 0, 2, 2))
             size = x.shape[axis]
             parts = [kernel[k] * wide.narrow(axis, k, size) for k in range(5)]
             x = parts[0] + parts[1] + parts[2] + parts[3] + parts[4]
         return x
 
     there = known.to(values.dtype)
-    weight = spread(there)
-    total = spread(values * there)
+    weight, total = spread(there), spread(values * there)
+    if not own:
+        centre = kernel[2].square() * there
+        weight, total = weight - centre, total - centre * values
     mean = sum_all(values * there) / sum_all(there).clamp_min(1.0)
     return torch.where(weight > 0, total / weight.clamp_min(1e-30), mean)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchpt.film import Film, Pilots
 from torchpt.film.known_error import error_by_pilots
 from torchpt.film.pilots import BLOCK
-from torchpt.film.sharing import shared_out, smoothed
+from torchpt.film.sharing import foreseen, shared_out
 from torchpt.forward.twice import Twice
 from torchpt.integrators.plate import Plate
 
@@ -41,9 +41,10 @@ class Shares:
         counts = self._of_blocks(picture.film.counts.cpu())
         aims = shared_out(self._errors(twice), counts, self.pixels, mean)
         spans: list[tuple[Plate, int, int]] = []
-        kinds = torch.stack((counts, aims))[:, aims > counts].unique(dim=1)
+        most = int(aims.max()) + 1
+        kinds = (counts * most + aims)[aims > counts].unique().tolist()
         pilot_blocks = self.block[self.pilots.places]
-        for have, aim in kinds.T.tolist():
+        for have, aim in (divmod(kind, most) for kind in kinds):
             chosen = (counts == have) & (aims == aim)
             places = chosen[self.block].nonzero()[:, 0].to(device)
             spans.append((self._part(picture, places, places), have, aim - have))
@@ -76,7 +77,7 @@ class Shares:
     def _errors(self, twice: Twice) -> Tensor:
         """Relative variance of the pixels of each block, up to a factor: second values alone are asked."""
         a, b = (x.cpu() for x in twice.plate.film.streams())
-        errors, known = a.new_zeros(*self.pilots.blocks, 1), torch.zeros(*self.pilots.blocks, 1, dtype=torch.bool)
+        errors, known = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
         at = tuple(self.pilots.block)
-        errors[at], known[at] = error_by_pilots(self.pilots, a, b)[:, None], True
-        return smoothed(errors, known).reshape(-1)
+        errors[at], known[at] = error_by_pilots(self.pilots, a, b), True
+        return foreseen(errors, known).reshape(-1)

@@ -175,8 +175,10 @@ class Run:
                 return self._advanced(0, False)
             self.tally.rays += share.tally.rays
             self.tally.truncated += share.tally.truncated
-            self.bad += share.bad
-            self.light += torch.tensor(share.light, dtype=torch.float64)
+            if share.bad:
+                self.bad += share.bad
+            if self.integrator.clamp is not None:
+                self.light += torch.tensor(share.light, dtype=torch.float64)
             left -= share.samples
             return self._advanced(share.samples, left == 0)
 

@@ -124,19 +124,27 @@ class Draws:
 
     def two(self, dimension: Dimension) -> Tensor:
         """``(2, N)`` float32 in ``[0, 1)``."""
+        if dimension is Dimension.LIGHT and self._points.joint:
+            return self._further(Dimension.LED_HERE)
         if self._by_kernel():
             return self._drawn(2, dimension)
         return self._points.draw_2d(self._key, self._salts[int(dimension)])
+
+    def _further(self, dimension: Dimension) -> Tensor:
+        """``(2, N)``: the set of ``dimension`` goes on."""
+        if self._by_kernel():
+            return self._drawn(2, dimension, further=True)
+        return self._points.draw_further(self._key, self._salts[int(dimension)])
 
     def _by_kernel(self) -> bool:
         """Whether numbers come from a CPU kernel: compiled stages have the tensor form inside."""
         eager = self._key.device.type == "cpu" and not tracing() and not torch.compiler.is_compiling()
         return eager and self._points.kernels() is not None
 
-    def _drawn(self, rows: int, dimension: Dimension) -> Tensor:
+    def _drawn(self, rows: int, dimension: Dimension, further: bool = False) -> Tensor:
         from torchpt.samplers import kernels
 
-        return kernels.draw(self._points, rows, self._key, int(self._salts[int(dimension)]))
+        return kernels.draw(self._points, rows, self._key, int(self._salts[int(dimension)]), further)
 
 
 @lru_cache(maxsize=4096)

@@ -45,12 +45,14 @@ class Points(ABC):
         needs_count: whether the number of points must be known before the first is drawn, so that nothing but ``spp`` may
             end a render.
         rows: of a key.
+        joint: whether sets of two dimensions go on: :meth:`draw_further` gives two more, stratified with them.
     """
 
     name: ClassVar[str] = ""
     parameters: ClassVar[Mapping[str, Spec]] = {}
     needs_count: ClassVar[bool] = False
     rows: ClassVar[int] = 2
+    joint: ClassVar[bool] = False
 
     def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
         """What tells a sample from all others, ``(rows, N)`` int32: a pixel's seed, a point's index, how many there are.
@@ -82,6 +84,10 @@ class Points(ABC):
     @abstractmethod
     def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """``(2, N)`` float32 in ``[0, 1)``; arguments as in :meth:`draw_1d`."""
+
+    def draw_further(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """The third and fourth dimension of the set whose first two :meth:`draw_2d` gives; where ``joint`` says so."""
+        raise NotImplementedError(f"sets of {self.name} points end with two dimensions")
 
     def kernels(self) -> Any:
         """The module of its CPU kernels, see :mod:`torchpt.samplers.kernels`; None: the tensor form runs everywhere."""

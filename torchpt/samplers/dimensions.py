@@ -20,6 +20,7 @@ class Dimension(IntEnum):
     BSDF = 5  # 2D, direction
     ROULETTE = 6  # 1D
     OPACITY = 7  # 1D, whether a surface is met
+    LED_HERE = 8  # no number of its own: by which the vertex was reached, BSDF of the one before or PIXEL
 
 
 #: More than there are dimensions, so that a new one leaves the numbers of the others as they were.
@@ -28,4 +29,6 @@ STREAMS = 16
 
 def salt(dimension: Dimension, depth: int) -> int:
     """A signed 32-bit constant that names ``dimension`` at path vertex ``depth``."""
+    if dimension is Dimension.LED_HERE:
+        dimension, depth = (Dimension.BSDF, depth - 1) if depth > 1 else (Dimension.PIXEL, 0)
     return mix_int(0x9E3779B9 * (1 + depth * STREAMS + int(dimension)))

@@ -6,6 +6,12 @@ Burley, *Practical Hash-based Owen Scrambling*, JCGT 10(4), 2020. The scrambling
 Working with bit-reversed numbers throughout spares most reversals. The first coordinate of point ``i`` is the reversal of
 ``i``; the second is the reversal of ``p(x + 1)`` where ``p`` is the polynomial over GF(2) whose coefficients are the bits
 of ``i`` (its direction numbers are the powers of ``x + 1``), and that shift takes five masked xor-shifts.
+
+The third and the fourth are of the same kind over the field of four elements 0, 1, w, w², whose digits are pairs of bits:
+reversals of ``p(x + w)`` and ``p(x + w²)`` (Niederreiter, *Point sets and sequences with small discrepancy*, 1987). All four
+are a (0, 4)-sequence in base 4: of any 4^m points each box of volume 4^-m whose sides are powers of 4 holds one. As in the SZ
+sequences of Ahmed, Skopenkov, Hadwiger and Wonka (2024) the two are a (0, 2)-sequence in base 2 by themselves, as the first
+two are; a bit of each digit of the fourth is added to the other for that.
 """
 
 from __future__ import annotations
@@ -14,11 +20,14 @@ from torch import Tensor
 
 from torchpt.math.hashing import as_int32, logical_shift
 
-__all__ = ["X", "Y", "reverse_bits", "scramble", "second_dimension"]
+__all__ = ["W", "X", "Y", "Z", "fourth_dimension", "reverse_bits", "scramble", "second_dimension", "third_dimension"]
 
-#: What a seed is mixed with for the first and for the second coordinate.
-X, Y = as_int32(0x68BC21EB), as_int32(0x02E5BE93)
+#: What a seed is mixed with for the four coordinates.
+X, Y, Z, W = as_int32(0x68BC21EB), as_int32(0x02E5BE93), as_int32(0x967A889B), as_int32(0x368CC8B7)
 _K0, _K1, _K2 = 0x3D20ADEA, 0x05526C56, 0x53A22864
+#: Low bits of the digits of base 4 whose number is 0, 1 or 2 modulo 3.
+_FIRST, _SECOND, _THIRD = 0x41041041, 0x04104104, 0x10410410
+_STAYS = as_int32(3 * _FIRST)
 _HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
 
 
@@ -43,3 +52,28 @@ def second_dimension(index: Tensor) -> Tensor:
     for shift, mask in reversed(_HALVES):
         index = index ^ ((index >> shift) & mask)
     return index
+
+
+def third_dimension(index: Tensor) -> Tensor:
+    """Bit-reversed third coordinate of point ``index``."""
+    return _turned(_shifted(_turned(index, _SECOND, _THIRD)), _THIRD, _SECOND)
+
+
+def fourth_dimension(index: Tensor) -> Tensor:
+    """Bit-reversed fourth coordinate of point ``index``."""
+    index = _turned(_shifted(_turned(index, _THIRD, _SECOND)), _SECOND, _THIRD)
+    return index ^ ((index >> 1) & 0x55555555)
+
+
+def _shifted(index: Tensor) -> Tensor:
+    """``p(x + 1)`` with coefficients of two bits each."""
+    for shift, mask in reversed(_HALVES[1:]):
+        index = index ^ ((index >> shift) & mask)
+    return index
+
+
+def _turned(index: Tensor, once: int, twice: int) -> Tensor:
+    """Digits of base 4 times w at the places ``once``, times w² at ``twice``; w times low and high bit: high, low + high."""
+    low, high = index & 0x55555555, (index >> 1) & 0x55555555
+    both = low ^ high
+    return (index & _STAYS) | (high & once) | (both & twice) | (((both & once) | (low & twice)) << 1)

@@ -28,6 +28,8 @@ __all__ = ["Loop", "Share"]
 TASKS = 6
 #: Fewest lanes that repay a task.
 FEWEST = 1024
+#: Pixels of a task, unless threads would be idle: a chunk of many samples of few pixels adds them up in as many steps.
+NARROW = 128
 #: Seconds after which the thread that asked for the render looks whether it is to end.
 PATIENCE = 0.05
 
@@ -112,7 +114,7 @@ class Loop:
         """Consecutive pixels of each task."""
         pixels = plate.film.width * plate.film.height
         size = -(-pixels // (self.threads * TASKS)) if self.threads > 1 else pixels
-        size = max(size, -(-FEWEST // samples))
+        size = max(size, -(-FEWEST // samples), min(NARROW, -(-pixels // self.threads)))
         size = min(-(-size // WIDTH) * WIDTH, self.lanes)
         for start in range(0, pixels, size):
             yield start, min(size, pixels - start)

@@ -1,4 +1,8 @@
-"""Owen-scrambled Sobol' points, padded: each 1D or 2D set of dimensions is its own shuffled, scrambled (0, 2)-sequence."""
+"""Owen-scrambled digital sequences, padded: each set of dimensions is shuffled by itself.
+
+Sets of one or two dimensions are Sobol' points. The light that a vertex samples goes with the direction that led there, or
+with the place in the pixel: they are the two halves of a set of four dimensions, stratified together.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,17 @@ from torch import Tensor
 
 from torchpt.math.hashing import mix, to_unit
 from torchpt.samplers.base import ADAPTIVE, Points
-from torchpt.samplers.scrambling import X, Y, reverse_bits, scramble, second_dimension
+from torchpt.samplers.scrambling import (
+    W,
+    X,
+    Y,
+    Z,
+    fourth_dimension,
+    reverse_bits,
+    scramble,
+    second_dimension,
+    third_dimension,
+)
 
 __all__ = ["Sobol"]
 
@@ -21,6 +35,7 @@ class Sobol(Points):
 
     name = "sobol"
     parameters = ADAPTIVE
+    joint = True
 
     def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """See :class:`Points`."""
@@ -35,6 +50,14 @@ class Sobol(Points):
         index = reverse_bits(scramble(reverse_bits(key[1]), seed))
         x = scramble(index, mix(seed ^ X))
         y = scramble(second_dimension(index), mix(seed ^ Y))
+        return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))
+
+    def draw_further(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """See :class:`Points`."""
+        seed = mix(key[0] ^ salt)
+        index = reverse_bits(scramble(reverse_bits(key[1]), seed))
+        x = scramble(third_dimension(index), mix(seed ^ Z))
+        y = scramble(fourth_dimension(index), mix(seed ^ W))
         return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))
 
     def kernels(self) -> Any:
