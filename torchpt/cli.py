@@ -28,6 +28,9 @@ from torchpt.commands.converge import converge
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.orbit import HELP as HELP_ORBIT
 from torchpt.commands.plain_words import compose_plainly
+from torchpt.commands.streams import ready, speaking
+from torchpt.commands.stress import HELP as HELP_STRESS
+from torchpt.commands.stress import stress
 from torchpt.errors import TorchptError
 
 if TYPE_CHECKING:
@@ -35,7 +38,7 @@ if TYPE_CHECKING:
 
     from torchpt.commands.render import Job
 
-__all__ = ["HELP_COMPARE", "main", "run"]
+__all__ = ["HELP_COMPARE", "HELP_STRESS", "main", "run"]
 
 HELP = """\
 torchpt: a wavefront path tracer that is a PyTorch program
@@ -45,6 +48,7 @@ torchpt: a wavefront path tracer that is a PyTorch program
   torchpt info   scene=cornell_box                                  what the scene holds, what was built, what left out
   torchpt compare test.exr reference.exr                            how far a picture is from its reference
   torchpt converge scene=cornell_box sampler=[independent,sobol]    error against run time, as a report
+  torchpt stress quick=true                                         stiff and extreme cases, measured
 
 torchpt COMMAND --help says more. Scenes that ship:
 {scenes}
@@ -80,26 +84,27 @@ _HELPS = {"render": HELP_RENDER, "orbit": HELP_ORBIT, "info": HELP_INFO, "conver
 def run() -> None:
     """The console script."""
     collector.pause()
+    ready()
     sys.exit(main())
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run ``torchpt`` with these words (default: those of the process) and return the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if argv[:1] in (["-h"], ["--help"], ["help"]):
-        print(_help(HELP), end="")
-        return 0
-    if argv == ["--version"]:
-        print(f"torchpt {__version__}")
-        return 0
     with Interrupt() as interrupt:
         try:
+            if argv[:1] in (["-h"], ["--help"], ["help"]):
+                return _say(_help(HELP))
+            if argv == ["--version"]:
+                return _say(f"torchpt {__version__}\n")
+            _check_place()
             if argv[:1] == ["compare"]:  # takes files, and no scene
                 return compare(argv[1:])
+            if argv[:1] == ["stress"]:
+                return stress(argv[1:])
             arguments = parse(argv)
             if arguments.help:
-                print(_help(_HELPS[arguments.command]), end="")
-                return 0
+                return _say(_help(_HELPS[arguments.command]))
             if arguments.command == "converge":
                 return _converge(arguments, interrupt)
             if not arguments.scenes and not arguments.only_shows:
@@ -119,6 +124,24 @@ def _converge(arguments: Arguments, interrupt: Interrupt) -> int:
         ship = ", ".join(keys.options("scene"))
         raise UsageError(f"scene: expected scene=NAME, scene=FILE.yaml or study=FILE.yaml; scenes that ship: {ship}")
     return converge(arguments.study, interrupt)
+
+
+def _check_place() -> None:
+    """Names on the command line begin at the working folder.
+
+    Raises:
+        UsageError: it is gone.
+    """
+    try:
+        os.getcwd()
+    except OSError:
+        raise UsageError("the working folder is not there any more: change to one that is") from None
+
+
+def _say(text: str) -> int:
+    with speaking():
+        print(text, end="")
+    return 0
 
 
 def _refuse(line: str) -> int:

@@ -14,7 +14,7 @@ from torchpt.errors import TorchptError
 
 __all__ = ["COMMANDS", "GROUPS", "Arguments", "UsageError", "parse"]
 
-COMMANDS = ("render", "orbit", "info", "converge", "compare")  # `compare` takes its words itself
+COMMANDS = ("render", "orbit", "info", "converge", "compare", "stress")  # the last two take their words themselves
 GROUPS = ("film", "integrator", "sampler", "render")
 PATH_KEYS = ("render.preview", "render.checkpoint")
 #: Keys of `torchpt orbit` alone.

@@ -55,6 +55,21 @@ class Film:
         self._first[:, places], self._sums[:, :, places] = part._first, part._sums
         self._counts[:, places] = part._counts
 
+    def state(self) -> dict[str, Tensor]:
+        """All that it holds, by name."""
+        return {"sums": self._sums, "counts": self._counts, "first": self._first}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Hold what another film of this size held, as :meth:`state` said.
+
+        Raises:
+            ValueError: a film of another size.
+        """
+        for name, value in self.state().items():
+            if state[name].shape != value.shape or state[name].dtype != value.dtype:
+                raise ValueError(f"{name} of a film of another size")
+            value.copy_(state[name])
+
     @property
     def counts(self) -> Tensor:
         """Samples of each pixel ``(pixels,)`` int64."""

@@ -109,7 +109,9 @@ def scene_names() -> list[str]:
 
 
 def read_description(
-    source: str | os.PathLike[str] | Mapping[str, Any], bsdfs: Mapping[str, Bsdf] | None = None
+    source: str | os.PathLike[str] | Mapping[str, Any],
+    bsdfs: Mapping[str, Bsdf] | None = None,
+    change: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Description:
     """A checked scene description.
 
@@ -117,6 +119,7 @@ def read_description(
         source: the name of a scene in ``configs/scene/``, a path ending in ``.yaml``, or a mapping of the same schema
             (its relative paths start at the current folder).
         bsdfs: material types of the caller's own: type name to model instance.
+        change: of what was written, before it is checked.
 
     Raises:
         SceneError: what is wrong first, with file, dotted key, value and what is accepted.
@@ -125,9 +128,9 @@ def read_description(
     Warns:
         EnergyWarning: a material may reflect more light than it receives.
     """
-    types = material_types(bsdfs)
+    types, change = material_types(bsdfs), change or (lambda raw: raw)
     if isinstance(source, Mapping):
-        return _describe(plain(source), types, None, Path.cwd())
+        return _describe(change(plain(source)), types, None, Path.cwd())
     if not isinstance(source, str | os.PathLike):
         raise SceneError("scene", source, "a scene's name, a path ending in .yaml, or a mapping")
     file = os.fspath(source)
@@ -138,7 +141,7 @@ def read_description(
         file = str(path)
     else:
         raise SceneError("scene", file, f"one of {', '.join(scene_names())}, or a path ending in .yaml")
-    return _describe(plain(read_yaml(path, file), file), types, file, path.resolve().parent)
+    return _describe(change(plain(read_yaml(path, file), file)), types, file, path.resolve().parent)
 
 
 def settings(description: Description, overrides: Mapping[str, Any] | None = None) -> Settings:

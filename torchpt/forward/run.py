@@ -14,6 +14,7 @@ from torch import Tensor
 from torchpt.errors import RenderError
 from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
+from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.kept import kept
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.schedule import Span, lanes_for, pieces
@@ -55,6 +56,10 @@ class Run:
         self.seen = surface_layers(settings)
         self.on_progress: Callable[[Progress], bool | None] | None = None
         self.eager: list[str] = []
+        self.keeper: Keeper | None = None
+        if settings.render.checkpoint is not None:
+            self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
+            self.keeper.check(settings.render.resume)
         self._begin()
         self.loop = self._loop(scene) if looped(self.wave, settings, self.device) else None
 
@@ -67,8 +72,9 @@ class Run:
         }
         self.picture = Plate(film, layers, streams)
         self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
-        self.tally, self.done, self.ended = Tally(), 0, False
-        self.stop = Stop(self.settings.render, streams.count)
+        self.tally, self.done, self.taken, self.ended = Tally(), 0, 0, False
+        self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
+        self.stop = Stop(self.settings.render, streams.count, None if self.keeper is None else EVERY)
         self.bad = torch.zeros((), dtype=torch.int64, device=device)
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.begun: float | None = None
@@ -111,6 +117,7 @@ class Run:
 
     def _complete(self) -> None:
         """The picture, and then what it takes to know its error."""
+        self._resume()
         self._sample()
         if self.twice is not None and not self.ended and not self._take(self.twice.look_again(self.picture.film)):
             self.twice.third = None
@@ -118,24 +125,29 @@ class Run:
     def _sample(self) -> None:
         """Pass by pass, until a rule says that it is enough."""
         self.begun = time.perf_counter()
-        taken = 0
-        while size := self.stop.step(taken):
-            spans = [(self.picture, taken, size)]
+        while not self._adapts() and (size := self.stop.step(self.taken)):
+            spans = [(self.picture, self.taken, size)]
             if self.twice is not None:
-                spans.append((self.twice.plate, taken, size))
+                spans.append((self.twice.plate, self.taken, size))
             if not self._take(spans):
                 return
-            taken += size
-            self.stop.told(taken, self.seconds_of_sampling(), self._decisive())
-            if self.twice is not None and self.settings.adaptive and taken >= FIRST_ROUND:
-                self._adapt(taken)
-                return
+            self.taken += size
+            self.stop.told(self.taken, self.seconds_of_sampling(), self._decisive())
+            self._keep()
+        if self._adapts():
+            self._adapt()
+        if not self.ended:
+            self._keep(last=True)
 
-    def _adapt(self, taken: int) -> None:
+    def _adapts(self) -> bool:
+        """Whether pilots say from now on where samples go."""
+        return self.twice is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
+
+    def _adapt(self) -> None:
         """Rounds that double the samples there are, each where pilots say."""
         assert self.twice is not None
         shares = Shares(self.twice.pilots, self.picture.film)
-        mean = float(taken)
+        mean = float(self.picture.film.counts.double().mean())
         while self.stop.going(mean):
             wish = min(2.0 * mean, float(self.settings.render.spp)) - mean
             more = self.stop.affordable(wish)
@@ -149,6 +161,45 @@ class Run:
                 break
             mean = float(self.picture.film.counts.double().mean())
             self.stop.told(mean, self.seconds_of_sampling(), self._decisive())
+            self._keep()
+
+    # -- what a killed render goes on from
+
+    def _films(self) -> dict[str, Film]:
+        """All that samples are added to, by name."""
+        films = {"picture": self.picture.film}
+        films |= {f"layers.{name}": film for name, film in self.picture.layers.items()}
+        return films if self.twice is None else films | {"pilots": self.twice.plate.film}
+
+    def _keep(self, last: bool = False) -> None:
+        """Write a checkpoint where it is time for one."""
+        if self.keeper is None or not (last or self.keeper.due()):
+            return
+        facts = {
+            "taken": self.taken,
+            "done": self.done,
+            "rays": self.tally.rays,
+            "truncated": self.tally.truncated,
+            "seconds": self.seconds_of_sampling(),
+        }
+        arrays = {f"{name}.{key}": value for name, film in self._films().items() for key, value in film.state().items()}
+        self.keeper.write(State(facts, arrays | {"bad": self.bad, "light": self.light}))
+
+    def _resume(self) -> None:
+        """Go on from the checkpoint, where that is wished and there is one."""
+        if self.keeper is None or not self.settings.render.resume:
+            return
+        state = self.keeper.read()
+        if state is None:
+            say_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
+            return
+        for name, film in self._films().items():
+            film.restore({key: state.arrays[f"{name}.{key}"].to(self.device) for key in film.state()})
+        self.bad, self.light = (state.arrays[name].to(self.device) for name in ("bad", "light"))
+        self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
+        self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
+        mean = float(self.picture.film.counts.double().mean()) if self._adapts() else self.taken
+        self.stop.told(mean, self.before, self._decisive())
 
     def _decisive(self) -> float | None:
         """RelMSE as pilots alone tell it, where the render may end by it."""
@@ -161,7 +212,8 @@ class Run:
         if self.begun is None:
             return 0.0
         made = 0.0 if self.loop is None else self.loop.kernels.seconds
-        return max(time.perf_counter() - self.begun - made, 0.0)
+        kept = 0.0 if self.keeper is None else self.keeper.seconds
+        return self.before + max(time.perf_counter() - self.begun - made - kept, 0.0)
 
     # -- how they are taken
 

@@ -33,7 +33,7 @@ class _Text:
     lines: dict[str, list[int]] = field(default_factory=lambda: {key: [] for key in ("v", "vt", "vn", "f")})
     face_groups: list[int] = field(default_factory=list)
     groups: dict[str, int] = field(default_factory=dict)
-    libraries: list[tuple[int, str]] = field(default_factory=list)
+    libraries: list[str] = field(default_factory=list)
     ignored: list[str] = field(default_factory=list)
 
 
@@ -41,7 +41,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     """The parts of an OBJ file, one per `usemtl` name.
 
     Raises:
-        AssetError: a malformed line, an index out of range, a missing or malformed MTL file.
+        AssetError: a malformed line, an index out of range, a malformed MTL file.
     """
     text = _split(decoded_lines(data), path)
     known = _libraries(text, path) if materials else {}
@@ -97,7 +97,7 @@ def _split(lines: list[str], path: Path) -> _Text:
             name = line.strip()[6:].strip()
             group = text.groups.setdefault(name, len(text.groups))
         elif key == "mtllib":
-            text.libraries.append((number, line.strip()[6:].strip()))
+            text.libraries.append(line.strip()[6:].strip())
         elif key in _CURVES:
             text.ignored.append(key)
     return text
@@ -123,11 +123,11 @@ def _absolute(words: list[str], counts: tuple[int, int, int], path: Path, number
 
 def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
     known: dict[str, FileMaterial] = {}
-    for number, name in text.libraries:
+    for name in text.libraries:
         whole = beside(path, name)  # a name may hold blanks; else blanks separate several names
         files = [whole] if whole is not None else [beside(path, word) for word in name.split()]
-        if not files or None in files:
-            raise AssetError(path, f"line {number}: the material file {name!r} is missing")
+        if not files or None in files:  # often so with files that were sent around; the shape is there all the same
+            text.ignored.append(f"mtllib {name} (no such file)")
         for file in files:
             if file is not None:
                 known.update(read_mtl(file, set(text.groups)))
