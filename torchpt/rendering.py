@@ -226,7 +226,12 @@ def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albed
     film = settings.film.but(
         aovs=names, denoise=False, filter=Described(FILTERS["box"], {})
     )  # one sample fills no wider filter
-    quick = replace(settings, film=film, integrator=INTEGRATORS["aov"](), render=settings.render.but(spp=1, checkpoint=None, resume=False))
+    quick = replace(
+        settings,
+        film=film,
+        integrator=INTEGRATORS["aov"](),
+        render=settings.render.but(spp=1, checkpoint=None, resume=False),
+    )
     return render_scene(scene, quick).layers
 
 

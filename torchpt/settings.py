@@ -13,9 +13,9 @@ from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
 from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.spec import Choice, Flag, Other, Refused, Scalar, Valued, Whole, not_built, parameters_of, reading
+from torchpt.spec import Choice, Flag, Other, Refused, Scalar, Valued, Whole, parameters_of, reading
 from torchpt.spec.declared import Described, described, refuse_foreign, values_of
-from torchpt.spec.validate import check_keys, dotted, refuse_not_built
+from torchpt.spec.validate import check_keys, dotted
 
 __all__ = ["BLOCKS", "FILTERS", "INTEGRATORS", "RECORDS", "SAMPLERS", "TYPED", "Film", "Render", "Settings", "merge"]
 
@@ -177,7 +177,6 @@ class Render(Valued):
             doc="albedo and normal beside it first, then the picture so far after each pass",
         ),
     }
-
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:

@@ -78,7 +78,11 @@ def test_a_device_is_not_replaced(tmp_path: Path) -> None:
 def test_a_working_folder_that_is_gone(tmp_path: Path) -> None:
     found = shell(f"mkdir gone; cd gone; rmdir ../gone; {TORCHPT} render {SMALL}", tmp_path)
     assert found.returncode == 2
-    assert found.stderr.strip().splitlines()[-1].endswith("the working folder is not there any more: change to one that is")
+    assert (
+        found.stderr.strip()
+        .splitlines()[-1]
+        .endswith("the working folder is not there any more: change to one that is")
+    )
 
 
 def test_a_picture_whose_folder_went_away_is_saved_elsewhere(tmp_path: Path) -> None:

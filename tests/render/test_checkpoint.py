@@ -37,7 +37,9 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoint, "PATIENCE", 0.0)
 
 
-def shot(scene: torchpt.Scene, stop: int | None = None, film: Any = None, sampler: Any = "sobol", **render: Any) -> Rendering:
+def shot(
+    scene: torchpt.Scene, stop: int | None = None, film: Any = None, sampler: Any = "sobol", **render: Any
+) -> Rendering:
     """A render; with ``stop`` it is ended from outside once so many camera samples were taken."""
     wishes = {"film": {"filter": "box", **(film or film_of(24))}, "sampler": sampler, "render": {"spp": 40, **render}}
 
@@ -50,7 +52,17 @@ def shot(scene: torchpt.Scene, stop: int | None = None, film: Any = None, sample
 def equal(a: Rendering, b: Rendering) -> bool:
     """In all but seconds."""
     assert a.layers.keys() == b.layers.keys()
-    numbers = ("spp", "paths", "rays", "nonfinite_samples", "truncated_paths", "clamped", "relmse", "relmse_interval", "stopped_by")
+    numbers = (
+        "spp",
+        "paths",
+        "rays",
+        "nonfinite_samples",
+        "truncated_paths",
+        "clamped",
+        "relmse",
+        "relmse_interval",
+        "stopped_by",
+    )
     same = [getattr(a, name) == getattr(b, name) for name in numbers]
     same += [torch.equal(a.image, b.image), *(torch.equal(a.layers[name], b.layers[name]) for name in a.layers)]
     return a.complete and b.complete and all(same)

@@ -60,7 +60,9 @@ def test_a_moved_scene_is_moved() -> None:
     camera = np.eye(4)
     camera[:3, 3] = [0, 0, 4]
     found = moved(raw, by, camera)
-    assert found["lights"]["p"]["position"] == pytest.approx([1, 5, 3]) and found["lights"]["p"]["intensity"] == pytest.approx(18)
+    assert found["lights"]["p"]["position"] == pytest.approx([1, 5, 3]) and found["lights"]["p"][
+        "intensity"
+    ] == pytest.approx(18)
     assert found["lights"]["d"]["direction"] == pytest.approx([0, 1, 0])
     pose = np.array(found["camera"]["to_world"])
     assert pose[:3, 3] == pytest.approx([1, 2, 15]) and np.linalg.det(pose[:3, :3]) == pytest.approx(1)
@@ -110,7 +112,9 @@ def test_the_table_the_files_and_the_exit_code(tmp_path: Path, capsys: pytest.Ca
     assert json.loads(capsys.readouterr().out)["cases"] == 3
 
 
-def test_a_failure_is_told_by_the_exit_code(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failure_is_told_by_the_exit_code(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("torchpt.stress.cases.all_cases", lambda: {"mine": (case(figure=failing), case(name="other"))})
     assert main(["stress"]) == 1
     assert "FAILED: ValueError: two lines" in (printed := capsys.readouterr().out) and "2 cases, 1 failed" in printed

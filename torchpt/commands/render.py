@@ -76,7 +76,9 @@ def render(job: Job, interrupt: Interrupt) -> int:
         for path in (*outs, *previews, *denoised):
             check_writable(path)
         if wishes.render.checkpoint is not None:
-            wishes = replace(wishes, render=wishes.render.but(checkpoint=numbered(wishes.render.checkpoint, job.number)))
+            wishes = replace(
+                wishes, render=wishes.render.but(checkpoint=numbered(wishes.render.checkpoint, job.number))
+            )
             Keeper(wishes.render.checkpoint).check(wishes.render.resume)
         scene = Scene(description, device_of(wishes.render.device))
     scene.load_seconds = time.perf_counter() - start

@@ -58,13 +58,17 @@ class State:
     arrays: dict[str, Tensor]
 
 
-def identity(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype) -> dict[str, Any]:
+def identity(
+    scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
+) -> dict[str, Any]:
     """What a render is of: where two have the same, one goes on from the other's checkpoint."""
     told = settings.plain()
     for group, keys in FREE.items():
         told[group] = {key: value for key, value in told[group].items() if key not in keys}
     blocks = {name: _hashed(repr(getattr(scene.description, name)).encode()) for name in _BLOCKS}
-    given = {name: _hashed(value.detach().cpu().contiguous().numpy().tobytes()) for name, value in (params or {}).items()}
+    given = {
+        name: _hashed(value.detach().cpu().contiguous().numpy().tobytes()) for name, value in (params or {}).items()
+    }
     return {
         "torchpt": __version__,
         "scene": {**blocks, "and its files": digest(scene)},

@@ -32,7 +32,9 @@ class Bench:
     compile: str = "auto"
     dtype: torch.dtype = torch.float32
 
-    def render(self, described: Mapping[str, Any], spp: int = 64, size: int = 8, seed: int = 1, **integrator: Any) -> Tensor:
+    def render(
+        self, described: Mapping[str, Any], spp: int = 64, size: int = 8, seed: int = 1, **integrator: Any
+    ) -> Tensor:
         """A picture ``(size, size, 3)`` in float64, box filter.
 
         Args:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -44,7 +44,10 @@ def cases_of(source: str, overrides: Mapping[str, Mapping[str, Any]]) -> tuple[C
     description, settings = overridden(read_description(source), overrides)
     wishes = _small(settings)
     own = Scene(description, torch.device("cpu"))
-    extent, pose = extent_of(own.built.parts, own.built.copies), np.asarray(own.built.parameters["camera.to_world"], np.float64)
+    extent, pose = (
+        extent_of(own.built.parts, own.built.copies),
+        np.asarray(own.built.parameters["camera.to_world"], np.float64),
+    )
     known: dict[Bench, Tensor] = {}
 
     def picture(bench: Bench, description: Description = description) -> Tensor:
@@ -125,7 +128,11 @@ def moved(raw: dict[str, Any], by: Array, camera: Array) -> dict[str, Any]:
 
     pose = by @ camera
     pose[:3, :3] /= scale
-    seen = {key: value for key, value in (raw.get("camera") or {}).items() if key not in ("origin", "target", "up", "R", "t")}
+    seen = {
+        key: value
+        for key, value in (raw.get("camera") or {}).items()
+        if key not in ("origin", "target", "up", "R", "t")
+    }
     seen |= {"to_world": pose.tolist()}
     seen |= {key: seen[key] * scale for key in ("aperture_radius", "focus_distance") if key in seen}
     if seen.get("type") == "orthographic":

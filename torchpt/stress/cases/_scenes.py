@@ -29,11 +29,16 @@ def ball(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), **
     return {"type": "sphere", "radius": radius, "center": list(centre), **keys}
 
 
-def floor_seen(lights: dict[str, Any] | None, shapes: dict[str, Any] | None = None, albedo: float = 0.5) -> dict[str, Any]:
+def floor_seen(
+    lights: dict[str, Any] | None, shapes: dict[str, Any] | None = None, albedo: float = 0.5
+) -> dict[str, Any]:
     """The middle of a diffuse square in z = 0, seen from aside and from near, so that nothing above it is in the way."""
     return {
         "camera": {"type": "perspective", "origin": [1e-3, 0, 1e-3], "target": [0, 0, 0], "up": [0, 0, 1], "fov": 1e-3},
-        "shapes": {"floor": {"type": "rectangle", "material": {"type": "diffuse", "reflectance": albedo}}, **(shapes or {})},
+        "shapes": {
+            "floor": {"type": "rectangle", "material": {"type": "diffuse", "reflectance": albedo}},
+            **(shapes or {}),
+        },
         **({"lights": lights} if lights else {}),
     }
 

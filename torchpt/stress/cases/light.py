@@ -51,7 +51,10 @@ def inside_a_light(bench: Bench, radius: float) -> float:
 
 def radiance(bench: Bench, value: float) -> float:
     """Light from everywhere of any strength."""
-    scene = {**furnace({"type": "diffuse", "reflectance": ALBEDO}), "lights": {"sky": {"type": "constant", "radiance": value}}}
+    scene = {
+        **furnace({"type": "diffuse", "reflectance": ALBEDO}),
+        "lights": {"sky": {"type": "constant", "radiance": value}},
+    }
     return relative(bench.render(scene), ALBEDO * value)
 
 

@@ -65,8 +65,17 @@ def grazing(bench: Bench, height: float) -> float:
         "width": 0.1 * height,
     }
     worst = 0.0
-    for material in (METAL(0.3), PLASTIC(0.3), {"type": "plastic", "reflectance": 1.0}, {"type": "principled", "base_color": 1.0}):
-        scene = {"camera": camera, "shapes": {"it": {"type": "rectangle", "material": material}}, "lights": furnace({})["lights"]}
+    for material in (
+        METAL(0.3),
+        PLASTIC(0.3),
+        {"type": "plastic", "reflectance": 1.0},
+        {"type": "principled", "base_color": 1.0},
+    ):
+        scene = {
+            "camera": camera,
+            "shapes": {"it": {"type": "rectangle", "material": material}},
+            "lights": furnace({})["lights"],
+        }
         worst = max(worst, float(bench.render(scene).mean()) - 1.0)
     return worst
 

@@ -40,7 +40,9 @@ def still_life(scale: float = 1.0, shift: float = 0.0, turn: float = 0.0) -> dic
         },
         "shapes": {
             "floor": put(type="rectangle", transform=[{"scale": 4}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}]),
-            "ball": put(type="sphere", radius=0.7, center=[-1, 0.7, 0], material={"type": "roughplastic", "alpha": 0.2}),
+            "ball": put(
+                type="sphere", radius=0.7, center=[-1, 0.7, 0], material={"type": "roughplastic", "alpha": 0.2}
+            ),
             "box": put(type="cube", transform=[{"scale": 0.5}, {"translate": [1, 0.5, 0]}]),
             "lamp": put(type="sphere", radius=0.3, center=[0, 3, 1], emission=10.0),
         },
