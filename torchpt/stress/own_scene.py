@@ -77,7 +77,9 @@ def cases_of(source: str, overrides: Mapping[str, Mapping[str, Any]]) -> tuple[C
         Case("in float64", "mean difference", 2e-2, lambda b, _: beside(b, b.exact())),
         Case("by tensor operations", "mean difference", 2e-2, lambda b, _: beside(b, replace(b, compile="off"))),
         *(searched(accel) for accel in ("numba", "torch", *(("brute",) if few else ()))),
-        Case("scaled", "mean difference", 2e-2, lambda b, s: elsewhere(b, np.diag([s, s, s, 1.0])), "scale", powers(-12, 12, 4)),
+        Case(
+            "scaled", "mean difference", 2e-2, lambda b, s: elsewhere(b, np.diag([s, s, s, 1.0])), "scale", powers(-12, 12, 4),
+        ),
         Case(
             "moved", "mean difference", 2e-2, lambda b, d: elsewhere(b, _step(d * extent)), "times its size", powers(0, 6),
         ),
