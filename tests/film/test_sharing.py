@@ -52,6 +52,7 @@ def test_a_constant_is_kept_and_the_known_alone_are_asked():
     lonely = torch.zeros(9, 7, dtype=torch.bool)
     lonely[0, 0] = True
     assert (foreseen(values, lonely) == 3.0).all()  # the mean where nothing near is known
+    assert (foreseen(values, torch.zeros_like(lonely)) == 0.0).all()
 
 
 def test_errors_that_gather_are_followed_and_those_that_do_not_are_shared():

@@ -148,6 +148,15 @@ def test_adaptive_pictures_of_a_few_blocks_are_complete(box, size, spp):
     assert found.complete and found.stopped_by == "spp" and min(16, spp) <= found.spp <= spp
 
 
+@pytest.mark.parametrize("compile", ["on", "off"])
+@pytest.mark.parametrize("sampler", ["sobol", {"type": "sobol", "adaptive": True}])
+def test_a_crop_without_pilots(box, sampler, compile):
+    """One pixel of sixteen is a pilot: most crops of one pixel have none, and know nothing."""
+    film = film_of(8) | {"crop": [0, 0, 1, 1]}
+    found = [shot(box, film, sampler, spp=100, seed=seed, pilots=True, compile=compile) for seed in range(4)]
+    assert all(one.complete and one.spp >= 16 for one in found) and None in [one.relmse for one in found]
+
+
 def pilots_at(seed: int, side: int) -> torch.Tensor:
     mask = torch.zeros(side * side, dtype=torch.bool)
     mask[pilots_of(seed, (side, side), (0, 0, side, side)).places] = True

@@ -28,8 +28,11 @@ def foreseen(errors: Tensor, known: Tensor) -> Tensor:
 
     Most pilots tell of the noise around them. The few large ones may be an edge, or rare samples that are as likely elsewhere:
     where they gathered by chance, samples would be taken from where the next ones will be. So what errors have above the 95th
-    percentile is believed only as far as the pilots around foretell it, by regression; the rest of it all blocks share.
+    percentile is believed only as far as the pilots around foretell it, by regression; the rest of it all blocks share. Where
+    no block is known nothing is expected of any.
     """
+    if not bool(known.any()):
+        return torch.zeros_like(errors)
     body = torch.minimum(errors, errors[known].quantile(ORDINARY))
     tail = torch.where(known, errors - body, 0.0)
     mean = sum_all(tail) / sum_all(known.double())

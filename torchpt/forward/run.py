@@ -219,6 +219,8 @@ class Run:
 
     def _take(self, spans: list[tuple[Plate, int, int]]) -> bool:
         """Samples of plates, with the first one and how many; returns whether all were taken."""
+        if not spans:
+            return True
         left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
 
         def each(share: Share | None) -> bool:
