@@ -71,7 +71,7 @@ def identity(
     }
     return {
         "torchpt": __version__,
-        "scene": {**blocks, "and its files": digest(scene)},
+        "scene": {**blocks, "files": digest(scene)},
         "params": given,
         "dtype": str(dtype).removeprefix("torch."),
         "device": scene.device.type,
@@ -126,7 +126,7 @@ class Keeper:
         arrays = {name: value.detach().cpu().numpy() for name, value in state.arrays.items()}
         try:
             with open(temporary, "xb") as file:
-                np.savez(file, **{_FACTS: np.frombuffer(text.encode(), np.uint8)}, **arrays)
+                np.savez(file, allow_pickle=False, **{_FACTS: np.frombuffer(text.encode(), np.uint8), **arrays})
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, destination)
@@ -148,7 +148,7 @@ class Keeper:
         if not self.path.exists():
             return None
         try:
-            with np.load(self.path, allow_pickle=False) as archive:
+            with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as archive:
                 arrays = {name: archive[name] for name in archive.files}
             facts = json.loads(arrays.pop(_FACTS).tobytes())
             if facts["format"] != _FORMAT or not isinstance(facts["of"], dict):
@@ -156,7 +156,8 @@ class Keeper:
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as problem:
             raise AssetError(self.path, f"is no whole checkpoint ({_said(problem)})") from None
         for key, there, here in _differences(facts.pop("of"), self._of):
-            raise AssetError(self.path, f"is the checkpoint of another render ({key}: {there} there, {here} here)")
+            said = f"its {key} are others" if key.startswith("scene.") else f"{key}: {there} there, {here} here"
+            raise AssetError(self.path, f"is the checkpoint of another render ({said})")
         return State(facts, {name: torch.from_numpy(value) for name, value in arrays.items()})
 
 
@@ -167,7 +168,7 @@ def _said(problem: Exception) -> str:
 def _differences(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
     """Where two nests of plain values differ: dotted key, and both values in JSON."""
     if isinstance(a, dict) and isinstance(b, dict):
-        for name in sorted(a.keys() | b.keys()):
+        for name in dict.fromkeys((*a, *b)):
             yield from _differences(a.get(name), b.get(name), f"{key}.{name}" if key else name)
     elif a != b:
         yield key, json.dumps(a), json.dumps(b)
