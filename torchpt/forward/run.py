@@ -2,41 +2,36 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchpt.errors import RenderError
 from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.kept import kept
+from torchpt.forward.piece import Counts, take
 from torchpt.forward.result import Progress, Rendering
-from torchpt.forward.schedule import Span, lanes_for, pieces
+from torchpt.forward.schedule import Span, budget_of
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
 from torchpt.forward.wave import kernels_of, looped, make_wave, surface_layers
+from torchpt.forward.waves import Waves, say_once
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
 from torchpt.integrators.loop.schedule import Loop, Share
 from torchpt.integrators.plate import Plate
 from torchpt.lanes.graph import Unsupported
+from torchpt.native.memory import Meter
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
-__all__ = ["Run", "say_once"]
-
-
-@cache
-def say_once(text: str) -> None:
-    """A line on stderr, the first time only."""
-    print(text, file=sys.stderr, flush=True)
+__all__ = ["Run"]
 
 
 class Run:
@@ -75,8 +70,8 @@ class Run:
         self.tally, self.done, self.taken, self.ended = Tally(), 0, 0, False
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
         self.stop = Stop(self.settings.render, streams.count, None if self.keeper is None else EVERY)
-        self.bad = torch.zeros((), dtype=torch.int64, device=device)
-        self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
+        self.counts = Counts.none(device)
+        self.waves: Waves | None = None  # of tensor operations
         self.begun: float | None = None
 
     def _loop(self, scene: Scene) -> Loop:
@@ -89,13 +84,13 @@ class Run:
             say_once(
                 f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}"
             )
-        limited = self.settings.render.max_memory is not None
         return Loop(
             kernels,
             torch.get_num_threads(),
-            lanes_for(self.settings, self.device) if limited else None,
+            None,
             self.integrator.clamp,
             self.integrator.strict,
+            say_once,
         )
 
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
@@ -183,7 +178,7 @@ class Run:
             "seconds": self.seconds_of_sampling(),
         }
         arrays = {f"{name}.{key}": value for name, film in self._films().items() for key, value in film.state().items()}
-        self.keeper.write(State(facts, arrays | {"bad": self.bad, "light": self.light}))
+        self.keeper.write(State(facts, arrays | {"bad": self.counts.bad, "light": self.counts.light}))
 
     def _resume(self) -> None:
         """Go on from the checkpoint, where that is wished and there is one."""
@@ -195,7 +190,7 @@ class Run:
             return
         for name, film in self._films().items():
             film.restore({key: state.arrays[f"{name}.{key}"].to(self.device) for key in film.state()})
-        self.bad, self.light = (state.arrays[name].to(self.device) for name in ("bad", "light"))
+        self.counts = Counts(*(state.arrays[name].to(self.device) for name in ("bad", "light")))
         self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
         self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
         mean = float(self.picture.film.counts.double().mean()) if self._adapts() else self.taken
@@ -230,22 +225,29 @@ class Run:
             self.tally.rays += share.tally.rays
             self.tally.truncated += share.tally.truncated
             if share.bad:
-                self.bad += share.bad
+                self.counts.bad += share.bad
             if self.integrator.clamp is not None:
-                self.light += torch.tensor(share.light, dtype=torch.float64)
+                self.counts.light += torch.tensor(share.light, dtype=torch.float64)
             left -= share.samples
             return self._advanced(share.samples, left == 0)
 
         if self.loop is not None:
             return self.loop.run(spans, each)
-        lanes = lanes_for(self.settings, self.device)
+        if self.waves is None:
+            self.waves = Waves(budget_of(self.settings, self.device))
         for plate, first, count in spans:
             pixels = plate.film.width * plate.film.height
-            for pixel, n, sample, samples in pieces(lanes, pixels, first, count):
-                self._chunk(plate, (pixel, n, sample, samples))
+            for _, n, _, samples in self.waves.through(partial(self._piece, plate), pixels, first, count):
                 if each(Share(Tally(), n * samples)):
                     return False
         return True
+
+    def _piece(self, plate: Plate, span: Span) -> None:
+        """A piece by tensor operations: all of it, or nothing where it raises."""
+        piece = take(self.wave, plate, self.counts, span)
+        piece.write()
+        self.tally.rays += piece.tally.rays
+        self.tally.truncated += piece.tally.truncated
 
     def _advanced(self, samples: int, ends: bool) -> bool:
         """Tell of progress; returns whether to stop."""
@@ -269,37 +271,6 @@ class Run:
         pixels = self.width * self.height + (0 if self.twice is None else len(self.twice.pilots))
         return pixels * self.settings.render.spp
 
-    def _chunk(self, plate: Plate, span: Span) -> None:
-        first, count, sample, samples = span
-        if self.integrator.light:
-            radiance, tally = self.wave.radiance(first, count, sample, samples, plate)
-            self.tally.rays += tally.rays
-            self.tally.truncated += tally.truncated
-            plate.film.add(self._checked(radiance, plate, first, sample), first, sample)
-        if plate.layers:
-            layers = self.wave.layers(tuple(plate.layers), first, count, sample, samples, plate)
-            self.tally.rays += count * samples
-            for name, values in layers.items():
-                plate.layers[name].add(values, first, sample)
-
-    def _checked(self, radiance: Tensor, plate: Plate, first: int, sample: int) -> Tensor:
-        """Count what is not finite and take it as black; apply the clamp."""
-        finite = torch.isfinite(radiance).all(0)
-        self.bad += (~finite).sum()
-        if self.integrator.strict and not bool(finite.all()):
-            s, p = (int(i) for i in (~finite).nonzero()[0])
-            p = first + p if plate.places is None else int(plate.places[first + p])
-            x, y = p % self.width + self.wave.crop[0], p // self.width + self.wave.crop[1]
-            raise RenderError(f"integrator.strict: sample {sample + s} of pixel ({x}, {y}) is not finite")
-        radiance = torch.where(finite, radiance, 0.0)
-        clamp = self.integrator.clamp
-        if clamp is None:
-            return radiance
-        scale = (clamp / radiance.abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
-        clamped = radiance * scale
-        self.light += torch.stack((radiance.double().sum(), clamped.double().sum()))
-        return clamped
-
     def result(self) -> Rendering:
         """The picture so far."""
         radiant, film = self.integrator.light, self.picture.film
@@ -314,11 +285,12 @@ class Run:
             image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else torch.cat((shown, blank), -1)
         clamped = None
         if radiant and self.integrator.clamp is not None:
-            before, after = self.light.tolist()
+            before, after = self.counts.light.tolist()
             clamped = 1.0 - after / before if before > 0 else 0.0
         counts = (film if radiant else next(iter(self.picture.layers.values()))).counts
         compile_seconds = 0.0 if self.loop is None else self.loop.kernels.seconds
         names = self.settings.film.aovs or self.integrator.layers
+        meter = Meter(self.device)
         return Rendering(
             image=image,
             layers={name: layers[name] for name in names},
@@ -331,7 +303,7 @@ class Run:
             render_seconds=self.seconds_of_sampling(),
             paths=self.done,
             rays=self.tally.rays,
-            nonfinite_samples=int(self.bad),
+            nonfinite_samples=int(self.counts.bad),
             truncated_paths=self.tally.truncated,
             clamped=clamped,
             relmse=None if known is None else known.relmse,
@@ -339,6 +311,8 @@ class Run:
             heavy_tailed=known is not None and known.heavy_tailed,
             stopped_by=self.stop.reason,
             complete=bool(self.stop.reason) and not self.ended,
+            peak_memory=max(meter.peak() - meter.base(), 0),
+            lanes=self.waves.lanes if self.waves is not None and self.waves.halved else None,
             eager=tuple(self.eager),
             scene=self.name,
             settings=self.settings,

@@ -21,6 +21,7 @@ from torchpt.cameras import Camera, PinholeMatrices
 from torchpt.cameras.opencv import extrinsics
 from torchpt.errors import RenderError, SceneError
 from torchpt.format.description import Description, read_description, settings
+from torchpt.native.memory import Meter
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
@@ -89,6 +90,8 @@ class Scene:
 
     def __init__(self, description: Description, device: torch.device, own_models: tuple[Bsdf, ...] = ()) -> None:
         settle()
+        self.meter = Meter(device)
+        self.meter.base()  # only now all modules are there
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
         self._built: Built = build_parts(description)
