@@ -115,8 +115,17 @@ def main(argv: list[str] | None = None) -> int:
             return _refuse(str(error))
         except Interrupted as interrupted:
             return interrupted.exit_code
-        except MemoryError:
-            return _refuse("not enough memory: a smaller film, or render.max_memory, needs less")
+        except Exception as error:
+            return _out_of_memory(error)
+
+
+def _out_of_memory(error: Exception) -> int:
+    """Refuse where memory ran out; any other error goes on its way."""
+    from torchpt.shortage import ran_out
+
+    if not ran_out(error):
+        raise error
+    return _refuse("not enough memory: a smaller film, or render.max_memory, needs less")
 
 
 def _converge(arguments: Arguments, interrupt: Interrupt) -> int:
@@ -187,6 +196,8 @@ class _Task:
                 return _refuse(str(error))
             except Interrupted as interrupted:
                 return interrupted.exit_code
+            except Exception as error:
+                return _out_of_memory(error)
 
     def _of_hydra(self, cfg: DictConfig) -> Job:
         from hydra.core.hydra_config import HydraConfig

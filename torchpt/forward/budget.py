@@ -1,29 +1,27 @@
 """What ``render.max_memory`` leaves for waves, and the least that a render works with.
 
 The limit is about the memory of the process above what it held after import. What is there already (scene, search structure,
-world) is measured. Films, the picture at the end and code that is still to be loaded are foreseen: :class:`Need`. What a lane
-costs depends on the scene, so it is measured while waves grow: :class:`Budget`.
+world) is measured. Films, the picture at the end and code that is still to be loaded are foreseen (``need.py``). What a lane
+costs depends on the scene, so it is measured while waves grow.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import torch
 
 from torchpt.errors import SceneError
 from torchpt.native.memory import Meter, let_go, mb
 
-__all__ = ["FEWEST", "Budget", "Need", "check_memory"]
+__all__ = ["Budget", "check_memory"]
 
 #: Lanes of the first wave under a limit, after which all code is there: what it adds for good is no lane's.
-FEWEST = 512
+FEWEST = 4096
 #: Of what is free, what waves are let to use: what one piece of the picture costs is measured on another.
 SHARE = 0.88
 #: Waves grow by no more than this from one to the next.
 GROWTH = 2
-#: What the least is above what was foreseen.
-SLACK = 1.04
 
 
 class Budget:
@@ -77,43 +75,20 @@ class Budget:
         self.limit = None
 
 
-@dataclass(frozen=True)
-class Need:
-    """Bytes that a render is still to take, beside what is held when it begins.
-
-    Attributes:
-        films: sums of samples, as long as it runs.
-        code: loaded while it runs, once a process.
-        waves: of the fewest lanes that it works with.
-        picture: made of the films at the end, when no wave is held.
-    """
-
-    films: int
-    code: int
-    waves: int
-    picture: int
-
-    def least(self, held: int) -> int:
-        """The most that is held at once, beside ``held``; with some to spare."""
-        return int(SLACK * (held + self.films + max(self.code + self.waves, self.code + self.picture)))
-
-
-def check_memory(limit: int | None, device: torch.device, need: Need, loading: int) -> None:
+def check_memory(limit: int, device: torch.device, least: Callable[[int], int], loading: int) -> None:
     """Refuse a limit under which nothing can be rendered.
 
     Args:
         limit: ``render.max_memory``.
         device: where lanes live.
-        need: of the render.
-        loading: the most that was held above import while the scene was loaded; 0 where it is not known.
+        least: from what is held above import to the least limit.
+        loading: the most that was held above import while the scene was made; 0 where it is not known.
 
     Raises:
         SceneError: it is too small; says the least that is not.
     """
-    if limit is None:
-        return
     let_go()
     meter = Meter(device)
-    least = max(need.least(max(meter.now() - meter.base(), 0)), int(loading))
-    if limit < least:
-        raise SceneError("render.max_memory", mb(limit), f"at least {mb(least)} for this scene and film")
+    enough = max(least(max(meter.now() - meter.base(), 0)), loading)
+    if limit < enough:
+        raise SceneError("render.max_memory", mb(limit), f"at least {mb(enough)} for this scene and film")

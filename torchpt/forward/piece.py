@@ -12,7 +12,7 @@ from torchpt.forward.schedule import Span
 from torchpt.integrators.base import Tally
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.wave import Wave
-from torchpt.native.memory import ran_out
+from torchpt.shortage import ran_out
 
 __all__ = ["Counts", "Piece", "take"]
 

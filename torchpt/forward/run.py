@@ -12,8 +12,10 @@ from torch import Tensor
 
 from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
+from torchpt.forward.budget import check_memory
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.kept import kept
+from torchpt.forward.need import loaded, need_of, shape_of
 from torchpt.forward.piece import Counts, take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.schedule import Span, budget_of
@@ -27,9 +29,10 @@ from torchpt.integrators.base import Tally
 from torchpt.integrators.loop.schedule import Loop, Share
 from torchpt.integrators.plate import Plate
 from torchpt.lanes.graph import Unsupported
-from torchpt.native.memory import Meter
+from torchpt.native.memory import Meter, let_go, mb
 from torchpt.scene import Scene
 from torchpt.settings import Settings
+from torchpt.shortage import needing, ran_out
 
 __all__ = ["Run"]
 
@@ -43,7 +46,11 @@ class Run:
         self.start = time.perf_counter()
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.name, self.load_seconds = scene.name, scene.load_seconds
-        self.wave = make_wave(scene, settings, params, dtype)
+        meter = Meter(self.device)
+        before = meter.peak()
+        with needing(lambda: f"a scene of {scene.told}"):
+            self.wave = make_wave(scene, settings, params, dtype)
+        built = meter.peak()
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
         self.dtype = dtype
@@ -55,8 +62,18 @@ class Run:
         if settings.render.checkpoint is not None:
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.keeper.check(settings.render.resume)
-        self._begin()
         self.loop = self._loop(scene) if looped(self.wave, settings, self.device) else None
+        how = "eager" if self.loop is None else "compiled"
+        rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
+        self.need = need_of(settings, how, len(self.wave.stages.world.materials.models), rows)
+        if settings.render.max_memory is not None:
+            loading = max(scene.peak, built - meter.base() if built > before else 0)
+            check_memory(settings.render.max_memory, self.device, self.need.least, loading)
+            if self.loop is not None:
+                left = self.need.left(settings.render.max_memory, max(meter.now() - meter.base(), 0))
+                self.loop.threads, self.loop.lanes = shape_of(left, self.loop.threads, rows, self.loop.lanes)
+        with needing(lambda: f"films of {self.width} x {self.height} pixels, which take {mb(self.need.films)}"):
+            self._begin()
 
     def _begin(self) -> None:
         """Nothing is sampled yet."""
@@ -87,7 +104,6 @@ class Run:
         return Loop(
             kernels,
             torch.get_num_threads(),
-            None,
             self.integrator.clamp,
             self.integrator.strict,
             say_once,
@@ -96,6 +112,27 @@ class Run:
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, or as many as the rules or ``on_progress`` let."""
         self.on_progress = on_progress
+        with needing("a render"):
+            self._all()
+        loaded("eager" if self.loop is None else "compiled")
+        return self._picture()
+
+    def _picture(self) -> Rendering:
+        """The picture at the end; where memory does not suffice, what else is held is given back first."""
+        try:
+            return self.result()
+        except Exception as error:
+            if not ran_out(error):
+                raise
+        if self.loop is not None:
+            self.loop.release()
+        let_go()
+        size = mb(self.need.picture)
+        with needing(lambda: f"the picture of {self.width} x {self.height} pixels, which takes {size}"):
+            return self.result()
+
+    def _all(self) -> None:
+        """All samples, by tensor operations where there can be no kernels."""
         try:
             self._complete()
         except Unsupported as error:
@@ -106,7 +143,6 @@ class Run:
             self.loop = None
             self._begin()
             self._complete()
-        return self.result()
 
     # -- which samples
 

@@ -9,7 +9,8 @@ from functools import cache
 from torchpt.errors import RenderError
 from torchpt.forward.budget import Budget
 from torchpt.forward.schedule import Span
-from torchpt.native.memory import let_go, ran_out
+from torchpt.native.memory import let_go
+from torchpt.shortage import ran_out
 
 __all__ = ["Waves", "say_once"]
 

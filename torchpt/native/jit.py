@@ -19,6 +19,8 @@ import numba
 import torch
 from numba.core import config as numba_config
 
+from torchpt.native.memory import MARGIN, room_for
+
 __all__ = ["compiled", "jit", "launch", "parallel_allowed", "part"]
 
 _lock = threading.Lock()
@@ -80,6 +82,8 @@ def part(**options: Any) -> Callable[[Callable], Any]:
 def compiled(kernel: Any, *args: Any) -> Any:
     """The kernel, compiled for arguments with which it does nothing; says so on stderr, once, where that takes long."""
     if not kernel.overloads:
+        if not room_for(MARGIN):  # LLVM ends the process where it finds no memory
+            raise MemoryError("no room to make kernels")
         timer = threading.Timer(_PATIENCE, _say)
         timer.daemon = True
         timer.start()

@@ -21,7 +21,8 @@ from torchpt.integrators.plate import Plate
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.block import WIDTH
 from torchpt.lanes.kernel import HEAD
-from torchpt.native.memory import let_go, needing, ran_out
+from torchpt.native.memory import let_go
+from torchpt.shortage import needing, ran_out
 
 __all__ = ["Loop", "Share"]
 
@@ -71,24 +72,25 @@ class Loop:
     Args:
         kernels: of the render.
         threads: how many.
-        lanes: most of a chunk; None: as many as caches like.
         clamp: largest contribution of a path, or None.
         strict: whether a sample that is not finite ends the render.
         said: tells the user a line.
+
+    Attributes:
+        lanes: most of a chunk.
     """
 
     def __init__(
         self,
         kernels: Kernels,
         threads: int,
-        lanes: int | None,
         clamp: float | None,
         strict: bool,
         said: Callable[[str], None],
     ) -> None:
         self.kernels, self.threads, self.clamp, self.strict = kernels, threads, clamp, strict
         self.said = said
-        self.lanes = LANES if lanes is None else max(1, min(lanes, LANES))
+        self.lanes = LANES
         self._workers: list[Worker] = []
         self._halt = threading.Event()
 
@@ -182,8 +184,7 @@ class Loop:
         Raises:
             RenderError: there is no memory for one thread and a vector of lanes.
         """
-        self._workers.clear()
-        let_go()
+        self.release()
         if self.threads == 1:
             if self.lanes <= WIDTH:
                 raise RenderError("not enough memory for the compiled loop on one thread")
@@ -204,6 +205,11 @@ class Loop:
         size = min(-(-size // WIDTH) * WIDTH, self.lanes)
         for start in range(0, pixels, size):
             yield start, min(size, pixels - start)
+
+    def release(self) -> None:
+        """Give back what threads keep for their next task."""
+        self._workers.clear()
+        let_go()
 
     def _task(self, plate: Plate, start: int, size: int, first: int, count: int) -> Share:
         share = Share(Tally())
