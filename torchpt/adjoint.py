@@ -12,6 +12,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torchpt.forward import BYTES_PER_LANE, Waves, budget_of, limited_threads, make_wave, rebound
+from torchpt.forward.budget import check_memory
+from torchpt.forward.need import loaded, need_of
 from torchpt.forward.schedule import Span
 from torchpt.scene import Scene
 from torchpt.settings import Settings
@@ -132,11 +134,15 @@ def chunks(
         work: takes a chunk: all of it, or, where it raises, nothing.
 
     Raises:
+        SceneError: ``render.max_memory`` is too small for it.
         RenderError: not even the tape of a single lane fits in memory.
     """
     plain = {name: value.detach() for name, value in params.items()}
     with torch.no_grad():
         still = make_wave(scene, settings, plain, dtype, True, attached)
+    if settings.render.max_memory is not None:
+        need = need_of(settings, "tape", len(still.stages.world.materials.models))
+        check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)
     pixels, spp = still.crop[2] * still.crop[3], settings.render.spp
     clamp = settings.integrator.clamp
 
@@ -155,6 +161,7 @@ def chunks(
     with limited_threads(settings.render.threads):  # while whoever asked for the chunks differentiates them
         for _ in waves.through(piece, pixels, 0, spp):
             pass
+    loaded("tape")
 
 
 def tape_per_lane(settings: Settings) -> int:

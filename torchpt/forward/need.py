@@ -15,11 +15,11 @@ CODE = {"eager": 75_000_000, "compiled": 18_000_000, "tape": 100_000_000}
 #: Of the machine code of a material model, beside that.
 CODE_OF_MODEL = 3_000_000
 #: Of a pixel while the picture is made of the films: alone, with pilots, with adaptive sampling, with layers of variance.
-PICTURE, PILOTS, ADAPTIVE, VARIANCE = 64, 242, 242, 216
+PICTURE, PILOTS, ADAPTIVE, VARIANCE = 64, 208, 160, 196
 #: Lanes of the smallest wave of tensor operations, and of a chunk that one thread takes in the compiled loop.
 FEWEST, FEWEST_OF_LOOP = 4096, 1024
 #: What the least is above what was foreseen.
-SLACK = 1.04
+SLACK, SPARE = 1.04, 3_000_000
 
 #: What has run in this process: its code is there.
 _ran: set[str] = set()
@@ -48,7 +48,11 @@ class Need:
 
     def least(self, held: int) -> int:
         """The most that is held at once, beside ``held``; with some to spare."""
-        return int(SLACK * (held + self.films + self.code + max(self.waves, self.picture))) + 1_000_000
+        return int(SLACK * (held + self.films + self.code + max(self.waves, self.picture))) + SPARE
+
+    def of_tape(self, held: int) -> int:
+        """The same of a backward pass, which has neither films nor a picture."""
+        return int(SLACK * (held + self.code + self.waves)) + SPARE
 
     def left(self, limit: int, held: int) -> int:
         """What waves may have of a limit."""
