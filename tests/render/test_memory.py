@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +17,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
-from torchpt.errors import RenderError
+from torchpt.errors import RenderError, SceneError
 from torchpt.forward import say_once
 from torchpt.integrators.loop import rows
 from torchpt.integrators.loop.chunk import Worker
@@ -237,3 +241,102 @@ def test_the_loop_ends_in_a_line_where_nothing_fits(box, monkeypatch):
     monkeypatch.setattr(Worker, "trace", failing)
     with pytest.raises(RenderError, match="not enough memory for the compiled loop on one thread"):
         looped(box)
+
+
+# -- limits of the system
+
+LIMITED = """
+import hashlib, resource, sys, torchpt
+mode, more = sys.argv[1], int(sys.argv[2])
+path = {"type": "path", "max_depth": 2}
+def shot(width, height):
+    film = {"width": width, "height": height, "filter": "box"}
+    scene = torchpt.load("cornell_box", "cpu")
+    return torchpt.render(scene, spp=1, film=film, integrator=path, compile=mode, threads=2, full=True)
+shot(100, 100)  # code and libraries are there
+if more:
+    with open("/proc/self/status") as file:
+        held = next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmSize"))
+    resource.setrlimit(resource.RLIMIT_AS, (held + more,) * 2)
+try:
+    found = shot(500, 400)
+except torchpt.TorchptError as error:
+    print("refused", error)
+else:
+    print(hashlib.sha256(found.image.numpy().tobytes()).hexdigest(), found.lanes)
+"""
+
+
+def limited(mode: str, more: int) -> tuple[str, str]:
+    command = [sys.executable, "-c", LIMITED, mode, str(more)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, env=os.environ | {"OMP_NUM_THREADS": "2"}
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout.strip(), done.stderr
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
+@pytest.mark.parametrize("mode", ["off", "on"])
+def test_under_a_limit_of_addresses_the_bits_are_the_same_or_it_is_one_line(mode):
+    whole, _ = limited(mode, 0)
+    same_bits = 0
+    for more in (2, 30, 90):
+        found, told = limited(mode, more * 1_000_000)
+        lines = [line for line in told.splitlines() if "memory ran out" in line]
+        assert len(lines) <= 1 and len(found.splitlines()) == 1
+        if not found.startswith("refused"):
+            assert found.split()[0] == whole.split()[0]
+            same_bits += 1
+    assert same_bits
+
+
+# -- render.max_memory
+
+
+def measured(wish: str, more: str = "{}") -> tuple[str, int]:
+    """What a render of a process of its own says, and bytes that it held above import at most."""
+    text = f"""
+import torchpt
+from torchpt.native.memory import Meter
+scene = torchpt.load("cornell_box", "cpu")
+try:
+    found = torchpt.render(scene, spp=1, full=True, max_memory={wish!r}, **{more})
+    print(found.peak_memory)
+except torchpt.SceneError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    said = done.stdout.strip()
+    return said, int(said) if said.isdigit() else 0
+
+
+WISHES = {
+    "compiled": "{'film': {'width': 900, 'height': 700}}",
+    "pilots": "{'film': {'width': 900, 'height': 700}, 'pilots': True}",
+    "eager": "{'film': {'width': 160, 'height': 120}, 'compile': 'off'}",
+}
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
+@pytest.mark.parametrize("name", WISHES)
+def test_too_small_a_limit_names_the_least_that_works(name):
+    measured("8GB", WISHES[name])  # kernels are compiled once a machine, which takes memory of its own
+    said, _ = measured("1MB", WISHES[name])
+    assert said.startswith("render.max_memory: expected at least ") and said.endswith(
+        " for this scene and film, got '1MB'"
+    )
+    least = int(said.split("at least ")[1].split("MB")[0]) + 1  # what is held differs by some pages
+    _, peak = measured(f"{least}MB", WISHES[name])
+    assert 0 < peak < 1.1e6 * least
+
+
+def test_a_limit_changes_no_bit(box):
+    whole = torchpt.render(box, spp=2, film=film_of(100, 80), compile="off", threads=2)
+    with pytest.raises(SceneError, match="render.max_memory: expected at least"):
+        torchpt.render(box, spp=2, film=film_of(100, 80), max_memory="1MB")
+    limit = str(int(torchpt.render(box, spp=1, film=film_of(4), full=True).peak_memory / 1e6) + 300) + "MB"
+    found = torchpt.render(box, spp=2, film=film_of(100, 80), compile="off", threads=2, max_memory=limit, full=True)
+    assert torch.equal(found.image, whole) and found.peak_memory > 0

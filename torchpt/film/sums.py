@@ -112,7 +112,8 @@ class Film:
 
     def keep_first(self, values: np.ndarray, first_pixel: int) -> None:
         """Keep the first samples ``(C, n)`` of consecutive pixels."""
-        self._first[:, first_pixel : first_pixel + values.shape[1]] = torch.from_numpy(values)
+        # By numpy: torch would start a team of threads for each thread that renders.
+        self._first.numpy()[:, first_pixel : first_pixel + values.shape[1]] = values
 
     def mean(self) -> Tensor:
         """The picture ``(H, W, C)`` in float64; pixels without samples are black."""

@@ -74,6 +74,7 @@ def _llvm() -> Any:
 def host() -> Target:
     """This machine."""
     if "host" not in _state:
+        _check_room()
         llvm = _llvm()
         _state["host"] = Target(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
     return _state["host"]

@@ -82,7 +82,8 @@ def part(**options: Any) -> Callable[[Callable], Any]:
 def compiled(kernel: Any, *args: Any) -> Any:
     """The kernel, compiled for arguments with which it does nothing; says so on stderr, once, where that takes long."""
     if not kernel.overloads:
-        if not room_for(MARGIN):  # LLVM ends the process where it finds no memory
+        # LLVM ends the process where it finds no memory, and so does the BLAS that numba brings along with its first kernel.
+        if not room_for(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN):
             raise MemoryError("no room to make kernels")
         timer = threading.Timer(_PATIENCE, _say)
         timer.daemon = True
