@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 
 from torchpt.forward.schedule import BYTES_PER_LANE, streams_of
@@ -11,11 +12,13 @@ from torchpt.settings import Settings
 __all__ = ["CODE", "Need", "loaded", "need_of", "shape_of"]
 
 #: Of machine code and tables of libraries, which are read from disk when they are first called, once a process.
-CODE = {"eager": 75_000_000, "compiled": 18_000_000, "tape": 100_000_000}
+CODE = {"eager": 75_000_000, "compiled": 54_000_000, "tape": 100_000_000}
+#: Of numba, which not all renders import.
+NUMBA = 60_000_000
 #: Of the machine code of a material model, beside that.
 CODE_OF_MODEL = 3_000_000
 #: Of a pixel while the picture is made of the films: alone, with pilots, with adaptive sampling, with layers of variance.
-PICTURE, PILOTS, ADAPTIVE, VARIANCE = 64, 208, 160, 196
+PICTURE, PILOTS, ADAPTIVE, VARIANCE = 64, 225, 160, 160
 #: Lanes of the smallest wave of tensor operations, and of a chunk that one thread takes in the compiled loop.
 FEWEST, FEWEST_OF_LOOP = 4096, 1024
 #: What the least is above what was foreseen.
@@ -79,6 +82,8 @@ def need_of(settings: Settings, how: str, models: int, rows: int = 0) -> Need:
         picture = ADAPTIVE if settings.adaptive else PILOTS
     picture += sum(8 * c + 4 for c in channels)
     code = 0 if how in _ran else CODE[how] + (CODE_OF_MODEL * models if how == "compiled" else 0)
+    if how != "compiled" and "numba" not in sys.modules:
+        code += NUMBA
     waves = FEWEST_OF_LOOP * 4 * rows if how == "compiled" else FEWEST * 2 * BYTES_PER_LANE
     return Need(pixels * films, code, waves, pixels * picture)
 

@@ -75,11 +75,7 @@ class Meter:
 
 @cache
 def after_import() -> int:
-    """Bytes that the process held when all modules were there; the first call is that moment."""
-    import llvmlite.binding
-    import numba
-
-    assert numba and llvmlite
+    """Bytes that the process held when modules were there; the first call is that moment."""
     return _status("VmRSS:")
 
 
