@@ -44,8 +44,8 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
             values = [max(one.figure, NOTHING) if math.isfinite(one.figure) else math.nan for one in outcome.readings]
             axes.plot(at, values, "o-", color="#0072B2", markersize=3, linewidth=1)
             axes.axhline(max(outcome.case.bound, NOTHING), color="#D55E00", linestyle="--", linewidth=1)
-            axes.set_yscale("log")
             axes.set_ylim(NOTHING / 3, max(*(v for v in values if not math.isnan(v)), outcome.case.bound, 1e-3) * 3)
+            axes.set_yscale("log")
             if min(at) > 0 and max(at) / min(at) > 50:
                 axes.set_xscale("log")
             axes.set_title(outcome.case.name, loc="left")
