@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchpt.errors import EdgeWarning
 from torchpt.rendering import render
 from torchpt.scene import load
 from torchpt.stress.bench import Bench
@@ -31,16 +33,18 @@ def slope(
     scene = load(described, device=bench.device)
     given = scene.params[name] if value is None else torch.as_tensor(value).expand(scene.params[name].shape)
     wanted = given.detach().clone().to(scene.device, scene.params[name].dtype).requires_grad_()
-    picture = render(
-        scene,
-        params={name: wanted},
-        spp=spp,
-        seed=seed,
-        integrator={"type": "path", "max_depth": depth},
-        film={"width": 8, "height": 8, "filter": "box"},
-        accel=bench.accel,
-        compile=bench.compile,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EdgeWarning)  # no edge is in sight
+        picture = render(
+            scene,
+            params={name: wanted},
+            spp=spp,
+            seed=seed,
+            integrator={"type": "path", "max_depth": depth},
+            film={"width": 8, "height": 8, "filter": "box"},
+            accel=bench.accel,
+            compile=bench.compile,
+        )
     picture.mean().backward()
     assert wanted.grad is not None
     return picture.detach().double().mean().cpu(), wanted.grad.double().cpu()
