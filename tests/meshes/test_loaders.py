@@ -273,6 +273,7 @@ def ply(faces: int | str, body: str, layout: str = "ascii 1.0") -> str:
     return HEADER.format(layout, faces) + LIST + body
 
 
+SPARSE = {"count": 0, "indices": {"bufferView": 0, "componentType": 5121}, "values": {"bufferView": 0}}
 MALFORMED: dict[str, tuple[str, str | bytes, str]] = {
     "unknown ending": ("a.fbx", "", r"\.obj, \.ply, \.stl, \.glb, \.gltf"),
     "obj without faces": ("a.obj", VERTICES, "empty"),
@@ -332,11 +333,11 @@ MALFORMED: dict[str, tuple[str, str | bytes, str]] = {
     "glb sparse": (
         "a.glb",
         square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 4, "sparse": {}}] * 2),
-        "malformed glTF",
+        r"malformed glTF: accessors\[0\].sparse: count is missing",
     ),
     "glb zeros": (
         "a.glb",
-        square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 10**9, "sparse": {}}] * 2),
+        square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 10**9, "sparse": SPARSE}] * 2),
         "declares 1000000000 rows without data",
     ),
     "glb draco": ("a.glb", square_glb(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),
@@ -351,8 +352,12 @@ MALFORMED: dict[str, tuple[str, str | bytes, str]] = {
     "gltf no json": ("a.gltf", "{", "JSON is missing or malformed"),
     "glb cycle": ("a.glb", square_glb(nodes=[{"children": [0]}]), "two parents"),
     "glb missing node": ("a.glb", square_glb(nodes=[]), "nodes 0 does not exist"),
-    "glb wrong types": ("a.glb", square_glb(meshes=[3]), "meshes 0 is no object"),
-    "glb wrong type inside": ("a.glb", square_glb(meshes=[{"primitives": 3}]), "malformed glTF"),
+    "glb wrong types": ("a.glb", square_glb(meshes=[3]), r"malformed glTF: meshes\[0\]: expected an object, got 3"),
+    "glb wrong type inside": (
+        "a.glb",
+        square_glb(meshes=[{"primitives": 3}]),
+        r"meshes\[0\].primitives: expected a list",
+    ),
     "glb empty": ("a.glb", square_glb(scenes=[{}]), "empty"),
 }
 

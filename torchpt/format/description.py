@@ -12,6 +12,7 @@ from torchpt import paths
 from torchpt import settings as run_settings
 from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, SceneError
+from torchpt.files import MAX_BYTES, check_regular
 from torchpt.format.cameras import read_camera
 from torchpt.format.materials import Kind, check_material, material_types, read_material
 from torchpt.format.textures import check_texture, texture_of
@@ -95,11 +96,15 @@ class Description:
             found = Path(folder) / rest
         else:
             found = self.base / path
-        if not found.is_file():
-            problem = "is a folder" if found.is_dir() else "no such file"
+        try:
+            check_regular(found, MAX_BYTES)
+        except OSError as error:
+            problem = (
+                "no such file" if isinstance(error, FileNotFoundError | NotADirectoryError) else str(error.strerror)
+            )
             hint = f"; only {ASSETS} is expanded" if path.startswith(("$", "~")) and head != ASSETS else ""
             where = f"{key} of {self.file}" if self.file else key
-            raise AssetError(found, f"{problem}, named by {where}{hint}")
+            raise AssetError(found, f"{problem}, named by {where}{hint}") from None
         return found
 
 

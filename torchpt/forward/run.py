@@ -175,6 +175,10 @@ class Run:
         """Write a checkpoint where it is time for one."""
         if self.keeper is None or not (last or self.keeper.due()):
             return
+        self.keeper.write(self._state())
+
+    def _state(self) -> State:
+        """Where the render is."""
         facts = {
             "taken": self.taken,
             "done": self.done,
@@ -183,13 +187,13 @@ class Run:
             "seconds": self.seconds_of_sampling(),
         }
         arrays = {f"{name}.{key}": value for name, film in self._films().items() for key, value in film.state().items()}
-        self.keeper.write(State(facts, arrays | {"bad": self.bad, "light": self.light}))
+        return State(facts, arrays | {"bad": self.bad, "light": self.light})
 
     def _resume(self) -> None:
         """Go on from the checkpoint, where that is wished and there is one."""
         if self.keeper is None or not self.settings.render.resume:
             return
-        state = self.keeper.read()
+        state = self.keeper.read(self._state())
         if state is None:
             say_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
             return

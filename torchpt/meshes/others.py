@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.errors import AssetError
+from torchpt.files import MAX_BYTES, check_regular
 from torchpt.meshes import PARSERS
 from torchpt.meshes.gltf import MOST_PLACED
 from torchpt.meshes.mesh_part import MeshPart
@@ -63,6 +64,12 @@ def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
     lost: list[str] = []
 
     class Beside(FilePathResolver):
+        def absolute(self, name: str) -> Path:
+            path = super().absolute(name)
+            if path.exists():
+                check_regular(path, MAX_BYTES)
+            return path
+
         def get(self, name: str) -> bytes:
             try:
                 return super().get(name)

@@ -90,9 +90,11 @@ def parts_of(mesh: Any, name: str, looks: Looks) -> list[MeshPart]:
     """A ``trimesh.Trimesh`` in its own space, one part for each material; unchecked.
 
     Raises:
-        AssetError: a picture that cannot be used.
+        AssetError: an index out of range, a picture that cannot be used.
     """
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):  # before anything is looked up by them
+        raise AssetError(looks.label, f"a face has an index outside 0..{len(vertices) - 1}")
     visual = mesh.visual
     normals: Matrix | None = None
     if "vertex_normals" in mesh._cache.cache:  # as trimesh's exporters tell: else they are made up from the faces
