@@ -24,9 +24,13 @@ from torchpt.spec.declared import Described, described
 from torchpt.spec.validate import check_keys
 from torchpt.textures import KINDS as TEXTURES
 
-__all__ = ["ASSETS", "Description", "overridden", "read_description", "scene_names", "settings"]
+__all__ = ["ASSETS", "MAX_ENTRIES", "Description", "overridden", "read_description", "scene_names", "settings"]
 
 ASSETS = "$TORCHPT_ASSETS"
+#: Textures, materials, shapes (instances are some) and lights that a scene may name, of each.
+MAX_ENTRIES = 100_000
+#: Keys of ``render`` by which files are written, or read as the render's own.
+_WRITTEN = ("preview", "checkpoint", "resume")
 _KEYS = ("version", "camera", *BLOCKS, "textures", "materials", "shapes", "lights")
 
 T = TypeVar("T")
@@ -209,6 +213,10 @@ def _settings_block(raw: Mapping[str, Any], name: str, file: str | None) -> dict
         return {}
     if not isinstance(block, dict):
         raise SceneError(name, block, "a mapping of settings", file)
+    for key in _WRITTEN if name == "render" else ():
+        if block.get(key) not in (None, False):
+            expected = "null: which files are written is said on the command line or in Python, never by a scene"
+            raise SceneError(f"{name}.{key}", block[key], expected, file)
     return {key: value for key, value in block.items() if value is not None}
 
 
@@ -218,6 +226,8 @@ def _named(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[
         return {}
     if not isinstance(items, dict):
         raise SceneError(block, items, f"a mapping from names to {block}", file)
+    if len(items) > MAX_ENTRIES:
+        raise SceneError(block, len(items), f"at most {MAX_ENTRIES} of them (what is larger is a mesh)", file)
     return {name: read(item, f"{block}.{name}") for name, item in items.items()}
 
 

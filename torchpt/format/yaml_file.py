@@ -99,7 +99,7 @@ class _Builder:
         self.anchors: dict[str, Any] = {}
         self.root: Any = None
         self.documents = 0
-        self.merged = 0
+        self.merged = self.values = 0
 
     def run(self, events: Iterator[Any]) -> Any:
         for event in events:
@@ -114,6 +114,7 @@ class _Builder:
                 values = self.stack[-1].value
                 if isinstance(values, list):  # numbers by the thousand
                     values.append(_resolve(event.value))
+                    self.count(event)
                     continue
             if name == "ScalarEvent":
                 self.scalar(event)
@@ -183,7 +184,14 @@ class _Builder:
             self.anchors[frame.anchor] = frame.value
         self.add(event, frame.value, None)
 
+    def count(self, event: Any) -> None:
+        """One value more, wherever it stands."""
+        self.values += 1
+        if self.values > MAX_VALUES:
+            raise self.error(event, self.values, f"at most {MAX_VALUES} values")
+
     def add(self, event: Any, value: Any, anchor: str | None = "") -> None:
+        self.count(event)
         if anchor == "" and getattr(event, "anchor", None) and event.__class__.__name__ == "ScalarEvent":
             self.anchors[event.anchor] = value
         if not self.stack:

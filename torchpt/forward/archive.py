@@ -26,12 +26,15 @@ def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     whole = file.seek(0, 2)
     with zipfile.ZipFile(file) as archive:
-        if sum(member.file_size for member in archive.infolist()) > whole:
+        members = archive.infolist()
+        if sum(member.compress_size for member in members) > whole:
             raise ValueError("its members overlap")
-        for member in archive.infolist():
+        for member in members:
             name = member.filename
-            if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 0x1:
+            if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:
                 raise ValueError(f"{name[:80]!r} is compressed or encrypted")
+            if member.file_size != member.compress_size:
+                raise ValueError(f"{name[:80]!r} has two sizes")
             if not name.endswith(".npy"):
                 raise ValueError(f"{name[:80]!r} is no array")
             try:

@@ -181,8 +181,9 @@ class Keeper:
 def _check(state: State, like: State, path: Path) -> None:
     """Refuse a state that the render could not hold."""
     for name, value in like.facts.items():
-        there = state.facts.get(name)
-        if isinstance(there, bool) or not isinstance(there, int | type(value)) or not 0 <= there < 2**62:
+        there: Any = state.facts.get(name)
+        kind = isinstance(there, int | type(value)) and not isinstance(there, bool)
+        if not kind or not 0 <= there < 2**62:
             raise AssetError(path, f"is no whole checkpoint ({name} is {str(there)[:40]})")
     for name, value in like.arrays.items():
         found = state.arrays.get(name)

@@ -17,7 +17,7 @@ from torchpt.errors import AssetError
 from torchpt.meshes.gltf_document import Document
 from torchpt.meshes.gltf_lights import PUNCTUAL, camera_at, light_at
 from torchpt.meshes.gltf_material import MATERIAL_EXTENSIONS, Materials
-from torchpt.meshes.mesh_part import FileMaterial, MeshPart, transformed
+from torchpt.meshes.mesh_part import MOST_PARTS, FileMaterial, MeshPart, too_many, transformed
 
 __all__ = ["load_gltf"]
 
@@ -65,11 +65,14 @@ class _Scene:
             if PUNCTUAL in node.get("extensions", {})
         )
         placed = [(node, matrix) for node, matrix in nodes if "mesh" in node]
-        total = 0
+        total = count = 0
         for node, _ in placed:
             total += sum(map(self.size, self.document.item("meshes", node["mesh"])["primitives"]))
             if total > self.most:
                 raise AssetError(self.path, f"more than {self.most} vertices or faces once nodes are placed")
+            count += len(self.document.item("meshes", node["mesh"])["primitives"])
+            if count > MOST_PARTS:
+                raise too_many(self.path)
         parts = []
         for node, matrix in placed:
             mesh = self.document.item("meshes", node["mesh"])
