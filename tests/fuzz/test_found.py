@@ -15,6 +15,7 @@ from small_files import float_picture
 import torchpt
 from torchpt.errors import AssetError
 from torchpt.images import read_header, read_image
+from torchpt.images.layers import group_channels
 from torchpt.meshes import load_mesh
 
 BALL: dict[str, Any] = {
@@ -35,9 +36,8 @@ def line(error: pytest.ExceptionInfo[AssetError], file: Path) -> str:
 def test_a_decoder_that_complains_in_the_files_own_bytes(tmp_path: Path, read: Any) -> None:
     """OpenImageIO's binding made text of bytes that are no UTF-8."""
     data = float_picture(tmp_path, "exr", "zip")
-    data = data.replace(b"compression\0compression\0", b"compression\0compressio\xff\0", 1)
     file = tmp_path / "a.exr"
-    file.write_bytes(data.replace(b"dataWindow\0box2i\0", b"dataWindow\0box2\xff\0", 1))
+    file.write_bytes(data.replace(b"channels\0chlist\0", b"channels\0\xffhlist\0", 1))
     with pytest.raises(AssetError) as caught:
         read(file)
     line(caught, file)
@@ -107,3 +107,13 @@ def test_an_index_out_of_range_beside_face_colours(tmp_path: Path) -> None:
     with pytest.raises(AssetError) as caught:
         load_mesh(file)
     line(caught, file)
+
+
+def test_a_digit_that_is_no_number(tmp_path: Path) -> None:
+    """Superscripts are digits to Python, and no numbers."""
+    file = tmp_path / "a.ply"
+    file.write_bytes("ply\nformat ascii 1.0\nelement vertex \u00b2\nproperty float x\nend_header\n".encode("latin-1"))
+    with pytest.raises(AssetError, match="element vertex .* is not understood") as caught:
+        load_mesh(file)
+    line(caught, file)
+    assert group_channels(("B", "x.\u00b2", "x.1")) == {"B": [0], "x": [2, 1]}

@@ -136,7 +136,7 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
         if words[0] == "format" and len(words) == 3:
             layout = words[1]
         elif words[0] == "element" and len(words) == 3:
-            if not words[2].isdigit() or len(words[2]) > 15:
+            if not words[2].isdecimal() or not words[2].isascii() or len(words[2]) > 15:
                 raise problem
             elements.append(_Element(words[1][:80], int(words[2])))
         elif words[0] == "property" and elements:
