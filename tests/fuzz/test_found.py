@@ -116,4 +116,4 @@ def test_a_digit_that_is_no_number(tmp_path: Path) -> None:
     with pytest.raises(AssetError, match="element vertex .* is not understood") as caught:
         load_mesh(file)
     line(caught, file)
-    assert group_channels(("B", "x.\u00b2", "x.1")) == {"B": [0], "x": [2, 1]}
+    assert group_channels(("Y", "x.\u00b2", "x.1")) == {"image": [0], "x": [2, 1]}

@@ -100,6 +100,8 @@ def load_and_render(source: Any, seed: int = 0) -> str:
     }  # fmt: skip
     description, settings = overridden(scene.description, {"film": film, "render": render})
     scene.description = description
+    if seed % 7 == 0:
+        json.dumps(scene.info(settings))  # what `torchpt info` tells
     made = render_scene(scene, settings)
     assert made.image.shape == (4, 4, 3), made.image.shape
     if not bool(torch.isfinite(made.image).all()):
