@@ -299,15 +299,14 @@ class _Ascii:
 
     def wrong(self, problem: str) -> AssetError:
         """The first row that is another than the header says; where all are as it says, the problem that was met."""
-        first = self.data.count(b"\n", 0, self.start) + 1
-        return AssetError(self.path, misfit(self.data[self.start :], first, self.elements) or problem)
+        return AssetError(self.path, misfit(self.data, self.start, self.elements) or problem)
 
     def end(self) -> None:
         """Refuse rows that came out even by chance: what is left over is not what the header says."""
         read = [element for element in self.elements if element.size and element.properties]
         last = next((number for number, element in enumerate(read) if element.name == "face"), len(read))
         if last >= len(read) - 1 and self.at < len(self.words):
-            found = misfit(self.data[self.start :], self.data.count(b"\n", 0, self.start) + 1, self.elements)
+            found = misfit(self.data, self.start, self.elements)
             if found is not None:
                 raise AssetError(self.path, found)
 

@@ -24,15 +24,15 @@ class _Element(Protocol):
     def properties(self) -> Sequence[_Property]: ...
 
 
-def misfit(body: bytes, first: int, elements: Iterable[_Element]) -> str | None:
+def misfit(data: bytes, start: int, elements: Iterable[_Element]) -> str | None:
     """What is wrong with the first row that its header does not describe; None where there is none.
 
     Args:
-        body: of the file, behind the header.
-        first: number of its first line, from 1.
+        data: the file.
+        start: where the header ends.
         elements: of the header, in order.
     """
-    lines = iter(enumerate(body.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n"), first))
+    lines = iter(enumerate(_lines(data[start:]), len(_lines(data[:start]))))
     for element in elements:
         if not element.properties:
             continue
@@ -44,6 +44,10 @@ def misfit(body: bytes, first: int, elements: Iterable[_Element]) -> str | None:
             if wrong:
                 return f"line {number}: {element.name} {row} {wrong}"
     return None
+
+
+def _lines(text: bytes) -> list[bytes]:
+    return text.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
 
 
 def _row(words: Sequence[bytes], properties: Sequence[_Property]) -> str | None:
