@@ -69,4 +69,4 @@ def read_regular(path: str | os.PathLike[str], most: int = MAX_BYTES) -> bytes:
                 raise Unfit(errno.EFBIG, f"has more than {most} bytes; at most so many are read")
             parts.append(file.read(min(_PIECE, most + 1 - total)))
             total += len(parts[-1])
-    return b"".join(parts)
+    return parts[0] if total == len(parts[0]) else b"".join(parts)  # not twice in memory

@@ -250,3 +250,29 @@ def test_xml_entities_are_refused_in_any_encoding(tmp_path: Path, text: bytes) -
     (tmp_path / "a.dae").write_bytes(text)
     said = refused(lambda: load_mesh(tmp_path / "a.dae"))
     assert "document type" in said or "is no XML in UTF-8" in said
+
+
+def test_a_film_that_memory_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ended the process: a film of 2^28 pixels takes tens of GiB."""
+    scene = torchpt.load({"camera": CAMERA, "film": {"width": 16384, "height": 16384}}, "cpu")
+    monkeypatch.setattr("torchpt.forward.room.free_memory", lambda: 2**30)
+    with pytest.raises(
+        SceneError, match=r"^film.width: expected a film that fits into memory: .* 1.0 GiB are free, got \[16384"
+    ):
+        torchpt.render(scene, spp=1)
+    assert torchpt.render(scene, spp=1, film={"crop": [0, 0, 4, 4]}, compile="off").shape == (4, 4, 3)
+
+
+def test_free_memory_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from torchpt.native import memory
+
+    told = memory.free_memory()
+    assert told is None or 2**20 < told < 2**50
+    (tmp_path / "memory.max").write_text("1000\n")
+    (tmp_path / "memory.current").write_text("900\n")
+    (tmp_path / "memory.stat").write_text("anon 3\ninactive_file 50\n")
+    monkeypatch.setattr(memory, "_GROUP", tmp_path)
+    assert memory.free_memory() == 150
+    monkeypatch.setattr(memory, "_GROUP", tmp_path / "none")
+    monkeypatch.setattr(memory, "_MEMINFO", tmp_path / "none")
+    assert memory.free_memory() is None

@@ -17,6 +17,7 @@ from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.kept import kept
 from torchpt.forward.result import Progress, Rendering
+from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, lanes_for, pieces
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
@@ -66,6 +67,7 @@ class Run:
     def _begin(self) -> None:
         """Nothing is sampled yet."""
         device, streams = self.device, self.wave.sampler.streams
+        check_room(self.width, self.height, streams.count, [len(x.channels) for x in self.seen.values()], device)
         film = Film(self.width, self.height, streams.count, device)
         layers = {
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
