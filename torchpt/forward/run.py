@@ -17,6 +17,7 @@ from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.kept import kept
 from torchpt.forward.result import Progress, Rendering
+from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, lanes_for, pieces
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
@@ -66,6 +67,7 @@ class Run:
     def _begin(self) -> None:
         """Nothing is sampled yet."""
         device, streams = self.device, self.wave.sampler.streams
+        check_room(self.width, self.height, streams.count, [len(x.channels) for x in self.seen.values()], device)
         film = Film(self.width, self.height, streams.count, device)
         layers = {
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
@@ -175,6 +177,10 @@ class Run:
         """Write a checkpoint where it is time for one."""
         if self.keeper is None or not (last or self.keeper.due()):
             return
+        self.keeper.write(self._state())
+
+    def _state(self) -> State:
+        """Where the render is."""
         facts = {
             "taken": self.taken,
             "done": self.done,
@@ -183,13 +189,13 @@ class Run:
             "seconds": self.seconds_of_sampling(),
         }
         arrays = {f"{name}.{key}": value for name, film in self._films().items() for key, value in film.state().items()}
-        self.keeper.write(State(facts, arrays | {"bad": self.bad, "light": self.light}))
+        return State(facts, arrays | {"bad": self.bad, "light": self.light})
 
     def _resume(self) -> None:
         """Go on from the checkpoint, where that is wished and there is one."""
         if self.keeper is None or not self.settings.render.resume:
             return
-        state = self.keeper.read()
+        state = self.keeper.read(self._state())
         if state is None:
             say_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
             return
