@@ -40,7 +40,7 @@ FREE = {
 }
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
-_FORMAT = 1
+_FORMAT = 2
 #: Of a scene's description.
 _BLOCKS = ("camera", "textures", "materials", "shapes", "lights")
 
