@@ -54,7 +54,7 @@ class Chosen:
         wi: direction to it.
         pdf: in solid angle, with the choice of the light; infinite of a light without extent.
         arriving: its radiance over that density.
-        bsdf: what the material reflects of it, with the cosine.
+        bsdf: what the material reflects of it, with the cosine and the shadowing of bent normals.
         mis_weight: of having sampled it.
         visible: how much of it gets here: 0, 1, or between behind what is not opaque; None where it would bring nothing anyway.
         contribution: to the sample.
@@ -77,7 +77,7 @@ class Scattered:
     Attributes:
         wi: the direction.
         pdf: in solid angle; infinite of a mirror's.
-        weight: BSDF and cosine over the density.
+        weight: BSDF and cosine over the density, with the shadowing of bent normals.
         eta: index of refraction of the side of ``wi`` over that of ``wo``; None where nothing refracts.
         survival: chance to survive roulette; None where it does not play.
         throughput: what the path carries on; before roulette where that ends it.
@@ -280,7 +280,7 @@ class _Story:
             wi=_three(lit.sample.wi),
             pdf=float(lit.sample.pdf),
             arriving=_three(lit.radiance * lit.sample.weight),
-            bsdf=_three(lit.reflected),
+            bsdf=_three(lit.reflected * lit.share),
             mis_weight=float(lit.weight),
             visible=float(clear) if bool((lit.brought != 0).any()) else None,
             contribution=_three(lit.brought * clear),
@@ -301,11 +301,13 @@ class _Story:
 
 def _scattered(bounced: Bounced) -> Scattered:
     drawn, chance, after = bounced.drawn, bounced.chance, bounced.after
-    goes_on = float(after.t_max) > 0.0
+    goes_on, weight, relief = float(after.t_max) > 0.0, drawn.weight, bounced.surface.relief
+    if relief is not None:
+        weight = weight * relief.shadowing(drawn.d)
     return Scattered(
         wi=_three(drawn.d),
         pdf=float(drawn.pdf),
-        weight=_three(drawn.weight),
+        weight=_three(weight),
         eta=None if drawn.eta is None else float(drawn.eta),
         survival=None if chance is None else float(chance),
         throughput=_three(after.throughput if goes_on else bounced.carried),

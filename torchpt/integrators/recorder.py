@@ -17,7 +17,7 @@ from torchpt import lights
 from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.compiled import Stages
-from torchpt.integrators.light_sampling import light_radiance, light_wish, sample_light
+from torchpt.integrators.light_sampling import leaning, light_radiance, light_wish, sample_light, through
 from torchpt.integrators.roulette import chance_of
 from torchpt.integrators.scattering import Drawn, carry_on, draw
 from torchpt.integrators.stages import shining
@@ -93,6 +93,7 @@ class Lit:
         sample: of it.
         radiance: ``(3, n)`` of the light, with its textures.
         reflected: ``(3, n)`` what the BSDF, with the cosine, makes of it.
+        share: ``(n,)`` of that: less than 1 where normals lean, and 0 on a back that is black.
         pdf: ``(n,)`` with which the BSDF would have drawn the direction.
         weight: ``(n,)`` of MIS.
         brought: ``(3, n)`` to the sample if nothing is in the way.
@@ -102,6 +103,7 @@ class Lit:
     sample: LightSample
     radiance: Tensor
     reflected: Tensor
+    share: Tensor
     pdf: Tensor
     weight: Tensor
     brought: Tensor
@@ -232,6 +234,14 @@ class Recorder(Stages):
         x, which, _, n = light_wish(plan, world, model, state, at, surface, salts)
         sample = sample_light(plan, world, model, state, at, surface, salts)
         row = lights.chosen(world.lights, which, x, n)
-        reflected, pdf = kind.eval_pdf(surface.parameters, surface.wo, surface.frame.to_local(sample.wi))
+        wi = surface.frame.to_local(sample.wi)
+        reflected, pdf = kind.eval_pdf(surface.parameters, surface.wo, wi)
         weight = power_heuristic(sample.pdf, pdf) if plan.strategy == "mis" else torch.ones_like(pdf)
-        return Lit(row, sample, light_radiance(world, sample), reflected, pdf, weight, shadow.radiance)
+        share = torch.ones_like(pdf)
+        if leaning(world, model):
+            share = share * (through(at, surface, sample.wi, wi) > 0)
+        if surface.shown is not None:
+            share = share * surface.shown
+        if surface.relief is not None:
+            share = share * surface.relief.shadowing(sample.wi)
+        return Lit(row, sample, light_radiance(world, sample), reflected, share, pdf, weight, shadow.radiance)
