@@ -21,6 +21,8 @@ render: {spp: 4, compile: off}
 SUN = BALL + "lights: {sun: {type: directional, direction: [0, 0, 1], irradiance: 2}}\n"
 NEAR = BALL + "lights: {near: {type: point, position: [0, 0, -1.01], intensity: 3.0e+38}}\n"
 
+FILM, SAMPLES = "the film of 16 x 12 pixels, counted from 0", "a whole number from 0 to 3, as render.spp is 4"
+
 Captured = pytest.CaptureFixture[str]
 
 
@@ -72,12 +74,12 @@ def test_hydras_words_lead_to_the_same_path(place: Path, capfd: Captured) -> Non
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["debug.pixel=[16,0]"], "debug.pixel: expected a pixel [x,y] of the film of 16 x 12 pixels, counted from 0, got [16, 0]"),
+        (["debug.pixel=[16,0]"], f"debug.pixel: expected a pixel [x,y] of {FILM}, got [16, 0]"),
         (["debug.pixel=[1]"], "debug.pixel: expected [x,y], two whole numbers from 0, got '[1]'"),
         (["debug.pixel=[-1,0]"], "debug.pixel: expected [x,y], two whole numbers from 0, got '[-1,0]'"),
         (["debug.pixel="], "debug.pixel: expected a name, got nothing"),
         (["debug.pixel=[1,1]", "debug.pixel=[2,1]"], "debug.pixel: given twice, as '[1,1]' and '[2,1]'"),
-        (["debug.pixel=[1,1]", "debug.sample=4"], "debug.sample: expected a whole number from 0 to 3, as render.spp is 4, got 4"),
+        (["debug.pixel=[1,1]", "debug.sample=4"], f"debug.sample: expected {SAMPLES}, got 4"),
         (["debug.pixel=[1,1]", "debug.sample=-1"], "debug.sample: expected a whole number from 0, got '-1'"),
         (["debug.sample=1"], "debug.sample: expected debug.pixel=[x,y] beside it, whose sample it is"),
         (["debug.pixels=[1,1]"], "debug.pixels: unknown key; known: debug.pixel, debug.sample"),

@@ -263,3 +263,6 @@ def test_no_more_are_kept_than_are_traced():
         lost.add(Lost.of(torch.full((3, 1, 50), torch.nan), 0, sample, (0, 0, 50, 1)))
     assert lost.count == 100 and len(lost.places) == KEPT
     assert [place.sample for place in lost.places] == [3] * 50 + [9] * (KEPT - 50)
+    pilots = Plate(torchpt.film.Film(50, 1, 1, torch.device("cpu")), {}, Streams(1, 1))
+    lost.add(Lost.of(torch.full((3, 1, 50), torch.nan), 0, 0, (0, 0, 50, 1), pilots))
+    assert lost.count == 150 and {place.first for place in lost.places} == {0}, "paths of the picture can be looked at"

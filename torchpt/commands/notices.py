@@ -49,7 +49,7 @@ def not_finite(facts: Mapping[str, Any]) -> None:
     causes = facts.get("nonfinite_causes")
     if not causes:
         return
-    told = ", ".join(f"{count:,} {name}" for name, count in causes.items())
+    told = "; ".join(f"{count:,} {name}" for name, count in causes.items())
     print(
         f"torchpt: warning: {facts['nonfinite_samples']:,} samples are not finite and count as black ({told}); the first is "
         f"{facts['nonfinite_first']}; debug.pixel=[x,y] debug.sample=k prints a path",

@@ -21,9 +21,9 @@ __all__ = ["KEPT", "Lost", "Place"]
 KEPT = 64
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True)
 class Place:
-    """One sample; they are ordered as samples are taken.
+    """One sample.
 
     Attributes:
         sample: its number in the pixel.
@@ -38,6 +38,11 @@ class Place:
     first: int = 0
     streams: int = 1
     nan: bool = True
+
+    @property
+    def rank(self) -> tuple[int, ...]:
+        """By which they are ordered: those of the picture first, then those of pilots, each as they are taken."""
+        return self.first, self.sample, self.y, self.x
 
     def __str__(self) -> str:
         return f"sample {self.sample} of pixel ({self.x}, {self.y})"
@@ -67,7 +72,7 @@ class Lost:
         if other.count:
             self.nan += other.nan
             self.infinite += other.infinite
-            self.places = sorted([*self.places, *other.places])[:KEPT]
+            self.places = sorted([*self.places, *other.places], key=lambda place: place.rank)[:KEPT]
 
     def plain(self) -> dict[str, Any]:
         """As plain values, for a checkpoint."""
