@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.bsdfs import Bsdf
 from torchpt.bsdfs.kinds.diffuse import Diffuse
 from torchpt.errors import RenderError
 from torchpt.format.description import settings
@@ -26,8 +25,8 @@ from torchpt.samplers import Streams
 WAYS = {"eager": ("off", "auto"), "packets": ("on", "brute"), "numba": ("on", "numba")}
 
 
-def scene_of(bsdfs: dict[str, Bsdf] | None = None, **blocks: Any) -> torchpt.Scene:
-    """A ball above another one, before the camera; blocks of the scene file in place of its own."""
+def scene_of(bsdfs: Any = None, **blocks: Any) -> torchpt.Scene:
+    """A ball above another one, before the camera, with models ``own``; blocks of the scene file in place of its own."""
     plain: dict[str, Any] = {
         "camera": {"origin": [0, 0, -4], "target": [0, 0, 0]},
         "materials": {"white": {"type": "diffuse"}},
@@ -74,6 +73,16 @@ class Strong(Diffuse):
         return replace(drawn, weight=drawn.weight * self.by)
 
 
+class Lame(Diffuse):
+    """Draws some directions with a weight that is NaN."""
+
+    name = "lame"
+
+    def sample(self, parameters: Any, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        drawn = super().sample(parameters, wo, lobe, u)
+        return replace(drawn, weight=torch.where(u[0] < 0.1, torch.nan, drawn.weight))
+
+
 class Broken(Diffuse):
     """Has no value for light from straight above."""
 
@@ -106,6 +115,17 @@ def test_a_model_without_a_value_is_the_cause(way):
     found = rendered(scene_of({"own": Broken()}, materials={"white": {"type": "own"}}, **sun), way, spp=1)
     assert found.nonfinite_causes == {"nan bsdf": found.nonfinite_samples} and found.nonfinite_samples
     assert found.nonfinite_first.endswith("nan bsdf at depth 1 (shape ball, material white)")
+
+
+@pytest.mark.parametrize("light", ["constant", "directional"])
+@pytest.mark.parametrize("way", WAYS)
+def test_a_path_does_not_end_unseen(way, light):
+    """NaN is greater than nothing, so a path that carries it ends: not as if it carried no light."""
+    values = {"radiance": 1} if light == "constant" else {"irradiance": 1, "direction": [0, -1, 1]}
+    scene = scene_of({"own": Lame()}, materials={"white": {"type": "own"}}, lights={"light": {"type": light, **values}})
+    found, eager = rendered(scene, way, spp=1), rendered(scene, spp=1)
+    assert found.nonfinite_causes == {"nan bsdf": found.nonfinite_samples}
+    assert found.nonfinite_samples == eager.nonfinite_samples > 5
 
 
 @pytest.mark.parametrize("way", WAYS)
