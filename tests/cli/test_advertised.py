@@ -109,6 +109,7 @@ def test_there_are_commands_from_everywhere() -> None:
         "info",
         "compare",
         "converge",
+        "stress",
     }
 
 
