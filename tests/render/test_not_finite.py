@@ -202,6 +202,7 @@ def test_pilots_are_among_them():
 
 def test_a_healthy_picture_has_none():
     found = rendered(scene_of(lights={"sky": {"type": "constant", "radiance": 1}}))
+    assert "nonfinite_causes" not in found.header()
     assert (found.nonfinite_samples, found.nonfinite_causes, found.nonfinite_first) == (0, {}, "")
     assert not {"nonfinite_causes", "nonfinite_first"} & found.summary().keys()
 
@@ -210,7 +211,9 @@ def test_the_summary_and_the_table_tell_them():
     found = rendered(scene_of(**NEAR))
     assert found.summary()["nonfinite_causes"] == found.nonfinite_causes
     assert found.summary()["nonfinite_first"] == found.nonfinite_first
-    assert f"samples not finite: {found.nonfinite_samples} (infinite light: " in repr(found)
+    count = found.nonfinite_samples
+    assert found.header()["nonfinite_causes"] == f"{count} infinite light"
+    assert f"samples not finite: {count} (infinite light: " in repr(found)
 
 
 # -- strict

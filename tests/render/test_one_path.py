@@ -80,7 +80,9 @@ def check_parts(path: Path) -> None:
             torch.testing.assert_close(product, doubles(vertex.emission.contribution), rtol=1e-4, atol=1e-9)
         if vertex.light and vertex.light.visible:
             light = vertex.light
-            product = throughput * doubles(light.bsdf) * doubles(light.arriving) * light.mis_weight * (light.visible or 0.0)
+            product = (
+                throughput * doubles(light.bsdf) * doubles(light.arriving) * light.mis_weight * (light.visible or 0.0)
+            )
             torch.testing.assert_close(product, doubles(light.contribution), rtol=1e-4, atol=1e-9)
         torch.testing.assert_close(total, doubles(vertex.radiance), rtol=1e-4, atol=1e-7)
         if vertex.scattered and depth < len(path.vertices):

@@ -147,6 +147,7 @@ class Rendering:
             "render_seconds": self.render_seconds,
             "rays": self.rays,
             "nonfinite_samples": self.nonfinite_samples,
+            "nonfinite_causes": "; ".join(f"{count} {name}" for name, count in self.nonfinite_causes.items()),
             "truncated_paths": self.truncated_paths or None,
             "clamped": self.clamped,
             "stopped_by": self.stopped_by,
