@@ -27,6 +27,7 @@ from torchpt.errors import AssetError, OutputError
 from torchpt.files import check_regular
 from torchpt.forward.archive import read_arrays
 from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
+from torchpt.integrators.lost import Lost
 from torchpt.scene.digest import digest
 from torchpt.scene.scene import Scene
 from torchpt.settings import Settings
@@ -42,7 +43,7 @@ FREE = {
 }
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
-_FORMAT = 1
+_FORMAT = 2
 #: Of a scene's description.
 _BLOCKS = ("camera", "textures", "materials", "shapes", "lights")
 
@@ -182,6 +183,12 @@ def _check(state: State, like: State, path: Path) -> None:
     """Refuse a state that the render could not hold."""
     for name, value in like.facts.items():
         there: Any = state.facts.get(name)
+        if name == "lost":
+            try:
+                Lost.read(there)
+            except ValueError as problem:
+                raise AssetError(path, f"is no whole checkpoint ({problem})") from None
+            continue
         kind = isinstance(there, int | type(value)) and not isinstance(there, bool)
         if not kind or not 0 <= there < 2**62:
             raise AssetError(path, f"is no whole checkpoint ({name} is {str(there)[:40]})")

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchpt.errors import RenderError
 from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
+from torchpt.forward.causes import causes_of, told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.kept import kept
 from torchpt.forward.result import Progress, Rendering
@@ -26,6 +27,7 @@ from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
 from torchpt.integrators.loop.schedule import Loop, Share
+from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.lanes.graph import Unsupported
 from torchpt.scene import Scene
@@ -48,7 +50,7 @@ class Run:
     ) -> None:
         self.start = time.perf_counter()
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
-        self.name, self.load_seconds = scene.name, scene.load_seconds
+        self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
         self.wave = make_wave(scene, settings, params, dtype)
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
@@ -77,7 +79,7 @@ class Run:
         self.tally, self.done, self.taken, self.ended = Tally(), 0, 0, False
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
         self.stop = Stop(self.settings.render, streams.count, None if self.keeper is None else EVERY)
-        self.bad = torch.zeros((), dtype=torch.int64, device=device)
+        self.lost = Lost()
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.begun: float | None = None
 
@@ -113,7 +115,9 @@ class Run:
             self.loop = None
             self._begin()
             self._complete()
-        return self.result()
+        rendering = self.result()
+        rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(self.scene, self.wave, self.lost)
+        return rendering
 
     # -- which samples
 
@@ -187,9 +191,10 @@ class Run:
             "rays": self.tally.rays,
             "truncated": self.tally.truncated,
             "seconds": self.seconds_of_sampling(),
+            "lost": self.lost.plain(),
         }
         arrays = {f"{name}.{key}": value for name, film in self._films().items() for key, value in film.state().items()}
-        return State(facts, arrays | {"bad": self.bad, "light": self.light})
+        return State(facts, arrays | {"light": self.light})
 
     def _resume(self) -> None:
         """Go on from the checkpoint, where that is wished and there is one."""
@@ -201,7 +206,7 @@ class Run:
             return
         for name, film in self._films().items():
             film.restore({key: state.arrays[f"{name}.{key}"].to(self.device) for key in film.state()})
-        self.bad, self.light = (state.arrays[name].to(self.device) for name in ("bad", "light"))
+        self.lost, self.light = Lost.read(state.facts["lost"]), state.arrays["light"].to(self.device)
         self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
         self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
         mean = float(self.picture.film.counts.double().mean()) if self._adapts() else self.taken
@@ -235,8 +240,7 @@ class Run:
                 return self._advanced(0, False)
             self.tally.rays += share.tally.rays
             self.tally.truncated += share.tally.truncated
-            if share.bad:
-                self.bad += share.bad
+            self._count(share.lost)
             if self.integrator.clamp is not None:
                 self.light += torch.tensor(share.light, dtype=torch.float64)
             left -= share.samples
@@ -291,12 +295,8 @@ class Run:
     def _checked(self, radiance: Tensor, plate: Plate, first: int, sample: int) -> Tensor:
         """Count what is not finite and take it as black; apply the clamp."""
         finite = torch.isfinite(radiance).all(0)
-        self.bad += (~finite).sum()
-        if self.integrator.strict and not bool(finite.all()):
-            s, p = (int(i) for i in (~finite).nonzero()[0])
-            p = first + p if plate.places is None else int(plate.places[first + p])
-            x, y = p % self.width + self.wave.crop[0], p // self.width + self.wave.crop[1]
-            raise RenderError(f"integrator.strict: sample {sample + s} of pixel ({x}, {y}) is not finite")
+        if not bool(finite.all()):
+            self._count(Lost.of(radiance, first, sample, self.wave.crop, plate))
         radiance = torch.where(finite, radiance, 0.0)
         clamp = self.integrator.clamp
         if clamp is None:
@@ -305,6 +305,12 @@ class Run:
         clamped = radiance * scale
         self.light += torch.stack((radiance.double().sum(), clamped.double().sum()))
         return clamped
+
+    def _count(self, lost: Lost) -> None:
+        """Count samples that are not finite; with ``integrator.strict`` the first one ends the render."""
+        if lost.count and self.integrator.strict:
+            raise RenderError(f"integrator.strict: {told(self.scene, self.wave, lost.places[0])}")
+        self.lost.add(lost)
 
     def result(self) -> Rendering:
         """The picture so far."""
@@ -337,7 +343,7 @@ class Run:
             render_seconds=self.seconds_of_sampling(),
             paths=self.done,
             rays=self.tally.rays,
-            nonfinite_samples=int(self.bad),
+            nonfinite_samples=self.lost.count,
             truncated_paths=self.tally.truncated,
             clamped=clamped,
             relmse=None if known is None else known.relmse,

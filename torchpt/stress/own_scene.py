@@ -58,7 +58,7 @@ def cases_of(source: str, overrides: Mapping[str, Mapping[str, Any]]) -> tuple[C
         given = replace(wishes, render=wishes.render.but(accel=bench.accel, compile=compiled, seed=seed))
         found = render_scene(Scene(description, device_of(bench.device)), given, dtype=bench.dtype)
         if found.nonfinite_samples:
-            raise RenderError(f"{found.nonfinite_samples} samples are not finite")
+            raise RenderError(f"{found.nonfinite_samples} samples are not finite; the first is {found.nonfinite_first}")
         return found.image.double().cpu()
 
     def beside(bench: Bench, found: Callable[[], Tensor]) -> float:
