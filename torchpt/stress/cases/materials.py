@@ -17,7 +17,7 @@ INDEX = tuple(10.0 ** (k / 4) for k in range(-12, 13))
 
 def gain(bench: Bench, material: dict[str, Any]) -> float:
     """By how much a ball gives back more than it receives; infinite where it gives back nothing at all."""
-    mean = float(bench.render(furnace(material), max_depth=-1).mean())
+    mean = float(bench.render(furnace(material), spp=256, max_depth=-1).mean())
     return max(mean - 1.0, 0.0) if mean > 0.0 else math.inf
 
 
