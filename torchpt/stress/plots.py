@@ -33,7 +33,8 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(
-        {"font.size": 8.0, "svg.hashsalt": "torchpt", "svg.fonttype": "none", "axes.spines.top": False, "axes.spines.right": False}
+        {"font.size": 8.0, "svg.hashsalt": "torchpt", "svg.fonttype": "none"}
+        | {f"axes.spines.{side}": False for side in ("top", "right")}
     ):
         rows = -(-len(swept) // COLUMNS)
         figure = Figure(figsize=(3.4 * COLUMNS, 2.3 * rows), layout="constrained")
