@@ -32,10 +32,7 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with matplotlib.rc_context(
-        {"font.size": 8.0, "svg.hashsalt": "torchpt", "svg.fonttype": "none"}
-        | {f"axes.spines.{side}": False for side in ("top", "right")}
-    ):
+    with matplotlib.rc_context({"font.size": 8.0, "svg.hashsalt": "torchpt", "svg.fonttype": "none"}):
         rows = -(-len(swept) // COLUMNS)
         figure = Figure(figsize=(3.4 * COLUMNS, 2.3 * rows), layout="constrained")
         FigureCanvasAgg(figure)
@@ -43,6 +40,7 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
             axes = figure.add_subplot(rows, COLUMNS, number + 1)
             at = [one.at for one in outcome.readings]
             values = [max(one.figure, NOTHING) if math.isfinite(one.figure) else math.nan for one in outcome.readings]
+            axes.spines[["top", "right"]].set_visible(False)
             axes.plot(at, values, "o-", color="#0072B2", markersize=3, linewidth=1)
             axes.axhline(max(outcome.case.bound, NOTHING), color="#D55E00", linestyle="--", linewidth=1)
             axes.set_ylim(NOTHING / 3, max(*(v for v in values if not math.isnan(v)), outcome.case.bound, 1e-3) * 3)
