@@ -13,13 +13,14 @@ SCENE ?= cornell_box
 OUT ?= $(notdir $(basename $(SCENE))).png
 ARGS ?=
 
-.PHONY: help render test test-all check format clean
+.PHONY: help render test test-all stress check format clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make render    render configs/scene/$(SCENE).yaml to $(OUT)   (SCENE=name OUT=file ARGS='render.spp=256')"
 	@echo "make test      the fast tests"
 	@echo "make test-all  all tests, the slow ones and the comparison with Mitsuba included"
+	@echo "make stress    stiff and extreme cases, whole sweeps by every backend, to stress/"
 	@echo "make check     ruff, pyright, import layers"
 	@echo "make format    let ruff rewrite the files"
 	@echo "make clean     remove the virtual environment and caches"
@@ -33,6 +34,9 @@ test: $(VENV)/dev.stamp
 
 test-all: $(VENV)/bench.stamp
 	$(PY) -m pytest $(ARGS)
+
+stress: $(VENV)/dev.stamp
+	$(PY) -m torchpt stress "accel=[numba,torch,brute]" "compile=[on,off]" out=stress $(ARGS)
 
 check: $(VENV)/dev.stamp
 	$(PY) -m ruff check .

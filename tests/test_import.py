@@ -83,3 +83,32 @@ def test_the_first_pixel_is_close_behind_torch(tmp_path: Path) -> None:
     cpu_seconds(*words)  # may compile
     torch, render = (min(cpu_seconds(*each) for _ in range(7)) for each in (("-c", "import torch"), words))
     assert render <= torch + 0.6
+
+
+UNIX_ONLY = ("fcntl", "grp", "pwd", "resource", "termios")
+
+
+def test_nothing_of_unix_alone_is_needed() -> None:
+    """Imported and rendered with what Windows lacks taken away; torch and numba, which bring their own ways, come first."""
+    code = f"""
+import sys, os, signal
+import torch, numba, llvmlite.binding, multiprocessing, concurrent.futures.thread
+for name in ("register_at_fork", "fork", "sched_getaffinity", "geteuid", "getuid", "getpgid", "killpg", "O_NOFOLLOW", "mkfifo",
+             "uname", "statvfs", "sysconf", "chown", "getloadavg"):
+    if hasattr(os, name):
+        delattr(os, name)
+for name in ("SIGKILL", "SIGHUP", "SIGALRM", "setitimer"):
+    if hasattr(signal, name):
+        delattr(signal, name)
+for name in {UNIX_ONLY!r}:
+    sys.modules[name] = None
+import torchpt
+film = {{"width": 8, "height": 8}}
+scene = torchpt.load("cornell_box", device="cpu")
+pictures = [torchpt.render(scene, spp=2, film=film, compile=mode) for mode in ("off", "on")]
+assert all(float(picture.mean()) > 0 for picture in pictures)
+from torchpt.cli import main
+assert main(["--version"]) == 0
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -28,6 +28,9 @@ from torchpt.commands.converge import converge
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.orbit import HELP as HELP_ORBIT
 from torchpt.commands.plain_words import compose_plainly
+from torchpt.commands.streams import ready, speaking
+from torchpt.commands.stress import HELP as HELP_STRESS
+from torchpt.commands.stress import stress
 from torchpt.errors import TorchptError
 
 if TYPE_CHECKING:
@@ -35,7 +38,7 @@ if TYPE_CHECKING:
 
     from torchpt.commands.render import Job
 
-__all__ = ["HELP_COMPARE", "main", "run"]
+__all__ = ["HELP_COMPARE", "HELP_STRESS", "main", "run"]
 
 HELP = """\
 torchpt: a wavefront path tracer that is a PyTorch program
@@ -45,6 +48,7 @@ torchpt: a wavefront path tracer that is a PyTorch program
   torchpt info   scene=cornell_box                                  what the scene holds, what was built, what left out
   torchpt compare test.exr reference.exr                            how far a picture is from its reference
   torchpt converge scene=cornell_box sampler=[independent,sobol]    error against run time, as a report
+  torchpt stress quick=true                                         stiff and extreme cases, measured
 
 torchpt COMMAND --help says more. Scenes that ship:
 {scenes}
@@ -56,13 +60,15 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
 {scenes}
   out=     .exr .hdr .png .jpg .ppm; several as out=[a.exr,a.png]; NAME.png where nothing is said
   {keys}
+  debug.pixel=[x,y] debug.sample=k [--json]
+                      print that path vertex by vertex, in place of a picture: [0,0] is at the upper left of the film
 
   integrator=NAME, sampler=NAME, ... take a group's file from configs/: integrator=direct sampler=independent
   --multirun, -m      one render for every combination: sampler=sobol,independent render.spp=16,64 scene=a,b out=x.exr
                       writes x_0.exr, x_1.exr, ...
   --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
 
-The last line on stdout is a summary in JSON.
+The last line on stdout is a summary in JSON. Samples that are not finite count as black, and stderr says why.
 Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the partial picture saved.
 """
 HELP_INFO = """\
@@ -80,26 +86,27 @@ _HELPS = {"render": HELP_RENDER, "orbit": HELP_ORBIT, "info": HELP_INFO, "conver
 def run() -> None:
     """The console script."""
     collector.pause()
+    ready()
     sys.exit(main())
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run ``torchpt`` with these words (default: those of the process) and return the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if argv[:1] in (["-h"], ["--help"], ["help"]):
-        print(_help(HELP), end="")
-        return 0
-    if argv == ["--version"]:
-        print(f"torchpt {__version__}")
-        return 0
     with Interrupt() as interrupt:
         try:
+            if argv[:1] in (["-h"], ["--help"], ["help"]):
+                return _say(_help(HELP))
+            if argv == ["--version"]:
+                return _say(f"torchpt {__version__}\n")
+            _check_place()
             if argv[:1] == ["compare"]:  # takes files, and no scene
                 return compare(argv[1:])
+            if argv[:1] == ["stress"]:
+                return stress(argv[1:])
             arguments = parse(argv)
             if arguments.help:
-                print(_help(_HELPS[arguments.command]), end="")
-                return 0
+                return _say(_help(_HELPS[arguments.command]))
             if arguments.command == "converge":
                 return _converge(arguments, interrupt)
             if not arguments.scenes and not arguments.only_shows:
@@ -121,6 +128,24 @@ def _converge(arguments: Arguments, interrupt: Interrupt) -> int:
     return converge(arguments.study, interrupt)
 
 
+def _check_place() -> None:
+    """Names on the command line begin at the working folder.
+
+    Raises:
+        UsageError: it is gone.
+    """
+    try:
+        os.getcwd()
+    except OSError:
+        raise UsageError("the working folder is not there any more: change to one that is") from None
+
+
+def _say(text: str) -> int:
+    with speaking():
+        print(text, end="")
+    return 0
+
+
 def _refuse(line: str) -> int:
     print("torchpt: " + " ".join(line.split("\n")), file=sys.stderr)
     return 2
@@ -136,6 +161,7 @@ class _Task:
     paths: dict[str, str | None]
     json: bool
     turn: dict[str, str]
+    debug: dict[str, str]
 
     def __call__(self, cfg: DictConfig) -> int:
         """Do one job. Ends the process (of this job) where it does not end well."""
@@ -150,6 +176,7 @@ class _Task:
 
     def _ended(self, make_job: Callable[[], Job]) -> int:
         """Make and do a job; returns the exit code."""
+        from torchpt.commands.debug import Wish, debug
         from torchpt.commands.info import info
         from torchpt.commands.orbit import Turn, orbit
         from torchpt.commands.render import render
@@ -159,6 +186,8 @@ class _Task:
                 job = make_job()
                 if self.command == "orbit":
                     return orbit(job, Turn.read(self.turn), interrupt)
+                if self.debug:
+                    return debug(job, Wish.read(self.debug), interrupt, self.json)
                 return info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
             except TorchptError as error:
                 return _refuse(str(error))
@@ -232,7 +261,15 @@ def _refuse_targets(value: Any, where: str) -> None:
 
 def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
     """Compose plain words here and hand all others over to Hydra; returns the exit code."""
-    task = _Task(arguments.command, arguments.scenes, arguments.outs, arguments.paths, arguments.json, arguments.turn)
+    task = _Task(
+        arguments.command,
+        arguments.scenes,
+        arguments.outs,
+        arguments.paths,
+        arguments.json,
+        arguments.turn,
+        arguments.debug,
+    )
     if not arguments.options and not arguments.multirun:
         composed = compose_plainly(arguments.overrides, _configs())
         if composed is not None:

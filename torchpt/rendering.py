@@ -35,6 +35,8 @@ class Wishes(TypedDict, total=False):
     time_limit: float | None
     target_error: float | None
     pilots: bool | str | None
+    checkpoint: str | None
+    resume: bool | None
     accel: str | None
     compile: str | bool | None
     threads: int | str | None
@@ -65,6 +67,8 @@ def render(
     time_limit: float | None = None,
     target_error: float | None = None,
     pilots: bool | str | None = None,
+    checkpoint: str | None = None,
+    resume: bool | None = None,
     accel: str | None = None,
     compile: str | bool | None = None,
     threads: int | str | None = None,
@@ -90,6 +94,8 @@ def render(
         time_limit, target_error: seconds of sampling, and a relMSE, that end the render.
         pilots: True: the picture knows its error (``relmse`` of a ``full`` one), by one pixel of 16 sampled twice; ``auto``:
             where ``target_error`` or ``sampler.adaptive`` ask for it.
+        checkpoint, resume: a file where the state of a long render is kept, and whether to go on from it; not where gradients
+            are wanted.
         accel, compile, threads, max_memory: of ``render``.
         device: must be the scene's own; load the scene on the device where it is to render.
         dtype: of the lanes. float64 is for checking derivatives; the search stays float32.
@@ -107,6 +113,7 @@ def render(
     given = {
         "spp": spp, "seed": seed, "accel": accel, "compile": compile, "threads": threads, "max_memory": max_memory,
         "time_limit": time_limit, "target_error": target_error, "pilots": pilots,
+        "checkpoint": checkpoint, "resume": resume,
     }  # fmt: skip
     wishes = {"film": film, "integrator": integrator, "sampler": sampler, "render": given}
     settings = complete(scene.description, wishes)
@@ -183,6 +190,8 @@ def _differentiable(
     if not settings.integrator.light:
         radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
         raise SceneError("integrator.type", settings.integrator.name, f"one of {radiant} where gradients are wanted")
+    if settings.render.checkpoint is not None:
+        raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
     attached = adjoints.attached(scene, wanted)
     if attached or adjoints.casts(scene, wanted):
         warnings.warn(
@@ -217,7 +226,12 @@ def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albed
     film = settings.film.but(
         aovs=names, denoise=False, filter=Described(FILTERS["box"], {})
     )  # one sample fills no wider filter
-    quick = replace(settings, film=film, integrator=INTEGRATORS["aov"](), render=settings.render.but(spp=1))
+    quick = replace(
+        settings,
+        film=film,
+        integrator=INTEGRATORS["aov"](),
+        render=settings.render.but(spp=1, checkpoint=None, resume=False),
+    )
     return render_scene(scene, quick).layers
 
 
@@ -240,6 +254,8 @@ def render_scene(
     Raises:
         SceneError: settings that this scene cannot be rendered with.
         RenderError: with ``integrator.strict``, the first sample that is not finite.
+        AssetError: a checkpoint that is damaged, or of another render.
+        OutputError: a checkpoint that cannot be written, or that is there although nobody wishes to go on from it.
     """
     with torch.no_grad(), limited_threads(settings.render.threads):
         return Run(scene, settings, params, dtype).go(on_progress)

@@ -13,9 +13,9 @@ from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
 from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.spec import Choice, Flag, Other, Refused, Scalar, Valued, Whole, not_built, parameters_of, reading
+from torchpt.spec import Choice, Flag, Other, Refused, Scalar, Valued, Whole, parameters_of, reading
 from torchpt.spec.declared import Described, described, refuse_foreign, values_of
-from torchpt.spec.validate import check_keys, dotted, refuse_not_built
+from torchpt.spec.validate import check_keys, dotted
 
 __all__ = ["BLOCKS", "FILTERS", "INTEGRATORS", "RECORDS", "SAMPLERS", "TYPED", "Film", "Render", "Settings", "merge"]
 
@@ -118,7 +118,7 @@ def _pilots(value: Any) -> bool | str:
     raise Refused("auto, true or false")
 
 
-def _preview(value: Any) -> str:
+def _file(value: Any) -> str:
     if isinstance(value, str) and value.strip() and value.isprintable():
         return value
     raise Refused("null or a file path")
@@ -163,13 +163,26 @@ class Render(Valued):
         "target_error": Scalar(
             None, above=0.0, words="null or a relMSE > 0", doc="the relMSE, by its pilots, at which the picture is done"
         ),
+        "checkpoint": Other(
+            None,
+            reader=_file,
+            words="null or a file path",
+            doc="where the state is written every few seconds and at the end, to go on from",
+        ),
+        "resume": Flag(False, doc="whether to go on from the checkpoint, where there is one"),
         "preview": Other(
             None,
-            reader=_preview,
+            reader=_file,
             words="null or a file path",
             doc="albedo and normal beside it first, then the picture so far after each pass",
         ),
     }
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Valued`."""
+        if values["resume"] and values["checkpoint"] is None:
+            raise Refused("false without render.checkpoint, the file to go on from", True, ("resume",))
 
 
 #: The blocks without types.
@@ -328,10 +341,7 @@ def _block(block: str, raw: dict[str, Any]) -> Any:
         if "filter" in raw:
             raw["filter"] = _typed("filter", raw["filter"], "film.filter")
         return Film(**values_of(Film, raw, block, None, "the film").values)
-    later, what, names = not_built.KEYS["render"], "the render settings", list(parameters_of(Render))
-    check_keys({k: v for k, v in raw.items() if k not in later}, names, block, what, None)
-    rest = refuse_not_built(raw, later, block, ", ".join(names), None)
-    return Render(**values_of(Render, rest, block, None, what).values)
+    return Render(**values_of(Render, raw, block, None, "the render settings").values)
 
 
 def _typed(what: str, raw: dict[str, Any], key: str) -> Described:

@@ -169,7 +169,6 @@ def test_bad_input_is_one_line_that_names_the_key(name: str) -> None:
 
 LATER: dict[str, tuple[dict[str, Any], str]] = {
     "integrator": (scene(integrator={"type": "bdpt"}), "integrator.type"),
-    "resume": (scene(render={"resume": True}), "render.resume"),
 }
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from torchpt.commands import collector
 from torchpt.commands.arguments import UsageError
 from torchpt.commands.render import plain
+from torchpt.commands.streams import speaking
 from torchpt.errors import AssetError, OutputError, SceneError
 
 if TYPE_CHECKING:
@@ -121,7 +122,8 @@ def compare(words: list[str]) -> int:
     """
     wishes = Wishes.read(words)
     if wishes.help:
-        print(HELP, end="")
+        with speaking():
+            print(HELP, end="")
         return 0
     from torchpt.images.comparison import compare as measure
 
@@ -147,10 +149,11 @@ def compare(words: list[str]) -> int:
         facts["largest_alpha_difference"] = float((alpha.double() - other.double()).abs().max())
     if chart is not None:
         facts["map"] = _write_map(chart, image, reference, shown)
-    if wishes.json:
-        print(json.dumps(plain(facts), allow_nan=False))
-    else:
-        _print(facts, found)
+    with speaking():
+        if wishes.json:
+            print(json.dumps(plain(facts), allow_nan=False))
+        else:
+            _print(facts, found)
     return 0
 
 
@@ -309,7 +312,11 @@ def _print(facts: dict[str, Any], found: Comparison) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+    class Piped(Console):
+        def on_broken_pipe(self) -> None:  # rich itself would end the process
+            raise BrokenPipeError
+
+    console = Piped(highlight=False, width=None if sys.stdout.isatty() else 120)
 
     def say(text: str) -> None:
         code = console.encoding  # a name of a file may hold what it does not

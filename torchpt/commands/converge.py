@@ -13,6 +13,7 @@ from torchpt.commands import collector
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.notices import notices
 from torchpt.commands.progress import Bar
+from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, SceneError
 
 __all__ = ["HELP", "converge", "raw_study"]
@@ -151,7 +152,8 @@ def converge(words: Mapping[str, str], interrupt: Interrupt) -> int:
             for topic in topics
         ],
     }
-    print(json.dumps(plain(facts), allow_nan=False), flush=True)
+    with speaking():
+        print(json.dumps(plain(facts), allow_nan=False))
     return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
 
 

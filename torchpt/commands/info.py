@@ -11,6 +11,7 @@ from torchpt.commands import collector
 from torchpt.commands.interrupt import Interrupt
 from torchpt.commands.notices import notices
 from torchpt.commands.render import Job, described, plain
+from torchpt.commands.streams import speaking
 
 __all__ = ["info", "lines"]
 
@@ -32,17 +33,17 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
         facts = scene.info(wishes)
         facts["built"]["loop"] = loop_facts(scene, wishes)
     interrupt.check()
-    if as_json:
-        print(json.dumps(plain(facts), allow_nan=False))
-        return 0
-    if not sys.stdout.isatty():
-        print("\n".join(key + value for key, value in lines(facts)))
-        return 0
-    from rich.console import Console
-    from rich.text import Text
+    with speaking():
+        if as_json:
+            print(json.dumps(plain(facts), allow_nan=False))
+        elif not sys.stdout.isatty():
+            print("\n".join(key + value for key, value in lines(facts)))
+        else:
+            from rich.console import Console
+            from rich.text import Text
 
-    for key, value in lines(facts):
-        Console().print(Text(key, style="bold") + Text(value), soft_wrap=True)
+            for key, value in lines(facts):
+                Console().print(Text(key, style="bold") + Text(value), soft_wrap=True)
     return 0
 
 

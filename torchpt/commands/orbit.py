@@ -10,6 +10,7 @@ import json
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.notices import notices
 from torchpt.commands.progress import Bar
 from torchpt.commands.render import Job, described, knowing, numbered, plain
+from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, SceneError
 
 if TYPE_CHECKING:
@@ -53,7 +55,7 @@ Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the fin
 """
 _MOST_FRAMES = 100_000
 #: Settings that leave a frame as it is.
-_FREE = ("render.threads", "render.max_memory", "render.preview")
+_FREE = ("render.threads", "render.max_memory", "render.preview", "render.checkpoint", "render.resume")
 _MANIFEST = "orbit.json"
 
 
@@ -141,7 +143,12 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     start = time.perf_counter()
     with notices():
         description, wishes = described(job)
-        for group, key in (("render", "preview"), ("film", "aovs"), ("film", "denoise")):
+        for group, key in (
+            ("render", "preview"),
+            ("render", "checkpoint"),
+            ("film", "aovs"),
+            ("film", "denoise"),
+        ):
             if job.overrides.get(group, {}).get(key):
                 what = "nothing: torchpt orbit writes frames only"
                 if key == "denoise":
@@ -172,7 +179,8 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     else:
         facts["complete"] = False
     facts["seconds"] = round(time.perf_counter() - start, 4)
-    print(json.dumps(plain(facts), allow_nan=False), flush=True)
+    with speaking():
+        print(json.dumps(plain(facts), allow_nan=False))
     if interrupt.signum is None:
         return 0
     kept = (
@@ -197,6 +205,7 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
 
     place, seed = scene.params["camera.to_world"], settings(scene.description, job.overrides).render.seed
     totals: dict[str, int] = {"rays": 0, "nonfinite_samples": 0}
+    causes: Counter[str] = Counter()
     begun = time.perf_counter()
     with Bar(frames.folder.stem) as bar:
 
@@ -212,9 +221,9 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
                 continue
             once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
             wishes = knowing(settings(scene.description, once))  # a frame is what `torchpt render` gives
-            wishes = replace(
-                wishes, film=wishes.film.but(denoise=False)
-            )  # a scene file's wish is about `torchpt render`
+            # A scene file's wishes of these are about `torchpt render`.
+            film, render = wishes.film.but(denoise=False), wishes.render.but(checkpoint=None, resume=False)
+            wishes = replace(wishes, film=film, render=render)
             scene.params["camera.to_world"] = torch.from_numpy(pose.copy()).to(place)
             rendering = render_scene(scene, wishes, on_progress=partial(on_progress, number, totals["rays"]))
             if not rendering.complete:
@@ -222,7 +231,8 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
             frames.write(number, rendering.image, wishes.film)
             summary = rendering.summary()
             totals = {name: count + summary[name] for name, count in totals.items()}
-    return totals
+            causes.update(summary.get("nonfinite_causes", {}))
+    return {**totals, "nonfinite_causes": dict(causes)} if causes else totals
 
 
 class Frames:

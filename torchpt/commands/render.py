@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import secrets
 import sys
+import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +18,9 @@ from typing import Any
 from torchpt.commands import collector
 from torchpt.commands.denoised import denoised_files
 from torchpt.commands.interrupt import Interrupt, Interrupted
-from torchpt.commands.notices import notices
+from torchpt.commands.notices import not_finite, notices
 from torchpt.commands.progress import Bar
+from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
 
 __all__ = ["Job", "described", "knowing", "numbered", "plain", "render"]
@@ -53,6 +58,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
         TorchptError: bad input, found before anything is rendered wherever that is possible.
         Interrupted: a signal came while there was no picture to keep.
     """
+    from torchpt.forward.checkpoint import Keeper
     from torchpt.forward.files import write_rendered
     from torchpt.images import check_writable
     from torchpt.rendering import first_hit, render_scene
@@ -69,6 +75,11 @@ def render(job: Job, interrupt: Interrupt) -> int:
         denoised = denoised_files(wishes, outs, previews)
         for path in (*outs, *previews, *denoised):
             check_writable(path)
+        if wishes.render.checkpoint is not None:
+            wishes = replace(
+                wishes, render=wishes.render.but(checkpoint=numbered(wishes.render.checkpoint, job.number))
+            )
+            Keeper(wishes.render.checkpoint).check(wishes.render.resume)
         scene = Scene(description, device_of(wishes.render.device))
     scene.load_seconds = time.perf_counter() - start
     if preview:
@@ -86,10 +97,16 @@ def render(job: Job, interrupt: Interrupt) -> int:
 
         rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress))
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)
-    print(_summary(rendering, outs, facts), flush=True)
+    summary = {"out": _names(outs), **facts, **rendering.summary()}
+    if not rendering.complete:
+        summary["complete"] = False
+    not_finite(summary)
+    with speaking():  # the last line on stdout
+        print(json.dumps(plain(summary), allow_nan=False))
     if interrupt.signum is None:
         return 0
-    print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far", file=sys.stderr)
+    again = "" if wishes.render.checkpoint is None else "; render.resume=true goes on"
+    print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far{again}", file=sys.stderr)
     return Interrupted(interrupt.signum).exit_code
 
 
@@ -154,6 +171,9 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: An
         try:
             write_rendered(path, rendering, wishes.film)
         except OutputError as error:
+            elsewhere = _written_elsewhere(path, rendering, wishes)
+            if elsewhere is not None:
+                error = OutputError(path, f"{error.problem}; the picture is in {elsewhere}")
             failed = failed or error
     try:
         if denoised:  # only now: what was rendered is safe
@@ -170,6 +190,20 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: An
     return facts
 
 
+def _written_elsewhere(path: str, rendering: Any, wishes: Any) -> str | None:
+    """Save a picture whose place went away while it was rendered; returns where it is, under a name that nothing had."""
+    from torchpt.forward.files import write_rendered
+
+    name = Path(path)
+    for place in (os.path.expanduser("~"), tempfile.gettempdir()):
+        spare = Path(place) / f"{name.stem}-{secrets.token_hex(3)}{name.suffix}"
+        if Path(place).is_dir():
+            with suppress(OutputError):
+                write_rendered(spare, rendering, wishes.film)
+                return str(spare)
+    return None
+
+
 def _write_layer(path: str, name: str, layer: Any) -> None:
     """A layer as a picture of its own; in 8 bits, a normal's -1..1 is shown as 0..1."""
     from torchpt.images import write_image
@@ -180,14 +214,6 @@ def _write_layer(path: str, name: str, layer: Any) -> None:
 
 def _names(paths: list[str]) -> str | list[str]:
     return paths[0] if len(paths) == 1 else paths
-
-
-def _summary(rendering: Any, outs: list[str], first: dict[str, Any]) -> str:
-    """The last line on stdout."""
-    facts = {"out": _names(outs), **first, **rendering.summary()}
-    if not rendering.complete:
-        facts["complete"] = False
-    return json.dumps(plain(facts), allow_nan=False)
 
 
 def plain(value: Any) -> Any:

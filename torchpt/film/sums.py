@@ -32,6 +32,11 @@ class Film:
         self._sums = torch.zeros(randomizations, channels, pixels, dtype=torch.float64, device=device)
         self._counts = torch.zeros(randomizations, pixels, dtype=torch.int64, device=device)
 
+    @staticmethod
+    def bytes_of(pixels: int, randomizations: int, channels: int = 3) -> int:
+        """What a film of so many pixels takes."""
+        return 8 * pixels * (channels + randomizations * (channels + 1))
+
     def add(self, radiance: Tensor, first_pixel: int, first_sample: int) -> None:
         """Add samples ``(C, S, n)`` of ``n`` consecutive pixels, ``S`` consecutive samples each."""
         count, n = radiance.shape[1], radiance.shape[2]
@@ -54,6 +59,21 @@ class Film:
         """What :meth:`taken` took, after more samples."""
         self._first[:, places], self._sums[:, :, places] = part._first, part._sums
         self._counts[:, places] = part._counts
+
+    def state(self) -> dict[str, Tensor]:
+        """All that it holds, by name."""
+        return {"sums": self._sums, "counts": self._counts, "first": self._first}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Hold what another film of this size held, as :meth:`state` said.
+
+        Raises:
+            ValueError: a film of another size.
+        """
+        for name, value in self.state().items():
+            if state[name].shape != value.shape or state[name].dtype != value.dtype:
+                raise ValueError(f"{name} of a film of another size")
+            value.copy_(state[name])
 
     @property
     def counts(self) -> Tensor:

@@ -14,8 +14,11 @@ from torch import Tensor
 from torchpt.errors import RenderError
 from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
+from torchpt.forward.causes import causes_of, told
+from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.kept import kept
 from torchpt.forward.result import Progress, Rendering
+from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, lanes_for, pieces
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
@@ -24,6 +27,7 @@ from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
 from torchpt.integrators.loop.schedule import Loop, Share
+from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.lanes.graph import Unsupported
 from torchpt.scene import Scene
@@ -46,7 +50,7 @@ class Run:
     ) -> None:
         self.start = time.perf_counter()
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
-        self.name, self.load_seconds = scene.name, scene.load_seconds
+        self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
         self.wave = make_wave(scene, settings, params, dtype)
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
@@ -55,21 +59,27 @@ class Run:
         self.seen = surface_layers(settings)
         self.on_progress: Callable[[Progress], bool | None] | None = None
         self.eager: list[str] = []
+        self.keeper: Keeper | None = None
+        if settings.render.checkpoint is not None:
+            self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
+            self.keeper.check(settings.render.resume)
         self._begin()
         self.loop = self._loop(scene) if looped(self.wave, settings, self.device) else None
 
     def _begin(self) -> None:
         """Nothing is sampled yet."""
         device, streams = self.device, self.wave.sampler.streams
+        check_room(self.width, self.height, streams.count, [len(x.channels) for x in self.seen.values()], device)
         film = Film(self.width, self.height, streams.count, device)
         layers = {
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
         }
         self.picture = Plate(film, layers, streams)
         self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
-        self.tally, self.done, self.ended = Tally(), 0, False
-        self.stop = Stop(self.settings.render, streams.count)
-        self.bad = torch.zeros((), dtype=torch.int64, device=device)
+        self.tally, self.done, self.taken, self.ended = Tally(), 0, 0, False
+        self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
+        self.stop = Stop(self.settings.render, streams.count, None if self.keeper is None else EVERY)
+        self.lost = Lost()
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.begun: float | None = None
 
@@ -105,12 +115,15 @@ class Run:
             self.loop = None
             self._begin()
             self._complete()
-        return self.result()
+        rendering = self.result()
+        rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(self.scene, self.wave, self.lost)
+        return rendering
 
     # -- which samples
 
     def _complete(self) -> None:
         """The picture, and then what it takes to know its error."""
+        self._resume()
         self._sample()
         if self.twice is not None and not self.ended and not self._take(self.twice.look_again(self.picture.film)):
             self.twice.third = None
@@ -118,24 +131,29 @@ class Run:
     def _sample(self) -> None:
         """Pass by pass, until a rule says that it is enough."""
         self.begun = time.perf_counter()
-        taken = 0
-        while size := self.stop.step(taken):
-            spans = [(self.picture, taken, size)]
+        while not self._adapts() and (size := self.stop.step(self.taken)):
+            spans = [(self.picture, self.taken, size)]
             if self.twice is not None:
-                spans.append((self.twice.plate, taken, size))
+                spans.append((self.twice.plate, self.taken, size))
             if not self._take(spans):
                 return
-            taken += size
-            self.stop.told(taken, self.seconds_of_sampling(), self._decisive())
-            if self.twice is not None and self.settings.adaptive and taken >= FIRST_ROUND:
-                self._adapt(taken)
-                return
+            self.taken += size
+            self.stop.told(self.taken, self.seconds_of_sampling(), self._decisive())
+            self._keep()
+        if self._adapts():
+            self._adapt()
+        if not self.ended:
+            self._keep(last=True)
 
-    def _adapt(self, taken: int) -> None:
+    def _adapts(self) -> bool:
+        """Whether pilots say from now on where samples go."""
+        return self.twice is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
+
+    def _adapt(self) -> None:
         """Rounds that double the samples there are, each where pilots say."""
         assert self.twice is not None
         shares = Shares(self.twice.pilots, self.picture.film)
-        mean = float(taken)
+        mean = float(self.picture.film.counts.double().mean())
         while self.stop.going(mean):
             wish = min(2.0 * mean, float(self.settings.render.spp)) - mean
             more = self.stop.affordable(wish)
@@ -149,6 +167,50 @@ class Run:
                 break
             mean = float(self.picture.film.counts.double().mean())
             self.stop.told(mean, self.seconds_of_sampling(), self._decisive())
+            self._keep()
+
+    # -- what a killed render goes on from
+
+    def _films(self) -> dict[str, Film]:
+        """All that samples are added to, by name."""
+        films = {"picture": self.picture.film}
+        films |= {f"layers.{name}": film for name, film in self.picture.layers.items()}
+        return films if self.twice is None else films | {"pilots": self.twice.plate.film}
+
+    def _keep(self, last: bool = False) -> None:
+        """Write a checkpoint where it is time for one."""
+        if self.keeper is None or not (last or self.keeper.due()):
+            return
+        self.keeper.write(self._state())
+
+    def _state(self) -> State:
+        """Where the render is."""
+        facts = {
+            "taken": self.taken,
+            "done": self.done,
+            "rays": self.tally.rays,
+            "truncated": self.tally.truncated,
+            "seconds": self.seconds_of_sampling(),
+            "lost": self.lost.plain(),
+        }
+        arrays = {f"{name}.{key}": value for name, film in self._films().items() for key, value in film.state().items()}
+        return State(facts, arrays | {"light": self.light})
+
+    def _resume(self) -> None:
+        """Go on from the checkpoint, where that is wished and there is one."""
+        if self.keeper is None or not self.settings.render.resume:
+            return
+        state = self.keeper.read(self._state())
+        if state is None:
+            say_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
+            return
+        for name, film in self._films().items():
+            film.restore({key: state.arrays[f"{name}.{key}"].to(self.device) for key in film.state()})
+        self.lost, self.light = Lost.read(state.facts["lost"]), state.arrays["light"].to(self.device)
+        self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
+        self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
+        mean = float(self.picture.film.counts.double().mean()) if self._adapts() else self.taken
+        self.stop.told(mean, self.before, self._decisive())
 
     def _decisive(self) -> float | None:
         """RelMSE as pilots alone tell it, where the render may end by it."""
@@ -161,7 +223,8 @@ class Run:
         if self.begun is None:
             return 0.0
         made = 0.0 if self.loop is None else self.loop.kernels.seconds
-        return max(time.perf_counter() - self.begun - made, 0.0)
+        kept = 0.0 if self.keeper is None else self.keeper.seconds
+        return self.before + max(time.perf_counter() - self.begun - made - kept, 0.0)
 
     # -- how they are taken
 
@@ -177,8 +240,7 @@ class Run:
                 return self._advanced(0, False)
             self.tally.rays += share.tally.rays
             self.tally.truncated += share.tally.truncated
-            if share.bad:
-                self.bad += share.bad
+            self._count(share.lost)
             if self.integrator.clamp is not None:
                 self.light += torch.tensor(share.light, dtype=torch.float64)
             left -= share.samples
@@ -233,12 +295,8 @@ class Run:
     def _checked(self, radiance: Tensor, plate: Plate, first: int, sample: int) -> Tensor:
         """Count what is not finite and take it as black; apply the clamp."""
         finite = torch.isfinite(radiance).all(0)
-        self.bad += (~finite).sum()
-        if self.integrator.strict and not bool(finite.all()):
-            s, p = (int(i) for i in (~finite).nonzero()[0])
-            p = first + p if plate.places is None else int(plate.places[first + p])
-            x, y = p % self.width + self.wave.crop[0], p // self.width + self.wave.crop[1]
-            raise RenderError(f"integrator.strict: sample {sample + s} of pixel ({x}, {y}) is not finite")
+        if not bool(finite.all()):
+            self._count(Lost.of(radiance, first, sample, self.wave.crop, plate))
         radiance = torch.where(finite, radiance, 0.0)
         clamp = self.integrator.clamp
         if clamp is None:
@@ -247,6 +305,12 @@ class Run:
         clamped = radiance * scale
         self.light += torch.stack((radiance.double().sum(), clamped.double().sum()))
         return clamped
+
+    def _count(self, lost: Lost) -> None:
+        """Count samples that are not finite; with ``integrator.strict`` the first one ends the render."""
+        if lost.count and self.integrator.strict:
+            raise RenderError(f"integrator.strict: {told(self.scene, self.wave, lost.places[0])}")
+        self.lost.add(lost)
 
     def result(self) -> Rendering:
         """The picture so far."""
@@ -279,7 +343,7 @@ class Run:
             render_seconds=self.seconds_of_sampling(),
             paths=self.done,
             rays=self.tally.rays,
-            nonfinite_samples=int(self.bad),
+            nonfinite_samples=self.lost.count,
             truncated_paths=self.tally.truncated,
             clamped=clamped,
             relmse=None if known is None else known.relmse,

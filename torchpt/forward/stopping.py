@@ -27,12 +27,14 @@ class Stop:
     Attributes:
         render: the settings.
         streams: that share the samples of a pixel.
+        longest: seconds that a pass may take where only ``render.spp`` ends it; None: it does not matter.
         reason: the rule that ended it; "" as long as it goes on.
         share: of the work that is done, 0..1, by the rule that is nearest to its end.
     """
 
     render: Render
     streams: int = 1
+    longest: float | None = None
     reason: str = ""
     share: float = 0.0
     _pace: float | None = field(default=None, repr=False)  # seconds a sample of every pixel, in the last pass
@@ -67,7 +69,10 @@ class Stop:
             self.reason = self.reason or "spp"
             return 0
         if not self.open:
-            return min(max(taken, self.streams), LARGEST_PASS, left)
+            size = max(taken, self.streams)
+            while self.longest is not None and self._pace is not None and size > 1 and self._pace * size > self.longest:
+                size //= 2
+            return min(size, LARGEST_PASS, left)
         if taken == 0:
             return min(self.streams, left)
         # The lowest bit that is set: what a pass of that length begins at a multiple of.

@@ -124,9 +124,12 @@ def place_of(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) -> 
         problem = f"cannot write the kind {destination.suffix!r}" if destination.suffix else "needs an ending"
         raise OutputError(path, f"{problem}; accepted: {' '.join(endings)}")
     try:
-        return Path(os.path.realpath(destination))  # a link stays a link: its target is replaced
+        found = Path(os.path.realpath(destination))  # a link stays a link: its target is replaced
+        if found.exists() and not (found.is_file() or found.is_dir()):
+            raise OutputError(path, "is a device or pipe, no file that could be replaced")
     except (OSError, ValueError) as problem:
         raise OutputError(path, reason_of(problem, destination)) from problem
+    return found
 
 
 def temporary_beside(destination: Path) -> Path:

@@ -172,8 +172,10 @@ def look_at(origin: Any, target: Any, up: Any = (0.0, 1.0, 0.0), key: str = "loo
     eye, goal = _vector(origin, _join(key, "origin")), _vector(target, _join(key, "target"))
     above = _vector(up, _join(key, "up"))
     direction = goal - eye
-    if np.abs(direction).max() <= 1e-12 * max(np.abs(eye).max(), np.abs(goal).max()):
-        raise SceneError(_join(key, "target"), target, "a point other than the origin")
+    if not direction.any():
+        raise SceneError(
+            _join(key, "target"), target, "a point other than the origin (to the 16 digits that numbers keep)"
+        )
     direction = direction / np.abs(direction).max()
     direction /= np.linalg.norm(direction)
     largest = np.abs(above).max()

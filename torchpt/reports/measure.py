@@ -151,7 +151,9 @@ def _job(
     purpose: str,
 ) -> Job:
     description, wishes = overridden(description, overrides)
-    wishes = replace(wishes, film=wishes.film.but(denoise=False, aovs=()))  # such wishes of a scene are about files
+    # Such wishes of a scene are about files.
+    film, render = wishes.film.but(denoise=False, aovs=()), wishes.render.but(checkpoint=None, resume=False)
+    wishes = replace(wishes, film=film, render=render)
     if not wishes.integrator.light:
         raise SceneError("integrator.type", wishes.integrator.name, "an integrator that carries light")
     device = str(device_of(wishes.render.device))

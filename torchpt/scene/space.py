@@ -20,7 +20,7 @@ from torchpt.lights import KINDS as LIGHTS
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.spec.declared import Described
 
-__all__ = ["FARTHEST", "Space", "centre_and_unit", "middle_of"]
+__all__ = ["FARTHEST", "Space", "centre_and_unit", "extent_of", "middle_of"]
 
 #: A scene is moved to the origin where it lies further away than this many times its own size.
 RECENTRE = 8.0
@@ -104,6 +104,12 @@ def middle_of(parts: Sequence[Part], copies: Sequence[Copy]) -> Array:
     """The middle of the box around all that can be hit, ``(3,)``; the origin where nothing can."""
     names, boxes, _ = _boxes(parts, copies)
     return 0.5 * (boxes.min((0, 1)) + boxes.max((0, 1))) if names else np.zeros(3)
+
+
+def extent_of(parts: Sequence[Part], copies: Sequence[Copy]) -> float:
+    """The longest side of the box around all that can be hit; 1 where nothing can."""
+    names, boxes, _ = _boxes(parts, copies)
+    return float((boxes.max((0, 1)) - boxes.min((0, 1))).max()) if names else 1.0
 
 
 def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Array, Array]:

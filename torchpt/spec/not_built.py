@@ -16,6 +16,4 @@ TYPES: dict[str, dict[str, tuple[str, ...]]] = {
 }
 
 #: kind of thing -> keys of built types that are not built -> the value that asks for nothing.
-KEYS: dict[str, dict[str, object]] = {
-    "render": {"checkpoint": None, "resume": False},
-}
+KEYS: dict[str, dict[str, object]] = {}

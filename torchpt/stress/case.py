@@ -1,0 +1,89 @@
+"""What a case is, and what comes of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torchpt.stress.bench import Bench
+
+__all__ = ["Case", "Outcome", "Reading", "powers"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Something that breaks path tracers, and what is to come of it.
+
+    Attributes:
+        name: a few words.
+        measures: what the figure is, in a line; nothing is lost and nothing is wrong where it is 0.
+        bound: the largest figure that passes.
+        figure: of one place in the sweep. It may raise: that is a failure, and is told.
+        axis: what is swept.
+        places: values of it.
+        quick: those that stand for all in a quick run; by default the first, the middle and the last.
+        backend: whether the figure depends on how rays are searched and stages are run; else one run tells for all.
+    """
+
+    name: str
+    measures: str
+    bound: float
+    figure: Callable[[Bench, float], float]
+    axis: str = ""
+    places: tuple[float, ...] = (0.0,)
+    quick: tuple[float, ...] = ()
+    backend: bool = True
+
+    def chosen(self, quick: bool) -> tuple[float, ...]:
+        """Places of a run."""
+        if not quick:
+            return self.places
+        return self.quick or tuple(dict.fromkeys((self.places[0], self.places[len(self.places) // 2], self.places[-1])))
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One figure.
+
+    Attributes:
+        at: the place in the sweep.
+        figure: NaN where there is none.
+        problem: why there is none.
+    """
+
+    at: float
+    figure: float
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of a case.
+
+    Attributes:
+        case: which.
+        readings: in the order of the sweep.
+        seconds: that it took.
+    """
+
+    case: Case
+    readings: tuple[Reading, ...] = field(default=())
+    seconds: float = 0.0
+
+    @property
+    def worst(self) -> Reading:
+        """The one that decides: a failure to measure, else the largest figure."""
+        return max(self.readings, key=lambda one: math.inf if math.isnan(one.figure) else one.figure)
+
+    @property
+    def passed(self) -> bool:
+        """Whether all figures are within the bound."""
+        return all(one.figure <= self.case.bound for one in self.readings)
+
+
+def powers(low: int, high: int, step: int = 1) -> tuple[float, ...]:
+    """``10^low .. 10^high``."""
+    return tuple(10.0**k for k in range(low, high + 1, step))

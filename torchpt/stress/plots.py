@@ -1,0 +1,60 @@
+"""The error over each sweep of a topic, with its bound."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchpt.errors import OutputError
+from torchpt.images.write import temporary_beside
+from torchpt.stress.case import Outcome
+
+__all__ = ["draw"]
+
+COLUMNS = 3
+#: What a figure of 0 is drawn as.
+NOTHING = 1e-9
+
+
+def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
+    """One picture, ``.svg`` or ``.png``, of all cases that are swept; returns whether there were any.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    swept = [outcome for outcome in outcomes if len(outcome.readings) > 2]
+    if not swept:
+        return False
+    os.environ.setdefault("MPLBACKEND", "agg")
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context({"font.size": 8.0, "svg.hashsalt": "torchpt", "svg.fonttype": "none"}):
+        rows = -(-len(swept) // COLUMNS)
+        figure = Figure(figsize=(3.4 * COLUMNS, 2.3 * rows), layout="constrained")
+        FigureCanvasAgg(figure)
+        for number, outcome in enumerate(swept):
+            axes = figure.add_subplot(rows, COLUMNS, number + 1)
+            at = [one.at for one in outcome.readings]
+            values = [max(one.figure, NOTHING) if math.isfinite(one.figure) else math.nan for one in outcome.readings]
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.plot(at, values, "o-", color="#0072B2", markersize=3, linewidth=1)
+            axes.axhline(max(outcome.case.bound, NOTHING), color="#D55E00", linestyle="--", linewidth=1)
+            axes.set_ylim(NOTHING / 3, max(*(v for v in values if not math.isnan(v)), outcome.case.bound, 1e-3) * 3)
+            axes.set_yscale("log")
+            if min(at) > 0 and max(at) / min(at) > 50:
+                axes.set_xscale("log")
+            axes.set_title(outcome.case.name, loc="left")
+            axes.set_xlabel(outcome.case.axis)
+        temporary = temporary_beside(file)
+        try:
+            figure.savefig(temporary, metadata={"Date": None} if file.suffix == ".svg" else None)
+            os.replace(temporary, file)
+        except (OSError, ValueError) as error:
+            raise OutputError(file, f"cannot be written ({error})") from None
+        finally:
+            temporary.unlink(missing_ok=True)
+    return True

@@ -1,0 +1,63 @@
+"""Outcomes as lines of text, as Markdown and as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torchpt.stress.case import Outcome
+
+__all__ = ["facts", "heading", "line", "markdown"]
+
+_COLUMNS = "{:38s} {:>10s} {:>10s} {:>14s}  {}"
+
+
+def heading() -> str:
+    """Of :func:`line`."""
+    return _COLUMNS.format("case", "worst", "bound", "at", "verdict")
+
+
+def line(outcome: Outcome) -> str:
+    """A case in a line; a failure says why."""
+    worst, case = outcome.worst, outcome.case
+    at = f"{case.axis} {worst.at:g}" if case.axis else ""
+    verdict = "passed" if outcome.passed else "FAILED"
+    figure = "-" if math.isnan(worst.figure) else f"{worst.figure:.2g}"
+    said = _COLUMNS.format(case.name, figure, f"{case.bound:g}", at if len(at) < 15 else f"{worst.at:g}", verdict)
+    return f"{said}: {worst.problem[:300]}" if worst.problem else said
+
+
+def facts(outcomes: Mapping[str, Sequence[Outcome]]) -> list[dict[str, Any]]:
+    """All figures, by topic."""
+    return [
+        {
+            "topic": topic,
+            "case": outcome.case.name,
+            "measures": outcome.case.measures,
+            "axis": outcome.case.axis,
+            "bound": outcome.case.bound,
+            "passed": outcome.passed,
+            "seconds": round(outcome.seconds, 3),
+            "readings": [
+                {"at": one.at, "figure": None if math.isnan(one.figure) else one.figure, "problem": one.problem}
+                for one in outcome.readings
+            ],
+        }
+        for topic, row in outcomes.items()
+        for outcome in row
+    ]
+
+
+def markdown(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
+    """A table for a page."""
+    rows = ["| case | sweep | what is measured | worst | at | bound |", "|---|---|---|---|---|---|"]
+    for row in outcomes.values():
+        for outcome in row:
+            case, worst, places = outcome.case, outcome.worst, outcome.case.places
+            swept = f"{case.axis} {places[0]:g} .. {places[-1]:g}" if case.axis else ""
+            figure = "-" if math.isnan(worst.figure) else f"{worst.figure:.1e}"
+            at = f"{worst.at:g}" if case.axis else ""
+            failed = "" if outcome.passed else " **failed**"
+            rows.append(f"| {case.name} | {swept} | {case.measures} | {figure}{failed} | {at} | {case.bound:g} |")
+    return "\n".join(rows)
