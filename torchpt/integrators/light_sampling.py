@@ -20,7 +20,7 @@ from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import offset_origin
 from torchpt.shapes.interaction import OFFSET
 
-__all__ = ["leaning", "light_radiance", "light_wish", "sample_light", "shade", "through"]
+__all__ = ["held_back", "leaning", "light_radiance", "light_wish", "sample_light", "shade", "through"]
 
 #: Shadow rays end this fraction of their length short of the light, beside the offset off its surface.
 SHORTEN = 1e-4
@@ -51,14 +51,32 @@ def shade(
         weight = weight * power_heuristic(light.pdf, pdf).detach()
     else:
         reflected = kind.eval(surface.parameters, surface.wo, wi)
+    weight = held_back(weight, world, model, at, surface, light.wi, wi)
+    radiance = state.throughput * reflected * light_radiance(world, light) * weight
+    return surface, _shadow_ray(plan, world, at, light, radiance)
+
+
+def held_back(
+    weight: Tensor, world: World, model: int, at: Interaction, surface: Surface, light: Tensor, wi: Tensor
+) -> Tensor:
+    """A weight of light ``(n,)``, times what the surface lets pass before its BSDF is asked.
+
+    Args:
+        weight: of the light.
+        world: the scene's tensors.
+        model: number of the BSDF model.
+        at: the points.
+        surface: with its material.
+        light: ``(3, n)`` direction to the light.
+        wi: the same in the surface's frame.
+    """
     if leaning(world, model):
-        weight = weight * (through(at, surface, light.wi, wi) > 0)
+        weight = weight * (through(at, surface, light, wi) > 0)
     if surface.shown is not None:
         weight = weight * surface.shown
     if surface.relief is not None:
-        weight = weight * surface.relief.shadowing(light.wi)
-    radiance = state.throughput * reflected * light_radiance(world, light) * weight
-    return surface, _shadow_ray(plan, world, at, light, radiance)
+        weight = weight * surface.relief.shadowing(light)
+    return weight
 
 
 def sample_light(

@@ -17,7 +17,7 @@ from torchpt import lights
 from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.compiled import Stages
-from torchpt.integrators.light_sampling import leaning, light_radiance, light_wish, sample_light, through
+from torchpt.integrators.light_sampling import held_back, light_radiance, light_wish, sample_light
 from torchpt.integrators.roulette import chance_of
 from torchpt.integrators.scattering import Drawn, carry_on, draw
 from torchpt.integrators.stages import shining
@@ -237,11 +237,5 @@ class Recorder(Stages):
         wi = surface.frame.to_local(sample.wi)
         reflected, pdf = kind.eval_pdf(surface.parameters, surface.wo, wi)
         weight = power_heuristic(sample.pdf, pdf) if plan.strategy == "mis" else torch.ones_like(pdf)
-        share = torch.ones_like(pdf)
-        if leaning(world, model):
-            share = share * (through(at, surface, sample.wi, wi) > 0)
-        if surface.shown is not None:
-            share = share * surface.shown
-        if surface.relief is not None:
-            share = share * surface.relief.shadowing(sample.wi)
+        share = held_back(torch.ones_like(pdf), world, model, at, surface, sample.wi, wi)
         return Lit(row, sample, light_radiance(world, sample), reflected, share, pdf, weight, shadow.radiance)
