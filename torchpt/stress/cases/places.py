@@ -18,8 +18,9 @@ WHITE = {"type": "diffuse", "reflectance": 1.0}
 
 
 def still_life(scale: float = 1.0, shift: float = 0.0, turn: float = 0.0) -> dict[str, Any]:
-    """A floor, a ball, a box and a lamp, scaled, shifted along x and turned about it."""
-    moved = [{"rotate": {"axis": [1, 0, 0], "angle": turn}}, {"scale": scale}, {"translate": [shift, 0, 0]}]
+    """A floor, a ball, a box and a lamp, scaled, turned about x, and shifted along what is no axis."""
+    step = [shift, 0.7 * shift, -0.3 * shift]
+    moved = [{"rotate": {"axis": [1, 0, 0], "angle": turn}}, {"scale": scale}, {"translate": step}]
 
     def put(**keys: Any) -> dict[str, Any]:
         return {**keys, "transform": [*keys.get("transform", []), *moved]}
@@ -28,7 +29,7 @@ def still_life(scale: float = 1.0, shift: float = 0.0, turn: float = 0.0) -> dic
     spin = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
 
     def place(x: float, y: float, z: float) -> list[float]:
-        return (scale * (spin @ [x, y, z]) + [shift, 0, 0]).tolist()
+        return (scale * (spin @ [x, y, z]) + step).tolist()
 
     return {
         "camera": {
