@@ -4,7 +4,7 @@
     python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
 
 A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), ``common.lights``: what all kinds
-of it have, or ``summary.lights``: a row a kind.
+of it have, or ``summary.lights``: a row a kind. ``bounds`` is the table of :mod:`bounds`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+import bounds
 
 from torchpt.spec import REQUIRED, Color, Index, Scalar, Spec, parameters_of
 
@@ -126,6 +128,8 @@ def _plain(spec: Spec) -> bool:
 def written(name: str) -> str:
     """What stands between the marks of NAME."""
     first, _, second = name.partition(".")
+    if name == "bounds":
+        return bounds.table()
     if first == "summary":
         return summary(kinds(second))
     if first == "common":

@@ -60,13 +60,15 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
 {scenes}
   out=     .exr .hdr .png .jpg .ppm; several as out=[a.exr,a.png]; NAME.png where nothing is said
   {keys}
+  debug.pixel=[x,y] debug.sample=k [--json]
+                      print that path vertex by vertex, in place of a picture: [0,0] is at the upper left of the film
 
   integrator=NAME, sampler=NAME, ... take a group's file from configs/: integrator=direct sampler=independent
   --multirun, -m      one render for every combination: sampler=sobol,independent render.spp=16,64 scene=a,b out=x.exr
                       writes x_0.exr, x_1.exr, ...
   --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
 
-The last line on stdout is a summary in JSON.
+The last line on stdout is a summary in JSON. Samples that are not finite count as black, and stderr says why.
 Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the partial picture saved.
 """
 HELP_INFO = """\
@@ -168,6 +170,7 @@ class _Task:
     paths: dict[str, str | None]
     json: bool
     turn: dict[str, str]
+    debug: dict[str, str]
 
     def __call__(self, cfg: DictConfig) -> int:
         """Do one job. Ends the process (of this job) where it does not end well."""
@@ -182,6 +185,7 @@ class _Task:
 
     def _ended(self, make_job: Callable[[], Job]) -> int:
         """Make and do a job; returns the exit code."""
+        from torchpt.commands.debug import Wish, debug
         from torchpt.commands.info import info
         from torchpt.commands.orbit import Turn, orbit
         from torchpt.commands.render import render
@@ -191,6 +195,8 @@ class _Task:
                 job = make_job()
                 if self.command == "orbit":
                     return orbit(job, Turn.read(self.turn), interrupt)
+                if self.debug:
+                    return debug(job, Wish.read(self.debug), interrupt, self.json)
                 return info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
             except TorchptError as error:
                 return _refuse(str(error))
@@ -266,7 +272,15 @@ def _refuse_targets(value: Any, where: str) -> None:
 
 def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
     """Compose plain words here and hand all others over to Hydra; returns the exit code."""
-    task = _Task(arguments.command, arguments.scenes, arguments.outs, arguments.paths, arguments.json, arguments.turn)
+    task = _Task(
+        arguments.command,
+        arguments.scenes,
+        arguments.outs,
+        arguments.paths,
+        arguments.json,
+        arguments.turn,
+        arguments.debug,
+    )
     if not arguments.options and not arguments.multirun:
         composed = compose_plainly(arguments.overrides, _configs())
         if composed is not None:

@@ -15,14 +15,22 @@ __all__ = [
 
 
 def _shown(value: object, limit: int = 80) -> str:
-    text = repr(value).replace("\n", " ")
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+    try:
+        text = repr(value)
+    except Exception:  # whole numbers of more than 4300 digits, and objects that cannot be shown
+        text = f"a value of type {type(value).__name__} that cannot be shown"
+    return _one_line(text, limit)
 
 
 def _one_line(text: str, limit: int = 500) -> str:
     """Text of a damaged file in one readable line."""
     text = "".join(letter if letter.isprintable() else " " for letter in text[: limit + 1])
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def _where(key: str, file: str | None) -> str:
+    """Of a scene: its file, however it is called, and the key."""
+    return f"{_one_line(file, len(file))}: {_one_line(key)}" if file else _one_line(key)
 
 
 class TorchptError(Exception):
@@ -41,8 +49,7 @@ class SceneError(TorchptError):
 
     def __init__(self, key: str, value: object, expected: str, file: str | None = None) -> None:
         self.key, self.value, self.expected, self.file = key, value, expected, file
-        where = f"{file}: {key}" if file else key
-        super().__init__(f"{where}: expected {expected}, got {_shown(value)}")
+        super().__init__(f"{_where(key, file)}: expected {_one_line(expected, 1000)}, got {_shown(value)}")
 
     def __reduce__(self) -> tuple:  # crosses process boundaries in worker pools
         return type(self), (self.key, self.value, self.expected, self.file)
@@ -54,9 +61,7 @@ class NotBuiltError(SceneError):
     def __init__(self, key: str, value: object, expected: str = "", file: str | None = None) -> None:
         TorchptError.__init__(
             self,
-            (f"{file}: " if file else "")
-            + f"{key}: {_shown(value)} is not built yet"
-            + (f"; available: {expected}" if expected else ""),
+            f"{_where(key, file)}: {_shown(value)} is not built yet" + (f"; available: {expected}" if expected else ""),
         )
         self.key, self.value, self.expected, self.file = key, value, expected, file
 
@@ -66,7 +71,7 @@ class AssetError(TorchptError):
 
     def __init__(self, file: object, problem: str) -> None:
         self.file, self.problem = str(file), _one_line(problem)
-        super().__init__(f"{self.file}: {self.problem}")
+        super().__init__(f"{_one_line(self.file, len(self.file))}: {self.problem}")
 
     def __reduce__(self) -> tuple:
         return type(self), (self.file, self.problem)
@@ -77,7 +82,7 @@ class OutputError(TorchptError):
 
     def __init__(self, file: object, problem: str) -> None:
         self.file, self.problem = str(file), problem.replace("\n", " ")
-        super().__init__(f"{self.file}: {self.problem}")
+        super().__init__(f"{_one_line(self.file, len(self.file))}: {self.problem}")
 
     def __reduce__(self) -> tuple:
         return type(self), (self.file, self.problem)

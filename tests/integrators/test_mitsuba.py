@@ -226,7 +226,7 @@ def excess(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> tuple[Tensor, 
 
 def assert_equal_materials(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> None:
     """Blocks, the whole, the common factor, and those statistics of the pixels that heavy tails leave alone."""
-    assert float(b[1].sum() / a[1].sum()) < 0.25
+    assert float(b[1].sum() / a[1].sum()) < 1.0  # the reference is the finer one
     assert_equal_pictures(a, b, pixels=False)
     share, error = excess(a, b)
     assert (share.abs() < z_limit(3) * error).all()

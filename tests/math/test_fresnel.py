@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.math.fresnel import fresnel_conductor, fresnel_dielectric, fresnel_diffuse, refract, schlick
+from torchpt.math.fresnel import diffuse_passed, fresnel_conductor, fresnel_dielectric, refract, schlick
 
 INDICES = [1e-3, 1 / 1.5, 0.99, 1.0, 1.00001, 1.01, 1.5, 10.0]
 COSINES = torch.linspace(-1, 1, 401, dtype=torch.float64)
@@ -112,14 +112,21 @@ def test_schlick():
     torch.testing.assert_close(schlick(torch.tensor([0.5]), f0), f0 + (1 - f0) / 32)
 
 
-@pytest.mark.parametrize("eta", [0.1, 0.3, 0.45, 0.6, 0.7, 0.9, 1.1, 1.49, 2.0, 5.0, 10.0])
-def test_the_diffuse_fits(eta):
-    cos = (torch.arange(20000, dtype=torch.float64) + 0.5) / 20000
-    exact = (fresnel_dielectric(cos, torch.full_like(cos, eta)).reflectance * 2 * cos).mean()
-    fit = fresnel_diffuse(torch.tensor([eta], dtype=torch.float64))[0]
-    assert abs(fit / exact - 1) < 0.015 and 0 < fit < 1
-    if 0.5 <= eta <= 2:
-        assert abs(fit - exact) < 0.002
+@pytest.mark.parametrize(
+    "eta", [1e-3, 0.01, 0.1, 0.3, 0.45, 0.6, 0.9, 0.999, 1.001, 1.1, 1.49, 2.0, 5.0, 10.0, 100.0, 1e3]
+)
+def test_what_passes_a_boundary_of_diffuse_light(eta):
+    cos2 = (torch.arange(200_000, dtype=torch.float64) + 0.5) / 200_000
+    if eta > 1.0:
+        exact = 1.0 - fresnel_dielectric(cos2.sqrt(), torch.full_like(cos2, eta)).reflectance.mean()
+    else:  # all is reflected but in a narrow cone, whose directions the other side has in its whole hemisphere
+        exact = eta**2 * (1.0 - fresnel_dielectric(cos2.sqrt(), torch.full_like(cos2, 1.0 / eta)).reflectance.mean())
+    passed = diffuse_passed(torch.tensor([eta], dtype=torch.float64))[0]
+    assert abs(passed / exact - 1.0) < 1.5e-4
+
+
+def test_diffuse_light_passes_equal_indices_whole():
+    assert float(diffuse_passed(torch.tensor([1.0], dtype=torch.float64))) == pytest.approx(1.0, abs=1e-7)
 
 
 def test_derivatives():
@@ -129,4 +136,4 @@ def test_derivatives():
     k = torch.tensor([3.0, 0.1, 1.0, 2.0, 0.5, 4.0], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda c, e: tuple(fresnel_dielectric(c, e)), (cos, eta))
     assert torch.autograd.gradcheck(fresnel_conductor, (cos, eta, k))
-    assert torch.autograd.gradcheck(fresnel_diffuse, (eta,))
+    assert torch.autograd.gradcheck(diffuse_passed, (eta,))

@@ -14,194 +14,29 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from damage import damaged, damaged_json
+from small_files import (
+    FACET,
+    MTL,
+    OBJ,
+    STL,
+    float_picture,
+    glb,
+    gltf_document,
+    picture_bytes,
+    ply_bytes,
+    sixteen_bits,
+)  # fmt: skip
 
 from torchpt.errors import AssetError
 from torchpt.images import EncodedImage, read_texels
 from torchpt.meshes import load_mesh
 
-SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
 SECONDS = 5.0
-WORDS = [
-    "nan",
-    "-1",
-    "0",
-    "1e39",
-    "-1e400",
-    "99999999999999",
-    "4294967295",
-    "x",
-    "",
-    "1/2/3/4",
-    "//",
-    "\\",
-    "\0",
-    "#",
-    "inf",
-]
-VALUES: list[Any] = [
-    None, True, -1, 0, 3, 2**31, 2**53, 10**30, 1e308, -0.5, float("nan"), "x", "", "data:,", "data:;base64,%", [], {}, [[]],
-    [0] * 17, {"index": 0}, {"count": 10**12},
-]  # fmt: skip
-
-
-def picture_bytes(kind: str, mode: str) -> bytes:
-    rows = np.random.default_rng(5).integers(0, 256, (23, 17, len(mode)), dtype=np.uint8)
-    file = BytesIO()
-    options: dict[str, Any] = {"compression": "tga_rle"} if kind == "TGA" and mode == "RGB" else {}
-    Image.fromarray(rows[..., 0] if len(mode) == 1 else rows, mode).save(file, kind, **options)
-    return file.getvalue()
-
-
-def float_picture(folder: Path, ending: str, compression: str) -> bytes:
-    import OpenImageIO as oiio
-
-    file = str(folder / f"whole.{ending}")
-    out = oiio.ImageOutput.create(file)
-    assert out is not None
-    spec = oiio.ImageSpec(33, 40, 3, "half")
-    spec.attribute("compression", compression)
-    out.open(file, spec)
-    out.write_image(np.random.default_rng(6).random((40, 33, 3), dtype=np.float32))
-    out.close()
-    return Path(file).read_bytes()
-
-
-def ply_bytes(layout: str) -> bytes:
-    names = ("x", "y", "z", "nx", "ny", "nz", "s", "t")
-    header = f"ply\nformat {layout} 1.0\ncomment a\nelement tag 1\nproperty list uchar float w\nelement vertex 4\n"
-    header += "".join(f"property float {name}\n" for name in names) + "property uchar red\nproperty uchar green\n"
-    header += "property uchar blue\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
-    if layout == "ascii":
-        rows = "".join(f"{x} {y} {z} 0 0 1 {x} {y} 1 2 3\n" for x, y, z in SQUARE)
-        return (header + "2 0.5 0.5\n" + rows + "3 0 1 2\n4 0 1 2 3\n").encode()
-    order = "<" if "little" in layout else ">"
-    body = struct.pack(f"{order}B2f", 2, 0.5, 0.5)
-    body += b"".join(struct.pack(f"{order}8f3B", x, y, z, 0, 0, 1, x, y, 1, 2, 3) for x, y, z in SQUARE)
-    return header.encode() + body + struct.pack(f"{order}B3iB4i", 3, 0, 1, 2, 4, 0, 1, 2, 3)
-
-
-def gltf_document() -> tuple[dict[str, Any], bytes]:
-    image = picture_bytes("PNG", "RGB")
-    body = (
-        SQUARE.astype("<f4").tobytes()
-        + np.array([0, 1, 2, 0, 2, 3], "<u2").tobytes()
-        + SQUARE[:, :2].astype("<f4").tobytes()
-    )
-    body += image + b"\0" * (-len(image) % 4)
-    sizes = [48, 12, 32, len(image)]
-    views = [{"buffer": 0, "byteOffset": sum(sizes[:i]), "byteLength": size} for i, size in enumerate(sizes)]
-    accessors: list[dict[str, Any]] = [
-        {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 4},
-        {"bufferView": 1, "componentType": 5123, "type": "SCALAR", "count": 6},
-        {"bufferView": 2, "componentType": 5126, "type": "VEC2", "count": 4},
-    ]
-    rows = {"indices": {"bufferView": 1, "componentType": 5123}, "values": {"bufferView": 0}}
-    accessors.append({**accessors[0], "sparse": {"count": 1, **rows}})
-    texture = {"index": 0, "texCoord": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2], "rotation": 1}}}
-    material = {
-        "name": "m",
-        "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "baseColorTexture": texture, "metallicFactor": 0},
-        "normalTexture": {"index": 0, "scale": 1},
-        "emissiveFactor": [0, 0, 1],
-        "alphaMode": "MASK",
-        "extensions": {"KHR_materials_clearcoat": {"clearcoatFactor": 1}, "KHR_materials_ior": {"ior": 1.4}},
-    }
-    cone = {"innerConeAngle": 0.5, "outerConeAngle": 1}
-    lamp = {"name": "l", "type": "spot", "color": [1, 1, 1], "intensity": 1, "range": 9, "spot": cone}
-    attributes = {"POSITION": 3, "TEXCOORD_0": 2, "NORMAL": 0}
-    document = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [
-            {"children": [1, 2], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]},
-            {"mesh": 0, "translation": [1, 2, 3]},
-            {"translation": [0, 5, 0], "camera": 0, "extensions": {"KHR_lights_punctual": {"light": 0}}},
-        ],
-        "extensions": {"KHR_lights_punctual": {"lights": [lamp]}},
-        "cameras": [{"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}],
-        "meshes": [{"name": "m", "primitives": [{"attributes": attributes, "indices": 1, "material": 0, "mode": 4}]}],
-        "materials": [material],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(body)}],
-        "images": [{"bufferView": 3, "mimeType": "image/png"}],
-        "samplers": [{"wrapS": 10497, "wrapT": 10497, "magFilter": 9729}],
-        "textures": [{"source": 0, "sampler": 0}],
-        "extensionsUsed": ["KHR_materials_ior"],
-    }
-    return document, body
-
-
-def glb(document: Any, body: bytes) -> bytes:
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
-    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
-
-
-OBJ = (
-    "mtllib a.mtl\no thing\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in SQUARE)
-    + "vt 0 0\nvt 1 0.5\nvn 0 0 1\nusemtl m\nf 1/1/1 2/2/1 3/1/1 4/2/1\nf -1//1 -2//1 -3//1\ns off\nl 1 2\n"
-)  # fmt: skip
-MTL = (
-    "newmtl m\nKa 1 1 1\nKd 0.5 0.5 0.5\nKs 0.1 0.1 0.1\nNs 10\nNi 1.5\nd 1\nTr 0\nTf 1 1 1\nillum 2\nPr 0.5\nPm 0\n"
-    "map_Kd -s 1 2 3 -o 1 1 -clamp on a.png\nbump -bm 0.5 a.png\nmap_d -imfchan m a.png\nnorm a.png\nKe 1 1 1\n"
-)
-STL = b"solid".ljust(80) + struct.pack("<I", 1) + struct.pack("<12fH", 0, 0, 1, *SQUARE[:3].ravel(), 0)
-FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
-
-
-def damaged(whole: bytes, rng: np.random.Generator) -> bytes:
-    """One kind of damage to bytes."""
-    data, size = bytearray(whole), len(whole)
-    kind = rng.integers(0, 6)
-    if kind == 0:
-        for at in rng.integers(0, size, rng.integers(1, 8)):
-            data[at] = rng.integers(0, 256)
-    elif kind == 1:
-        del data[rng.integers(0, size) :]
-    elif kind == 2:  # a count, or an offset
-        at = int(rng.integers(0, size))
-        data[at : at + 4] = struct.pack(rng.choice(["<I", ">I"]), int(rng.choice([0, 1, 2**16, 2**31 - 1, 2**32 - 1])))
-    elif kind == 3:
-        a, b = sorted(rng.integers(0, size, 2))
-        data[a:b] = bytes(b - a)
-    elif kind == 4:
-        a, b = sorted(rng.integers(0, size, 2))
-        data[a:a] = data[a:b]
-    else:  # a word of text
-        words = bytes(data).split(b" ")
-        words[rng.integers(0, len(words))] = str(rng.choice(WORDS)).encode()
-        data = bytearray(b" ".join(words))
-    return bytes(data)
-
-
-def damaged_json(document: Any, rng: np.random.Generator) -> Any:
-    """A document with one value replaced, taken out or repeated."""
-    document = json.loads(json.dumps(document))
-    places: list[tuple[Any, Any]] = []
-
-    def walk(node: Any) -> None:
-        for key in list(node) if isinstance(node, dict) else range(len(node)):
-            places.append((node, key))
-            if isinstance(node[key], dict | list):
-                walk(node[key])
-
-    walk(document)
-    node, key = places[rng.integers(0, len(places))]
-    if rng.random() < 0.15:
-        del node[key]
-    else:
-        node[key] = VALUES[rng.integers(0, len(VALUES))]
-    return document
 
 
 def check_mesh(file: Path) -> None:
@@ -288,18 +123,6 @@ IMAGES: dict[str, Callable[[Path], tuple[bytes, str]]] = {
     "exr piz": lambda folder: (float_picture(folder, "exr", "piz"), "exr"),
     "exr none": lambda folder: (float_picture(folder, "exr", "none"), "exr"),
 }
-
-
-def sixteen_bits(folder: Path) -> bytes:
-    import OpenImageIO as oiio
-
-    file = str(folder / "whole.png")
-    out = oiio.ImageOutput.create(file)
-    assert out is not None
-    out.open(file, oiio.ImageSpec(9, 11, 3, "uint16"))
-    out.write_image(np.random.default_rng(7).integers(0, 65536, (11, 9, 3)).astype(np.uint16))
-    out.close()
-    return Path(file).read_bytes()
 
 
 def run_images(folder: Path, name: str, seed: int, count: int) -> None:

@@ -238,7 +238,7 @@ ERRORS: dict[str, tuple[Any, str]] = {
         "innerConeAngle 0.5 is not below outerConeAngle 0.5",
     ),
     "unknown": ({**BULB, "type": "area"}, "type 'area', expected point, spot or directional"),
-    "no object": (3, "malformed glTF"),
+    "no object": (3, r"extensions.KHR_lights_punctual.lights\[0\]: expected an object, got 3"),
 }
 
 

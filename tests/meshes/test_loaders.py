@@ -273,6 +273,7 @@ def ply(faces: int | str, body: str, layout: str = "ascii 1.0") -> str:
     return HEADER.format(layout, faces) + LIST + body
 
 
+SPARSE = {"count": 0, "indices": {"bufferView": 0, "componentType": 5121}, "values": {"bufferView": 0}}
 MALFORMED: dict[str, tuple[str, str | bytes, str]] = {
     "unknown ending": ("a.fbx", "", r"\.obj, \.ply, \.stl, \.glb, \.gltf"),
     "obj without faces": ("a.obj", VERTICES, "empty"),
@@ -305,12 +306,20 @@ MALFORMED: dict[str, tuple[str, str | bytes, str]] = {
         ply(999_999_999_999, "", "binary_little_endian 1.0"),
         "truncated: 4 of element vertex",
     ),
-    "ply huge list": ("a.ply", ply(1, ROWS + "2000000000 0 1\n"), r"truncated.*face 0"),
+    "ply huge list": (
+        "a.ply",
+        ply(1, ROWS + "2000000000 0 1\n"),
+        r"line 14: face 0 has 3 values, the properties in the header come to 2000000001",
+    ),
     "ply truncated": ("a.ply", ply(2, ROWS + "3 0 1 2\n"), "truncated"),
     "ply index": ("a.ply", ply(2, ROWS + "3 0 1 2\n3 0 1 4\n"), r"face 1 has an index outside 0\.\.3"),
     "ply negative index": ("a.ply", ply(1, ROWS + "3 0 1 -2\n"), "face 0 has an index"),
     "ply NaN": ("a.ply", ply(1, ROWS.replace("1 1", "1 nan") + "3 0 1 2\n"), "vertex 3 is not finite"),
-    "ply words": ("a.ply", ply(1, ROWS.replace("1 1", "1 x") + "3 0 1 2\n"), "no number"),
+    "ply words": (
+        "a.ply",
+        ply(1, ROWS.replace("1 1", "1 x") + "3 0 1 2\n"),
+        "element vertex holds .x., expected a number",
+    ),
     "ply face of two": ("a.ply", ply(1, ROWS + "2 0 1\n"), "face 0 has 2 corners"),
     "ply empty": ("a.ply", ply(0, ROWS), "empty"),
     "ply no vertex": ("a.ply", "ply\nformat ascii 1.0\nend_header\n", "no element vertex"),
@@ -332,11 +341,11 @@ MALFORMED: dict[str, tuple[str, str | bytes, str]] = {
     "glb sparse": (
         "a.glb",
         square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 4, "sparse": {}}] * 2),
-        "malformed glTF",
+        r"malformed glTF: accessors\[0\].sparse: count is missing",
     ),
     "glb zeros": (
         "a.glb",
-        square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 10**9, "sparse": {}}] * 2),
+        square_glb(accessors=[{"componentType": 5126, "type": "VEC3", "count": 10**9, "sparse": SPARSE}] * 2),
         "declares 1000000000 rows without data",
     ),
     "glb draco": ("a.glb", square_glb(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),
@@ -351,8 +360,12 @@ MALFORMED: dict[str, tuple[str, str | bytes, str]] = {
     "gltf no json": ("a.gltf", "{", "JSON is missing or malformed"),
     "glb cycle": ("a.glb", square_glb(nodes=[{"children": [0]}]), "two parents"),
     "glb missing node": ("a.glb", square_glb(nodes=[]), "nodes 0 does not exist"),
-    "glb wrong types": ("a.glb", square_glb(meshes=[3]), "meshes 0 is no object"),
-    "glb wrong type inside": ("a.glb", square_glb(meshes=[{"primitives": 3}]), "malformed glTF"),
+    "glb wrong types": ("a.glb", square_glb(meshes=[3]), r"malformed glTF: meshes\[0\]: expected an object, got 3"),
+    "glb wrong type inside": (
+        "a.glb",
+        square_glb(meshes=[{"primitives": 3}]),
+        r"meshes\[0\].primitives: expected a list",
+    ),
     "glb empty": ("a.glb", square_glb(scenes=[{}]), "empty"),
 }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from small_files import DAE, XAML, zipped
 
 import torchpt
 from torchpt.errors import AssetError
@@ -28,44 +28,6 @@ def picture() -> Image.Image:
 def needs(kind: str) -> None:
     for name in PARSERS[kind]:
         pytest.importorskip(name, reason=f"{name} is not installed (extra `formats`)")
-
-
-XAML = """<Viewport3D xmlns="http://schemas.microsoft.com/winfx/2006/xaml/presentation"><ModelVisual3D><GeometryModel3D>
-<GeometryModel3D.Material><DiffuseMaterial><DiffuseMaterial.Brush><SolidColorBrush Color="#FF8000" Opacity="1"/>
-</DiffuseMaterial.Brush></DiffuseMaterial></GeometryModel3D.Material><GeometryModel3D.Geometry>
-<MeshGeometry3D Positions="0,0,0 1,0,0 1,1,0" Normals="0,0,1 0,0,1 0,0,1" TriangleIndices="0 1 2"/>
-</GeometryModel3D.Geometry></GeometryModel3D></ModelVisual3D></Viewport3D>"""
-
-DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><created>2020-01-01T00:00:00</created><modified>2020-01-01T00:00:00</modified></asset>
-<library_images><image id="img"><init_from>wood.png</init_from></image></library_images>
-<library_effects><effect id="fx"><profile_COMMON>
-<newparam sid="surf"><surface type="2D"><init_from>img</init_from></surface></newparam>
-<newparam sid="samp"><sampler2D><source>surf</source></sampler2D></newparam>
-<technique sid="common"><lambert><diffuse><texture texture="samp" texcoord="UV"/></diffuse></lambert></technique>
-</profile_COMMON></effect></library_effects>
-<library_materials><material id="mat"><instance_effect url="#fx"/></material></library_materials>
-<library_geometries><geometry id="geo"><mesh>
-<source id="p"><float_array id="pa" count="9">0 0 0 1 0 0 1 1 0</float_array><technique_common>
-<accessor source="#pa" count="3" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
-<param name="Z" type="float"/></accessor></technique_common></source>
-<source id="t"><float_array id="ta" count="6">0 0 1 0 1 0.75</float_array><technique_common>
-<accessor source="#ta" count="3" stride="2"><param name="S" type="float"/><param name="T" type="float"/></accessor>
-</technique_common></source>
-<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
-<triangles count="1" material="m"><input semantic="VERTEX" source="#v" offset="0"/>
-<input semantic="TEXCOORD" source="#t" offset="1"/><p>0 0 1 1 2 2</p></triangles></mesh></geometry></library_geometries>
-<library_visual_scenes><visual_scene id="s"><node><translate>0 0 5</translate><instance_geometry url="#geo"><bind_material>
-<technique_common><instance_material symbol="m" target="#mat"/></technique_common></bind_material></instance_geometry>
-</node></visual_scene></library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
-
-
-def zipped(**members: bytes) -> bytes:
-    data = io.BytesIO()
-    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members.items():
-            archive.writestr(name.replace("_", "."), content)
-    return data.getvalue()
 
 
 def encoded(kind: str) -> bytes:

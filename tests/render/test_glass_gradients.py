@@ -203,7 +203,7 @@ GLOSSY = {"diffuse": [0.6, 0.4, 0.2], "specular": [0.1, 0.08, 0.05]}
         ),
         pytest.param(before_a_wall(SHEET, FROSTED), of_it(int_ior=0.02), 128, 256, id="frosted surface"),
         pytest.param(before_a_wall(SHEET, STAINED), of_it(weight=0.05), 128, 512, id="blend with glass"),
-        pytest.param(under_the_sky({"type": "dielectric", **BLACK_BELOW}), of_it(int_ior=0.05), 64, 1024, id="clear"),
+        pytest.param(under_the_sky({"type": "dielectric", **BLACK_BELOW}), of_it(int_ior=0.05), 256, 2048, id="clear"),
         pytest.param(
             under_the_sky({"type": "thindielectric", **BLACK_BELOW}), of_it(int_ior=0.05), 64, 1024, id="pane"
         ),

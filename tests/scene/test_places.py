@@ -182,3 +182,30 @@ def test_a_usable_matrix() -> None:
     assert is_usable(np.eye(4)) and is_usable(np.diag([1e38, 1e38, 1e38, 1])) and is_usable(np.diag([1e-38] * 3 + [1]))
     for size in (1e39, 1e-39, 1e-160, 1e-320):
         assert not is_usable(np.diag([size] * 3 + [1]))
+
+
+@pytest.mark.parametrize("camera", [{}, {"type": "orthographic"}])
+def test_a_camera_far_from_the_origin_sees_what_lies_there(camera: dict[str, Any]) -> None:
+    """Target and origin were compared once float32 had made them one."""
+    pictures = []
+    for far in (0.0, 1e12):
+        places = {"origin": [far, 0, far + 4], "target": [far, 0, far]}
+        scene = torchpt.load(
+            {
+                "camera": {**camera, **places},
+                "film": {"width": 8, "height": 8},
+                "lights": {"sky": {"type": "constant", "radiance": 0.5}},
+                "shapes": {"ball": {"type": "sphere", "center": places["target"]}},
+            },
+            device="cpu",
+        )
+        pictures.append(torchpt.render(scene, spp=4, compile="off"))
+    assert torch.allclose(pictures[0], pictures[1], atol=1e-3) and pictures[0].std() > 0.05
+
+
+def test_a_camera_that_looks_nowhere_is_refused() -> None:
+    for target in (10**17 + 1, 1e17):
+        with pytest.raises(
+            SceneError, match=r"^camera.target: expected a point other than the origin \(to the 16 digits"
+        ):
+            load(camera={"origin": [10**17, 0, 0], "target": [target, 0, 0]})

@@ -123,7 +123,10 @@ def test_a_failure_is_told_by_the_exit_code(
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["case=nonsense"], "case: expected a topic (light, materials, numbers, places) or a case"),
+        (
+            ["case=nonsense"],
+            "case: expected a topic (gradients, light, materials, numbers, places, surfaces) or a case",
+        ),
         (["accel=fast"], "accel: expected one of auto, numba, torch, brute, got 'fast'"),
         (["dtype=float16"], "dtype: expected one of float32, float64"),
         (["device=tpu"], "device: expected cpu, cuda or cuda:N"),

@@ -12,7 +12,7 @@ from torchpt.bsdfs.glass import tinted
 from torchpt.bsdfs.lobes import mean, reflectance_at_normal, share
 from torchpt.bsdfs.presets import INDICES
 from torchpt.bsdfs.specs import GREY, index, reflectance
-from torchpt.math.fresnel import fresnel_diffuse
+from torchpt.math.fresnel import diffuse_passed
 from torchpt.records import SplitSumMaterial
 from torchpt.spec import Flag
 
@@ -31,20 +31,20 @@ class Coat(Bsdf, part=True):
     }
 
 
-def coated(values: Parameters, eta: Tensor, inner: Tensor, nonlinear: bool) -> Parameters:
+def coated(values: Parameters, eta: Tensor, passed: Tensor, nonlinear: bool) -> Parameters:
     """What the coats have in common.
 
     Args:
         values: as given.
         eta: ``(1,)`` index of the coat over that outside.
-        inner: ``(1,)`` reflectance of the coat for diffuse light from within.
+        passed: ``(1,)`` part of diffuse light from within that the coat lets out.
         nonlinear: whether light that the coat throws back takes the base's colour again, which saturates it.
     """
     diffuse, specular = values["diffuse_reflectance"], values.get("specular_reflectance")
-    often = mean(diffuse)
+    often, again = mean(diffuse), diffuse if nonlinear else 1.0
     return {
         "eta": eta,
-        "base": diffuse / ((1.0 - inner * (diffuse if nonlinear else 1.0)) * eta * eta),
+        "base": diffuse / ((1.0 - again + again * passed) * eta * eta),
         "diffuse_reflectance": diffuse,
         "specular_reflectance": specular,
         "specular_share": share(torch.ones_like(often) if specular is None else mean(specular), often),
@@ -55,6 +55,6 @@ def over_base(parameters: Parameters, roughness: Tensor) -> SplitSumMaterial:
     """A coat in the preview, over a base which light enters by what the coat's mean reflectance leaves."""
     eta, factor = parameters["eta"], parameters["specular_reflectance"]
     one = torch.ones_like(eta)
-    base = parameters["base"] * (1.0 - fresnel_diffuse(eta))
+    base = parameters["base"] * diffuse_passed(eta)
     f0 = reflectance_at_normal(eta)
     return SplitSumMaterial(base, tinted(f0, factor), tinted(one, factor), roughness, f0)

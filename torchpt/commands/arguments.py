@@ -12,7 +12,7 @@ from pathlib import Path
 
 from torchpt.errors import TorchptError
 
-__all__ = ["COMMANDS", "GROUPS", "Arguments", "UsageError", "parse"]
+__all__ = ["COMMANDS", "DEBUG_KEYS", "GROUPS", "Arguments", "UsageError", "parse"]
 
 COMMANDS = ("render", "orbit", "info", "converge", "compare", "stress")  # the last two take their words themselves
 GROUPS = ("film", "integrator", "sampler", "render")
@@ -20,6 +20,9 @@ PATH_KEYS = ("render.preview", "render.checkpoint")
 #: Keys of `torchpt orbit` alone.
 TURN_KEYS = ("frames", "degrees", "fps", "keep")
 _TURN = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)
+#: Keys of `torchpt render` alone: one path in place of a picture. No scene file has them.
+DEBUG_KEYS = ("debug.pixel", "debug.sample")
+_DEBUG = re.compile(r"\+{0,2}(debug\.[^=]*)=(.*)\Z", re.DOTALL)
 _TAKEN = re.compile(r"\+{0,2}(scene|out|render\.preview|render\.checkpoint)=(.*)\Z", re.DOTALL)
 
 # option -> (its other name, whether a value follows)
@@ -50,11 +53,12 @@ class Arguments:
         outs: pictures to write, as given; empty where nothing was said.
         paths: values of the keys in `PATH_KEYS`.
         turn: values of the keys in `TURN_KEYS`, as written.
+        debug: values of the keys in `DEBUG_KEYS`, as written.
         study: of `converge` all words by key, as written: its lists are axes, which Hydra has no part in.
         overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``.
         options: what Hydra gets besides, such as ``--multirun`` or ``--cfg job``.
         multirun: whether this is a sweep.
-        json: print `info` as JSON.
+        json: print `info`, or the path of `render debug.pixel=...`, as JSON.
         help: print help and stop.
     """
 
@@ -63,6 +67,7 @@ class Arguments:
     outs: list[str] = field(default_factory=list)
     paths: dict[str, str | None] = field(default_factory=dict)
     turn: dict[str, str] = field(default_factory=dict)
+    debug: dict[str, str] = field(default_factory=dict)
     study: dict[str, str] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
     options: list[str] = field(default_factory=list)
@@ -93,7 +98,7 @@ def parse(argv: list[str]) -> Arguments:
         if word.startswith("-"):
             _option(arguments, word, words)
             continue
-        match = _TAKEN.match(word) or (_TURN.match(word) if arguments.command == "orbit" else None)
+        match = _TAKEN.match(word) or (_TURN.match(word) if arguments.command == "orbit" else _DEBUG.match(word))
         if match is None:
             _override(arguments, word)
             continue
@@ -108,9 +113,10 @@ def parse(argv: list[str]) -> Arguments:
     arguments.multirun |= any(word.replace(" ", "") == "hydra.mode=MULTIRUN" for word in arguments.overrides)
     if arguments.multirun and arguments.only_shows:
         raise UsageError("--multirun: cannot be combined with --cfg or --hydra-help")
-    if arguments.json and arguments.command != "info":
+    arguments.debug = _debug(arguments, taken)
+    if arguments.json and arguments.command != "info" and not arguments.debug:
         raise UsageError(
-            "--json: only `torchpt info` and `torchpt compare` take it; "
+            "--json: only `torchpt info`, `torchpt compare` and `torchpt render debug.pixel=[x,y]` take it; "
             f"the last line of `torchpt {arguments.command}` is JSON anyway"
         )
     if arguments.command == "info" and "out" in taken:
@@ -124,6 +130,21 @@ def parse(argv: list[str]) -> Arguments:
     if len(arguments.scenes) < 2:
         arguments.overrides = [word for word in arguments.overrides if word != sweep]
     return arguments
+
+
+def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
+    """The words about one path."""
+    found = {key: value for key, value in taken.items() if key.startswith("debug.")}
+    for key in found:
+        if key not in DEBUG_KEYS:
+            raise UsageError(f"{key}: unknown key; known: {', '.join(DEBUG_KEYS)}")
+        if arguments.command != "render":
+            raise UsageError(f"{key}: only `torchpt render` takes it")
+    if "debug.sample" in found and "debug.pixel" not in found:
+        raise UsageError("debug.sample: expected debug.pixel=[x,y] beside it, whose sample it is")
+    if found and "out" in taken:
+        raise UsageError("out: no picture is rendered where debug.pixel is given")
+    return found
 
 
 def _study(arguments: Arguments, words: list[str]) -> Arguments:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TextIO
+from typing import Any, TextIO
 
 from torchpt.errors import EnergyWarning
 
-__all__ = ["notices"]
+__all__ = ["not_finite", "notices"]
 
 
 @contextmanager
@@ -38,3 +38,20 @@ def notices() -> Iterator[None]:
         yield
     for text in dict.fromkeys(lines):
         print(text, file=sys.stderr)
+
+
+def not_finite(facts: Mapping[str, Any]) -> None:
+    """Say on stderr that samples of a picture are not finite, why, and where to look; nothing where all are.
+
+    Args:
+        facts: of :meth:`torchpt.Rendering.summary`.
+    """
+    causes = facts.get("nonfinite_causes")
+    if not causes:
+        return
+    told = "; ".join(f"{count:,} {name}" for name, count in causes.items())
+    print(
+        f"torchpt: warning: {facts['nonfinite_samples']:,} samples are not finite and count as black ({told}); the first is "
+        f"{facts['nonfinite_first']}; debug.pixel=[x,y] debug.sample=k prints a path",
+        file=sys.stderr,
+    )

@@ -10,6 +10,7 @@ import json
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -204,6 +205,7 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
 
     place, seed = scene.params["camera.to_world"], settings(scene.description, job.overrides).render.seed
     totals: dict[str, int] = {"rays": 0, "nonfinite_samples": 0}
+    causes: Counter[str] = Counter()
     begun = time.perf_counter()
     with Bar(frames.folder.stem) as bar:
 
@@ -229,7 +231,8 @@ def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Inter
             frames.write(number, rendering.image, wishes.film)
             summary = rendering.summary()
             totals = {name: count + summary[name] for name, count in totals.items()}
-    return totals
+            causes.update(summary.get("nonfinite_causes", {}))
+    return {**totals, "nonfinite_causes": dict(causes)} if causes else totals
 
 
 class Frames:

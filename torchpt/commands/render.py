@@ -18,7 +18,7 @@ from typing import Any
 from torchpt.commands import collector
 from torchpt.commands.denoised import denoised_files
 from torchpt.commands.interrupt import Interrupt, Interrupted
-from torchpt.commands.notices import notices
+from torchpt.commands.notices import not_finite, notices
 from torchpt.commands.progress import Bar
 from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
@@ -97,8 +97,12 @@ def render(job: Job, interrupt: Interrupt) -> int:
 
         rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress))
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)
-    with speaking():
-        print(_summary(rendering, outs, facts))
+    summary = {"out": _names(outs), **facts, **rendering.summary()}
+    if not rendering.complete:
+        summary["complete"] = False
+    not_finite(summary)
+    with speaking():  # the last line on stdout
+        print(json.dumps(plain(summary), allow_nan=False))
     if interrupt.signum is None:
         return 0
     again = "" if wishes.render.checkpoint is None else "; render.resume=true goes on"
@@ -210,14 +214,6 @@ def _write_layer(path: str, name: str, layer: Any) -> None:
 
 def _names(paths: list[str]) -> str | list[str]:
     return paths[0] if len(paths) == 1 else paths
-
-
-def _summary(rendering: Any, outs: list[str], first: dict[str, Any]) -> str:
-    """The last line on stdout."""
-    facts = {"out": _names(outs), **first, **rendering.summary()}
-    if not rendering.complete:
-        facts["complete"] = False
-    return json.dumps(plain(facts), allow_nan=False)
 
 
 def plain(value: Any) -> Any:

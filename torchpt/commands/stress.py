@@ -27,7 +27,7 @@ torchpt stress scene=NAME|FILE.yaml [key=value ...]
   What breaks path tracers, measured against closed forms and float64: roughness, index, albedo, sizes, distances, radiance,
   lights and path lengths swept over all that float32 holds. With scene= the same of a scene of yours: moved, scaled, turned,
   in float64 and by every search it has to be the same picture.
-  quick=    true: three places of each sweep                                    false
+  quick=    true: a few places of each sweep                                    false
   case=     names of cases or topics, with * and ?: case=*glass*, case=places   all
   device=   cpu, cuda, cuda:N                                                   cpu
   accel=    auto, numba, torch, brute, or a list of them                        auto

@@ -32,6 +32,11 @@ class Film:
         self._sums = torch.zeros(randomizations, channels, pixels, dtype=torch.float64, device=device)
         self._counts = torch.zeros(randomizations, pixels, dtype=torch.int64, device=device)
 
+    @staticmethod
+    def bytes_of(pixels: int, randomizations: int, channels: int = 3) -> int:
+        """What a film of so many pixels takes."""
+        return 8 * pixels * (channels + randomizations * (channels + 1))
+
     def add(self, radiance: Tensor, first_pixel: int, first_sample: int) -> None:
         """Add samples ``(C, S, n)`` of ``n`` consecutive pixels, ``S`` consecutive samples each."""
         for place, value in self.after(radiance, first_pixel, first_sample):

@@ -12,6 +12,7 @@ from torchpt import paths
 from torchpt import settings as run_settings
 from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, SceneError
+from torchpt.files import MAX_BYTES, check_regular
 from torchpt.format.cameras import read_camera
 from torchpt.format.materials import Kind, check_material, material_types, read_material
 from torchpt.format.textures import check_texture, texture_of
@@ -23,9 +24,13 @@ from torchpt.spec.declared import Described, described
 from torchpt.spec.validate import check_keys
 from torchpt.textures import KINDS as TEXTURES
 
-__all__ = ["ASSETS", "Description", "overridden", "read_description", "scene_names", "settings"]
+__all__ = ["ASSETS", "MAX_ENTRIES", "Description", "overridden", "read_description", "scene_names", "settings"]
 
 ASSETS = "$TORCHPT_ASSETS"
+#: Textures, materials, shapes (instances are some) and lights that a scene may name, of each.
+MAX_ENTRIES = 100_000
+#: Keys of ``render`` by which files are written, or read as the render's own.
+_WRITTEN = ("preview", "checkpoint", "resume")
 _KEYS = ("version", "camera", *BLOCKS, "textures", "materials", "shapes", "lights")
 
 T = TypeVar("T")
@@ -95,11 +100,15 @@ class Description:
             found = Path(folder) / rest
         else:
             found = self.base / path
-        if not found.is_file():
-            problem = "is a folder" if found.is_dir() else "no such file"
+        try:
+            check_regular(found, MAX_BYTES)
+        except OSError as error:
+            problem = (
+                "no such file" if isinstance(error, FileNotFoundError | NotADirectoryError) else str(error.strerror)
+            )
             hint = f"; only {ASSETS} is expanded" if path.startswith(("$", "~")) and head != ASSETS else ""
             where = f"{key} of {self.file}" if self.file else key
-            raise AssetError(found, f"{problem}, named by {where}{hint}")
+            raise AssetError(found, f"{problem}, named by {where}{hint}") from None
         return found
 
 
@@ -204,6 +213,10 @@ def _settings_block(raw: Mapping[str, Any], name: str, file: str | None) -> dict
         return {}
     if not isinstance(block, dict):
         raise SceneError(name, block, "a mapping of settings", file)
+    for key in _WRITTEN if name == "render" else ():
+        if block.get(key) not in (None, False):
+            expected = "null: which files are written is said on the command line or in Python, never by a scene"
+            raise SceneError(f"{name}.{key}", block[key], expected, file)
     return {key: value for key, value in block.items() if value is not None}
 
 
@@ -213,6 +226,8 @@ def _named(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[
         return {}
     if not isinstance(items, dict):
         raise SceneError(block, items, f"a mapping from names to {block}", file)
+    if len(items) > MAX_ENTRIES:
+        raise SceneError(block, len(items), f"at most {MAX_ENTRIES} of them (what is larger is a mesh)", file)
     return {name: read(item, f"{block}.{name}") for name, item in items.items()}
 
 

@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.errors import SceneError
+from torchpt.files import check_regular, read_regular
 
-__all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_VALUES", "parse_yaml", "plain", "read_yaml"]
+__all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_KEY", "MAX_VALUES", "parse_yaml", "plain", "read_yaml"]
 
 MAX_BYTES = 256 * 2**20
 MAX_DEPTH = 100
+MAX_KEY = 256
 MAX_VALUES = 5_000_000  # after aliases are expanded
 MAX_MERGED = 1_000_000  # keys that `<<` may copy
 
@@ -40,11 +42,11 @@ def read_yaml(path: Path, file: str) -> Any:
         SceneError: the file is missing, too large, or no valid YAML.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if check_regular(path) > MAX_BYTES:
             raise SceneError(
                 "scene", file, f"a file of at most {MAX_BYTES // 2**20} MiB (large meshes belong in PLY files)"
             )
-        data = path.read_bytes()
+        data = read_regular(path, MAX_BYTES)
     except OSError as error:
         raise SceneError("scene", file, f"a scene file that can be read ({error.strerror})") from None
     return parse_yaml(data, file)
@@ -97,7 +99,7 @@ class _Builder:
         self.anchors: dict[str, Any] = {}
         self.root: Any = None
         self.documents = 0
-        self.merged = 0
+        self.merged = self.values = 0
 
     def run(self, events: Iterator[Any]) -> Any:
         for event in events:
@@ -112,6 +114,7 @@ class _Builder:
                 values = self.stack[-1].value
                 if isinstance(values, list):  # numbers by the thousand
                     values.append(_resolve(event.value))
+                    self.count(event)
                     continue
             if name == "ScalarEvent":
                 self.scalar(event)
@@ -181,7 +184,14 @@ class _Builder:
             self.anchors[frame.anchor] = frame.value
         self.add(event, frame.value, None)
 
+    def count(self, event: Any) -> None:
+        """One value more, wherever it stands."""
+        self.values += 1
+        if self.values > MAX_VALUES:
+            raise self.error(event, self.values, f"at most {MAX_VALUES} values")
+
     def add(self, event: Any, value: Any, anchor: str | None = "") -> None:
+        self.count(event)
         if anchor == "" and getattr(event, "anchor", None) and event.__class__.__name__ == "ScalarEvent":
             self.anchors[event.anchor] = value
         if not self.stack:
@@ -249,8 +259,8 @@ def plain(source: Any, file: str | None = None) -> Any:
         for name, value in item.items() if isinstance(item, Mapping) else enumerate(item):
             count += 1
             if isinstance(item, Mapping):
-                if not isinstance(name, str) or not name.strip() or not name.isprintable():
-                    raise error(name, "keys that are printable text")
+                if not isinstance(name, str) or not name.strip() or not name.isprintable() or len(name) > MAX_KEY:
+                    raise error(name, f"keys that are printable text of at most {MAX_KEY} characters")
                 if name == "_target_":
                     trail.append(name)
                     raise error(value, "no `_target_`: a scene never names Python objects")

@@ -24,7 +24,10 @@ from torch import Tensor
 
 from torchpt import __version__
 from torchpt.errors import AssetError, OutputError
+from torchpt.files import check_regular
+from torchpt.forward.archive import read_arrays
 from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
+from torchpt.integrators.lost import Lost
 from torchpt.scene.digest import digest
 from torchpt.scene.scene import Scene
 from torchpt.settings import Settings
@@ -40,7 +43,7 @@ FREE = {
 }
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
-_FORMAT = 1
+_FORMAT = 2
 #: Of a scene's description.
 _BLOCKS = ("camera", "textures", "materials", "shapes", "lights")
 
@@ -139,8 +142,11 @@ class Keeper:
         self._took = self._last - begun
         self.seconds += self._took
 
-    def read(self) -> State | None:
+    def read(self, like: State) -> State | None:
         """The checkpoint; None where there is none.
+
+        Args:
+            like: a state of this render: facts and arrays of the same names, kinds and sizes are there, or it is refused.
 
         Raises:
             AssetError: a file that is no whole checkpoint, or one of another render.
@@ -148,17 +154,48 @@ class Keeper:
         if not self.path.exists():
             return None
         try:
-            with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
+            check_regular(self.path)
+            with open(self.path, "rb") as file:
+                arrays = read_arrays(file)
             facts = json.loads(arrays.pop(_FACTS).tobytes())
             if facts["format"] != _FORMAT or not isinstance(facts["of"], dict):
                 raise ValueError("another format")
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as problem:
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            EOFError,
+            RecursionError,
+            RuntimeError,
+            zipfile.BadZipFile,
+        ) as problem:
             raise AssetError(self.path, f"is no whole checkpoint ({_said(problem)})") from None
         for key, there, here in _differences(facts.pop("of"), self._of):
             said = f"its {key} are others" if key.startswith("scene.") else f"{key}: {there} there, {here} here"
             raise AssetError(self.path, f"is the checkpoint of another render ({said})")
-        return State(facts, {name: torch.from_numpy(value) for name, value in arrays.items()})
+        state = State(facts, {name: torch.from_numpy(value) for name, value in arrays.items()})
+        _check(state, like, self.path)
+        return state
+
+
+def _check(state: State, like: State, path: Path) -> None:
+    """Refuse a state that the render could not hold."""
+    for name, value in like.facts.items():
+        there: Any = state.facts.get(name)
+        if name == "lost":
+            try:
+                Lost.read(there)
+            except ValueError as problem:
+                raise AssetError(path, f"is no whole checkpoint ({problem})") from None
+            continue
+        kind = isinstance(there, int | type(value)) and not isinstance(there, bool)
+        if not kind or not 0 <= there < 2**62:
+            raise AssetError(path, f"is no whole checkpoint ({name} is {str(there)[:40]})")
+    for name, value in like.arrays.items():
+        found = state.arrays.get(name)
+        if found is None or found.shape != value.shape or found.dtype != value.dtype:
+            raise AssetError(path, f"is no whole checkpoint (the numbers {name} are missing, or others)")
 
 
 def _said(problem: Exception) -> str:

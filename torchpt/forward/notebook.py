@@ -55,7 +55,8 @@ def table_of(rendering: Rendering) -> dict[str, str]:
     if rendering.layers:
         facts["layers"] = ", ".join(rendering.layers)
     if rendering.nonfinite_samples:
-        facts["samples not finite"] = f"{rendering.nonfinite_samples:,}"
+        causes = "; ".join(f"{name}: {count:,}" for name, count in rendering.nonfinite_causes.items())
+        facts["samples not finite"] = f"{rendering.nonfinite_samples:,}" + (f" ({causes})" if causes else "")
     if rendering.truncated_paths:
         facts["paths cut off"] = f"{rendering.truncated_paths:,}"
     if rendering.stopped_by not in ("", "spp"):

@@ -10,34 +10,15 @@ from torch import Tensor
 from torchpt.errors import RenderError
 from torchpt.forward.schedule import Span
 from torchpt.integrators.base import Tally
+from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.wave import Wave
 from torchpt.shortage import ran_out
 
-__all__ = ["Counts", "Piece", "take"]
+__all__ = ["Piece", "take"]
 
 #: How often it is tried to write what is computed already.
 ATTEMPTS = 16
-
-
-@dataclass
-class Counts:
-    """What is counted beside samples.
-
-    Attributes:
-        bad: samples that were not finite, an int64.
-        light: before and after the clamp ``(2,)`` float64.
-    """
-
-    bad: Tensor
-    light: Tensor
-
-    @classmethod
-    def none(cls, device: torch.device) -> Counts:
-        """Nothing yet."""
-        return cls(
-            torch.zeros((), dtype=torch.int64, device=device), torch.zeros(2, dtype=torch.float64, device=device)
-        )
 
 
 @dataclass
@@ -46,10 +27,12 @@ class Piece:
 
     Attributes:
         tally: rays and paths.
+        lost: samples that were not finite.
         writes: places, and what they are to hold then.
     """
 
     tally: Tally = field(default_factory=Tally)
+    lost: Lost = field(default_factory=Lost)
     writes: list[tuple[Tensor, Tensor]] = field(default_factory=list)
 
     def write(self) -> None:
@@ -74,19 +57,24 @@ class Piece:
         return True
 
 
-def take(wave: Wave, plate: Plate, counts: Counts, span: Span) -> Piece:
-    """Compute a piece of a plate.
-
-    Raises:
-        RenderError: ``integrator.strict``, and a sample that is not finite.
-    """
+def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
+    """Compute a piece of a plate; ``light`` is all light before and after the clamp so far, ``(2,)`` float64."""
     first, count, sample, samples = span
     piece = Piece()
     if wave.integrator.light:
         radiance, tally = wave.radiance(first, count, sample, samples, plate)
         piece.tally.rays += tally.rays
         piece.tally.truncated += tally.truncated
-        radiance = _checked(wave, radiance, plate, counts, span, piece)
+        finite = torch.isfinite(radiance).all(0)
+        if not bool(finite.all()):
+            piece.lost = Lost.of(radiance, first, sample, wave.crop, plate)
+        radiance = torch.where(finite, radiance, 0.0)
+        clamp = wave.integrator.clamp
+        if clamp is not None:
+            scale = (clamp / radiance.abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
+            clamped = radiance * scale
+            piece.writes.append((light, light + torch.stack((radiance.double().sum(), clamped.double().sum()))))
+            radiance = clamped
         piece.writes += plate.film.after(radiance, first, sample)
     if plate.layers:
         layers = wave.layers(tuple(plate.layers), first, count, sample, samples, plate)
@@ -94,26 +82,3 @@ def take(wave: Wave, plate: Plate, counts: Counts, span: Span) -> Piece:
         for name, values in layers.items():
             piece.writes += plate.layers[name].after(values, first, sample)
     return piece
-
-
-def _checked(wave: Wave, radiance: Tensor, plate: Plate, counts: Counts, span: Span, piece: Piece) -> Tensor:
-    """Count what is not finite and take it as black; apply the clamp."""
-    finite = torch.isfinite(radiance).all(0)
-    piece.writes.append((counts.bad, counts.bad + (~finite).sum()))
-    integrator = wave.integrator
-    if integrator.strict and not bool(finite.all()):
-        s, p = (int(i) for i in (~finite).nonzero()[0])
-        p = span[0] + p if plate.places is None else int(plate.places[span[0] + p])
-        x0, y0, width, _ = wave.crop
-        raise RenderError(
-            f"integrator.strict: sample {span[2] + s} of pixel ({p % width + x0}, {p // width + y0}) is not finite"
-        )
-    radiance = torch.where(finite, radiance, 0.0)
-    clamp = integrator.clamp
-    if clamp is None:
-        return radiance
-    scale = (clamp / radiance.abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
-    clamped = radiance * scale
-    light = torch.stack((radiance.double().sum(), clamped.double().sum()))
-    piece.writes.append((counts.light, counts.light + light))
-    return clamped

@@ -36,6 +36,9 @@ class Rendering:
         paths: camera samples traced.
         rays: rays traced, shadow rays included.
         nonfinite_samples: samples that were NaN or infinite, and counted as black.
+        nonfinite_causes: how many of them by cause, such as ``{"infinite light": 3}``; they add up to ``nonfinite_samples``.
+            See :data:`torchpt.integrators.faults.CAUSES`. Not known yet of a picture that is still being rendered.
+        nonfinite_first: which sample was the first of them, and what of it stopped being finite; "" where there is none.
         truncated_paths: paths ended by the cap on endless depth.
         clamped: fraction of the light that ``integrator.clamp`` took away; None where it is off.
         relmse: the picture's estimate of its own relMSE; None where it has no pilots.
@@ -63,6 +66,8 @@ class Rendering:
     paths: int = 0
     rays: int = 0
     nonfinite_samples: int = 0
+    nonfinite_causes: dict[str, int] = field(default_factory=dict)
+    nonfinite_first: str = ""
     truncated_paths: int = 0
     clamped: float | None = None
     relmse: float | None = None
@@ -146,6 +151,7 @@ class Rendering:
             "render_seconds": self.render_seconds,
             "rays": self.rays,
             "nonfinite_samples": self.nonfinite_samples,
+            "nonfinite_causes": "; ".join(f"{count} {name}" for name, count in self.nonfinite_causes.items()),
             "truncated_paths": self.truncated_paths or None,
             "clamped": self.clamped,
             "stopped_by": self.stopped_by,
@@ -201,6 +207,9 @@ class Rendering:
         facts["peak_memory"] = self.peak_memory
         if self.lanes is not None:
             facts["lanes"] = self.lanes
+        if self.nonfinite_causes:
+            facts["nonfinite_causes"] = dict(self.nonfinite_causes)
+            facts["nonfinite_first"] = self.nonfinite_first
         if self.heavy_tailed:
             facts["heavy_tailed"] = True
         if self.stopped_by not in ("", "spp"):

@@ -10,14 +10,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.errors import RenderError
 from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.budget import check_memory
+from torchpt.forward.causes import causes_of, told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.kept import kept
 from torchpt.forward.need import loaded, need_of, shape_of
-from torchpt.forward.piece import Counts, take
+from torchpt.forward.piece import take
 from torchpt.forward.result import Progress, Rendering
+from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, budget_of
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
@@ -27,6 +30,7 @@ from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
 from torchpt.integrators.loop.schedule import Loop, Share
+from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.lanes.graph import Unsupported
 from torchpt.native.memory import Meter, let_go, mb
@@ -45,7 +49,7 @@ class Run:
     ) -> None:
         self.start = time.perf_counter()
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
-        self.name, self.load_seconds = scene.name, scene.load_seconds
+        self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
         meter = Meter(self.device)
         before = meter.peak()
         with needing(lambda: f"a scene of {scene.told}"):
@@ -78,6 +82,7 @@ class Run:
     def _begin(self) -> None:
         """Nothing is sampled yet."""
         device, streams = self.device, self.wave.sampler.streams
+        check_room(self.width, self.height, streams.count, [len(x.channels) for x in self.seen.values()], device)
         film = Film(self.width, self.height, streams.count, device)
         layers = {
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
@@ -87,7 +92,8 @@ class Run:
         self.tally, self.done, self.taken, self.ended = Tally(), 0, 0, False
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
         self.stop = Stop(self.settings.render, streams.count, None if self.keeper is None else EVERY)
-        self.counts = Counts.none(device)
+        self.lost = Lost()
+        self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.waves: Waves | None = None  # of tensor operations
         self.begun: float | None = None
 
@@ -120,7 +126,7 @@ class Run:
     def _picture(self) -> Rendering:
         """The picture at the end; where memory does not suffice, what else is held is given back first."""
         try:
-            return self.result()
+            return self._told()
         except Exception as error:
             if not ran_out(error):
                 raise
@@ -129,7 +135,13 @@ class Run:
         let_go()
         size = mb(self.need.picture)
         with needing(lambda: f"the picture of {self.width} x {self.height} pixels, which takes {size}"):
-            return self.result()
+            return self._told()
+
+    def _told(self) -> Rendering:
+        """The picture, and why samples of it are not finite."""
+        rendering = self.result()
+        rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(self.scene, self.wave, self.lost)
+        return rendering
 
     def _all(self) -> None:
         """All samples, by tensor operations where there can be no kernels."""
@@ -206,27 +218,32 @@ class Run:
         """Write a checkpoint where it is time for one."""
         if self.keeper is None or not (last or self.keeper.due()):
             return
+        self.keeper.write(self._state())
+
+    def _state(self) -> State:
+        """Where the render is."""
         facts = {
             "taken": self.taken,
             "done": self.done,
             "rays": self.tally.rays,
             "truncated": self.tally.truncated,
             "seconds": self.seconds_of_sampling(),
+            "lost": self.lost.plain(),
         }
         arrays = {f"{name}.{key}": value for name, film in self._films().items() for key, value in film.state().items()}
-        self.keeper.write(State(facts, arrays | {"bad": self.counts.bad, "light": self.counts.light}))
+        return State(facts, arrays | {"light": self.light})
 
     def _resume(self) -> None:
         """Go on from the checkpoint, where that is wished and there is one."""
         if self.keeper is None or not self.settings.render.resume:
             return
-        state = self.keeper.read()
+        state = self.keeper.read(self._state())
         if state is None:
             say_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
             return
         for name, film in self._films().items():
             film.restore({key: state.arrays[f"{name}.{key}"].to(self.device) for key in film.state()})
-        self.counts = Counts(*(state.arrays[name].to(self.device) for name in ("bad", "light")))
+        self.lost, self.light = Lost.read(state.facts["lost"]), state.arrays["light"].to(self.device)
         self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
         self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
         mean = float(self.picture.film.counts.double().mean()) if self._adapts() else self.taken
@@ -260,10 +277,9 @@ class Run:
                 return self._advanced(0, False)
             self.tally.rays += share.tally.rays
             self.tally.truncated += share.tally.truncated
-            if share.bad:
-                self.counts.bad += share.bad
+            self._count(share.lost)
             if self.integrator.clamp is not None:
-                self.counts.light += torch.tensor(share.light, dtype=torch.float64)
+                self.light += torch.tensor(share.light, dtype=torch.float64)
             left -= share.samples
             return self._advanced(share.samples, left == 0)
 
@@ -280,7 +296,8 @@ class Run:
 
     def _piece(self, plate: Plate, span: Span) -> None:
         """A piece by tensor operations: all of it, or nothing where it raises."""
-        piece = take(self.wave, plate, self.counts, span)
+        piece = take(self.wave, plate, self.light, span)
+        self._count(piece.lost)
         piece.write()
         self.tally.rays += piece.tally.rays
         self.tally.truncated += piece.tally.truncated
@@ -307,6 +324,12 @@ class Run:
         pixels = self.width * self.height + (0 if self.twice is None else len(self.twice.pilots))
         return pixels * self.settings.render.spp
 
+    def _count(self, lost: Lost) -> None:
+        """Count samples that are not finite; with ``integrator.strict`` the first one ends the render."""
+        if lost.count and self.integrator.strict:
+            raise RenderError(f"integrator.strict: {told(self.scene, self.wave, lost.places[0])}")
+        self.lost.add(lost)
+
     def result(self) -> Rendering:
         """The picture so far."""
         radiant, film = self.integrator.light, self.picture.film
@@ -321,7 +344,7 @@ class Run:
             image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else torch.cat((shown, blank), -1)
         clamped = None
         if radiant and self.integrator.clamp is not None:
-            before, after = self.counts.light.tolist()
+            before, after = self.light.tolist()
             clamped = 1.0 - after / before if before > 0 else 0.0
         counts = (film if radiant else next(iter(self.picture.layers.values()))).counts
         compile_seconds = 0.0 if self.loop is None else self.loop.kernels.seconds
@@ -339,7 +362,7 @@ class Run:
             render_seconds=self.seconds_of_sampling(),
             paths=self.done,
             rays=self.tally.rays,
-            nonfinite_samples=int(self.counts.bad),
+            nonfinite_samples=self.lost.count,
             truncated_paths=self.tally.truncated,
             clamped=clamped,
             relmse=None if known is None else known.relmse,

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
+from torchpt.files import read_regular
 from torchpt.images.png import plain_png
 
-__all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "existing", "pixels_of"]
+__all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "complaint", "existing", "pixels_of"]
 
 MAX_PIXELS = 64 * 2**20  # a header may claim anything: refuse before memory is asked for
 FLOAT_FORMATS = (".exr", ".hdr")
@@ -116,7 +117,7 @@ def pixels_of(source: Path | EncodedImage, max_pixels: int) -> Pixels:
             raise AssetError(label, f"unknown kind of image {kind.strip('.')!r}; known: {known}")
         # byte 24 of a PNG: bits a value; byte 25: what they mean. Pillow keeps 8 bits of 16-bit colours.
         if kind == ".png" and data[24:26] in (b"\x10\x02", b"\x10\x04", b"\x10\x06"):
-            whole = source.read_bytes() if isinstance(source, Path) else source.data
+            whole = read_regular(source) if isinstance(source, Path) else source.data
             width, height = (int.from_bytes(whole[at : at + 4], "big") for at in (16, 20))
             _check_size(label, width, height, 4, max_pixels, len(whole))
             source = EncodedImage(label, plain_png(whole), "png")
@@ -164,7 +165,7 @@ def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: st
     wishes.attribute("oiio:RawColor", 1)
     picture = oiio.ImageInput.open(str(source), wishes)
     if picture is None:
-        raise AssetError(label, f"cannot be read ({_brief(oiio.geterror() or 'unknown format')})")
+        raise AssetError(label, f"cannot be read ({complaint(oiio) or 'unknown format'})")
     try:
         spec = picture.spec()
         if spec.deep:
@@ -174,14 +175,14 @@ def _through_oiio(source: Path | EncodedImage, label: str, kind: str, stored: st
         if spec.tile_width:
             values = picture.read_image(stored)
             if values is None:
-                raise AssetError(label, f"cannot be read ({_brief(picture.geterror() or 'truncated')})")
+                raise AssetError(label, f"cannot be read ({complaint(picture) or 'truncated'})")
             return Pixels(values.reshape(spec.height, spec.width, spec.nchannels), 65535, tuple(spec.channelnames))
         step = max(1, _BAND // (spec.width * spec.nchannels))
         for start in range(0, spec.height, step):
             end = min(start + step, spec.height)
             band = picture.read_scanlines(0, 0, spec.y + start, spec.y + end, 0, 0, spec.nchannels, stored)
             if band is None:
-                raise AssetError(label, f"cannot be read ({_brief(picture.geterror() or 'truncated')})")
+                raise AssetError(label, f"cannot be read ({complaint(picture) or 'truncated'})")
             if values is None:
                 values = np.empty((spec.height, spec.width, spec.nchannels), band.dtype)
             values[start:end] = band.reshape(end - start, spec.width, spec.nchannels)
@@ -202,7 +203,7 @@ def _through_pillow(source: Path | EncodedImage, label: str, kind: str, max_pixe
     # The plugins themselves: each takes its own format only, and none warns of sizes that are checked here.
     plugin = {".png": PngImageFile, ".jpg": JpegImageFile, ".jpeg": JpegImageFile, ".bmp": BmpImageFile}
     plugin |= {".tga": TgaImageFile, ".ppm": PpmImageFile, ".pgm": PpmImageFile}
-    data = source.read_bytes() if isinstance(source, Path) else source.data
+    data = read_regular(source) if isinstance(source, Path) else source.data
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow warns of odd metadata, of which nothing is used
         return _pillow_pixels(plugin[kind](BytesIO(data)), label, len(data), max_pixels)
@@ -229,6 +230,15 @@ _MODES = {
     **{"1": 1, "L": 255, "LA": 255, "P": 255, "RGB": 255, "RGBA": 255},
     **{"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I": 65535},
 }
+
+
+def complaint(teller: Any) -> str:
+    """What OpenImageIO, or one of its inputs, says is wrong: one line, empty where it says nothing."""
+    try:
+        found = teller.geterror()
+    except UnicodeDecodeError:  # it tells bytes of the file as they are
+        return "malformed"
+    return _brief(found) if found.strip() else ""
 
 
 def _brief(problem: object) -> str:

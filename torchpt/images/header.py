@@ -11,7 +11,7 @@ from os import PathLike
 from typing import Any
 
 from torchpt.errors import AssetError
-from torchpt.images.decode import existing
+from torchpt.images.decode import complaint, existing
 
 __all__ = ["Fact", "checked_header", "put_header", "read_header"]
 
@@ -74,10 +74,9 @@ def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
 
     picture = oiio.ImageInput.open(str(path))
     if picture is None:
-        problem = (oiio.geterror() or "unknown format").strip().splitlines()[0][:120]
-        raise AssetError(path, f"cannot be read ({problem})")
+        raise AssetError(path, f"cannot be read ({complaint(oiio) or 'unknown format'})")
     try:
-        found = [(item.name, item.value) for item in picture.spec().extra_attribs]
+        found = [_told(item) for item in picture.spec().extra_attribs]
     finally:
         picture.close()
     return {
@@ -85,6 +84,14 @@ def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
         for name, value in found
         if name.startswith(PREFIX) and isinstance(value, str | int | float)
     }
+
+
+def _told(item: Any) -> tuple[str, Any]:
+    """Name and value of an attribute; other programs' need not be UTF-8, and none of those is ours."""
+    try:
+        return item.name, item.value
+    except UnicodeDecodeError:
+        return "", None
 
 
 def _read(value: Fact) -> Fact:

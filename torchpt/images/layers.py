@@ -33,7 +33,7 @@ def channel_names(layer: str, components: int) -> tuple[str, ...]:
 
 def _rank(channel: str) -> tuple[int, int, str]:
     last = channel.rpartition(".")[2]
-    if last.isdigit():
+    if last.isdecimal() and last.isascii():
         return 0, int(last), last
     return 1, _ORDER.find(last) if len(last) == 1 else -1, last
 

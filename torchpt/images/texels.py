@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from os import PathLike, fspath
-from pathlib import Path
+from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
+from torchpt.files import read_regular
 from torchpt.images.decode import MAX_PIXELS, EncodedImage, Pixels, existing, pixels_of
 from torchpt.images.layers import group_channels
 
@@ -60,7 +60,7 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
 def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
     """Whether a PNG declares an alpha channel, or transparent colours; False for any other file."""
     try:
-        data = source.data if isinstance(source, EncodedImage) else Path(fspath(source)).read_bytes()
+        data = source.data if isinstance(source, EncodedImage) else read_regular(source)
     except OSError:
         return False
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):

@@ -74,6 +74,7 @@ class FirstSurfaceIntegrator(Integrator):
         slide = plan.attached or plan.dtype == torch.float64
         hit = search.nearest(state, 1)
         tally = Tally(rays=len(state.lane))
+        stages.met(1, state, hit)
         ends, groups = partition(world, hit)
         gather_light(stages, state, hit, ends, slide)
         salt = salts(1, state.lane.device)

@@ -20,7 +20,7 @@ from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import offset_origin
 from torchpt.shapes.interaction import OFFSET
 
-__all__ = ["leaning", "sample_light", "shade", "through"]
+__all__ = ["held_back", "leaning", "light_radiance", "light_wish", "sample_light", "shade", "through"]
 
 #: Shadow rays end this fraction of their length short of the light, beside the offset off its surface.
 SHORTEN = 1e-4
@@ -51,20 +51,47 @@ def shade(
         weight = weight * power_heuristic(light.pdf, pdf).detach()
     else:
         reflected = kind.eval(surface.parameters, surface.wo, wi)
+    weight = held_back(weight, world, model, at, surface, light.wi, wi)
+    radiance = state.throughput * reflected * light_radiance(world, light) * weight
+    return surface, _shadow_ray(plan, world, at, light, radiance)
+
+
+def held_back(
+    weight: Tensor, world: World, model: int, at: Interaction, surface: Surface, light: Tensor, wi: Tensor
+) -> Tensor:
+    """A weight of light ``(n,)``, times what the surface lets pass before its BSDF is asked.
+
+    Args:
+        weight: of the light.
+        world: the scene's tensors.
+        model: number of the BSDF model.
+        at: the points.
+        surface: with its material.
+        light: ``(3, n)`` direction to the light.
+        wi: the same in the surface's frame.
+    """
     if leaning(world, model):
-        weight = weight * (through(at, surface, light.wi, wi) > 0)
+        weight = weight * (through(at, surface, light, wi) > 0)
     if surface.shown is not None:
         weight = weight * surface.shown
     if surface.relief is not None:
-        weight = weight * surface.relief.shadowing(light.wi)
-    radiance = state.throughput * reflected * _shining(world, light) * weight
-    return surface, _shadow_ray(plan, world, at, light, radiance)
+        weight = weight * surface.relief.shadowing(light)
+    return weight
 
 
 def sample_light(
     plan: Plan, world: World, model: int, state: PathState, at: Interaction, surface: Surface, salts: Tensor
 ) -> LightSample:
     """A point on the lights for each surface point."""
+    assert world.lights is not None
+    x, which, numbers, n = light_wish(plan, world, model, state, at, surface, salts)
+    return lights.sample(world.lights, x, which, numbers, OFFSET, n, plan.strategy == "mis")
+
+
+def light_wish(
+    plan: Plan, world: World, model: int, state: PathState, at: Interaction, surface: Surface, salts: Tensor
+) -> tuple[Tensor, Tensor | None, Tensor, Tensor | None]:
+    """What ``lights.sample`` is asked for each surface point: ``x (3, n)``, ``which (n,)``, ``u (2, n)``, ``n (3, n)``."""
     table = world.lights
     assert table is not None
     draws = Draws(plan.sampler, state.key, salts)
@@ -77,10 +104,10 @@ def sample_light(
     if table.choice is not None:
         # One number chooses the light and goes on to the place on it, so that both are stratified together.
         which = lights.fine(torch.stack((numbers[0], draws.one(Dimension.LIGHT_DIGITS))))
-    return lights.sample(table, x, which, numbers.to(plan.dtype), OFFSET, n, plan.strategy == "mis")
+    return x, which, numbers.to(plan.dtype), n
 
 
-def _shining(world: World, light: LightSample) -> Tensor:
+def light_radiance(world: World, light: LightSample) -> Tensor:
     """Radiance ``(3, N)`` of the points on lights, textures of emission and opacity included."""
     if light.at is None:
         return light.radiance

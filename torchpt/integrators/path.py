@@ -65,6 +65,8 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
         tally.rays += len(state.lane)
         if hit is None:
             hit = search.nearest(state, depth)
+        if stages.met(depth, state, hit):
+            break
         # Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64
         # the camera's point is found anew, since the search rounds it to float32.
         slide = sliding or (depth == 1 and exact)
@@ -87,6 +89,7 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
             if shadow is not None:
                 tally.rays += len(shadow.t_max)
                 clear = search.clear(shadow)
+                stages.cleared(clear)
                 after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
             parts.append((after, found))
         state = joined([after for after, _ in parts])

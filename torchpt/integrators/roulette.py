@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchpt.samplers import Dimension, Draws
 
-__all__ = ["DEEP", "DEEP_CAP", "survived"]
+__all__ = ["DEEP", "DEEP_CAP", "chance_of", "survived"]
 
 #: Where nothing else ends paths, those of more vertices than this may be ended whatever they carry. Before it a cap below 1
 #: would only cost: each vertex of a path that loses nothing multiplies its variance by one over the cap.
@@ -37,11 +37,15 @@ def survived(
         brightest: its largest component ``(N,)``.
         eta: index of refraction along the path ``(N,)``, where there is refraction.
     """
-    if chance is None:
-        # Radiance is scaled at refraction; what a path can still bring is not.
-        expected = brightest if eta is None else brightest * eta * eta
-        survival = expected.clamp_max(float(cap))
-    else:
-        survival = torch.full_like(brightest, chance)
+    survival = chance_of(chance, cap, brightest, eta)
     alive = alive & (draws.one(Dimension.ROULETTE) < survival)
     return alive, throughput / torch.where(alive, survival, 1.0)
+
+
+def chance_of(chance: float | None, cap: float, brightest: Tensor, eta: Tensor | None) -> Tensor:
+    """With what chance paths survive ``(N,)``; see :func:`survived`."""
+    if chance is not None:
+        return torch.full_like(brightest, chance)
+    # Radiance is scaled at refraction; what a path can still bring is not.
+    expected = brightest if eta is None else brightest * eta * eta
+    return expected.clamp_max(float(cap))

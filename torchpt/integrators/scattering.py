@@ -165,12 +165,14 @@ def next_ray(
         pdf = torch.full_like(drawn.pdf, 0.0 if alone else math.inf)
         if alone and drawn.sharp is not None:
             pdf = torch.where(drawn.sharp, drawn.pdf, pdf)
+    # A path that carries what is not finite must not end unseen: no comparison holds for NaN, so it would count as dark.
+    radiance = state.radiance if plan.tape else state.radiance + onward.throughput * 0.0
     leaving = PathState(
         o=drawn.o,
         d=drawn.d,
         t_max=on * FOREVER,
         throughput=onward.throughput * on,
-        radiance=state.radiance,
+        radiance=radiance,
         pdf=pdf,
         lane=state.lane,
         key=state.key,

@@ -26,7 +26,7 @@ from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import interact
 
-__all__ = ["STRATEGIES", "Plan", "bounce", "emit", "escape", "generate", "scatter", "shade"]
+__all__ = ["STRATEGIES", "Plan", "bounce", "emit", "escape", "generate", "scatter", "shade", "shining"]
 
 
 def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
@@ -45,6 +45,12 @@ def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, k
 
 def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
     """Radiance ``(3, n)`` that the paths at ``index`` gather from the emitters they hit, weighted by MIS."""
+    radiance, pdf = shining(world, state, hit, index, slide)
+    return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
+
+
+def shining(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -> tuple[Tensor, Tensor]:
+    """Radiance ``(3, n)`` of the emitters that the paths at ``index`` hit, and the density of sampling it ``(n,)``."""
     assert world.lights is not None
     o, d = take(state.o, index), take(state.d, index)
     at = interact(world, o, d, rows(hit, index), slide)
@@ -53,7 +59,7 @@ def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -
     radiance, pdf = lights.emitted(world.lights, x, at, d, None if state.n is None else take(state.n, index))
     if world.textures.emission is not None:
         radiance = radiance * emission_map(world, at)
-    return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
+    return radiance, pdf
 
 
 def escape(world: World, state: PathState, hit: Hit, index: Tensor) -> Tensor:

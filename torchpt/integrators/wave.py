@@ -16,7 +16,7 @@ from torchpt.integrators.compiled import Stages
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.search import Search
 from torchpt.records import PathState
-from torchpt.samplers import Dimension, Draws, Sampler, salts
+from torchpt.samplers import Dimension, Draws, Sampler, Streams, salts
 
 if TYPE_CHECKING:
     from torchpt.integrators.first_surface import FirstSurface
@@ -65,22 +65,36 @@ class Wave:
         if plate is not None and plate.places is not None:
             place = plate.places[first_pixel : first_pixel + pixels]
         x, y = place % width + x0, place // width + y0
-        # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
-        pixel = (y * self.camera.resolution[0] + x).repeat(samples)
         sample = torch.arange(first_sample, first_sample + samples, device=device).repeat_interleave(pixels)
-        key = self.sampler.key(pixel, sample, None if plate is None else plate.streams)
-        x, y = (a.to(self.stages.plan.dtype).repeat(samples) for a in (x, y))
-        return self.stages.generate(self.camera, self.filter, x, y, key, salts(0, device))
+        return self.rays_of(x.repeat(samples), y.repeat(samples), sample, None if plate is None else plate.streams)
+
+    def rays_of(self, x: Tensor, y: Tensor, sample: Tensor, streams: Streams | None = None) -> PathState:
+        """Camera rays of single samples.
+
+        Args:
+            x: of pixels on the whole film ``(N,)`` int64.
+            y: of them, likewise.
+            sample: of theirs ``(N,)`` int64.
+            streams: which share a pixel's samples; None: those of the picture.
+        """
+        # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
+        key = self.sampler.key(y * self.camera.resolution[0] + x, sample, streams)
+        x, y = (a.to(self.stages.plan.dtype) for a in (x, y))
+        return self.stages.generate(self.camera, self.filter, x, y, key, salts(0, self.centre.device))
 
     def radiance(
         self, first_pixel: int, pixels: int, first_sample: int, samples: int, plate: Plate | None = None
     ) -> tuple[Tensor, Tally]:
         """Radiance ``(3, samples, pixels)`` and what it took."""
-        state = self.rays(first_pixel, pixels, first_sample, samples, plate)
+        radiance, tally = self.brought(self.rays(first_pixel, pixels, first_sample, samples, plate))
+        return radiance.view(3, samples, pixels), tally
+
+    def brought(self, state: PathState) -> tuple[Tensor, Tally]:
+        """Radiance ``(3, N)`` that camera rays bring, weighted by the filter, and what it took."""
         radiance, tally = self.integrator.radiance(self.stages, self.accel, state, self.first)
         if self.filter.signed:
             radiance = radiance * self._weight(state)
-        return radiance.view(3, samples, pixels), tally
+        return radiance, tally
 
     def _weight(self, state: PathState) -> Tensor:
         """What the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""

@@ -173,7 +173,9 @@ def look_at(origin: Any, target: Any, up: Any = (0.0, 1.0, 0.0), key: str = "loo
     above = _vector(up, _join(key, "up"))
     direction = goal - eye
     if not direction.any():
-        raise SceneError(_join(key, "target"), target, "a point other than the origin")
+        raise SceneError(
+            _join(key, "target"), target, "a point other than the origin (to the 16 digits that numbers keep)"
+        )
     direction = direction / np.abs(direction).max()
     direction /= np.linalg.norm(direction)
     largest = np.abs(above).max()

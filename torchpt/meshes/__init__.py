@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from torchpt.errors import AssetError
+from torchpt.files import read_regular
 from torchpt.meshes.mesh_part import FileCamera, FileLight, FileMaterial, MeshPart, checked
 from torchpt.meshes.normals import smooth_normals
 
@@ -49,7 +50,7 @@ def load_mesh(path: Path, *, materials: bool = True) -> list[MeshPart]:
     if kind is None:
         raise AssetError(path, f"expected a mesh file ending in {', '.join(FORMATS)}, got {path.suffix or 'no ending'}")
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror})") from None
     reader = getattr(import_module(f"{__name__}.{kind}"), f"load_{kind}")

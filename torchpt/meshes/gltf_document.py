@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
+from torchpt.files import is_regular, read_regular
+from torchpt.meshes.gltf_schema import BLOCKS, ROOT, Wrong, check
 
 __all__ = ["Document"]
 
@@ -46,6 +48,8 @@ class Document:
             raise AssetError(path, "the JSON is missing or malformed") from None
         if not isinstance(self.json, dict):
             raise AssetError(path, "the JSON is no object")
+        self._check(self.json, ROOT, "")
+        self._checked: set[tuple[str, int]] = set()
         self._buffers: dict[int, bytes] = {}
         if binary is not None:
             first = self.json.get("buffers")
@@ -53,14 +57,21 @@ class Document:
                 self._buffers[0] = binary
 
     def item(self, block: str, index: Any) -> dict[str, Any]:
-        """An object of one of the document's lists."""
+        """An object of one of the document's lists, of which all that is read is of the right kind."""
         items = self.json.get(block, [])
         if type(index) is not int or not isinstance(items, list) or not 0 <= index < len(items):
             count = len(items) if isinstance(items, list) else 0
             raise AssetError(self.path, f"{block} {str(index)[:40]} does not exist ({count} are declared)")
-        if not isinstance(items[index], dict):
-            raise AssetError(self.path, f"{block} {index} is no object")
+        if (block, index) not in self._checked:
+            self._check(items[index], BLOCKS[block], f"{block}[{index}]")
+            self._checked.add((block, index))
         return items[index]
+
+    def _check(self, value: Any, kind: Any, where: str) -> None:
+        try:
+            check(value, kind, where)
+        except Wrong as wrong:
+            raise AssetError(self.path, f"malformed glTF: {wrong}") from None
 
     def resource(self, uri: Any, where: str) -> bytes:
         """The bytes of a data: URI, or of a file beside the document."""
@@ -74,7 +85,7 @@ class Document:
                 raise AssetError(self.path, f"{where}: malformed data: URI") from None
         file = self.file(uri, where)
         try:
-            return file.read_bytes()
+            return read_regular(file)
         except OSError as error:
             raise AssetError(file, f"cannot be read ({error.strerror}), {where} of {self.path}") from None
 
@@ -83,12 +94,9 @@ class Document:
         if "://" in uri:
             raise AssetError(self.path, f"{where}: only files and data: URIs are read, got {uri[:60]!r}")
         for name in dict.fromkeys((unquote(uri), uri)):
-            try:
-                file = self.path.parent / name
-                if file.is_file():
-                    return file
-            except (OSError, ValueError):
-                continue
+            file = self.path.parent / name
+            if is_regular(file):
+                return file
         raise AssetError(self.path, f"{where}: the file {uri[:80]!r} is missing")
 
     def view(self, number: Any) -> tuple[memoryview, int | None]:

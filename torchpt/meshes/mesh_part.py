@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from torchpt.errors import AssetError
 from torchpt.meshes.normals import smooth_normals
 
-__all__ = ["FileCamera", "FileLight", "FileMaterial", "MeshPart", "checked", "corners_of_polygons", "transformed"]
+__all__ = [
+    "MOST_PARTS", "FileCamera", "FileLight", "FileMaterial", "MeshPart", "checked", "corners_of_polygons", "too_many",
+    "transformed",
+]  # fmt: skip
+
+#: Parts that one file may come to: groups of an OBJ file, placed primitives of a glTF file.
+MOST_PARTS = 100_000
 
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -106,11 +112,19 @@ def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:
     A zero normal becomes the smooth one of its vertex; a texture coordinate that is not finite becomes 0.
 
     Raises:
-        AssetError: no triangle at all, a vertex, normal or colour that is not finite, an index out of range.
+        AssetError: no triangle at all, more than :data:`MOST_PARTS` parts, a vertex, normal or colour that is not finite, an
+            index out of range.
     """
+    if len(parts) > MOST_PARTS:
+        raise too_many(path)
     if not parts or all(len(part.faces) == 0 for part in parts):
         raise AssetError(path, "the mesh is empty (no face)")
     return [_checked(part, path) for part in parts if len(part.faces)]
+
+
+def too_many(path: Path) -> AssetError:
+    """What is said of a file of more than :data:`MOST_PARTS`."""
+    return AssetError(path, f"has more than {MOST_PARTS} parts; at most so many are read")
 
 
 def _checked(part: MeshPart, path: Path) -> MeshPart:

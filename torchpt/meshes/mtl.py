@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchpt.errors import AssetError
+from torchpt.files import is_regular, read_regular
 from torchpt.meshes.mesh_part import FileMaterial, Rgb
 from torchpt.meshes.mtl_material import COLORS, MAPS, NUMBERS, Map, Statements, material_of
 
@@ -50,11 +51,8 @@ def beside(path: Path, name: str) -> Path | None:
     forward = name.replace("\\", "/")
     for form in dict.fromkeys((name, forward, forward.rpartition("/")[2])):
         candidate = path.parent / form
-        try:
-            if form and candidate.is_file():
-                return candidate
-        except (OSError, ValueError):  # a name too long, or one with a NUL
-            continue
+        if form and is_regular(candidate):
+            return candidate
     return None
 
 
@@ -69,7 +67,7 @@ def read_mtl(path: Path, wanted: set[str]) -> dict[str, FileMaterial]:
         AssetError: a file that cannot be read, a statement that is malformed, a picture that is missing.
     """
     try:
-        lines = decoded_lines(path.read_bytes())
+        lines = decoded_lines(read_regular(path))
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror})") from None
     found: dict[str, Statements] = {}

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
-from torchpt.meshes.mesh_part import FileMaterial, MeshPart, corners_of_polygons
+from torchpt.meshes.mesh_part import MOST_PARTS, FileMaterial, MeshPart, corners_of_polygons, too_many
 from torchpt.meshes.mtl import beside, decoded_lines, read_mtl
 from torchpt.meshes.normals import smooth_normals
 
@@ -58,9 +58,13 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     all_uvs, all_normals = _looked_up(combos[:, 1], uvs), _looked_up(combos[:, 2], normals)
     if all_normals is None and len(text.groups) > 1 and np.isfinite(positions).all():
         all_normals = smooth_normals(all_positions, all_faces)  # over the whole file: groups meet without a crease
+    if len(text.groups) > MOST_PARTS:
+        raise too_many(path)
     parts = []
-    for name, group in text.groups.items():
-        faces = all_faces[owner == group]
+    order = np.argsort(owner, kind="stable")  # faces of a group stay in the order of the file
+    ends = np.searchsorted(owner[order], np.arange(1, len(text.groups) + 1))
+    for (name, _), rows in zip(text.groups.items(), np.split(order, ends[:-1]), strict=True):
+        faces = all_faces[rows]
         used, local = np.unique(faces, return_inverse=True)
         material = known.get(name)
         if material is None and name and materials:

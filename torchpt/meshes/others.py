@@ -7,6 +7,7 @@ beside the file or below.
 from __future__ import annotations
 
 import io
+import re
 import warnings
 import zipfile
 from dataclasses import replace
@@ -15,12 +16,27 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.errors import AssetError
+from torchpt.files import MAX_BYTES, check_regular
 from torchpt.meshes import PARSERS
 from torchpt.meshes.gltf import MOST_PLACED
 from torchpt.meshes.mesh_part import MeshPart
 from torchpt.meshes.trimesh_parts import Notes, mesh_parts_of
 
 __all__ = ["load_others"]
+
+_BEGINS = re.compile(rb"(?:\xef\xbb\xbf|\xff\xfe|\xfe\xff)?\s*<")
+_ENCODING = re.compile(rb"<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)")
+_ENCODINGS = (
+    b"utf-8",
+    b"utf8",
+    b"utf-16",
+    b"us-ascii",
+    b"ascii",
+    b"iso-8859-1",
+    b"latin-1",
+    b"latin1",
+    b"windows-1252",
+)
 
 #: Bytes that an archive may unfold to.
 MOST_UNFOLDED = 2**30
@@ -63,6 +79,12 @@ def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
     lost: list[str] = []
 
     class Beside(FilePathResolver):
+        def absolute(self, name: str) -> Path:
+            path = super().absolute(name)
+            if path.exists():
+                check_regular(path, MAX_BYTES)
+            return path
+
         def get(self, name: str) -> bytes:
             try:
                 return super().get(name)
@@ -86,5 +108,8 @@ def _screen(path: Path, data: bytes) -> None:
             texts += [archive.read(info) for info in archive.infolist() if info.filename.lower().endswith(".dae")]
     for text in texts:
         plain = text.replace(b"\0", b"")  # of UTF-16
+        declared = _ENCODING.search(plain[:200])
+        if not _BEGINS.match(plain) or (declared and declared[1].lower() not in _ENCODINGS):
+            raise AssetError(path, "is no XML in UTF-8, UTF-16, ASCII or Latin-1")  # in which what follows would hide
         if b"<!DOCTYPE" in plain or b"<!ENTITY" in plain:
             raise AssetError(path, "declares a document type, which is not read")

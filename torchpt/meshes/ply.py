@@ -5,6 +5,7 @@ Declared sizes are held against the file's before anything is allocated.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
 from torchpt.meshes.mesh_part import FileMaterial, MeshPart, corners_of_polygons
+from torchpt.meshes.ply_rows import misfit
 
 __all__ = ["load_ply"]
 
@@ -25,6 +27,9 @@ _TYPES = {
 _INDICES = ("vertex_indices", "vertex_index")
 _COLORS = ("red", "green", "blue")
 _COLORED = {"type": "diffuse", "reflectance": {"type": "vertex_color"}}
+#: Bytes of the longest header.
+_MOST_HEADER = 2**20
+_END = re.compile(rb"(?:^|\r)end_header[ \t]*(?:\r\n|\n|\r(?!\n))", re.MULTILINE)
 _UVS = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
 
 
@@ -52,7 +57,7 @@ def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
         AssetError: truncated, malformed, or without vertices and faces.
     """
     layout, elements, start = _header(path, data)
-    reader = _Ascii(path, data[start:]) if layout == "ascii" else _Binary(path, data, start, layout)
+    reader = _Ascii(path, data, start, elements) if layout == "ascii" else _Binary(path, data, start, layout)
     found: dict[str, Columns] = {}
     for element in elements:
         columns = reader.read(element)
@@ -64,13 +69,17 @@ def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
             break
     if "vertex" not in found:
         raise AssetError(path, "no element vertex")
+    if isinstance(reader, _Ascii):
+        reader.end()
     return [_part(path, found["vertex"], found.get("face", {}), elements, materials)]
 
 
 def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], materials: bool) -> MeshPart:
     missing = [name for name in "xyz" if not isinstance(vertex.get(name), np.ndarray)]
     if missing:
-        raise AssetError(path, f"element vertex has no property {missing[0]}")
+        problem = f"has a list as its property {missing[0]}, expected a number"
+        problem = problem if missing[0] in vertex else f"has no property {missing[0]}"
+        raise AssetError(path, f"element vertex {problem}")
 
     def stack(names: tuple[str, ...]) -> NDArray[np.float64] | None:
         if not all(isinstance(vertex.get(name), np.ndarray) for name in names):
@@ -112,12 +121,14 @@ def _colors(vertex: Columns, elements: list[_Element]) -> NDArray[np.float64] | 
 def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
     if not data.startswith(b"ply"):
         raise AssetError(path, "no PLY file (it does not start with ply)")
-    marker = data.find(b"end_header", 0, 1 << 20)
-    end = data.find(b"\n", marker)
-    if marker < 0 or end < 0:
-        raise AssetError(path, "truncated: no end_header")
+    found = _END.search(data, 0, _MOST_HEADER)
+    if found is None:
+        long = len(data) > _MOST_HEADER
+        raise AssetError(
+            path, f"no end_header in its first {_MOST_HEADER} bytes" if long else "truncated: no end_header"
+        )
     layout, elements = "", []
-    for line in data[:marker].decode("latin-1").replace("\r", "\n").split("\n"):
+    for line in data[: found.start()].decode("latin-1").replace("\r", "\n").split("\n"):
         words = line.split()
         problem = AssetError(path, f"header: {line.strip()[:60]!r} is not understood")
         if not words or words[0] in ("ply", "comment", "obj_info"):
@@ -125,7 +136,7 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
         if words[0] == "format" and len(words) == 3:
             layout = words[1]
         elif words[0] == "element" and len(words) == 3:
-            if not words[2].isdigit() or len(words[2]) > 15:
+            if not words[2].isdecimal() or not words[2].isascii() or len(words[2]) > 15:
                 raise problem
             elements.append(_Element(words[1][:80], int(words[2])))
         elif words[0] == "property" and elements:
@@ -134,7 +145,7 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
             raise problem
     if layout not in ("ascii", "binary_little_endian", "binary_big_endian"):
         raise AssetError(path, f"header: unknown format {layout!r}")
-    return layout, elements, end + 1
+    return layout, elements, found.end()
 
 
 def _property(words: list[str], problem: AssetError) -> _Property:
@@ -241,13 +252,14 @@ class _Binary:
 class _Ascii:
     """The same from words of text."""
 
-    def __init__(self, path: Path, data: bytes) -> None:
-        self.path, self.words, self.at = path, data.split(), 0
+    def __init__(self, path: Path, data: bytes, start: int, elements: list[_Element]) -> None:
+        self.path, self.data, self.start, self.elements = path, data, start, elements
+        self.words, self.at = data[start:].split(), 0
 
     def read(self, element: _Element) -> Columns:
         properties = element.properties
         if element.size * len(properties) > len(self.words) - self.at:
-            raise _truncated(self.path, element)
+            raise self.wrong(_truncated(self.path, element).problem)
         if not any(p.count for p in properties):
             flat = self.take(element.size * len(properties), element, float)
             table = flat.reshape(-1, max(len(properties), 1))
@@ -260,7 +272,7 @@ class _Ascii:
                 if p.count:
                     length = int(self.take(1, element, int)[0])
                 if length < 0 or self.at + length > len(self.words):
-                    raise _truncated(self.path, element, row)
+                    raise self.wrong(_truncated(self.path, element, row).problem)
                 chunks[slot] += self.words[self.at : self.at + length]
                 counts[slot].append(length)
                 self.at += length
@@ -272,7 +284,7 @@ class _Ascii:
 
     def take(self, size: int, element: _Element, kind: type) -> NDArray[Any]:
         if self.at + size > len(self.words):
-            raise _truncated(self.path, element)
+            raise self.wrong(_truncated(self.path, element).problem)
         self.at += size
         return self.convert(self.words[self.at - size : self.at], element, kind)
 
@@ -280,4 +292,27 @@ class _Ascii:
         try:
             return np.array(list(map(kind, words)), dtype=np.float64 if kind is float else np.int64)
         except (ValueError, OverflowError):
-            raise AssetError(self.path, f"element {element.name} holds something that is no number") from None
+            expected = "a number" if kind is float else "a whole number of at most 64 bits"
+            word = next(word for word in words if not _fits(word, kind))
+            found = repr(word[:40].decode("latin-1"))
+            raise self.wrong(f"element {element.name} holds {found}, expected {expected}") from None
+
+    def wrong(self, problem: str) -> AssetError:
+        """The first row that is another than the header says; where all are as it says, the problem that was met."""
+        return AssetError(self.path, misfit(self.data, self.start, self.elements) or problem)
+
+    def end(self) -> None:
+        """Refuse rows that came out even by chance: what is left over is not what the header says."""
+        read = [element for element in self.elements if element.size and element.properties]
+        last = next((number for number, element in enumerate(read) if element.name == "face"), len(read))
+        if last >= len(read) - 1 and self.at < len(self.words):
+            found = misfit(self.data, self.start, self.elements)
+            if found is not None:
+                raise AssetError(self.path, found)
+
+
+def _fits(word: bytes, kind: type) -> bool:
+    try:
+        return bool(np.array([kind(word)], dtype=np.float64 if kind is float else np.int64).size)
+    except (ValueError, OverflowError):
+        return False

@@ -15,7 +15,7 @@ from torchpt.errors import AssetError
 from torchpt.meshes.gltf import MOST_PLACED
 from torchpt.meshes.gltf_document import Document
 from torchpt.meshes.gltf_lights import PUNCTUAL, light_at
-from torchpt.meshes.mesh_part import FileCamera, FileLight, MeshPart, checked, transformed
+from torchpt.meshes.mesh_part import MOST_PARTS, FileCamera, FileLight, MeshPart, checked, too_many, transformed
 from torchpt.meshes.normals import smooth_normals
 from torchpt.meshes.trimesh_material import Looks
 
@@ -60,6 +60,8 @@ def mesh_parts_of(
             raise AssetError(label, f"more than {most} vertices or faces once nodes are placed")
         if name not in known:
             known[name] = parts_of(geometry, str(name)[:80] if len(source.geometry) > 1 else "", looks)
+        if len(parts) > MOST_PARTS:
+            raise too_many(Path(label))
         stays = np.array_equal(matrix, np.eye(4))
         parts += known[name] if stays else [transformed(part, matrix) for part in known[name]]
     parts = checked(parts, Path(label))
@@ -90,9 +92,11 @@ def parts_of(mesh: Any, name: str, looks: Looks) -> list[MeshPart]:
     """A ``trimesh.Trimesh`` in its own space, one part for each material; unchecked.
 
     Raises:
-        AssetError: a picture that cannot be used.
+        AssetError: an index out of range, a picture that cannot be used.
     """
     vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):  # before anything is looked up by them
+        raise AssetError(looks.label, f"a face has an index outside 0..{len(vertices) - 1}")
     visual = mesh.visual
     normals: Matrix | None = None
     if "vertex_normals" in mesh._cache.cache:  # as trimesh's exporters tell: else they are made up from the faces

@@ -59,7 +59,7 @@ class Bench:
             full=True,
         )
         if found.nonfinite_samples:
-            raise RenderError(f"{found.nonfinite_samples} samples are not finite")
+            raise RenderError(f"{found.nonfinite_samples} samples are not finite; the first is {found.nonfinite_first}")
         return found.image.double().cpu()
 
     def exact(self) -> Bench:

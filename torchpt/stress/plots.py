@@ -32,21 +32,21 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with matplotlib.rc_context(
-        {"font.size": 8.0, "svg.hashsalt": "torchpt", "axes.spines.top": False, "axes.spines.right": False}
-    ):
+    with matplotlib.rc_context({"font.size": 8.0, "svg.hashsalt": "torchpt", "svg.fonttype": "none"}):
         rows = -(-len(swept) // COLUMNS)
         figure = Figure(figsize=(3.4 * COLUMNS, 2.3 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         for number, outcome in enumerate(swept):
             axes = figure.add_subplot(rows, COLUMNS, number + 1)
-            at = [one.at for one in outcome.readings]
-            values = [max(one.figure, NOTHING) if math.isfinite(one.figure) else math.nan for one in outcome.readings]
+            readings = sorted(outcome.readings, key=lambda one: one.at)
+            at, wide = _places([one.at for one in readings])
+            values = [max(one.figure, NOTHING) if math.isfinite(one.figure) else math.nan for one in readings]
+            axes.spines[["top", "right"]].set_visible(False)
             axes.plot(at, values, "o-", color="#0072B2", markersize=3, linewidth=1)
             axes.axhline(max(outcome.case.bound, NOTHING), color="#D55E00", linestyle="--", linewidth=1)
-            axes.set_yscale("log")
             axes.set_ylim(NOTHING / 3, max(*(v for v in values if not math.isnan(v)), outcome.case.bound, 1e-3) * 3)
-            if min(at) > 0 and max(at) / min(at) > 50:
+            axes.set_yscale("log")
+            if wide:
                 axes.set_xscale("log")
             axes.set_title(outcome.case.name, loc="left")
             axes.set_xlabel(outcome.case.axis)
@@ -59,3 +59,11 @@ def draw(outcomes: Sequence[Outcome], file: Path) -> bool:
         finally:
             temporary.unlink(missing_ok=True)
     return True
+
+
+def _places(at: list[float]) -> tuple[list[float], bool]:
+    """Where readings stand, and whether on a logarithmic axis: there a place at 0 is half the least of the others."""
+    positive = [place for place in at if place > 0]
+    if not positive or min(at) < 0 or max(positive) <= 50 * min(positive):
+        return at, False
+    return [place or min(positive) / 2 for place in at], True

@@ -14,7 +14,7 @@ from torchpt.bsdfs.coat import Coat, coated, over_base
 from torchpt.bsdfs.glass import tinted
 from torchpt.bsdfs.lobes import share, weighed, with_delta
 from torchpt.bsdfs.specs import smooth
-from torchpt.math.fresnel import fresnel_dielectric, fresnel_diffuse
+from torchpt.math.fresnel import diffuse_passed, fresnel_dielectric
 from torchpt.math.warps import cosine_hemisphere
 from torchpt.records import BsdfSample, SplitSumMaterial
 
@@ -25,7 +25,7 @@ __all__ = ["Plastic"]
 class Plastic(Coat):
     """A polished coat over a diffuse base.
 
-    Its diffuse fits (see ``fresnel_diffuse``) conserve energy to 0.2 %.
+    Its fit of the coat's mean reflectance (see ``diffuse_passed``) conserves energy to 0.02 %.
 
     Attributes:
         nonlinear: light that the coat throws back takes the base's colour again.
@@ -51,7 +51,7 @@ class Plastic(Coat):
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""
         eta = values["int_ior"] / values["ext_ior"]
-        return coated(values, eta, fresnel_diffuse(1.0 / eta), self.nonlinear)
+        return coated(values, eta, diffuse_passed(1.0 / eta), self.nonlinear)
 
     def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
         """The base, seen through the coat both ways."""

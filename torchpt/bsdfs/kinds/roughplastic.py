@@ -68,7 +68,7 @@ class RoughPlastic(Rough, Coat):
         """See :class:`Bsdf`."""
         tables = values if "transmittance" in values else self.tabulate(values)
         return {
-            **coated(values, values["int_ior"] / values["ext_ior"], tables["inner"], self.nonlinear),
+            **coated(values, values["int_ior"] / values["ext_ior"], 1.0 - tables["inner"], self.nonlinear),
             **rough(values, False),
             "transmittance": tables["transmittance"],
         }

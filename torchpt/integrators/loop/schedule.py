@@ -10,12 +10,14 @@ from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 
 import numpy as np
+import torch
 
 from torchpt.errors import RenderError
 from torchpt.film import Film
 from torchpt.integrators.loop.calls import Halted
 from torchpt.integrators.loop.chunk import LANES, Chunk, Worker
 from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.lost import Lost
 from torchpt.integrators.path import Tally
 from torchpt.integrators.plate import Plate
 from torchpt.lanes.arena import CAPACITY
@@ -46,14 +48,14 @@ class Share:
     Attributes:
         tally: rays and paths.
         samples: camera samples taken.
-        bad: samples that were not finite.
+        lost: samples that were not finite.
         light: before and after the clamp.
         rest: what memory did not suffice for.
     """
 
     tally: Tally
     samples: int = 0
-    bad: int = 0
+    lost: Lost = field(default_factory=Lost)
     light: tuple[float, float] = (0.0, 0.0)
     rest: list[Block] = field(default_factory=list)
 
@@ -73,7 +75,7 @@ class Loop:
         kernels: of the render.
         threads: how many.
         clamp: largest contribution of a path, or None.
-        strict: whether a sample that is not finite ends the render.
+        strict: whether a task ends at a sample that is not finite; whoever is told of it ends the render.
         said: tells the user a line.
 
     Attributes:
@@ -222,6 +224,8 @@ class Loop:
                 self._chunk(worker, chunk, plate, share)
                 sample += chunk.samples
                 share.samples += size * chunk.samples
+                if self.strict and share.lost.count:
+                    break
             self._workers.append(worker)
         except Halted:
             pass  # what was added so far counts
@@ -259,13 +263,16 @@ class Loop:
     def _radiance(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
         values = worker.slots.floats
         used = values[:, : chunk.pixels * chunk.samples]
-        before = _total(used) if self.clamp is not None else 0.0
-        bad = self._deposit(worker, values, chunk, plate.film, 3, self.clamp)
-        share.bad += bad
-        if self.clamp is not None:
-            share.light = share.light[0] + before, share.light[1] + _total(used)
-        if bad and self.strict:
-            raise self._not_finite(used, chunk, plate)
+        if self.clamp is None:
+            if self._deposit(worker, values, chunk, plate.film, 3, None):
+                share.lost.add(self._lost(used, chunk))
+            return
+        finite = np.isfinite(used).all(0)
+        if not finite.all():
+            share.lost.add(self._lost(used, chunk))  # the clamp writes over them
+        before = float(np.where(finite, used, 0.0).sum(dtype=np.float64))
+        self._deposit(worker, values, chunk, plate.film, 3, self.clamp)
+        share.light = share.light[0] + before, share.light[1] + float(np.ascontiguousarray(used).sum(dtype=np.float64))
 
     def _layers(self, worker: Worker, chunk: Chunk, plate: Plate) -> None:
         assert worker.shown is not None
@@ -304,16 +311,7 @@ class Loop:
             film.keep_first(values[:, :n], chunk.first_pixel)
         return int(counters[0])
 
-    def _not_finite(self, used: np.ndarray, chunk: Chunk, plate: Plate) -> RenderError:
-        place = int(np.flatnonzero(~np.isfinite(used).all(0))[0])
-        sample, pixel = divmod(place, chunk.pixels)
-        x0, y0, width, _ = self.kernels.wave.crop
-        pixel += chunk.first_pixel
-        if plate.places is not None:
-            pixel = int(plate.places[pixel])
-        x, y = pixel % width + x0, pixel // width + y0
-        return RenderError(f"integrator.strict: sample {chunk.first_sample + sample} of pixel ({x}, {y}) is not finite")
-
-
-def _total(values: np.ndarray) -> float:
-    return float(np.where(np.isfinite(values).all(0), values, 0.0).sum(dtype=np.float64))
+    def _lost(self, used: np.ndarray, chunk: Chunk) -> Lost:
+        """Which samples of a chunk are not finite, of the radiance ``(3, samples * pixels)`` of all."""
+        radiance = torch.from_numpy(used).view(3, chunk.samples, chunk.pixels)
+        return Lost.of(radiance, chunk.first_pixel, chunk.first_sample, self.kernels.wave.crop, chunk.plate)

@@ -30,11 +30,11 @@ def ball(radius: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), **
 
 
 def floor_seen(
-    lights: dict[str, Any] | None, shapes: dict[str, Any] | None = None, albedo: float = 0.5
+    lights: dict[str, Any] | None, shapes: dict[str, Any] | None = None, albedo: float = 0.5, near: float = 1e-3
 ) -> dict[str, Any]:
-    """The middle of a diffuse square in z = 0, seen from aside and from near, so that nothing above it is in the way."""
+    """The middle of a diffuse square in z = 0, seen from aside and from so near that nothing above it is in the way."""
     return {
-        "camera": {"type": "perspective", "origin": [1e-3, 0, 1e-3], "target": [0, 0, 0], "up": [0, 0, 1], "fov": 1e-3},
+        "camera": {"type": "perspective", "origin": [near, 0, near], "target": [0, 0, 0], "up": [0, 0, 1], "fov": 1e-3},
         "shapes": {
             "floor": {"type": "rectangle", "material": {"type": "diffuse", "reflectance": albedo}},
             **(shapes or {}),

@@ -17,7 +17,7 @@ INDEX = tuple(10.0 ** (k / 4) for k in range(-12, 13))
 
 def gain(bench: Bench, material: dict[str, Any]) -> float:
     """By how much a ball gives back more than it receives; infinite where it gives back nothing at all."""
-    mean = float(bench.render(furnace(material), max_depth=-1).mean())
+    mean = float(bench.render(furnace(material), spp=256, max_depth=-1).mean())
     return max(mean - 1.0, 0.0) if mean > 0.0 else math.inf
 
 
@@ -35,7 +35,7 @@ def rough(kind: str, **more: Any):
 METAL = rough("roughconductor", reflectance=1.0)
 COMPENSATED = rough("roughconductor", reflectance=1.0, energy_compensation=True)
 GLASS = rough("roughdielectric", int_ior=1.5)
-PLASTIC = rough("roughplastic", reflectance=1.0)
+PLASTIC = rough("roughplastic", diffuse_reflectance=1.0)
 
 
 def one_direction(bench: Bench, alpha: float) -> float:
@@ -47,6 +47,12 @@ def one_direction(bench: Bench, alpha: float) -> float:
 def glass_in_a_furnace(bench: Bench, index: float) -> float:
     """Smooth glass neither takes nor gives."""
     return relative(bench.render(furnace({"type": "dielectric", "int_ior": index}), max_depth=-1), 1.0)
+
+
+def plastic(bench: Bench, index: float) -> float:
+    """A coat over white keeps nothing."""
+    material = {"type": "plastic", "diffuse_reflectance": 1.0, "int_ior": index, "nonlinear": True}
+    return relative(bench.render(furnace(material), spp=256, max_depth=-1), 1.0)
 
 
 def thin_glass(bench: Bench, index: float) -> float:
@@ -68,8 +74,8 @@ def grazing(bench: Bench, height: float) -> float:
     for material in (
         METAL(0.3),
         PLASTIC(0.3),
-        {"type": "plastic", "reflectance": 1.0},
-        {"type": "principled", "base_color": 1.0},
+        {"type": "plastic", "diffuse_reflectance": 1.0},
+        COMPENSATED(0.3),
     ):
         scene = {
             "camera": camera,
@@ -81,8 +87,9 @@ def grazing(bench: Bench, height: float) -> float:
 
 
 def albedo(bench: Bench, value: float) -> float:
-    """A ball of this albedo gives back that."""
-    return relative(bench.render(furnace({"type": "diffuse", "reflectance": value})), value)
+    """A ball of this albedo gives back so many times what a white one does."""
+    some, white = (bench.render(furnace({"type": "diffuse", "reflectance": r}), max_depth=2) for r in (value, 1.0))
+    return relative(some, white.mean() * value)
 
 
 def backs(bench: Bench, alpha: float) -> float:
@@ -108,12 +115,13 @@ CASES = (
     Case("rough glass as in float64", "relative", 5e-3, lambda b, a: beside_float64(b, GLASS(a)), "alpha", ALPHA),
     Case("one roughness of two is 0", "reflectance above 1", 2e-3, one_direction, "alpha", ALPHA),
     Case("glass of any index", "relative to 1", 1e-4, glass_in_a_furnace, "index", INDEX),
-    Case("panes of any index", "relative to 1", 1e-4, thin_glass, "index", INDEX),
+    Case("white plastic of any index", "relative to 1", 2e-3, plastic, "index", tuple(n for n in INDEX if n > 1.0)),
+    Case("panes of any index", "relative to 1", 1e-3, thin_glass, "index", INDEX),
     Case(
         "rough glass of any index as in float64", "relative", 5e-3,
         lambda b, n: beside_float64(b, {"type": "roughdielectric", "alpha": 0.2, "int_ior": n}), "index", INDEX,
     ),
     Case("grazing light", "radiance above 1", 5e-3, grazing, "sine of the angle", powers(-5, 0)),
-    Case("albedo", "relative", 1e-5, albedo, "albedo", (*powers(-30, -2, 4), 0.5, 0.9, 0.999, 1.0)),
+    Case("albedo", "relative to a white one", 1e-5, albedo, "albedo", (*powers(-30, -2, 4), 0.5, 0.9, 0.999, 1.0)),
     Case("backs are fronts", "relative", 5e-3, backs, "alpha", ALPHA[::4]),
 )  # fmt: skip

@@ -49,7 +49,8 @@ def weights(bench: Bench, density: float) -> float:
 
 
 CASES = (
-    Case("sums of many samples", "relative", 1e-9, sums, "samples", (1e3, 1e5, 1e6), backend=False),
+    Case("sums of many samples", "relative", 1e-9, sums, "samples", (1e3, 1e5, 1e6), (1e3, 1e4),
+         backend=False),
     Case("numbers of late samples", "deviations / 4", 1.0, late_samples, "sample",
          (0.0, 2.0**24, 2.0**31 - 5000), backend=False),
     Case("weights of densities", "difference from 1", 1e-6, weights, "density", powers(-37, 37, 2), backend=False),

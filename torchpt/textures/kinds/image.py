@@ -17,7 +17,10 @@ from torchpt.spec import Texels as TexelsSpec
 from torchpt.textures.atlas import WRAPS, ImageNode
 from torchpt.textures.base import CHANNELS, Mapped, Node, Opening
 
-__all__ = ["Image"]
+__all__ = ["MOST_PIXELS", "Image"]
+
+#: Pixels up to which a texture may ask for a larger image to be read.
+MOST_PIXELS = 2**30
 
 
 def _source(value: Any) -> tuple[str, ...] | EncodedImage:
@@ -47,7 +50,9 @@ class Image(Mapped):
         ),
         "scale": Color((1.0, 1.0, 1.0), low=None, doc="multiplies the values"),
         "channel": Choice(None, names=CHANNELS, doc="what a number takes: luminance where nothing is said"),
-        "max_pixels": Whole(None, low=1, high=2**34, also=(None,), doc="larger images are refused; null: 64 Mpixel"),
+        "max_pixels": Whole(
+            None, low=1, high=MOST_PIXELS, also=(None,), doc="larger images are refused; null: 64 Mpixel"
+        ),
     }
     filters = ("trilinear",)
 

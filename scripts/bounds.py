@@ -1,0 +1,50 @@
+"""What a scene and its files may ask for at most: the table of docs/stability.md, from the constants themselves.
+
+``python scripts/make_tables.py`` writes it.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+__all__ = ["BOUNDS", "table"]
+
+#: Of what, where the constant is, its unit.
+BOUNDS: list[tuple[str, str, str]] = [
+    ("a scene file", "torchpt.format.yaml_file:MAX_BYTES", "bytes"),
+    ("levels of nesting in it", "torchpt.format.yaml_file:MAX_DEPTH", ""),
+    ("values in it, and once aliases are expanded", "torchpt.format.yaml_file:MAX_VALUES", ""),
+    ("keys that its `<<` merges copy", "torchpt.format.yaml_file:MAX_MERGED", ""),
+    ("a key", "torchpt.format.yaml_file:MAX_KEY", "characters"),
+    ("textures, materials, shapes with instances, lights: of each", "torchpt.format.description:MAX_ENTRIES", ""),
+    ("levels of blends within blends", "torchpt.format.materials:MAX_BLENDS", ""),
+    ("models of materials, told apart by what they are made of", "torchpt.scene.assembly.materials:MOST_MODELS", ""),
+    ("primitives, those of instances counted again", "torchpt.scene.assembly.copies:MOST_PRIMITIVES", ""),
+    ("faces of a displaced mesh", "torchpt.scene.meshes:MOST_FACES", ""),
+    ("a side of the film", "torchpt.settings:MAX_SIDE", "pixels"),
+    ("the film", "torchpt.settings:MAX_PIXELS", "pixels"),
+    ("a number", "torchpt.spec.reading:LARGEST", ""),
+    ("a mesh or picture file", "torchpt.files:MAX_BYTES", "bytes"),
+    ("parts of a mesh file", "torchpt.meshes.mesh_part:MOST_PARTS", ""),
+    ("vertices or faces once its nodes are placed, in a file of fewer bytes", "torchpt.meshes.gltf:MOST_PLACED", ""),
+    ("what an archive of meshes unfolds to", "torchpt.meshes.others:MOST_UNFOLDED", "bytes"),
+    ("a picture", "torchpt.images.decode:MAX_PIXELS", "pixels"),
+    ("a picture by the texture's `max_pixels`", "torchpt.textures.kinds.image:MOST_PIXELS", "pixels"),
+]
+
+
+def table() -> str:
+    """The bounds as a table of Markdown."""
+    rows = [f"| {what} | {_shown(place, unit)} |\n" for what, place, unit in BOUNDS]
+    return "| what | at most |\n|---|---|\n" + "".join(rows)
+
+
+def _shown(place: str, unit: str) -> str:
+    module, _, name = place.partition(":")
+    value = getattr(import_module(module), name)
+    if isinstance(value, float):
+        return f"{value:.2g}"
+    for size, prefix in ((2**30, "Gi"), (2**20, "Mi")):
+        if unit == "bytes" and value % size == 0:
+            return f"{value // size} {prefix}B"
+    return f"{value:,} {unit}".strip()

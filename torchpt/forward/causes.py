@@ -1,0 +1,54 @@
+"""What a render says of its samples that are not finite: how many by cause, and where the first one is."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from torchpt.integrators.faults import Fault, faults_of
+from torchpt.integrators.lost import Lost, Place
+from torchpt.integrators.wave import Wave
+from torchpt.scene.names import Names
+from torchpt.scene.scene import Scene
+
+__all__ = ["causes_of", "told"]
+
+
+def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str]:
+    """Samples by cause, most first, and a sentence about the first one; nothing where none was lost.
+
+    Only the first :data:`~torchpt.integrators.lost.KEPT` are traced again. The others are counted as ``nan, not traced`` and
+    ``infinite, not traced``, so that all add up to ``lost.count``.
+
+    Args:
+        scene: what was rendered.
+        wave: of the render.
+        lost: its samples that were not finite.
+    """
+    if not lost.count:
+        return {}, ""
+    faults = faults_of(wave, lost.places)
+    causes = Counter(fault.name for fault in faults)
+    nans = sum(place.nan for place in lost.places)
+    causes["nan, not traced"] = lost.nan - nans
+    causes["infinite, not traced"] = lost.infinite - (len(lost.places) - nans)
+    first = f"{_named(lost.places[0])}: {_said(scene, wave, faults[0])}"
+    return {name: count for name, count in causes.most_common() if count}, first
+
+
+def told(scene: Scene, wave: Wave, place: Place) -> str:
+    """A sentence about one sample that is not finite."""
+    return f"{_named(place)} is not finite: {_said(scene, wave, faults_of(wave, [place])[0])}"
+
+
+def _named(place: Place) -> str:
+    """A sample by number and pixel; pilots take some of their own."""
+    return str(place) + (" (its second value)" if place.first else "")
+
+
+def _said(scene: Scene, wave: Wave, fault: Fault) -> str:
+    if fault.cause == "not repeated":
+        return "traced again by tensor operations it is finite"
+    depth = f" at depth {fault.depth}" if fault.depth else ""
+    if fault.slot < 0:
+        return fault.name + depth
+    return f"{fault.name}{depth} ({Names(scene.built, wave.stages.world).owner(fault.slot)})"
