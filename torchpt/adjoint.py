@@ -141,7 +141,7 @@ def chunks(
     with torch.no_grad():
         still = make_wave(scene, settings, plain, dtype, True, attached)
     if settings.render.max_memory is not None:
-        need = need_of(settings, "tape", len(still.stages.world.materials.models))
+        need = need_of(settings, scene.device, "tape", len(still.stages.world.materials.models))
         check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)
     pixels, spp = still.crop[2] * still.crop[3], settings.render.spp
     clamp = settings.integrator.clamp

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
+import torch
+
 from torchpt.forward.schedule import BYTES_PER_LANE, streams_of
 from torchpt.forward.wave import surface_layers
 from torchpt.settings import Settings
@@ -62,11 +64,12 @@ class Need:
         return limit - held - self.films - self.code - self.picture
 
 
-def need_of(settings: Settings, how: str, models: int, rows: int = 0) -> Need:
+def need_of(settings: Settings, device: torch.device, how: str, models: int, rows: int = 0) -> Need:
     """What a render takes.
 
     Args:
         settings: complete.
+        device: of the lanes; where it is not the CPU, code takes none of its memory.
         how: ``eager``, ``compiled`` or ``tape``.
         models: of materials.
         rows: of 32-bit numbers that a thread of the compiled loop has for its lanes.
@@ -84,6 +87,8 @@ def need_of(settings: Settings, how: str, models: int, rows: int = 0) -> Need:
     code = 0 if how in _ran else CODE[how] + (CODE_OF_MODEL * models if how == "compiled" else 0)
     if how != "compiled" and "numba" not in sys.modules:
         code += NUMBA
+    if device.type != "cpu":
+        code = 0
     waves = FEWEST_OF_LOOP * 4 * rows if how == "compiled" else FEWEST * 2 * BYTES_PER_LANE
     return Need(pixels * films, code, waves, pixels * picture)
 

@@ -69,7 +69,7 @@ class Run:
         self.loop = self._loop(scene) if looped(self.wave, settings, self.device) else None
         how = "eager" if self.loop is None else "compiled"
         rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
-        self.need = need_of(settings, how, len(self.wave.stages.world.materials.models), rows)
+        self.need = need_of(settings, self.device, how, len(self.wave.stages.world.materials.models), rows)
         if settings.render.max_memory is not None:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
             check_memory(settings.render.max_memory, self.device, self.need.least, loading)
