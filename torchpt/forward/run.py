@@ -107,13 +107,8 @@ class Run:
             say_once(
                 f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}"
             )
-        return Loop(
-            kernels,
-            torch.get_num_threads(),
-            self.integrator.clamp,
-            self.integrator.strict,
-            say_once,
-        )
+        integrator = self.integrator
+        return Loop(kernels, torch.get_num_threads(), integrator.clamp, integrator.strict, say_once)
 
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, or as many as the rules or ``on_progress`` let."""
