@@ -96,7 +96,7 @@ def test_what_it_warns_of_is_real():
             warnings.simplefilter("ignore", torchpt.EnergyWarning)
             loaded = torchpt.load(given, "cpu")
         wish = {"film": {"width": 24, "height": 24}, "integrator": {"type": "path", "max_depth": -1}}
-        return float(torchpt.render(loaded, spp=64, **wish).max())
+        return float(torchpt.render(loaded, spp=64, accel="numba", **wish).max())
 
     assert worst(0.0) > 1.05
     assert math.isclose(worst(1e-3), 1.0, rel_tol=2e-3)
