@@ -103,7 +103,7 @@ def test_none_of_a_thousand_million_rays_escapes(name, place):
     assert escapes(name, place, 84_000_000) == (0, 0)
 
 
-@pytest.mark.parametrize("count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [4_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["torch", "brute"])
 @pytest.mark.parametrize(("name", "place"), [("sphere", HERE), ("sphere", FAR), ("cube", HERE), ("cube", FAR)])
 def test_no_ray_escapes_the_other_searches(kind, name, place, count):
@@ -113,11 +113,12 @@ def test_no_ray_escapes_the_other_searches(kind, name, place, count):
     scale = 1000.0 if any(place) else 1.0
     vertices = (vertices * scale + np.array(place)).astype(np.float32)
     accel = build(triangles(vertices, faces), kind)
-    for seed in range(count // 20_000):
+    n = min(count, 20_000)
+    for seed in range(count // n):
         rng = np.random.default_rng(seed)
-        o = (rng.normal(size=(3, 20_000)) * 0.15 * scale + np.array(place)[:, None]).astype(np.float32)
-        o, d = (torch.from_numpy(x) for x in directions(rng, vertices, faces, o, 20_000))
-        far = torch.full((20_000,), float("inf"))
+        o = (rng.normal(size=(3, n)) * 0.15 * scale + np.array(place)[:, None]).astype(np.float32)
+        o, d = (torch.from_numpy(x) for x in directions(rng, vertices, faces, o, n))
+        far = torch.full((n,), float("inf"))
         assert (accel.intersect(o, d, far)[1] >= 0).all()
         assert accel.occluded(o, d, far).all()
 
