@@ -85,7 +85,7 @@ def render(
         scene: from :func:`torchpt.load`.
         spp: samples a pixel; the most of them where ``time_limit`` or ``target_error`` may end it.
         seed: any integer from 0; the same seed gives the same picture.
-        params: tensors in place of ``scene.params`` by dotted name. Where one requires gradients, so does the picture.
+        params: tensors in place of ``scene.params`` by dotted name. Where one of them requires gradients, so does the picture.
         full: True returns a :class:`torchpt.Rendering`: picture, layers, error, counts and seconds as one object.
 
     Other arguments, all as in the scene file; ``None`` keeps the scene's own wish:
@@ -121,6 +121,8 @@ def render(
         settings = _of_one_picture(settings, film)
     elif settings.film.denoise:
         check_denoiser()
+    if torch.is_grad_enabled():
+        params = {name: value for name, value in scene.params.items() if value.requires_grad} | dict(params or {})
     scene.check(params)
     wanted = tuple(name for name, value in (params or {}).items() if value.requires_grad)
     if not (wanted or scene.weights()) or not torch.is_grad_enabled():
@@ -135,15 +137,17 @@ def render(
 
 
 def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
-    """Settings of a render that returns a tensor; a scene file's wish to denoise is about files.
+    """Settings of a render that returns a tensor; a scene file's wishes for layers and to denoise are about files.
 
     Raises:
-        SceneError: the caller's own wish to denoise.
+        SceneError: such a wish of the caller's own.
     """
+    if (film or {}).get("aovs"):
+        raise SceneError("film.aovs", settings.film.aovs, "none, or full=True: a tensor is one picture, without layers")
     if (film or {}).get("denoise") and settings.film.denoise:
         expected = "false, or full=True: a tensor is one picture; hand it to torchpt.denoise with its layers"
         raise SceneError("film.denoise", True, expected)
-    return replace(settings, film=settings.film.but(denoise=False))
+    return replace(settings, film=settings.film.but(denoise=False, aovs=()))
 
 
 def _check(

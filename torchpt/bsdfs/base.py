@@ -188,9 +188,14 @@ class Bsdf:
 
     def weights(self) -> Iterator[Tensor]:
         """Trainable tensors of its own, those of modules it holds: gradients flow to them."""
-        held = [value for value in vars(self).values() if isinstance(value, torch.nn.Module)]
-        for module in [self] if isinstance(self, torch.nn.Module) else held:
+        for module in self.held():
             yield from torch.nn.Module.parameters(module)
+
+    def held(self) -> list[torch.nn.Module]:
+        """The modules with such tensors: itself, where it is one."""
+        if isinstance(self, torch.nn.Module):
+            return [self]
+        return [value for value in vars(self).values() if isinstance(value, torch.nn.Module)]
 
     def __str__(self) -> str:
         variants = [key.replace("_", " ") for key, value in vars(self).items() if value is True]

@@ -6,17 +6,17 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 from torchpt import paths
 from torchpt import settings as run_settings
 from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, SceneError
-from torchpt.files import MAX_BYTES, check_regular
+from torchpt.files import MAX_BYTES, check_regular, is_regular
 from torchpt.format.cameras import read_camera
 from torchpt.format.materials import Kind, check_material, material_types, read_material
 from torchpt.format.textures import check_texture, texture_of
-from torchpt.format.yaml_file import plain, read_yaml
+from torchpt.format.yaml_file import parse_yaml, plain, read_open, read_yaml
 from torchpt.lights import KINDS as LIGHTS
 from torchpt.settings import BLOCKS, Settings
 from torchpt.shapes import KINDS as SHAPES
@@ -24,7 +24,16 @@ from torchpt.spec.declared import Described, described
 from torchpt.spec.validate import check_keys
 from torchpt.textures import KINDS as TEXTURES
 
-__all__ = ["ASSETS", "MAX_ENTRIES", "Description", "overridden", "read_description", "scene_names", "settings"]
+__all__ = [
+    "ASSETS",
+    "MAX_ENTRIES",
+    "Description",
+    "Source",
+    "overridden",
+    "read_description",
+    "scene_names",
+    "settings",
+]
 
 ASSETS = "$TORCHPT_ASSETS"
 #: Textures, materials, shapes (instances are some) and lights that a scene may name, of each.
@@ -34,6 +43,9 @@ _WRITTEN = ("preview", "checkpoint", "resume")
 _KEYS = ("version", "camera", *BLOCKS, "textures", "materials", "shapes", "lights")
 
 T = TypeVar("T")
+#: What a scene is read from.
+Source = str | os.PathLike[str] | IO[str] | IO[bytes] | Mapping[str, Any]
+SOURCES = "a scene's name, a path ending in .yaml, YAML text, an open file, or a mapping"
 
 
 @dataclass(frozen=True)
@@ -118,15 +130,16 @@ def scene_names() -> list[str]:
 
 
 def read_description(
-    source: str | os.PathLike[str] | Mapping[str, Any],
+    source: Source,
     bsdfs: Mapping[str, Bsdf] | None = None,
     change: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Description:
     """A checked scene description.
 
     Args:
-        source: the name of a scene in ``configs/scene/``, a path ending in ``.yaml``, or a mapping of the same schema
-            (its relative paths start at the current folder).
+        source: the name of a scene in ``configs/scene/``, a path ending in ``.yaml``, an open file, YAML text of more than
+            one line, or a mapping of the same schema. Relative paths start at the file's folder; where there is no file, at
+            the current one.
         bsdfs: material types of the caller's own: type name to model instance.
         change: of what was written, before it is checked.
 
@@ -140,9 +153,16 @@ def read_description(
     types, change = material_types(bsdfs), change or (lambda raw: raw)
     if isinstance(source, Mapping):
         return _describe(change(plain(source)), types, None, Path.cwd())
+    if not isinstance(source, str | os.PathLike) and hasattr(source, "read"):
+        named = getattr(source, "name", None)
+        file = named if isinstance(named, str) and is_regular(named) else None
+        base = Path.cwd() if file is None else Path(file).resolve().parent
+        return _describe(change(plain(read_open(source, file), file)), types, file, base)
     if not isinstance(source, str | os.PathLike):
-        raise SceneError("scene", source, "a scene's name, a path ending in .yaml, or a mapping")
+        raise SceneError("scene", source, SOURCES)
     file = os.fspath(source)
+    if isinstance(source, str) and "\n" in source:
+        return _describe(change(plain(parse_yaml(source))), types, None, Path.cwd())
     if file.endswith((".yaml", ".yml")):
         path = Path(file)
     elif file in scene_names():

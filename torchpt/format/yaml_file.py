@@ -15,7 +15,7 @@ from typing import Any
 from torchpt.errors import SceneError
 from torchpt.files import check_regular, read_regular
 
-__all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_KEY", "MAX_VALUES", "parse_yaml", "plain", "read_yaml"]
+__all__ = ["MAX_BYTES", "MAX_DEPTH", "MAX_KEY", "MAX_VALUES", "parse_yaml", "plain", "read_open", "read_yaml"]
 
 MAX_BYTES = 256 * 2**20
 MAX_DEPTH = 100
@@ -49,6 +49,25 @@ def read_yaml(path: Path, file: str) -> Any:
         data = read_regular(path, MAX_BYTES)
     except OSError as error:
         raise SceneError("scene", file, f"a scene file that can be read ({error.strerror})") from None
+    return parse_yaml(data, file)
+
+
+def read_open(source: Any, file: str | None) -> Any:
+    """The document in what is left of an open file, or of anything with a ``read``.
+
+    Raises:
+        SceneError: it cannot be read, is too large, or is no valid YAML.
+    """
+    name = file or "an open file"
+    try:
+        data = source.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:  # closed, or not text
+        reason = getattr(error, "strerror", None) or str(error)
+        raise SceneError("scene", name, f"an open file that can be read ({reason})") from None
+    if not isinstance(data, str | bytes):
+        raise SceneError("scene", name, "an open file of text or bytes")
+    if len(data) > MAX_BYTES:
+        raise SceneError("scene", name, f"at most {MAX_BYTES // 2**20} MiB (large meshes belong in PLY files)")
     return parse_yaml(data, file)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
-import os
 import threading
 import time
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from torchpt.bsdfs import Bsdf
 from torchpt.cameras import Camera, PinholeMatrices
 from torchpt.cameras.opencv import extrinsics
 from torchpt.errors import RenderError, SceneError
-from torchpt.format.description import Description, read_description, settings
+from torchpt.format.description import Description, Source, read_description, settings
 from torchpt.native.memory import Meter, mb
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
@@ -35,16 +35,20 @@ from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
 __all__ = ["Scene", "device_of", "load"]
 
+#: Of a scene, what copies of it have: all else is made of it on demand.
+_KEPT = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
+
 
 def load(
-    source: str | os.PathLike[str] | Mapping[str, Any],
+    source: Source,
     device: str | torch.device | None = None,
     bsdfs: Mapping[str, Bsdf] | None = None,
 ) -> Scene:
     """Load a scene.
 
     Args:
-        source: the name of a scene that ships, a path ending in ``.yaml``, or a dict of the same schema.
+        source: the name of a scene that ships, a path ending in ``.yaml``, an open file, YAML text (of more than one line),
+            or a dict of the same schema. Relative paths in it start at the file's folder, else at the current one.
         device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
             ``render.device``, which is ``auto`` where it does not say.
         bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
@@ -109,12 +113,59 @@ class Scene:
         after = meter.peak()
         #: The most that was held above import while the scene was read; 0 where it is not known.
         self.peak = after - meter.base() if after > before else 0
-        self._space = Space(torch.from_numpy(self._built.centre).to(device), self._built.unit)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Nothing is made of the parameters yet."""
+        self._space = Space(torch.from_numpy(self._built.centre).to(self.device), self._built.unit)
         self._lock = threading.RLock()
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
         self._state: dict[str, tuple[Tensor, int]] = {}
+
+    def to(self, device: str | torch.device) -> Scene:
+        """The scene on a device, which may be ``auto``: itself where it is there already, else a copy.
+
+        Parameters stay on the tape of those that they were copied from, as tensors do; models of the caller's own are copied.
+
+        Raises:
+            RenderError: the device is not there.
+        """
+        chosen = device_of(device)
+        if chosen.type == self.device.type and chosen.index in (None, self.device.index or 0):
+            return self
+        return self._copied(chosen, {name: value.to(chosen) for name, value in self.params.items()}, {})
+
+    def __copy__(self) -> Scene:
+        """Another scene of the same tensors."""
+        return self._copied(self.device, dict(self.params), None)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
+        """Another scene of copied tensors and models; what its description came to never changes, and is shared."""
+        return self._copied(
+            self.device, {name: copy.deepcopy(value, memo) for name, value in self.params.items()}, memo
+        )
+
+    def _copied(self, device: torch.device, params: dict[str, Tensor], memo: dict[int, Any] | None) -> Scene:
+        """Another scene of other parameters; with copies of the caller's models where there is a ``memo``."""
+        made = object.__new__(type(self))
+        state = self.__dict__ | {"device": device, "params": params, "peak": 0}
+        if memo is not None and self.own_models:
+            state |= copy.deepcopy({name: state[name] for name in ("description", "_built", "own_models")}, memo)
+            for module in (module for model in state["own_models"] for module in model.held()):
+                module.to(device)
+        made.__setstate__({name: state[name] for name in _KEPT})
+        return made
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy in another process is made of: files are not read again."""
+        return {name: getattr(self, name) for name in _KEPT}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        settle()
+        self.__dict__.update(state)
+        self._begin()
 
     def weights(self) -> tuple[Tensor, ...]:
         """Tensors of the caller's own models that want gradients."""
