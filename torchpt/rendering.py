@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt import adjoint as adjoints
+from torchpt.edges import add_gradients, concerns
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
@@ -46,6 +47,8 @@ class Wishes(TypedDict, total=False):
     adjoint: str | None
     seed_grad: int | None
     spp_grad: int | None
+    edges: bool
+    edge_spp: int | None
 
 
 @overload
@@ -78,6 +81,8 @@ def render(
     adjoint: str | None = None,
     seed_grad: int | None = None,
     spp_grad: int | None = None,
+    edges: bool = True,
+    edge_spp: int | None = None,
 ) -> Tensor | Rendering:
     """Render a scene to linear RGB ``(H, W, 3)`` on the scene's device; differentiable in ``params``.
 
@@ -109,7 +114,7 @@ def render(
         SceneError: a setting or parameter that is not accepted.
         RenderError: a device, compiler or denoiser that is not there.
     """
-    _check(scene, device, dtype, adjoint, {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1)})
+    _check(scene, device, dtype, adjoint, {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1), "edge_spp": (edge_spp, 1)})
     given = {
         "spp": spp, "seed": seed, "accel": accel, "compile": compile, "threads": threads, "max_memory": max_memory,
         "time_limit": time_limit, "target_error": target_error, "pilots": pilots,
@@ -126,7 +131,8 @@ def render(
     if not (wanted or scene.weights()) or not torch.is_grad_enabled():
         rendering = render_scene(scene, settings, params=params, dtype=dtype)
     else:
-        backward = {"seed": settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad, "spp": spp_grad}
+        seed_grad = settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad
+        backward = {"seed": seed_grad, "spp": spp_grad, "edges": edge_spp if edges else 0}
         rendering = _differentiable(scene, settings, backward, params or {}, wanted, dtype, adjoint or "autograd")
     if settings.film.denoise:
         with limited_threads(settings.render.threads):
@@ -185,7 +191,8 @@ def _differentiable(
 ) -> Rendering:
     """A rendering whose picture is on a tape from the parameters ``wanted``.
 
-    ``backward`` has the backward pass's own seed and samples a pixel; None: as many as the forward pass took.
+    ``backward`` has the backward pass's own seed, its samples a pixel and its samples of edges a pixel (0: none); None: as
+    many as the forward pass took.
     """
     if not settings.integrator.light:
         radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
@@ -193,7 +200,7 @@ def _differentiable(
     if settings.render.checkpoint is not None:
         raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
     attached = adjoints.attached(scene, wanted)
-    if attached or adjoints.casts(scene, wanted):
+    if backward["edges"] == 0 and (attached or adjoints.casts(scene, wanted)):
         warnings.warn(
             "the gradient with respect to what moves or bends rays leaves out visibility edges (silhouettes and shadow edges "
             "that move); see docs/gradients.md",
@@ -215,7 +222,15 @@ def _differentiable(
         again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
         return adjoints.chunks(scene, again, given, wanted, dtype, attached)
 
-    image = adjoints.KINDS[adjoint](forward, chunks, tuple(params[name] for name in wanted), scene.weights())
+    def moved(cotangent: Tensor, *tensors: Tensor) -> tuple[Tensor | None, ...]:
+        given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
+        spp = taken[0] if backward["edges"] is None else backward["edges"]
+        again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=1))
+        return add_gradients(scene, again, given, wanted, dtype, cotangent, spp)
+
+    with_edges = moved if backward["edges"] != 0 and concerns(scene, wanted) else None
+    tensors = tuple(params[name] for name in wanted)
+    image = adjoints.KINDS[adjoint](forward, chunks, tensors, scene.weights(), with_edges)
     rendering = made.pop()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
     return replace(rendering, image=image)
