@@ -9,13 +9,18 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from torchpt.accel.bounds import primitive_bounds
 from torchpt.edges.bodies import Bodies, bodies_of
 from torchpt.edges.draws import Numbers
 from torchpt.edges.film import Worth
 from torchpt.edges.primary import primary_of
 from torchpt.edges.seen import pieces_of
+from torchpt.edges.lit import sources_of
+from torchpt.edges.occluders import occluders_of
+from torchpt.edges.shadows import Shadows, in_chunks
 from torchpt.edges.traced import Traced, traced_of
 from torchpt.forward import lanes_for, limited_threads
+from torchpt.integrators.path import PathIntegrator
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 from torchpt.spec import Moves
@@ -51,6 +56,7 @@ class _Asked:
     traced: Traced
     still: Bodies
     worth: Worth
+    onward: bool
 
     def chunks(self, total: int) -> Iterator[tuple[int, int]]:
         """First samples and how many."""
@@ -98,7 +104,8 @@ def add_gradients(
         with torch.no_grad():
             traced = traced_of(scene, settings, plain, dtype)
             worth = Worth(cotangent.permute(2, 0, 1), traced.wave.filter, traced.wave.crop)
-            asked = _Asked(scene, settings, plain, traced, still, worth)
+            onward = any(not name.startswith("camera.") for name in moving)
+            asked = _Asked(scene, settings, plain, traced, still, worth, onward)
         sums = {name: torch.zeros_like(t) for name, t in outputs.items()}
         total = samples * cotangent.shape[0] * cotangent.shape[1]
         for found in _samples(asked, total):
@@ -117,6 +124,33 @@ def _samples(asked: _Asked, total: int) -> Iterator[Samples]:
         primary = primary_of(still, pieces, asked.traced, Numbers(asked.settings.render.seed, 0))
         for first, count in asked.chunks(total):
             yield primary.samples(first, count, total, worth, asked.traced.radiance)
+    yield from _shadows(asked, total)
+
+
+def _shadows(asked: _Asked, total: int) -> Iterator[Samples]:
+    """Samples of the edges of shadows: of lights, then of what surfaces reflect."""
+    still, integrator, seed = asked.still, asked.traced.wave.integrator, asked.settings.render.seed
+    depth = integrator.limits.max_depth
+    if not isinstance(integrator, PathIntegrator) or 0 <= depth < 2:
+        return
+    with torch.no_grad():
+        occluders = occluders_of(asked.scene, still, asked.scene.merged(asked.plain))
+        if occluders is None:
+            return
+        world = asked.traced.wave.stages.world
+        _, geometry = asked.scene.world(torch.float32, asked.plain)
+        low, high = primitive_bounds(geometry)
+        reach = float((high.double().amax(1) - low.double().amin(1)).norm()) * 0.5
+        met = asked.settings.integrator.strategy in ("bsdf", "uniform")
+        sources = sources_of(still, world, reach, met)
+    if sources is None:
+        return
+    numbers = [Numbers(seed, stream) for stream in (1, 2)]
+    parts = [Shadows(still, occluders, sources, asked.traced, numbers[0], reach, depth, asked.onward)]
+    if not 0 <= depth < 3:
+        parts.append(Shadows(still, occluders, None, asked.traced, numbers[1], reach, depth, asked.onward))
+    for part in parts:
+        yield from in_chunks(part, asked.chunks(total), total, asked.worth)
 
 
 def _add(sums: dict[str, Tensor], still: Bodies, found: Samples) -> None:

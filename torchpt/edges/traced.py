@@ -49,10 +49,14 @@ class Traced:
         one, lane = torch.ones_like(d), torch.arange(n, device=d.device)
         return PathState(o.to(self.dtype).clone(), d, forever, one, torch.zeros_like(d), forever.clone(), lane, key)
 
-    def radiance(self, o: Tensor, d: Tensor, key: Tensor) -> Tensor:
-        """Radiance ``(3, N)`` float64 that rays bring; black where it is not finite, as in pictures."""
+    def radiance(self, o: Tensor, d: Tensor, key: Tensor, depth: int | None = None) -> Tensor:
+        """Radiance ``(3, N)`` float64 that rays bring; black where it is not finite, as in pictures.
+
+        ``depth``: vertices of their paths at most, in place of the integrator's own limit.
+        """
         wave = self.wave
-        values, _ = wave.integrator.radiance(wave.stages, wave.accel, self.state(o, d, key), wave.first)
+        integrator = wave.integrator if depth is None else wave.integrator.but(max_depth=depth)
+        values, _ = integrator.radiance(wave.stages, wave.accel, self.state(o, d, key), wave.first)
         values = torch.where(torch.isfinite(values).all(0), values, 0.0).double()
         if self.clamp is not None:
             values = values * (self.clamp / values.abs().amax(0).clamp_min(self.clamp)).clamp_max(1.0)
