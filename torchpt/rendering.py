@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt import adjoint as adjoints
-from torchpt.edges import add_gradients, concerns
+from torchpt.edges import add_gradients, concerns, left_out
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
@@ -107,8 +107,10 @@ def render(
         adjoint: how gradients are taken: ``autograd`` (the default) runs each chunk of pixels again under a tape in the
             backward pass, so memory is that of a chunk.
         seed_grad, spp_grad: of the backward pass. By default it draws samples of its own, as many as the forward pass took:
-            shared samples would bias the gradient of a squared loss. Visibility edges that move (silhouettes, shadow
-            edges) are not differentiated; see docs/gradients.md.
+            shared samples would bias the gradient of a squared loss.
+        edges: whether edges that move (silhouettes, shadow edges) are differentiated where vertices, poses, the camera or
+            lights are; False leaves them out, which biases such gradients, and warns. See docs/gradients.md.
+        edge_spp: samples of edges a pixel, for each of their estimators; by default as many as the backward pass takes.
 
     Raises:
         SceneError: a setting or parameter that is not accepted.
@@ -200,13 +202,8 @@ def _differentiable(
     if settings.render.checkpoint is not None:
         raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
     attached = adjoints.attached(scene, wanted)
-    if backward["edges"] == 0 and (attached or adjoints.casts(scene, wanted)):
-        warnings.warn(
-            "the gradient with respect to what moves or bends rays leaves out visibility edges (silhouettes and shadow edges "
-            "that move); see docs/gradients.md",
-            EdgeWarning,
-            stacklevel=3,
-        )
+    if concerns(scene, wanted):
+        _warn_of_edges(scene, settings, backward["edges"] == 0)
     fixed = {name: value for name, value in params.items() if name not in wanted}
     made: list[Rendering] = []
     taken: list[int] = []
@@ -224,7 +221,7 @@ def _differentiable(
 
     def moved(cotangent: Tensor, *tensors: Tensor) -> tuple[Tensor | None, ...]:
         given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
-        spp = taken[0] if backward["edges"] is None else backward["edges"]
+        spp = backward["edges"] or backward["spp"] or taken[0]
         again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=1))
         return add_gradients(scene, again, given, wanted, dtype, cotangent, spp)
 
@@ -234,6 +231,17 @@ def _differentiable(
     rendering = made.pop()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
     return replace(rendering, image=image)
+
+
+def _warn_of_edges(scene: Scene, settings: Settings, every: bool) -> None:
+    """Say which visibility edges (``every`` one, or those of this scene that are not done) a gradient leaves out."""
+    edges = "all visibility edges (silhouettes and shadow edges that move)"
+    if not every:
+        missing = left_out(scene, settings)
+        if not missing:
+            return
+        edges = f"some edges: {'; '.join(missing)}"
+    warnings.warn(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning, stacklevel=5)
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:
