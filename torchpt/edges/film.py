@@ -55,6 +55,8 @@ class Worth:
             pixel = first + k
             away = (s - (pixel + low) - 0.5).cpu().numpy()
             weight = torch.from_numpy(self._filter.profile(away)).to(s.device) / self._whole
+            # A box ends at once: a place on the border of two pixels is half in each.
+            weight = torch.where((s - (pixel + low) - 0.5).abs() == radius, 0.5 * weight, weight)
             weights.append(torch.where((pixel >= 0) & (pixel < size), weight, 0.0))
         return first, weights
 

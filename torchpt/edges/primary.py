@@ -27,6 +27,8 @@ __all__ = ["Along", "Primary", "step_of"]
 
 #: A place counts as hidden where a ray beside it ends before this share of the way.
 _BEFORE = 1.0 - 2.0**-10
+#: The same where the ray meets the edge's own surface.
+_OWN = 1.0 - 2.0**-6
 #: How far beside a curve rays are traced, in units of the film's longer side at a slope of 1.
 _STEP = 2.0**-16
 
@@ -118,7 +120,7 @@ class Primary:
         reach = (away * d[:, :n]).sum(0)
         t, prim = t.view(2, n), prim.view(2, n)
         own = (prim == held.prim) | (prim == mate)  # a round surface comes forward quickly behind its outline
-        seen = (own | (t > reach * _BEFORE)).all(0)
+        seen = (t > reach * torch.where(own, _OWN, _BEFORE)).all(0)
         near = (t - reach).abs() < reach * 2.0**-8
         return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step_of(self.bodies)), 0.0)
 

@@ -33,6 +33,8 @@ __all__ = ["Cast", "Shadows"]
 _STEP = 2.0**-16
 #: What ends so close to an edge, against the way to it, ends at it.
 _NEAR = 2.0**-10
+#: The same where it ends at the edge's own surface, which may come forward quickly.
+_OWN = 2.0**-6
 #: Where a ray from a light begins, against the way to the edge.
 _BEGIN = 2.0**-12
 #: Vertices after which light that reaches no camera is given up where paths have no limit of their own.
@@ -164,7 +166,7 @@ class Shadows:
         t, prim = self.traced.nearest(torch.cat((o, o), 1), torch.cat((way + step, way - step), 1))
         t, prim = t.view(2, n), prim.view(2, n)
         own = (prim == passed.held.prim) | ((prim == passed.mate) & (passed.mate >= 0))
-        hidden = (t < 1.0 - _NEAR) & ~own
+        hidden = t < torch.where(own, 1.0 - _OWN, 1.0 - _NEAR)
         near = (t < 1.0 + _NEAR) & ~hidden
         far = (t > 1.0 + _NEAR) & (prim >= 0)
         good = (near[0] & far[1]) | (near[1] & far[0])
