@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchpt.forward import BYTES_PER_LANE, lanes_for, limited_threads, make_wave, pieces, rebound
+from torchpt.forward import BYTES_PER_LANE, Waves, budget_of, limited_threads, make_wave, rebound
+from torchpt.forward.budget import check_memory
+from torchpt.forward.need import loaded, need_of
 from torchpt.forward.schedule import Span
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 from torchpt.spec import Moves
 
-__all__ = ["KINDS", "Chunk", "attached", "casts", "chunks"]
+__all__ = ["KINDS", "Chunk", "attached", "casts", "chunks", "tape_per_lane"]
 
 #: Vertices of a path that memory is planned for where its depth is without end.
 LONGEST = 64
@@ -39,8 +41,15 @@ class Chunk:
 
 
 Forward = Callable[..., Tensor]
-Chunks = Callable[..., Iterator[Chunk]]
-Edges = Callable[..., tuple[Tensor | None, ...]]
+            grads = torch.autograd.grad(radiance, [*leaves, *ctx.held], share, allow_unused=True)
+            # Memory may run out in any of these sums: the total changes once all are there.
+            total[:] = [sum_ if grad is None else sum_ + grad for sum_, grad in zip(total, grads, strict=True)]
+
+        ctx.chunks(add, *tensors)
+        if ctx.edges is not None:
+            moved = ctx.edges(cotangents[0], *tensors)
+            total[: len(moved)] = [a if b is None else a + b for a, b in zip(total[: len(moved)], moved, strict=True)]
+        return (None, None, None, None, *total)
 
 
 class _Autograd(torch.autograd.Function):
@@ -63,17 +72,19 @@ class _Autograd(torch.autograd.Function):
         tensors = tuple(t.detach() for t in ctx.saved_tensors)
         flat = cotangents[0].reshape(-1, 3).T
         total = [torch.zeros_like(t) for t in (*tensors, *ctx.held)]
-        for chunk in ctx.chunks(*tensors):
+
+        def add(chunk: Chunk) -> None:
             with torch.enable_grad():
                 leaves = [t.clone().requires_grad_() for t in tensors]
                 radiance = chunk.radiance(*leaves)
             if not radiance.requires_grad:  # nothing in these pixels depends on the parameters
-                continue
+                return
             share = flat[:, chunk.first : chunk.first + chunk.count].to(radiance.dtype)
-            inputs = [*leaves, *ctx.held]
-            for sum_, grad in zip(total, torch.autograd.grad(radiance, inputs, share, allow_unused=True), strict=True):
-                if grad is not None:
-                    sum_ += grad
+            grads = torch.autograd.grad(radiance, [*leaves, *ctx.held], share, allow_unused=True)
+            # Memory may run out in any of these sums: the total changes once all are there.
+            total[:] = [sum_ if grad is None else sum_ + grad for sum_, grad in zip(total, grads, strict=True)]
+
+        ctx.chunks(add, *tensors)
         if ctx.edges is not None:
             for sum_, grad in zip(total, ctx.edges(cotangents[0], *tensors), strict=False):
                 if grad is not None:
@@ -92,7 +103,7 @@ def autograd(
 
     Args:
         forward: from detached ``tensors`` to the picture.
-        chunks: from ``tensors`` to its parts.
+        chunks: from what is done with each part of the picture, and ``tensors``; memory may ask for smaller parts.
         tensors: what is handed to both.
         held: what both use by themselves, such as weights of modules.
         edges: from the picture's cotangent and ``tensors`` to what moving edges add to the gradient of each, or None.
@@ -129,14 +140,30 @@ def chunks(
     wanted: tuple[str, ...],
     dtype: torch.dtype,
     attached: bool,
-) -> Iterator[Chunk]:
-    """Chunks of pixels as differentiable functions of the tensors ``wanted``, for the backward pass."""
+    work: Callable[[Chunk], None],
+) -> None:
+    """Do something with chunks of pixels as differentiable functions of the tensors ``wanted``, for the backward pass.
+
+    Args:
+        scene: what.
+        settings: of the backward pass.
+        params: tensors in place of the scene's.
+        wanted: names of those that are differentiated.
+        dtype: of the lanes.
+        attached: see :class:`torchpt.integrators.stages.Plan`.
+        work: takes a chunk: all of it, or, where it raises, nothing.
+
+    Raises:
+        SceneError: ``render.max_memory`` is too small for it.
+        RenderError: not even the tape of a single lane fits in memory.
+    """
     plain = {name: value.detach() for name, value in params.items()}
     with torch.no_grad():
         still = make_wave(scene, settings, plain, dtype, True, attached)
-    depth = still.integrator.limits.max_depth
-    lanes = lanes_for(settings, scene.device, BYTES_PER_LANE * max(depth if 0 <= depth < LONGEST else LONGEST, 1))
-    pixels = still.crop[2] * still.crop[3]
+    if settings.render.max_memory is not None:
+        need = need_of(settings, scene.device, "tape", len(still.stages.world.materials.models))
+        check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)
+    pixels, spp = still.crop[2] * still.crop[3], settings.render.spp
     clamp = settings.integrator.clamp
 
     def radiance(span: Span, *tensors: Tensor) -> Tensor:
@@ -145,8 +172,19 @@ def chunks(
         values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
         if clamp is not None:
             values = values * (clamp / values.detach().abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
-        return values.sum(1) / settings.render.spp
+        return values.sum(1) / spp
 
+    def piece(span: Span) -> None:
+        work(Chunk(span[0], span[1], partial(radiance, span)))
+
+    waves = Waves(budget_of(settings, scene.device, tape_per_lane(settings)), "the tape of a single lane")
     with limited_threads(settings.render.threads):  # while whoever asked for the chunks differentiates them
-        for first, count, sample, samples in pieces(lanes, pixels, 0, settings.render.spp):
-            yield Chunk(first, count, partial(radiance, (first, count, sample, samples)))
+        for _ in waves.through(piece, pixels, 0, spp):
+            pass
+    loaded("tape")
+
+
+def tape_per_lane(settings: Settings) -> int:
+    """Bytes that the tape of a lane is expected to take: each vertex keeps about what a lane takes without one."""
+    limits = settings.integrator.limits
+    return BYTES_PER_LANE * max(limits.max_depth if 0 <= limits.max_depth < LONGEST else LONGEST, 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Literal, TypedDict, Unpack, overload
 
@@ -213,11 +213,11 @@ def _differentiable(
         made.append(render_scene(scene, settings, params=given, dtype=dtype))
         return made[-1].image
 
-    def chunks(*tensors: Tensor) -> Iterator[adjoints.Chunk]:
+    def chunks(work: Callable[[adjoints.Chunk], None], *tensors: Tensor) -> None:
         given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
         spp = taken[0] if backward["spp"] is None else backward["spp"]
         again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
-        return adjoints.chunks(scene, again, given, wanted, dtype, attached)
+        adjoints.chunks(scene, again, given, wanted, dtype, attached, work)
 
     def moved(cotangent: Tensor, *tensors: Tensor) -> tuple[Tensor | None, ...]:
         given = {**fixed, **dict(zip(wanted, tensors, strict=True))}

@@ -19,7 +19,7 @@ from torchpt.edges.lit import sources_of
 from torchpt.edges.occluders import occluders_of
 from torchpt.edges.shadows import Shadows, in_chunks
 from torchpt.edges.traced import Traced, traced_of
-from torchpt.forward import lanes_for, limited_threads
+from torchpt.forward import limited_threads
 from torchpt.integrators.path import PathIntegrator
 from torchpt.scene import Scene
 from torchpt.settings import Settings
@@ -30,7 +30,7 @@ __all__ = ["add_gradients", "concerns"]
 #: Bytes that a sample of an edge takes, two paths included.
 BYTES_PER_SAMPLE = 4096
 #: Samples of a chunk where memory is not limited.
-SAMPLES = 1 << 16
+SAMPLES = 1 << 15
 
 
 class Samples(Protocol):
@@ -60,8 +60,8 @@ class _Asked:
 
     def chunks(self, total: int) -> Iterator[tuple[int, int]]:
         """First samples and how many."""
-        limit = lanes_for(self.settings, self.scene.device, BYTES_PER_SAMPLE)
-        step = max(min(limit, SAMPLES), 1)
+        most = self.settings.render.max_memory
+        step = SAMPLES if most is None else max(min(most // BYTES_PER_SAMPLE, SAMPLES), 1)
         for first in range(0, total, step):
             yield first, min(step, total - first)
 
