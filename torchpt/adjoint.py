@@ -41,15 +41,9 @@ class Chunk:
 
 
 Forward = Callable[..., Tensor]
-            grads = torch.autograd.grad(radiance, [*leaves, *ctx.held], share, allow_unused=True)
-            # Memory may run out in any of these sums: the total changes once all are there.
-            total[:] = [sum_ if grad is None else sum_ + grad for sum_, grad in zip(total, grads, strict=True)]
-
-        ctx.chunks(add, *tensors)
-        if ctx.edges is not None:
-            moved = ctx.edges(cotangents[0], *tensors)
-            total[: len(moved)] = [a if b is None else a + b for a, b in zip(total[: len(moved)], moved, strict=True)]
-        return (None, None, None, None, *total)
+#: From the tensors and what is done with a chunk: all of it, or nothing where it raises.
+Chunks = Callable[..., None]
+Edges = Callable[..., tuple[Tensor | None, ...]]
 
 
 class _Autograd(torch.autograd.Function):
