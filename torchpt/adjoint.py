@@ -43,7 +43,7 @@ class Chunk:
 Forward = Callable[..., Tensor]
 #: From the tensors and what is done with a chunk: all of it, or nothing where it raises.
 Chunks = Callable[..., None]
-Edges = Callable[..., tuple[Tensor | None, ...]]
+Edges = Callable[..., list[Tensor | None]]
 
 
 class _Autograd(torch.autograd.Function):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt import adjoint as adjoints
-from torchpt.edges import add_gradients, concerns, left_out
+from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
@@ -116,7 +116,13 @@ def render(
         SceneError: a setting or parameter that is not accepted.
         RenderError: a device, compiler or denoiser that is not there.
     """
-    _check(scene, device, dtype, adjoint, {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1), "edge_spp": (edge_spp, 1)})
+    _check(
+        scene,
+        device,
+        dtype,
+        adjoint,
+        {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1), "edge_spp": (edge_spp, 1)},
+    )
     given = {
         "spp": spp, "seed": seed, "accel": accel, "compile": compile, "threads": threads, "max_memory": max_memory,
         "time_limit": time_limit, "target_error": target_error, "pilots": pilots,
@@ -208,28 +214,39 @@ def _differentiable(
     made: list[Rendering] = []
     taken: list[int] = []
 
+    def given_by(*tensors: Tensor) -> dict[str, Tensor]:
+        return {**fixed, **dict(zip(wanted, tensors, strict=True))}
+
     def forward(*tensors: Tensor) -> Tensor:
-        given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
-        made.append(render_scene(scene, settings, params=given, dtype=dtype))
+        made.append(render_scene(scene, settings, params=given_by(*tensors), dtype=dtype))
         return made[-1].image
 
     def chunks(work: Callable[[adjoints.Chunk], None], *tensors: Tensor) -> None:
-        given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
         spp = taken[0] if backward["spp"] is None else backward["spp"]
         again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
-        adjoints.chunks(scene, again, given, wanted, dtype, attached, work)
+        adjoints.chunks(scene, again, given_by(*tensors), wanted, dtype, attached, work)
 
-    def moved(cotangent: Tensor, *tensors: Tensor) -> tuple[Tensor | None, ...]:
-        given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
-        spp = backward["edges"] or backward["spp"] or taken[0]
+    def edges_taken() -> int:
+        return 0 if backward["edges"] == 0 else backward["edges"] or backward["spp"] or taken[0]
+
+    def moved(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
         again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=1))
-        return add_gradients(scene, again, given, wanted, dtype, cotangent, spp)
+        return add_gradients(scene, again, given_by(*tensors), wanted, dtype, cotangent, edges_taken())
+
+    def asked() -> Asked:
+        spp = taken[0] if backward["spp"] is None else backward["spp"]
+        again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
+        return Asked(scene, again, wanted, dtype, edges_taken())
 
     with_edges = moved if backward["edges"] != 0 and concerns(scene, wanted) else None
     tensors = tuple(params[name] for name in wanted)
     image = adjoints.KINDS[adjoint](forward, chunks, tensors, scene.weights(), with_edges)
     rendering = made.pop()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
+    names = followed(settings)
+    if names:
+        values = {name: rendering.layers[name] for name in names}
+        rendering.layers |= on_tape(values, tensors, asked, given_by)
     return replace(rendering, image=image)
 
 

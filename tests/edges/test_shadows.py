@@ -98,10 +98,15 @@ CASES: dict[str, tuple[dict[str, Any], str, tuple[int, ...], float, int]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_agrees_with_central_differences(case: str) -> None:
     more, name, entry, step, depth = CASES[case]
-    cube = {"type": "cube", "transform": [{"scale": 0.4}, {"rotate": {"axis": [1, 2, 3], "angle": 40}}, {"translate": [0.3, 0, 2]}]}
+    cube = {
+        "type": "cube",
+        "transform": [{"scale": 0.4}, {"rotate": {"axis": [1, 2, 3], "angle": 40}}, {"translate": [0.3, 0, 2]}],
+    }
     wall = {"type": "rectangle", "material": "grey", "transform": [{"scale": 9}, {"rotate": {"axis": [0, 1, 0], "angle": 70}}, {"translate": [-3, 0, 0]}]}  # fmt: skip
     lamp = {"lamp": {**LAMP["lamp"], "position": [1, 0.5, 5]}}
-    scene = scene_of(lamp, cube, integrator={"type": "path", "max_depth": depth, "rr_depth": 100}, shapes={"wall": wall})
+    scene = scene_of(
+        lamp, cube, integrator={"type": "path", "max_depth": depth, "rr_depth": 100}, shapes={"wall": wall}
+    )
     tall = torch.linspace(0.0, 1.0, 8, dtype=torch.float64)
     weight = (0.3 + torch.sin(3 * tall)[:, None] * torch.cos(2 * tall)[None])[..., None]
     base, shift = scene.params[name].double(), torch.zeros_like(scene.params[name]).double()

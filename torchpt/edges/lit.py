@@ -85,7 +85,9 @@ class Sources:
                 continue
             at = taken(lights, take(row, mine) if len(lights.area) > 1 else None)
             if KINDS[name].distant:
-                drawn = KINDS[name].sample(at, torch.zeros_like(take(e, mine)).to(at.p0), take(u, mine).to(at.p0), False)
+                drawn = KINDS[name].sample(
+                    at, torch.zeros_like(take(e, mine)).to(at.p0), take(u, mine).to(at.p0), False
+                )
                 e[:, mine] = drawn.wi.double().expand(3, len(mine))
             else:
                 e[:, mine] = at.p0.double().expand(3, len(mine))

@@ -128,5 +128,3 @@ class Primary:
 def primary_of(bodies: Bodies, pieces: Pieces, traced: Traced, numbers: Numbers) -> Primary:
     """The estimator over ``pieces``."""
     return Primary(bodies, pieces, Choice(pieces.weight), traced, numbers)
-
-

@@ -10,7 +10,6 @@ Differentiable Rendering*, 2020, whose boundary segments these are): from x ligh
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -138,7 +137,7 @@ class Shadows:
         aside = aside / dot(aside, aside).sqrt() * (_STEP * self.reach)
         spots = [met(self.traced, passed.p + aside * side, away) for side in (1.0, -1.0)]
         far = [torch.where(spot.hit.prim >= 0, spot.hit.t, -1.0) for spot in spots]
-        first = (far[0] >= far[1])
+        first = far[0] >= far[1]
         prim = torch.where(first, spots[0].hit.prim, spots[1].hit.prim)
         y = torch.where(first, spots[0].p, spots[1].p).double()
         numbers = [torch.where(first, getattr(spots[0].hit, k), getattr(spots[1].hit, k)) for k in ("u", "v")]
@@ -198,7 +197,7 @@ class Shadows:
         else:
             brought = self._bounced(number, beam, passed, x, wi, light)
         direct = self._seen(spot, wi, brought[0], worth)
-        s, jacobian = slopes(self.bodies.camera, x)
+        _, jacobian = slopes(self.bodies.camera, x)
         ds = (jacobian * along).sum(1)
         normal = torch.stack((ds[1], -ds[0]))
         sign = torch.sign((normal * (jacobian * across).sum(1)).sum(0))
@@ -312,11 +311,3 @@ class Shadows:
             away, det = take(x, bent) - p0, dot(axes[0], faces[0])
             a[:, bent] = torch.stack([dot(face, away) / det for face in faces])
         return Held(prim, a)
-
-
-def in_chunks(shadows: Shadows, spans: Iterator[tuple[int, int]], total: int, worth: Worth) -> Iterator[Cast]:
-    """All samples, chunk by chunk."""
-    for first, count in spans:
-        cast = shadows.samples(first, count, total, worth)
-        if cast is not None:
-            yield cast

@@ -15,9 +15,7 @@ from torchpt.edges.film import film_places
 __all__ = ["share_of"]
 
 
-def share_of(
-    bodies: Bodies, held: Held, mate: Tensor, s: Tensor, prim: Tensor, near: Tensor, step: float
-) -> Tensor:
+def share_of(bodies: Bodies, held: Held, mate: Tensor, s: Tensor, prim: Tensor, near: Tensor, step: float) -> Tensor:
     """Parts ``(N,)`` with which places of edges count.
 
     Args:

@@ -53,7 +53,9 @@ class Spot:
         """Fill in what each model makes of its lanes."""
         _, groups = partition(self.traced.wave.stages.world, self.hit)
         for model, index in groups:
-            at = interact(self.traced.wave.stages.world, take(self.o, index), take(self.d, index), rows(self.hit, index))
+            at = interact(
+                self.traced.wave.stages.world, take(self.o, index), take(self.d, index), rows(self.hit, index)
+            )
             for into, value in zip(found, make(model, index, at), strict=True):
                 into.index_copy_(into.dim() - 1, index, value.to(into.dtype))
 
