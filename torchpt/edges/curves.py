@@ -31,6 +31,10 @@ class View:
     e: Tensor
     w: Tensor | float
 
+    def taken(self, index: Tensor) -> View:
+        """Some of ``N`` places."""
+        return View(take(self.e, index), take(self.w, index) if isinstance(self.w, Tensor) else self.w)
+
     def toward(self, p: Tensor) -> Tensor:
         """From points ``(3, N)`` to where they are seen from; of no particular length."""
         return self.e - p * self.w

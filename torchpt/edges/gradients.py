@@ -93,6 +93,8 @@ class Boundary:
     def primary(self, spp: int, look: Look) -> Iterator[Samples]:
         """Samples of the edges that the camera sees, chunk by chunk; ``look``: what rays beside them see."""
         total = spp * self.pixels
+        if self.moving.keys() <= {"lights"}:  # none of which is seen
+            return
         with torch.no_grad():
             pieces = pieces_of(self.scene, self.still, self.scene.merged(self.params), self.worth.bounds())
         if pieces is None:
@@ -129,7 +131,7 @@ class Boundary:
         # Where nothing but the camera moves, what it does not see itself stays as it is.
         onward = any(not name.startswith("camera.") for name in self.leaves)
         for stream, light in enumerate((sources, None), 1):
-            if light is not None or not 0 <= depth < 3:
+            if light is not None or (not 0 <= depth < 3 and self.moving.keys() - {"lights"}):
                 numbers = Numbers(seed, stream)
                 yield Shadows(still, occluders, light, self.traced, numbers, reach, depth, onward)
 

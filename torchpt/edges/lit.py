@@ -42,8 +42,7 @@ class Beam:
 
     def taken(self, index: Tensor) -> Beam:
         """Some of the lanes."""
-        w = self.view.w if isinstance(self.view.w, float) else take(self.view.w, index)
-        view = View(take(self.view.e, index), w)
+        view = self.view.taken(index)
         return Beam(view, self.held.taken(index), take(self.row, index), take(self.u, index), take(self.chance, index))
 
 

@@ -1,4 +1,4 @@
-"""What of a scene moves edges that no estimator here knows, for the warning; what cannot be told of a scene stands in the docs."""
+"""What of a scene moves edges that no estimator knows, for the warning; what no scene tells beforehand stands in the docs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
     elif scene.camera(settings.film, scene.params, torch.float64).film_of(torch.zeros(3, 1).double()) is None:
         yield f"those that a camera of kind {camera.name} sees"
     materials = [owner.material for owner in (*built.parts, *built.copies)]
-    if any(model.delta for material in materials for model in (material.model, *_inner(material))):
+    if any(part.model.delta for material in materials for part in material.all()):
         yield "those seen in mirrors and clear glass, and of light that these send on"
     if any(material.opacity != 1.0 for material in materials):
         yield "those of surfaces that are not opaque"
@@ -39,12 +39,6 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
         yield "the rims of spots that do not fade out"
     if not isinstance(settings.integrator, PathIntegrator):
         yield f"edges of shadows where the integrator is {settings.integrator.name}"
-
-
-def _inner(material: object) -> tuple[object, ...]:
-    """Models of a blend's two materials."""
-    inner = getattr(material, "inner", None) or ()
-    return tuple(model for part in inner for model in (part.model, *_inner(part)))
 
 
 def _sharp(scene: Scene, name: str) -> bool:

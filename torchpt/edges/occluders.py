@@ -44,8 +44,10 @@ class Passed:
 
     def taken(self, index: Tensor) -> Passed:
         """Some of the lanes."""
-        own = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Passed(**{k: v.taken(index) if isinstance(v, Held) else take(v, index) for k, v in own.items()})
+        lane, mate, p, along, density = (
+            take(x, index) for x in (self.lane, self.mate, self.p, self.along, self.density)
+        )
+        return Passed(lane, self.held.taken(index), mate, p, along, density)
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,7 @@ class Occluders:
             mine = (form == number).nonzero().squeeze(1)
             if not len(mine):
                 continue
-            w = view.w if isinstance(view.w, float) else take(view.w, mine)
-            part, prim = View(take(view.e, mine), w), take(curves.prim, mine)
+            part, prim = view.taken(mine), take(curves.prim, mine)
             if number == 0:
                 found, there = round_outline(self.bodies, prim, part)
             else:

@@ -1,7 +1,7 @@
 """Edges that move across the film: silhouettes, borders and creases that the camera sees.
 
-A picture is an integral over the film of the radiance ``L(s)``, which jumps along curves ``s(t)``. As these move, the loss changes
-by the integral along them of ``C (L- - L+) n . ds``, with ``C(s)`` the worth of radiance at s and n the curve's normal toward +
+A picture is an integral over the film of the radiance ``L(s)``, which jumps along curves ``s(t)``. As these move, the loss
+changes by the integral along them of ``C (L- - L+) n . ds``, with ``C(s)`` the worth of radiance at s and n the normal toward +
 (Reynolds' transport theorem; Li, Aittala, Durand, Lehtinen, *Differentiable Monte Carlo Ray Tracing through Edge Sampling*,
 2018). With ``n dt = (ds_y / dt, -ds_x / dt)`` any parameter t of the curve will do. Places are drawn along the curves by their
 length on the film; the radiance on both sides is traced by the same random numbers.

@@ -91,7 +91,7 @@ def pieces_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bo
 
 def _silhouettes(bodies: Bodies, folds: Folds, view: View) -> tuple[Curves, Tensor]:
     """Edges that are seen as outlines or creases, and their importance."""
-    held, p, along = folds.curves.moving(bodies, torch.zeros_like(folds.curves.low))
+    _held, p, along = folds.curves.moving(bodies, torch.zeros_like(folds.curves.low))
     across = cross(along, view.toward(p))
     one, two = (dot(across, bodies.points(other) - p) for other in folds.others)
     outline = folds.border | (one * two >= 0)

@@ -1,4 +1,4 @@
-"""The curves of a scene, owner by owner: those that are there anyway, and the round surfaces whose outlines depend on the place."""
+"""The curves of a scene, owner by owner: those that are there anyway, and round ones, whose outlines depend on the place."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class Spot:
                 into.index_copy_(into.dim() - 1, index, value.to(into.dtype))
 
     def sent(self, wo: Tensor, wi: Tensor) -> Tensor:
-        """``f cos_s(wi) / cos_g(wi)`` ``(3, N)`` of light that comes from ``wi`` and leaves along ``wo``; deltas give nothing."""
+        """``f cos_s(wi) / cos_g(wi)`` ``(3, N)`` of light from ``wi`` that leaves along ``wo``; deltas give nothing."""
         out = torch.zeros_like(wo)
 
         def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
