@@ -135,17 +135,30 @@ def render(
     elif settings.film.denoise:
         check_denoiser()
     scene.check(params)
-    wanted = tuple(name for name, value in (params or {}).items() if value.requires_grad)
+    backward = {"seed": seed_grad, "spp": spp_grad, "edges": edge_spp if edges else 0}
+    rendering = _rendered(scene, settings, backward, params or {}, dtype, adjoint or "autograd")
+    return rendering if full else rendering.image
+
+
+def _rendered(
+    scene: Scene,
+    settings: Settings,
+    backward: Mapping[str, int | None],
+    params: Mapping[str, Tensor],
+    dtype: torch.dtype,
+    adjoint: str,
+) -> Rendering:
+    """A rendering, on a tape where one is wanted, and denoised where that is; ``backward``: see :func:`_differentiable`."""
+    wanted = tuple(name for name, value in params.items() if value.requires_grad)
     if not (wanted or scene.weights()) or not torch.is_grad_enabled():
         rendering = render_scene(scene, settings, params=params, dtype=dtype)
     else:
-        seed_grad = settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad
-        backward = {"seed": seed_grad, "spp": spp_grad, "edges": edge_spp if edges else 0}
-        rendering = _differentiable(scene, settings, backward, params or {}, wanted, dtype, adjoint or "autograd")
+        seed = settings.render.seed ^ 0x5DEECE66D if backward["seed"] is None else backward["seed"]
+        rendering = _differentiable(scene, settings, {**backward, "seed": seed}, params, wanted, dtype, adjoint)
     if settings.film.denoise:
         with limited_threads(settings.render.threads):
             rendering.denoised = denoise(rendering.image.detach(), **rendering.guides)
-    return rendering if full else rendering.image
+    return rendering
 
 
 def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
