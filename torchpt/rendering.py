@@ -108,7 +108,7 @@ def render(
             backward pass, so memory is that of a chunk.
         seed_grad, spp_grad: of the backward pass. By default it draws samples of its own, as many as the forward pass took:
             shared samples would bias the gradient of a squared loss.
-        edges: whether silhouettes and shadow edges that move are differentiated (docs/gradients.md); else this is biased, and warns.
+        edges: whether silhouettes and shadow edges that move are differentiated (docs/gradients.md); False warns.
         edge_spp: samples of edges a pixel, for each of their estimators; by default as many as the backward pass takes.
 
     Raises:

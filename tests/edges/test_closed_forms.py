@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import pytest
@@ -115,3 +116,47 @@ def test_two_surfaces_that_meet_count_once() -> None:
     assert leaf.grad is not None
     # Four rows of a seam of step 2 in three channels move by 4 pixels a unit.
     assert float(leaf.grad[0, 3]) == pytest.approx(4 * 3 * 2 * 4, rel=1e-3)
+
+
+def test_what_is_left_out_is_named() -> None:
+    shapes = {"it": {"type": "sphere", "material": "black"}}
+
+    def told(**more: Any) -> str:
+        scene = torchpt.load({**BASE, "shapes": shapes, **more}, "cpu")
+        leaf = scene.params["shapes.it.to_world"].requires_grad_()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            torchpt.render(scene, params={"shapes.it.to_world": leaf}, spp=1)
+        return " ".join(str(one.message) for one in caught)
+
+    assert told() == ""
+    glass = {"black": {"type": "dielectric"}}
+    assert "mirrors and clear glass" in told(materials=glass)
+    assert "not opaque" in told(materials={"black": {"type": "diffuse", "opacity": 0.5}})
+    squares = {"black": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}
+    assert "not interpolated" in told(materials=squares)
+    lens = {"type": "thinlens", "origin": [0, 0, 5], "target": [0, 0, 0], "aperture_radius": 0.1, "focus_distance": 5}
+    assert "a lens blurs" in told(camera=lens)
+    spot = {"type": "spot", "position": [0, 3, 0], "target": [0, 0, 0], "cutoff_angle": 20, "beam_width": 20}
+    assert "rims of spots" in told(lights={"spot": spot})
+
+
+def test_edges_can_be_left_out() -> None:
+    scene = torchpt.load({**BASE, "shapes": {"it": {"type": "sphere", "material": "black"}}}, "cpu")
+    leaf = scene.params["shapes.it.to_world"].requires_grad_()
+    with pytest.warns(torchpt.EdgeWarning, match="all visibility edges"):
+        picture = torchpt.render(scene, params={"shapes.it.to_world": leaf}, spp=1, edges=False)
+    picture.sum().backward()
+    assert leaf.grad is None or float(leaf.grad.abs().max()) == 0.0
+
+
+def test_gradients_are_the_same_for_any_threads_and_memory() -> None:
+    shapes = {"it": {"type": "cube", "transform": [{"scale": 0.6}]}, "ball": {"type": "sphere", "center": [1, 1, 2]}}
+    scene = torchpt.load({**BASE, "integrator": {"type": "path", "max_depth": 4}, "shapes": shapes}, "cpu")
+    found = []
+    wishes: list[dict[str, Any]] = [{}, {"threads": 2}, {"max_memory": "400MB"}]
+    for wish in wishes:
+        leaf = scene.params["shapes.it.to_world"].clone().requires_grad_()
+        torchpt.render(scene, params={"shapes.it.to_world": leaf}, spp=4, edge_spp=16, **wish).mean().backward()
+        found.append(leaf.grad)
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
