@@ -43,15 +43,18 @@ class Chunk:
 Forward = Callable[..., Tensor]
 #: From the tensors and what is done with a chunk: all of it, or nothing where it raises.
 Chunks = Callable[..., None]
+Edges = Callable[..., list[Tensor | None]]
 
 
 class _Autograd(torch.autograd.Function):
     """The forward pass keeps nothing; the backward pass renders again, chunk by chunk, each under a tape of its own."""
 
     @staticmethod
-    def forward(ctx: Any, forward: Forward, chunks: Chunks, held: tuple[Tensor, ...], *tensors: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, forward: Forward, chunks: Chunks, edges: Edges | None, held: tuple[Tensor, ...], *tensors: Tensor
+    ) -> Tensor:
         own = tensors[: len(tensors) - len(held)]
-        ctx.chunks, ctx.held = chunks, held
+        ctx.chunks, ctx.held, ctx.edges = chunks, held, edges
         ctx.save_for_backward(*own)
         return forward(*(t.detach() for t in own))
 
@@ -76,10 +79,20 @@ class _Autograd(torch.autograd.Function):
             total[:] = [sum_ if grad is None else sum_ + grad for sum_, grad in zip(total, grads, strict=True)]
 
         ctx.chunks(add, *tensors)
-        return (None, None, None, *total)
+        if ctx.edges is not None:
+            for sum_, grad in zip(total, ctx.edges(cotangents[0], *tensors), strict=False):
+                if grad is not None:
+                    sum_ += grad
+        return (None, None, None, None, *total)
 
 
-def autograd(forward: Forward, chunks: Chunks, tensors: tuple[Tensor, ...], held: tuple[Tensor, ...]) -> Tensor:
+def autograd(
+    forward: Forward,
+    chunks: Chunks,
+    tensors: tuple[Tensor, ...],
+    held: tuple[Tensor, ...],
+    edges: Edges | None = None,
+) -> Tensor:
     """Reverse mode on a plain tape, a chunk of pixels at a time: memory grows with depth, not with the picture.
 
     Args:
@@ -87,8 +100,9 @@ def autograd(forward: Forward, chunks: Chunks, tensors: tuple[Tensor, ...], held
         chunks: from what is done with each part of the picture, and ``tensors``; memory may ask for smaller parts.
         tensors: what is handed to both.
         held: what both use by themselves, such as weights of modules.
+        edges: from the picture's cotangent and ``tensors`` to what moving edges add to the gradient of each, or None.
     """
-    return _Autograd.apply(forward, chunks, held, *tensors, *held)
+    return _Autograd.apply(forward, chunks, edges, held, *tensors, *held)
 
 
 KINDS = {"autograd": autograd}

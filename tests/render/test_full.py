@@ -124,7 +124,7 @@ def test_samples_are_counted(scene: torchpt.Scene) -> None:
         torchpt.render(scene, film=film("samples"), integrator="aov")
 
 
-def test_gradients_are_of_the_picture_alone(scene: torchpt.Scene) -> None:
+def test_gradients_are_of_the_picture_and_of_first_surfaces(scene: torchpt.Scene) -> None:
     name = "materials.grey.reflectance"
     gradients = []
     for wish in ({}, {"full": True, "film": film("albedo")}):
@@ -132,7 +132,7 @@ def test_gradients_are_of_the_picture_alone(scene: torchpt.Scene) -> None:
         found = torchpt.render(scene, params={name: colour}, spp=2, **wish)
         image = found.image if isinstance(found, torchpt.Rendering) else found
         if isinstance(found, torchpt.Rendering):
-            assert not found["albedo"].requires_grad and found.spp == 2
+            assert found["albedo"].requires_grad and found.spp == 2
             assert "requires_grad" not in repr(found) and len(found.summary()["mean"]) == 3
             assert found._repr_png_()
         image.sum().backward()

@@ -80,6 +80,15 @@ class Camera(ABC):
         against them, ``w`` is 0, and ``spread`` a pixel's side. Of a pixel that is no square, the root of its area.
         """
 
+    def film_of(self, p: Tensor) -> Tensor | None:
+        """Where points ``(3, N)`` of the world lie on the film: ``x h``, ``y h``, ``h`` and their depth, ``(4, N)``.
+
+        Affine in ``p``: a line of the world is one on the film. ``x, y`` are pixels as :meth:`rays` takes them; with
+        ``h`` or the depth not positive a point lies behind the camera. None: a picture that no such map makes (a lens that
+        blurs it), so that edges on it are not differentiated.
+        """
+        return None
+
     def intrinsics(self) -> Tensor | None:
         """OpenCV's ``K (3, 3)`` in pixels, see :mod:`torchpt.cameras.opencv`; None where no such matrix says it."""
         return None

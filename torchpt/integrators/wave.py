@@ -109,14 +109,15 @@ class Wave:
         first_sample: int,
         samples: int,
         plate: Plate | None = None,
+        slide: bool = False,
     ) -> dict[str, Tensor]:
-        """The layers ``names``, each ``(C, samples, pixels)``."""
+        """The layers ``names``, each ``(C, samples, pixels)``; ``slide``: see :func:`torchpt.integrators.aov.first_hit`."""
         from torchpt.integrators import aov
 
         state = self.rays(first_pixel, pixels, first_sample, samples, plate)
         plan, world = self.stages.plan, self.stages.world
         search = Search(self.accel, world, plan.sampler, plan.dtype)
-        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel)
+        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel, slide)
         if self.filter.signed:
             found = aov.weighted(found, self._weight(state))
         return {name: value.view(len(value), samples, pixels) for name, value in found.items()}
