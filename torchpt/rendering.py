@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Literal, TypedDict, Unpack, overload
 
@@ -99,8 +99,9 @@ def render(
         accel, compile, threads, max_memory: of ``render``.
         device: must be the scene's own; load the scene on the device where it is to render.
         dtype: of the lanes. float64 is for checking derivatives; the search stays float32.
-        adjoint: how gradients are taken: ``autograd`` (the default) runs each chunk of pixels again under a tape in the
-            backward pass, so memory is that of a chunk.
+        adjoint: how gradients are taken: ``replay`` (the default) traces paths again in the backward pass and goes back along
+            them vertex by vertex, so that memory grows with neither depth nor samples; ``autograd`` runs each chunk of
+            pixels again under a plain tape.
         seed_grad, spp_grad: of the backward pass. By default it draws samples of its own, as many as the forward pass took:
             shared samples would bias the gradient of a squared loss. Visibility edges that move (silhouettes, shadow
             edges) are not differentiated; see docs/gradients.md.
@@ -127,7 +128,7 @@ def render(
         rendering = render_scene(scene, settings, params=params, dtype=dtype)
     else:
         backward = {"seed": settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad, "spp": spp_grad}
-        rendering = _differentiable(scene, settings, backward, params or {}, wanted, dtype, adjoint or "autograd")
+        rendering = _differentiable(scene, settings, backward, params or {}, wanted, dtype, adjoint or "replay")
     if settings.film.denoise:
         with limited_threads(settings.render.threads):
             rendering.denoised = denoise(rendering.image.detach(), **rendering.guides)
@@ -209,13 +210,13 @@ def _differentiable(
         made.append(render_scene(scene, settings, params=given, dtype=dtype))
         return made[-1].image
 
-    def chunks(*tensors: Tensor) -> Iterator[adjoints.Chunk]:
+    def backward_pass(asked: Tensor, *tensors: Tensor) -> list[Tensor]:
         given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
         spp = taken[0] if backward["spp"] is None else backward["spp"]
         again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
-        return adjoints.chunks(scene, again, given, wanted, dtype, attached)
+        return adjoints.gradients(scene, again, given, wanted, dtype, attached, adjoint, asked)
 
-    image = adjoints.KINDS[adjoint](forward, chunks, tuple(params[name] for name in wanted), scene.weights())
+    image = adjoints.on_tape(forward, backward_pass, tuple(params[name] for name in wanted), scene.weights())
     rendering = made.pop()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
     return replace(rendering, image=image)
