@@ -3,7 +3,9 @@
 =================  ==============================================================================
 ``function.py``    a picture on autograd's tape; its backward pass is ``gradients`` below
 ``assembly.py``    from parameters to what waves read, differentiated once a backward pass
-``replay.py``      ``replay``, the default: paths traced again, and gone back along vertex by vertex
+``loop.py``        ``replay``, the default, by kernels over threads: start here
+``sweep.py``       a chunk of that: paths traced again, and gone back along vertex by vertex
+``replay.py``      the same by tensor operations: on CUDA, in float64, and where no kernels can be made
 ``tape.py``        ``autograd``: chunks rendered again under a plain tape
 ``samples.py``     what a loss asks of single samples
 ``sums.py``        sums of gradients, in the order of their terms
@@ -21,7 +23,7 @@ from torch import Tensor
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.attachment import attached, casts
 from torchpt.adjoint.function import on_tape
-from torchpt.adjoint.replay import replay
+from torchpt.adjoint.loop import compiled_replay
 from torchpt.adjoint.tape import tape
 from torchpt.forward import limited_threads
 from torchpt.integrators.path import PathIntegrator
@@ -31,7 +33,7 @@ from torchpt.settings import Settings
 __all__ = ["KINDS", "attached", "casts", "gradients", "on_tape"]
 
 #: By name, the default first.
-KINDS = {"replay": replay, "autograd": tape}
+KINDS = ("replay", "autograd")
 
 
 def gradients(
@@ -60,6 +62,8 @@ def gradients(
         assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached)
         sums = assembly.sums()
         # Integrators that end at the first surface have but one vertex to keep.
-        take = KINDS[kind] if isinstance(assembly.wave.integrator, PathIntegrator) else tape
-        take(assembly, settings, asked, sums)
+        if kind == "replay" and isinstance(assembly.wave.integrator, PathIntegrator):
+            compiled_replay(scene, assembly, settings, asked, sums)
+        else:
+            tape(assembly, settings, asked, sums)
         return assembly.gradients(sums)

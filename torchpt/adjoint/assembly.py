@@ -17,6 +17,7 @@ from torchpt.adjoint.sums import Sums
 from torchpt.forward.wave import make_wave
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.wave import Wave
+from torchpt.records import tensors_of
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
@@ -39,6 +40,7 @@ class Assembly:
         wave: with plain tensors.
         taped: the same with leaves in place of those tensors that depend on the parameters.
         leaves: these leaves; ``held`` follow them in the sums.
+        plain: the tensors that they stand for.
         held: see above.
     """
 
@@ -58,6 +60,7 @@ class Assembly:
             made = make_wave(scene, settings, given, dtype, True, attached)
         self._outputs: list[Tensor] = []
         self.leaves: list[Tensor] = []
+        self.plain: list[Tensor] = []
         self.held = tuple(held)
         plain: dict[int, Tensor] = {}
         leaves: dict[int, Tensor] = {}
@@ -79,7 +82,18 @@ class Assembly:
             one = plain[id(tensor)]
             leaves[id(one)] = one.detach().requires_grad_()
             self.leaves.append(leaves[id(one)])
+            self.plain.append(one)
         self.taped = _over(self.wave, leaf)
+
+    @property
+    def passing(self) -> bool:
+        """Whether it is differentiated by what lets rays pass surfaces."""
+        world = self.taped.stages.world
+        opacity, maps = world.materials.opacity, world.textures.opacity
+        if opacity is None:
+            return False
+        read = [] if maps is None else [x for k in maps.tables for x in tensors_of(world.textures.tables[k])]
+        return any(x.requires_grad for x in (opacity, *read))
 
     def sums(self) -> Sums:
         """Sums of the gradients of the leaves, and of what is held."""

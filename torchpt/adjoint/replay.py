@@ -102,10 +102,7 @@ class _Chunk:
         self.plan = self.wave.stages.plan
         self.world = self.taped.stages.world
         self.tensors = [*assembly.leaves, *assembly.held]
-        materials, maps = self.world.materials, self.world.textures
-        self.passing = materials.opacity is not None and (
-            materials.opacity.requires_grad or (maps.opacity is not None and any(x.requires_grad for x in self.tensors))
-        )
+        self.passing = assembly.passing
         self.search = Search(self.wave.accel, self.world, self.plan.sampler, self.plan.dtype)
 
     def run(self, pixels: Tensor) -> None:

@@ -91,4 +91,5 @@ def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], lis
         results=len(sinks.store),
         shadows=sinks.shadows,
         nodes=nodes,
+        sums=tuple(trace.sums),
     )

@@ -1,0 +1,90 @@
+"""Chunks of a backward pass over threads, by kernels: sums are joined in the order of chunks, whichever thread took them."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import torch
+from torch import Tensor
+
+from torchpt.adjoint.assembly import Assembly
+from torchpt.adjoint.replay import replay
+from torchpt.adjoint.sums import ChunkSums, Sums
+from torchpt.adjoint.sweep import Sweep
+from torchpt.forward.run import say_once
+from torchpt.forward.schedule import pieces
+from torchpt.integrators.loop.chunk import LANES, Chunk
+from torchpt.integrators.loop.joint_kernels import JointKernels
+from torchpt.lanes.graph import Unsupported
+from torchpt.scene import Scene
+from torchpt.settings import Settings
+
+__all__ = ["compiled_replay"]
+
+
+def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
+    """As :func:`torchpt.adjoint.replay.replay`, by kernels where these can be made.
+
+    Args:
+        scene: what is rendered.
+        assembly: what waves read.
+        settings: of the backward pass.
+        asked: derivatives by the pixels ``(3, H W)``.
+        sums: what is added to.
+    """
+    if not _looped(assembly, settings):
+        return replay(assembly, settings, asked, sums)
+    wave = assembly.wave
+    packets = wave.accel.name == "brute" and not wave.stages.world.geometry.counts[4]
+    kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets)
+    models = wave.stages.world.materials.models
+    kernels.eager = kernels.probe([k for k, model in enumerate(models) if any(model is x for x in scene.own_models)])
+    pixels = wave.crop[2] * wave.crop[3]
+    chunks = [Chunk(*span) for span in pieces(LANES, pixels, 0, settings.render.spp)]
+    sweeps: list[Sweep] = []
+    lock = threading.Lock()
+
+    def task(chunk: Chunk) -> ChunkSums:
+        with lock:
+            sweep = sweeps.pop() if sweeps else Sweep(kernels, assembly, settings)
+        with torch.no_grad():
+            found = sweep.run(chunk, asked[:, chunk.first_pixel : chunk.first_pixel + chunk.pixels].float())
+        with lock:
+            sweeps.append(sweep)
+        return found
+
+    threads = torch.get_num_threads()
+    try:
+        if threads == 1:
+            for chunk in chunks:
+                sums.merge(task(chunk))
+            return None
+        waiting: deque[Future[ChunkSums]] = deque()
+        with ThreadPoolExecutor(threads, thread_name_prefix="torchpt") as pool:
+            for chunk in chunks:
+                waiting.append(pool.submit(task, chunk))
+                if len(waiting) > 2 * threads:
+                    sums.merge(waiting.popleft().result())
+            while waiting:
+                sums.merge(waiting.popleft().result())
+    except Unsupported as error:
+        say_once(
+            f"torchpt: gradients of this scene are taken by tensor operations, as no kernel can be made of {error}"
+        )
+        sums.clear()
+        replay(assembly, settings, asked, sums)
+    finally:
+        for what, reason in kernels.back_eager.items():
+            say_once(f"torchpt: {what} is differentiated by tensor operations, as no kernel can be made of {reason}")
+    return None
+
+
+def _looped(assembly: Assembly, settings: Settings) -> bool:
+    """Whether kernels may be made: on a CPU, in float32, without weights of modules and without derivatives by opacity."""
+    wave = assembly.wave
+    plan = wave.stages.plan
+    if wave.centre.device.type != "cpu" or plan.dtype != torch.float32 or settings.render.compile == "off":
+        return False
+    return wave.integrator.looped and not assembly.held and not assembly.passing
