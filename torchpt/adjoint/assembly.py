@@ -54,7 +54,7 @@ class Assembly:
         dtype: torch.dtype,
         attached: bool,
     ) -> None:
-        self._inputs = [params[name].detach().clone().requires_grad_() for name in wanted]
+        self._inputs = [params[name].detach().requires_grad_() for name in wanted]
         given = {name: value.detach() for name, value in params.items()} | dict(zip(wanted, self._inputs, strict=True))
         with torch.enable_grad():
             made = make_wave(scene, settings, given, dtype, True, attached)

@@ -1,9 +1,9 @@
 """Vertices of paths gone back along, as kernels: each traces a stage of :mod:`torchpt.integrators.joint`, its tape included.
 
-The operators of the backward pass are nodes as those of the stage are. A look-up in a table that is differentiated is taken for
-an input of the lane, and its derivative is written to a row beside a row of the index: whoever runs the kernel adds them up.
-What is handed from vertex to vertex lies in *slots*, by the samples' own numbers: each path reads there what those behind it ask
-of the ray that left, and leaves what it asks of the ray that came.
+The operators of the backward pass are nodes as those of the stage are. A look-up in a table that is differentiated is taken
+for an input of the lane, and its derivative is written to a row beside a row of the index: whoever runs the kernel adds them
+up. What is handed from vertex to vertex lies in *slots*, by the samples' own numbers: each path reads there what those behind
+it ask of the ray that left, and leaves what it asks of the ray that came.
 """
 
 from __future__ import annotations
@@ -167,23 +167,21 @@ def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added:
             if known is not None:
                 mine = [graph.binary("add", "f", a, b) for a, b in zip(known, mine, strict=True)]
             columns[key] = mine
-    kept: dict[int, int] = {}
+    places_of: dict[int, int] = {}  # rows of indices
 
-    def row(node: int) -> int:
-        if node not in kept:
-            kept[node] = len(kept)
-            sinks.write.append((kept[node], node))
-        return kept[node]
+    def written(nodes: list[int]) -> int:
+        """Rows of their own, side by side; returns the first."""
+        first = len(sinks.write)
+        sinks.write += [(first + k, node) for k, node in enumerate(nodes)]
+        return first
 
     zero = graph.constant("f", 0)
     for (number, place), nodes in columns.items():
         if all(node == zero for node in nodes):
             continue
-        first = len(kept)  # the values of an entry lie together
-        for node in nodes:
-            sinks.write.append((len(kept), node))
-            kept[("value", len(kept))] = len(kept)  # type: ignore[index]
-        trace.sums.append((number, row(place), first, len(nodes)))
+        if place not in places_of:
+            places_of[place] = written([place])
+        trace.sums.append((number, places_of[place], written(nodes), len(nodes)))
     for number, gradient in enumerate(before.others[len(noted.taken) :]):
         if gradient is None:
             continue
@@ -192,9 +190,5 @@ def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added:
         if any(node is not None for node in lanes):
             if len(lanes) > 64:
                 raise Unsupported("a derivative by all of a table in every lane")
-            first = len(kept)
-            for node in lanes:
-                sinks.write.append((len(kept), zero if node is None else node))
-                kept[("value", len(kept))] = len(kept)  # type: ignore[index]
-            trace.sums.append((number, -1, first, len(lanes)))
+            trace.sums.append((number, -1, written([zero if node is None else node for node in lanes]), len(lanes)))
     return sinks

@@ -59,7 +59,7 @@ class JointKernels(Kernels):
         self.back_eager: dict[tuple[Any, ...], str] = {}
 
     def back_kernel(self, key: tuple[Any, ...]) -> Kernel | None:
-        """The kernel of a stage gone back through: ``("bounce", model, roulette, slide)``, ``("emit", slide)``, ``("escape",)``.
+        """The kernel of ``("bounce", model, roulette, slide)``, ``("emit", slide)`` or ``("escape",)`` gone back through.
 
         None: none can be made; :attr:`back_eager` says why.
         """

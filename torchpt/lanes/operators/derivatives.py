@@ -11,7 +11,7 @@ from torchpt.lanes.graph import DTYPES, Graph, Unsupported
 from torchpt.lanes.operators.nodes import apply, cast_all
 from torchpt.lanes.tracing import Tracer, handles
 
-__all__ = ["summands"]
+__all__ = ["summands", "totals"]
 
 
 def _zeros(tracer: Tracer, out: Tensor) -> tuple[Any, int | None]:
@@ -56,8 +56,8 @@ def _threshold_backward(tracer: Tracer, out: Tensor, given: Tensor, a: Tensor, t
     graph, ty = tracer.graph, DTYPES[out.dtype]
 
     def function(g: int, x: int) -> int:
-        above = graph.node("gt", "b", graph.cast(x, ty), graph.constant(ty, threshold))
-        return graph.select(above, graph.cast(g, ty), graph.constant(ty, 0))
+        below = graph.node("le", "b", graph.cast(x, ty), graph.constant(ty, threshold))
+        return graph.select(below, graph.constant(ty, 0), graph.cast(g, ty))
 
     apply(tracer, out, function, given, a)
 
@@ -82,11 +82,6 @@ def _sigmoid_backward(tracer: Tracer, out: Tensor, given: Tensor, y: Tensor) -> 
         return graph.binary("mul", ty, g, rest)
 
     apply(tracer, out, function, given, y)
-
-
-@handles("cat_backward", "narrow_backward")
-def _unknown(tracer: Tracer, out: Tensor, *_: Any) -> None:
-    raise Unsupported("a backward pass by parts")
 
 
 def totals(tracer: Tracer, nodes: Any, axis: int, ty: str) -> Any:
