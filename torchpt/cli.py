@@ -11,9 +11,8 @@ from __future__ import annotations
 import os
 import re
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +30,7 @@ from torchpt.commands.plain_words import compose_plainly
 from torchpt.commands.streams import ready, speaking
 from torchpt.commands.stress import HELP as HELP_STRESS
 from torchpt.commands.stress import stress
+from torchpt.commands.sweep_folder import sweep_folder
 from torchpt.errors import TorchptError
 
 if TYPE_CHECKING:
@@ -117,8 +117,17 @@ def main(argv: list[str] | None = None) -> int:
             return _refuse(str(error))
         except Interrupted as interrupted:
             return interrupted.exit_code
-        except MemoryError:
-            return _refuse("not enough memory: a smaller film, or render.max_memory, needs less")
+        except Exception as error:
+            return _out_of_memory(error)
+
+
+def _out_of_memory(error: Exception) -> int:
+    """Refuse where memory ran out; any other error goes on its way."""
+    from torchpt.shortage import ran_out
+
+    if not ran_out(error):
+        raise error
+    return _refuse("not enough memory: a smaller film, or render.max_memory, needs less")
 
 
 def _converge(arguments: Arguments, interrupt: Interrupt) -> int:
@@ -193,6 +202,8 @@ class _Task:
                 return _refuse(str(error))
             except Interrupted as interrupted:
                 return interrupted.exit_code
+            except Exception as error:
+                return _out_of_memory(error)
 
     def _of_hydra(self, cfg: DictConfig) -> Job:
         from hydra.core.hydra_config import HydraConfig
@@ -279,8 +290,8 @@ def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
 
     _check_grammar(arguments.overrides)
     words = [*arguments.options, *arguments.overrides]
-    with tempfile.TemporaryDirectory(prefix="torchpt-sweep-") as folder:
-        if arguments.multirun:  # the sweeper writes a multirun.yaml: not beside the pictures
+    with sweep_folder() if arguments.multirun else nullcontext() as folder:
+        if folder is not None:
             words.append(f"hydra.sweep.dir={_quoted(folder)}")
         with _hydra_environment(words):
             try:

@@ -97,4 +97,4 @@ class EdgeWarning(UserWarning):
 
 
 class EnergyWarning(UserWarning):
-    """A material may reflect more light than it receives."""
+    """Energy may not be kept: a material that may reflect more than it receives, refracting shapes that touch."""

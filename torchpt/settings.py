@@ -149,7 +149,7 @@ class Render(Valued):
             None,
             reader=reading.memory_size,
             words="null, bytes, or a size such as 4GB",
-            doc="of what is traced at once",
+            doc="of all that the process holds above what import took; see docs/stability.md",
         ),
         "pilots": Other(
             "auto",

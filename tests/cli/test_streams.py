@@ -102,3 +102,78 @@ def test_a_picture_whose_folder_went_away_is_saved_elsewhere(tmp_path: Path) -> 
     (saved,) = home.glob("a-*.exr")
     assert work.returncode == 2 and f"the picture is in {saved}" in said and "Traceback" not in said
     assert torchpt.read_image(saved).shape == (64, 64, 3)
+
+
+def test_two_writers_of_one_picture(tmp_path: Path) -> None:
+    """Each writes beside the file and puts it there in one step: what is left is one of both, whole."""
+    words = [
+        sys.executable,
+        "-m",
+        "torchpt",
+        "render",
+        "scene=cornell_box",
+        "film.width=24",
+        "film.height=24",
+        "out=a.exr",
+    ]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    both = [
+        subprocess.Popen([*words, f"render.spp={spp}"], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+        for spp in (1, 2, 3)
+    ]
+    assert [work.wait(120) for work in both] == [0, 0, 0]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    assert torchpt.read_image(tmp_path / "a.exr").shape == (24, 24, 3)
+
+
+def test_two_writers_of_one_checkpoint(tmp_path: Path) -> None:
+    """It is of the one or of the other, never of both: a render goes on from it to the bits of one that was left alone."""
+    words = [sys.executable, "-m", "torchpt", "render", "scene=cornell_box", "film.width=24", "film.height=24"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    once = [*words, "render.spp=6", "render.checkpoint=c.npz", "render.resume=true"]
+    both = [
+        subprocess.Popen([*once, f"out={k}.exr"], cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL)
+        for k in "ab"
+    ]
+    assert [work.wait(120) for work in both] == [0, 0]
+    assert shell(f"{TORCHPT} render {' '.join(once[4:])} out=c.exr", tmp_path).returncode == 0
+    assert shell(f"{TORCHPT} render {' '.join(words[4:])} render.spp=6 out=d.exr", tmp_path).returncode == 0
+    pictures = [torchpt.read_image(tmp_path / f"{k}.exr") for k in "abcd"]
+    assert all(picture.equal(pictures[0]) for picture in pictures)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.exr", "b.exr", "c.exr", "c.npz", "d.exr"]
+
+
+@pytest.mark.skipif(os.name != "posix" or os.getuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_may_not_be_written(tmp_path: Path) -> None:
+    (tmp_path / "closed").mkdir(mode=0o500)
+    found = shell(f"{TORCHPT} render {SMALL.replace('a.png', 'closed/a.png')}", tmp_path)
+    assert found.returncode == 2 and "closed/a.png" in found.stderr and found.stderr.count("\n") == 1
+
+
+def test_a_file_that_grows_no_further_leaves_nothing_half_written(tmp_path: Path) -> None:
+    """A full disk, by the limit on the size of files: the picture that was there before is there still."""
+    assert shell(f"{TORCHPT} render {SMALL}", tmp_path).returncode == 0
+    before = (tmp_path / "a.png").read_bytes()
+    large = SMALL.replace("width=16", "width=512").replace("height=16", "height=512")
+    found = shell(f"trap '' XFSZ; ulimit -f 16; TORCHPT_CACHE= {TORCHPT} render {large} render.compile=off", tmp_path)
+    assert found.returncode == 2 and "Traceback" not in found.stderr
+    assert "cannot be written (File too large)" in found.stderr.strip().splitlines()[-1]
+    assert (tmp_path / "a.png").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are asked by signals")
+def test_folders_of_killed_sweeps_go_with_the_next(tmp_path: Path) -> None:
+    """Hydra's sweeper wants a folder; that of a process which is gone is nobody's, that of a living one is not touched."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    (dead := tmp_path / f"torchpt-sweep-{gone.pid}-abc").mkdir()
+    (dead / "multirun.yaml").write_text("")
+    (mine := tmp_path / f"torchpt-sweep-{os.getpid()}-abc").mkdir()
+    (other := tmp_path / "torchpt-sweep-of-mine").mkdir()
+    line = f"TMPDIR={tmp_path} {TORCHPT} render -m {SMALL} render.spp=1,2"
+    (place := tmp_path / "place").mkdir()
+    found = shell(line, place)
+    assert found.returncode == 0, found.stderr
+    assert not dead.exists() and mine.exists() and other.exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([mine.name, other.name, "place"])

@@ -15,13 +15,13 @@ from typing import Any
 
 import pytest
 import torch
+from few_lanes import few_lanes
 from showcase import showcase
 from trials import film_of
 
 import torchpt
 from torchpt.film import FILTERS
 from torchpt.format.description import settings
-from torchpt.forward import BYTES_PER_LANE
 from torchpt.forward.stopping import Stop
 from torchpt.integrators.loop import schedule
 from torchpt.rendering import Rendering, render_scene
@@ -149,24 +149,27 @@ ROWS: dict[str, Row] = {
 MODES = {"eager": "off", "compiled": "on"}
 #: What is asked otherwise. Tensor operations take 20 ms a wave however small it is, so there all is asked at once.
 COLUMNS: dict[str, dict[str, dict[str, Any]]] = {
-    "eager": {"chunks on two threads": {"threads": 2, "max_memory": 307 * BYTES_PER_LANE}},
+    "eager": {"chunks on two threads": {"threads": 2, "lanes": 307}},
     "compiled": {
         "again": {},
-        "chunks": {"max_memory": 307 * BYTES_PER_LANE + 11},
+        "chunks": {"lanes": 307},
         "threads": {"threads": 2},
-        "chunks on two threads": {"threads": 2, "max_memory": 131 * BYTES_PER_LANE},
+        "chunks on two threads": {"threads": 2, "lanes": 131},
     },
 }
 
 
-def shot(scene: torchpt.Scene, wish: dict[str, Any], mode: str, film: Any = None, **render: Any) -> Rendering:
+def shot(
+    scene: torchpt.Scene, wish: dict[str, Any], mode: str, film: Any = None, lanes: int | None = None, **render: Any
+) -> Rendering:
     wishes = {
         "integrator": PATH,
         **wish,
         "film": {"filter": "box", **film_of(WIDTH, HEIGHT), **wish.get("film", {}), **(film or {})},
         "render": {"spp": SPP, "seed": 3, "threads": 1, "compile": MODES[mode], **wish.get("render", {}), **render},
     }
-    return render_scene(scene, settings(scene.description, wishes))
+    with few_lanes(lanes):
+        return render_scene(scene, settings(scene.description, wishes))
 
 
 def same(a: Rendering, b: Rendering) -> bool:
@@ -208,7 +211,7 @@ def test_the_same_bits(scene_of, monkeypatch, name, mode):
 @pytest.mark.parametrize("lanes", [1, 3, 7])
 def test_chunks_of_a_few_lanes(scene_of, lanes, mode):
     scene, film = scene_of("plain"), film_of(4, 3)
-    assert same(shot(scene, {}, mode, film, max_memory=lanes * BYTES_PER_LANE), shot(scene, {}, mode, film))
+    assert same(shot(scene, {}, mode, film, lanes=lanes), shot(scene, {}, mode, film))
 
 
 def test_waves_that_threads_divide(scene_of):
@@ -216,7 +219,7 @@ def test_waves_that_threads_divide(scene_of):
     scene, film = scene_of("every kind of primitive"), film_of(129)
     one = shot(scene, {}, "eager", film, spp=2)
     assert same(shot(scene, {}, "eager", film, spp=2, threads=2), one)
-    assert same(shot(scene, {}, "eager", film, spp=2, threads=2, max_memory=20_011 * BYTES_PER_LANE), one)
+    assert same(shot(scene, {}, "eager", film, spp=2, threads=2, lanes=20_011), one)
 
 
 @pytest.mark.parametrize(("tasks", "fewest"), [(1, 1), (50, 1), (3, 5000)])

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from few_lanes import few_lanes
 from showcase import showcase
 from trials import film_of
 
 import torchpt
 from torchpt.errors import RenderError
 from torchpt.format.description import settings
-from torchpt.forward import BYTES_PER_LANE
 from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.path import Tally
 from torchpt.rendering import Progress, Rendering, render_scene
@@ -111,7 +111,8 @@ def test_progress_may_end_it_early(threads):
         seen.append(progress)
         return len(seen) == 9
 
-    found = rendered(scene, 64, film, on_progress=stop, threads=threads, max_memory=1000 * BYTES_PER_LANE)
+    with few_lanes(1000):
+        found = rendered(scene, 64, film, on_progress=stop, threads=threads)
     assert not found.complete and found.paths < 64 * 64 * 64
     assert len(seen) == 9  # who has asked for an end is not asked again
     assert [p.done for p in seen] == sorted({p.done for p in seen}) and seen[-1].done <= found.paths
@@ -139,8 +140,8 @@ def test_an_error_in_a_task_ends_the_render(monkeypatch, threads):
     with monkeypatch.context() as patched:
         patched.setattr(Worker, "trace", fails)
         begin = time.monotonic()
-        with pytest.raises(RuntimeError, match="out of order"):
-            rendered(scene, 4, film, threads=threads, max_memory=500 * BYTES_PER_LANE)
+        with pytest.raises(RuntimeError, match="out of order"), few_lanes(500):
+            rendered(scene, 4, film, threads=threads)
         assert time.monotonic() - begin < 30
     assert not [t for t in threading.enumerate() if t.name.startswith("torchpt")]  # no thread of the pool is left
     assert same(rendered(scene, 4, film, threads=threads), whole)

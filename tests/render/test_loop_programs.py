@@ -93,7 +93,7 @@ def test_the_same_scene_otherwise(work, which):
         {"integrator": {"max_depth": 7}},
         {"integrator": {"clamp": 2.0}, "film": film_of(8)},
         {"integrator": {"clamp": 3.0}, "film": film_of(8)},
-        {"render": {"max_memory": 100_000, "threads": 1}},
+        {"render": {"max_memory": "8GB", "threads": 1}},
     ):
         rendered(scene, **copy.deepcopy(change))
         found = work()

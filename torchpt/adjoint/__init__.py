@@ -26,6 +26,8 @@ from torchpt.adjoint.function import on_tape
 from torchpt.adjoint.loop import compiled_replay
 from torchpt.adjoint.tape import tape
 from torchpt.forward import limited_threads
+from torchpt.forward.budget import check_memory
+from torchpt.forward.need import loaded, need_of
 from torchpt.integrators.path import PathIntegrator
 from torchpt.scene import Scene
 from torchpt.settings import Settings
@@ -57,13 +59,21 @@ def gradients(
         attached: whether geometry is differentiated.
         kind: one of :data:`KINDS`.
         asked: derivatives of a loss by the pixels ``(3, H W)``.
+
+    Raises:
+        SceneError: ``render.max_memory`` is too small for it.
+        RenderError: not even a single lane fits in memory.
     """
     with limited_threads(settings.render.threads):
         assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached)
+        if settings.render.max_memory is not None:
+            need = need_of(settings, scene.device, "tape", len(assembly.wave.stages.world.materials.models))
+            check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)
         sums = assembly.sums()
         # Integrators that end at the first surface have but one vertex to keep.
         if kind == "replay" and isinstance(assembly.wave.integrator, PathIntegrator):
             compiled_replay(scene, assembly, settings, asked, sums)
         else:
             tape(assembly, settings, asked, sums)
+        loaded("tape")
         return assembly.gradients(sums)

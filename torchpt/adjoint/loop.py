@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
@@ -12,11 +13,12 @@ from torch import Tensor
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.replay import replay
 from torchpt.adjoint.sums import ChunkSums, Sums
-from torchpt.adjoint.sweep import Sweep
-from torchpt.forward.run import say_once
-from torchpt.forward.schedule import pieces
+from torchpt.adjoint.sweep import KEPT, Sweep
+from torchpt.forward.schedule import Span
+from torchpt.forward.waves import say_once
 from torchpt.integrators.loop.chunk import LANES, Chunk
 from torchpt.integrators.loop.joint_kernels import JointKernels
+from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.graph import Unsupported
 from torchpt.scene import Scene
 from torchpt.settings import Settings
@@ -35,14 +37,15 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
         sums: what is added to.
     """
     if not _looped(assembly, settings):
-        return replay(assembly, settings, asked, sums)
+        replay(assembly, settings, asked, sums)
+        return
     wave = assembly.wave
     packets = wave.accel.name == "brute" and not wave.stages.world.geometry.counts[4]
     kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets)
     models = wave.stages.world.materials.models
     kernels.eager = kernels.probe([k for k, model in enumerate(models) if any(model is x for x in scene.own_models)])
     pixels = wave.crop[2] * wave.crop[3]
-    chunks = [Chunk(*span) for span in pieces(LANES, pixels, 0, settings.render.spp)]
+    chunks = [Chunk(*span) for span in _spans(pixels, settings.render.spp)]
     sweeps: list[Sweep] = []
     lock = threading.Lock()
 
@@ -55,12 +58,12 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
             sweeps.append(sweep)
         return found
 
-    threads = torch.get_num_threads()
+    threads, again = _threads(kernels, settings), False
     try:
         if threads == 1:
             for chunk in chunks:
                 sums.merge(task(chunk))
-            return None
+            chunks = []
         waiting: deque[Future[ChunkSums]] = deque()
         with ThreadPoolExecutor(threads, thread_name_prefix="torchpt") as pool:
             for chunk in chunks:
@@ -78,7 +81,28 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
     finally:
         for what, reason in kernels.back_eager.items():
             say_once(f"torchpt: {what} is differentiated by tensor operations, as no kernel can be made of {reason}")
-    return None
+    if again:
+        sweeps.clear()
+        replay(assembly, settings, asked, sums)
+
+
+def _spans(pixels: int, samples: int) -> Iterator[Span]:
+    """The chunks of a picture: always the same."""
+    for sample in range(0, samples, LANES):
+        count = min(LANES, samples - sample)
+        step = max(LANES // count, 1)
+        for pixel in range(0, pixels, step):
+            yield pixel, min(step, pixels - pixel), sample, count
+
+
+def _threads(kernels: JointKernels, settings: Settings) -> int:
+    """How many threads there are, fewer where the arenas of all would take more than half of ``render.max_memory``."""
+    threads, limit = torch.get_num_threads(), settings.render.max_memory
+    if limit is None:
+        return threads
+    depth = settings.integrator.limits.max_depth
+    levels = min(depth, KEPT) if depth >= 0 else KEPT
+    return max(1, min(threads, limit // (8 * CAPACITY * (levels + 2) * (kernels.state.count + kernels.models + 2))))
 
 
 def _looped(assembly: Assembly, settings: Settings) -> bool:

@@ -17,7 +17,9 @@ from torch import Tensor
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
 from torchpt.adjoint.sums import Sums
-from torchpt.forward.schedule import Span, pieces
+from torchpt.forward.budget import Budget
+from torchpt.forward.schedule import Span
+from torchpt.forward.waves import Waves
 from torchpt.integrators import joint
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.joint import Behind
@@ -54,7 +56,7 @@ class Keeper(Stages):
         super().__init__(stages.plan, stages.world, stages.pixel)
         self.kept: list[Vertex] = []
         self.marks: list[Vertex] = []
-        self._end, self._step, self._now = end, KEPT, None
+        self._end, self._step = end, KEPT
         self._now: Vertex | None = None
 
     def met(self, depth: int, state: PathState, hit: Hit) -> bool:
@@ -78,12 +80,28 @@ class Keeper(Stages):
 
 
 def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
-    """Reverse mode by replaying paths; as :func:`torchpt.adjoint.tape.tape`, but memory does not grow with depth."""
+    """Reverse mode by replaying paths; as :func:`torchpt.adjoint.tape.tape`, but memory does not grow with depth.
+
+    Chunks have fewer lanes only where an allocation failed.
+    """
     wave = assembly.wave
-    pixels = wave.crop[2] * wave.crop[3]
-    lanes = LANES.get(wave.centre.device.type, LANES["cpu"])
-    for span in pieces(lanes, pixels, 0, settings.render.spp):
-        _Chunk(assembly, settings, span, sums).run(asked[:, span[0] : span[0] + span[1]])
+
+    def whole(span: Span) -> None:
+        sums.join(piece(assembly, settings, asked, span))
+
+    device = wave.centre.device
+    budget = Budget(None, device, LANES.get(device.type, LANES["cpu"]), 0)
+    for _ in Waves(budget, "the vertices of a single lane").through(
+        whole, wave.crop[2] * wave.crop[3], 0, settings.render.spp
+    ):
+        pass
+
+
+def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:
+    """The sums of a chunk."""
+    sums = assembly.sums()
+    _Chunk(assembly, settings, span, sums).run(asked[:, span[0] : span[0] + span[1]])
+    return sums
 
 
 class _Chunk:

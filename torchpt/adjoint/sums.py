@@ -60,6 +60,14 @@ class Sums:
         total = self.total(number)
         total += gradient.reshape(total.shape[1], total.shape[0]).T
 
+    def join(self, part: Sums) -> None:
+        """Add the sums of a piece: all of them, or nothing where there is no memory for that."""
+        own = [
+            total if more is None else more if total is None else total + more
+            for total, more in zip(self._totals, part._totals, strict=True)
+        ]
+        self._totals = own
+
     def merge(self, part: ChunkSums) -> None:
         """Add the sums of a chunk."""
         for number, total in part.dense.items():

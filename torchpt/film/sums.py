@@ -26,7 +26,7 @@ class Film:
     """
 
     def __init__(self, width: int, height: int, randomizations: int, device: torch.device, channels: int = 3) -> None:
-        self.width, self.height, self.randomizations = width, height, randomizations
+        self.width, self.height, self.randomizations, self.channels = width, height, randomizations, channels
         pixels = width * height
         self._first = torch.zeros(channels, pixels, dtype=torch.float64, device=device)
         self._sums = torch.zeros(randomizations, channels, pixels, dtype=torch.float64, device=device)
@@ -39,14 +39,27 @@ class Film:
 
     def add(self, radiance: Tensor, first_pixel: int, first_sample: int) -> None:
         """Add samples ``(C, S, n)`` of ``n`` consecutive pixels, ``S`` consecutive samples each."""
+        for place, value in self.after(radiance, first_pixel, first_sample):
+            place.copy_(value)
+
+    def after(self, radiance: Tensor, first_pixel: int, first_sample: int) -> list[tuple[Tensor, Tensor]]:
+        """What :meth:`add` would change: places in this film, and what they would hold.
+
+        It changes nothing, and copying the values allocates nothing: who runs out of memory has added all or nothing.
+        """
         count, n = radiance.shape[1], radiance.shape[2]
         pixels = slice(first_pixel, first_pixel + n)
+        changed = []
         if first_sample == 0:
-            self._first[:, pixels] = radiance[:, 0].double()
-        for s in range(count):
-            group = (first_sample + s) % self.randomizations
-            self._sums[group, :, pixels] += radiance[:, s]
-            self._counts[group, pixels] += 1
+            changed.append((self._first[:, pixels], radiance[:, 0].double()))
+        for group in {(first_sample + s) % self.randomizations for s in range(min(count, self.randomizations))}:
+            own = range((group - first_sample) % self.randomizations, count, self.randomizations)
+            sums = self._sums[group, :, pixels].clone()
+            for s in own:
+                sums += radiance[:, s]
+            changed.append((self._sums[group, :, pixels], sums))
+            changed.append((self._counts[group, pixels], self._counts[group, pixels] + len(own)))
+        return changed
 
     def taken(self, places: Tensor) -> Film:
         """Some of its pixels as a film of their own."""
@@ -104,7 +117,8 @@ class Film:
 
     def keep_first(self, values: np.ndarray, first_pixel: int) -> None:
         """Keep the first samples ``(C, n)`` of consecutive pixels."""
-        self._first[:, first_pixel : first_pixel + values.shape[1]] = torch.from_numpy(values)
+        # By numpy: torch would start a team of threads for each thread that renders.
+        self._first.numpy()[:, first_pixel : first_pixel + values.shape[1]] = values
 
     def mean(self) -> Tensor:
         """The picture ``(H, W, C)`` in float64; pixels without samples are black."""

@@ -46,6 +46,8 @@ class Rendering:
         heavy_tailed: whether few pixels carry the error, so that the interval is not to be trusted.
         stopped_by: the rule that ended it: spp, time_limit or target_error; "" where it was ended from outside.
         complete: whether a rule ended it.
+        peak_memory: bytes, the most that the process ever held above what it held after import; on CUDA, of tensors.
+        lanes: of a wave at the end, where failed allocations made them fewer; None where memory sufficed.
         eager: stages that ran as tensor operations although kernels were wanted, and why.
         scene: name of the scene; "" where it came as a mapping.
         settings: what it was rendered with, complete.
@@ -73,6 +75,8 @@ class Rendering:
     heavy_tailed: bool = False
     stopped_by: str = ""
     complete: bool = True
+    peak_memory: int = 0
+    lanes: int | None = None
     eager: tuple[str, ...] = ()
     scene: str = ""
     settings: Settings | None = None
@@ -200,6 +204,9 @@ class Rendering:
             "relmse": self.relmse,
             "relmse_interval": None if self.relmse_interval is None else list(self.relmse_interval),
         }
+        facts["peak_memory"] = self.peak_memory
+        if self.lanes is not None:
+            facts["lanes"] = self.lanes
         if self.nonfinite_causes:
             facts["nonfinite_causes"] = dict(self.nonfinite_causes)
             facts["nonfinite_first"] = self.nonfinite_first

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import partial
 from typing import Any
 
 import torch
@@ -14,15 +13,19 @@ from torch import Tensor
 from torchpt.errors import RenderError
 from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
+from torchpt.forward.budget import check_memory
 from torchpt.forward.causes import causes_of, told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.kept import kept
+from torchpt.forward.need import loaded, need_of, shape_of
+from torchpt.forward.piece import take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.room import check_room
-from torchpt.forward.schedule import Span, lanes_for, pieces
+from torchpt.forward.schedule import Span, budget_of
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
 from torchpt.forward.wave import kernels_of, looped, make_wave, surface_layers
+from torchpt.forward.waves import Waves, say_once
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
@@ -30,16 +33,12 @@ from torchpt.integrators.loop.schedule import Loop, Share
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.lanes.graph import Unsupported
+from torchpt.native.memory import Meter, let_go, mb
 from torchpt.scene import Scene
 from torchpt.settings import Settings
+from torchpt.shortage import needing, ran_out
 
-__all__ = ["Run", "say_once"]
-
-
-@cache
-def say_once(text: str) -> None:
-    """A line on stderr, the first time only."""
-    print(text, file=sys.stderr, flush=True)
+__all__ = ["Run"]
 
 
 class Run:
@@ -51,7 +50,11 @@ class Run:
         self.start = time.perf_counter()
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
-        self.wave = make_wave(scene, settings, params, dtype)
+        meter = Meter(self.device)
+        before = meter.peak()
+        with needing(lambda: f"a scene of {scene.told}"):
+            self.wave = make_wave(scene, settings, params, dtype)
+        built = meter.peak()
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
         self.dtype = dtype
@@ -63,8 +66,18 @@ class Run:
         if settings.render.checkpoint is not None:
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.keeper.check(settings.render.resume)
-        self._begin()
         self.loop = self._loop(scene) if looped(self.wave, settings, self.device) else None
+        how = "eager" if self.loop is None else "compiled"
+        rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
+        self.need = need_of(settings, self.device, how, len(self.wave.stages.world.materials.models), rows)
+        if settings.render.max_memory is not None:
+            loading = max(scene.peak, built - meter.base() if built > before else 0)
+            check_memory(settings.render.max_memory, self.device, self.need.least, loading)
+            if self.loop is not None:
+                left = self.need.left(settings.render.max_memory, max(meter.now() - meter.base(), 0))
+                self.loop.threads, self.loop.lanes = shape_of(left, self.loop.threads, rows, self.loop.lanes)
+        with needing(lambda: f"films of {self.width} x {self.height} pixels, which take {mb(self.need.films)}"):
+            self._begin()
 
     def _begin(self) -> None:
         """Nothing is sampled yet."""
@@ -81,6 +94,7 @@ class Run:
         self.stop = Stop(self.settings.render, streams.count, None if self.keeper is None else EVERY)
         self.lost = Lost()
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
+        self.waves: Waves | None = None  # of tensor operations
         self.begun: float | None = None
 
     def _loop(self, scene: Scene) -> Loop:
@@ -93,18 +107,39 @@ class Run:
             say_once(
                 f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}"
             )
-        limited = self.settings.render.max_memory is not None
-        return Loop(
-            kernels,
-            torch.get_num_threads(),
-            lanes_for(self.settings, self.device) if limited else None,
-            self.integrator.clamp,
-            self.integrator.strict,
-        )
+        integrator = self.integrator
+        return Loop(kernels, torch.get_num_threads(), integrator.clamp, integrator.strict, say_once)
 
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, or as many as the rules or ``on_progress`` let."""
         self.on_progress = on_progress
+        with needing("a render"):
+            self._all()
+        loaded("eager" if self.loop is None else "compiled")
+        return self._picture()
+
+    def _picture(self) -> Rendering:
+        """The picture at the end; where memory does not suffice, what else is held is given back first."""
+        try:
+            return self._told()
+        except Exception as error:
+            if not ran_out(error):
+                raise
+        if self.loop is not None:
+            self.loop.release()
+        let_go()
+        size = mb(self.need.picture)
+        with needing(lambda: f"the picture of {self.width} x {self.height} pixels, which takes {size}"):
+            return self._told()
+
+    def _told(self) -> Rendering:
+        """The picture, and why samples of it are not finite."""
+        rendering = self.result()
+        rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(self.scene, self.wave, self.lost)
+        return rendering
+
+    def _all(self) -> None:
+        """All samples, by tensor operations where there can be no kernels."""
         try:
             self._complete()
         except Unsupported as error:
@@ -115,9 +150,6 @@ class Run:
             self.loop = None
             self._begin()
             self._complete()
-        rendering = self.result()
-        rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(self.scene, self.wave, self.lost)
-        return rendering
 
     # -- which samples
 
@@ -248,14 +280,22 @@ class Run:
 
         if self.loop is not None:
             return self.loop.run(spans, each)
-        lanes = lanes_for(self.settings, self.device)
+        if self.waves is None:
+            self.waves = Waves(budget_of(self.settings, self.device))
         for plate, first, count in spans:
             pixels = plate.film.width * plate.film.height
-            for pixel, n, sample, samples in pieces(lanes, pixels, first, count):
-                self._chunk(plate, (pixel, n, sample, samples))
+            for _, n, _, samples in self.waves.through(partial(self._piece, plate), pixels, first, count):
                 if each(Share(Tally(), n * samples)):
                     return False
         return True
+
+    def _piece(self, plate: Plate, span: Span) -> None:
+        """A piece by tensor operations: all of it, or nothing where it raises."""
+        piece = take(self.wave, plate, self.light, span)
+        self._count(piece.lost)
+        piece.write()
+        self.tally.rays += piece.tally.rays
+        self.tally.truncated += piece.tally.truncated
 
     def _advanced(self, samples: int, ends: bool) -> bool:
         """Tell of progress; returns whether to stop."""
@@ -278,33 +318,6 @@ class Run:
         """Camera samples that ``render.spp`` comes to."""
         pixels = self.width * self.height + (0 if self.twice is None else len(self.twice.pilots))
         return pixels * self.settings.render.spp
-
-    def _chunk(self, plate: Plate, span: Span) -> None:
-        first, count, sample, samples = span
-        if self.integrator.light:
-            radiance, tally = self.wave.radiance(first, count, sample, samples, plate)
-            self.tally.rays += tally.rays
-            self.tally.truncated += tally.truncated
-            plate.film.add(self._checked(radiance, plate, first, sample), first, sample)
-        if plate.layers:
-            layers = self.wave.layers(tuple(plate.layers), first, count, sample, samples, plate)
-            self.tally.rays += count * samples
-            for name, values in layers.items():
-                plate.layers[name].add(values, first, sample)
-
-    def _checked(self, radiance: Tensor, plate: Plate, first: int, sample: int) -> Tensor:
-        """Count what is not finite and take it as black; apply the clamp."""
-        finite = torch.isfinite(radiance).all(0)
-        if not bool(finite.all()):
-            self._count(Lost.of(radiance, first, sample, self.wave.crop, plate))
-        radiance = torch.where(finite, radiance, 0.0)
-        clamp = self.integrator.clamp
-        if clamp is None:
-            return radiance
-        scale = (clamp / radiance.abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
-        clamped = radiance * scale
-        self.light += torch.stack((radiance.double().sum(), clamped.double().sum()))
-        return clamped
 
     def _count(self, lost: Lost) -> None:
         """Count samples that are not finite; with ``integrator.strict`` the first one ends the render."""
@@ -331,6 +344,7 @@ class Run:
         counts = (film if radiant else next(iter(self.picture.layers.values()))).counts
         compile_seconds = 0.0 if self.loop is None else self.loop.kernels.seconds
         names = self.settings.film.aovs or self.integrator.layers
+        meter = Meter(self.device)
         return Rendering(
             image=image,
             layers={name: layers[name] for name in names},
@@ -351,6 +365,8 @@ class Run:
             heavy_tailed=known is not None and known.heavy_tailed,
             stopped_by=self.stop.reason,
             complete=bool(self.stop.reason) and not self.ended,
+            peak_memory=max(meter.peak() - meter.base(), 0),
+            lanes=self.waves.lanes if self.waves is not None and self.waves.halved else None,
             eager=tuple(self.eager),
             scene=self.name,
             settings=self.settings,

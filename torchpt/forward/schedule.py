@@ -1,14 +1,13 @@
-"""How a pass over samples is cut: chunks of pixels, lanes of a wave. How long passes are, ``stopping.py`` says."""
+"""How many lanes and samples are taken at once. How long passes are, ``stopping.py`` says; how they are cut, ``waves.py``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import torch
 
+from torchpt.forward.budget import Budget
 from torchpt.settings import Settings
 
-__all__ = ["BLOCK", "BYTES_PER_LANE", "LANES", "LARGEST_PASS", "Span", "lanes_for", "pieces", "streams_of"]
+__all__ = ["BLOCK", "BYTES_PER_LANE", "LANES", "LARGEST_PASS", "Span", "budget_of", "streams_of"]
 
 #: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
 LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
@@ -33,19 +32,6 @@ def streams_of(settings: Settings) -> int:
     return min(spp, 4 if spp >= MANY_SAMPLES else 2) if "variance" in settings.film.aovs else 1
 
 
-def pieces(lanes: int, pixels: int, first: int, count: int) -> Iterator[Span]:
-    """Samples ``first .. first + count`` of all pixels in chunks of so many lanes: they split pixels, never samples' order."""
-    batch = max(min(count, lanes), 1)
-    for start in range(first, first + count, batch):
-        samples = min(batch, first + count - start)
-        step = max(lanes // samples, 1)
-        for pixel in range(0, pixels, step):
-            yield pixel, min(step, pixels - pixel), start, samples
-
-
-def lanes_for(settings: Settings, device: torch.device, per_lane: int = BYTES_PER_LANE) -> int:
-    """Lanes of a wave, under ``render.max_memory``."""
-    lanes = LANES.get(device.type, LANES["cpu"])
-    if settings.render.max_memory is not None:
-        lanes = min(lanes, max(settings.render.max_memory // per_lane, 1))
-    return lanes
+def budget_of(settings: Settings, device: torch.device, per_lane: int = BYTES_PER_LANE) -> Budget:
+    """What waves of tensor operations may hold, under ``render.max_memory``."""
+    return Budget(settings.render.max_memory, device, LANES.get(device.type, LANES["cpu"]), per_lane)

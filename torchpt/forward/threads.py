@@ -9,6 +9,8 @@ from contextlib import contextmanager
 
 import torch
 
+from torchpt.native.threads import start_team
+
 __all__ = ["limited_threads"]
 
 
@@ -28,6 +30,7 @@ class _Wish:
             now = 1 if self.forked else self.before if wish == "auto" else int(wish)
             if now != torch.get_num_threads():
                 torch.set_num_threads(now)
+            start_team()
 
     def leave(self) -> None:
         with self.lock:

@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from typing import Any
 import numba
 import torch
 from numba.core import config as numba_config
+
+from torchpt.native.memory import MARGIN, room_for
 
 __all__ = ["compiled", "jit", "launch", "parallel_allowed", "part"]
 
@@ -54,11 +57,31 @@ def jit(**options: Any) -> Callable[[Callable], Any]:
             kernel: Any = numba.njit(cache=True, **settings)(function)
             if hasattr(kernel._cache, "_cache_file"):
                 kernel._cache._cache_file._source_stamp = _stamp()
+                _forgive(kernel._cache)
             return kernel
         except (RuntimeError, OSError):  # numba: "no locator available", no folder for its cache
             return numba.njit(**settings)(function)
 
     return wrap
+
+
+def _forgive(cache: Any) -> None:
+    """Let a cache that fails cost time and nothing else: a full disk, an entry that is damaged or another process is at."""
+    save, load = cache.save_overload, cache.load_overload
+
+    def save_overload(signature: Any, data: Any) -> None:
+        with suppress(OSError, RuntimeError):  # numba: "no compiled object yet"
+            save(signature, data)
+
+    def load_overload(signature: Any, target: Any) -> Any:
+        try:
+            return load(signature, target)
+        except Exception:  # whatever a damaged file raises: it is emptied, and the kernel compiled anew
+            with suppress(OSError):
+                cache.flush()
+            return None
+
+    cache.save_overload, cache.load_overload = save_overload, load_overload
 
 
 @functools.cache
@@ -80,6 +103,9 @@ def part(**options: Any) -> Callable[[Callable], Any]:
 def compiled(kernel: Any, *args: Any) -> Any:
     """The kernel, compiled for arguments with which it does nothing; says so on stderr, once, where that takes long."""
     if not kernel.overloads:
+        # LLVM ends the process where it finds no memory, and so does the BLAS that numba brings along with its first kernel.
+        if not room_for(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN):
+            raise MemoryError("no room to make kernels")
         timer = threading.Timer(_PATIENCE, _say)
         timer.daemon = True
         timer.start()

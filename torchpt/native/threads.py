@@ -6,10 +6,16 @@ import functools
 
 import torch
 
-__all__ = ["settle", "thread_count"]
+from torchpt.native.memory import room_for
+
+__all__ = ["settle", "start_team", "thread_count"]
 
 #: What torch hands over to MKL's vector mathematics.
 _FUNCTIONS = "acos asin atan cos erf erfc erfinv exp log log10 log2 sin sqrt tan tanh trunc".split()
+#: Numbers of a tensor that torch leaves to one thread.
+_GRAIN = 32_768
+#: Bytes of addresses that a thread may ask for: its stack, and some to spare.
+_STACK = 12 << 20
 
 
 def thread_count(threads: int | None) -> int:
@@ -28,3 +34,21 @@ def settle() -> None:
         half = torch.full((1,), 0.5, dtype=dtype)
         for name in _FUNCTIONS:
             getattr(torch, name)(half)
+
+
+def start_team() -> None:
+    """Starts torch's threads for the calling one while there is memory for them; where there is not, it renders alone.
+
+    OpenMP ends the process where it cannot start a thread, which it does at the first large tensor, however late that is.
+    """
+    count = torch.get_num_threads()
+    if count > 1 and count not in _started:
+        if room_for(count * _STACK):
+            torch.zeros(count * _GRAIN).add_(1.0)
+            _started.add(count)
+        else:
+            torch.set_num_threads(1)
+
+
+#: Numbers of threads that were started, by the thread that renders.
+_started: set[int] = set()

@@ -16,6 +16,7 @@ from torchpt.scene.shapes import Owner, ShapeBuilder
 from torchpt.scene.sources import sources_of
 from torchpt.scene.space import centre_and_unit
 from torchpt.scene.texels import Opener
+from torchpt.scene.touching import warn_of_touching
 
 __all__ = ["Built", "build_parts"]
 
@@ -47,6 +48,9 @@ def build_parts(description: Description) -> Built:
     Raises:
         SceneError: more than one environment, a shape that cannot be placed, or sizes too far apart for float32.
         AssetError: a mesh file that is missing or malformed.
+
+    Warns:
+        EnergyWarning: two refracting shapes touch.
     """
     parameters = Parameters()
     opener = Opener(description.textures, description.resolve, parameters, description.file)
@@ -61,4 +65,5 @@ def build_parts(description: Description) -> Built:
     parameters.declare_all("camera", description.camera.kind, description.camera.values)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)
+    warn_of_touching(parts, copies, description.file)
     return Built(tuple(parts), parameters, centre, unit, tuple(sources), tuple(copies))

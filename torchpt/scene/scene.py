@@ -21,6 +21,7 @@ from torchpt.cameras import Camera, PinholeMatrices
 from torchpt.cameras.opencv import extrinsics
 from torchpt.errors import RenderError, SceneError
 from torchpt.format.description import Description, read_description, settings
+from torchpt.native.memory import Meter, mb
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
@@ -29,6 +30,7 @@ from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, middle_of
 from torchpt.settings import Film, Settings
+from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
 __all__ = ["Scene", "device_of", "load"]
@@ -89,9 +91,13 @@ class Scene:
 
     def __init__(self, description: Description, device: torch.device, own_models: tuple[Bsdf, ...] = ()) -> None:
         settle()
+        meter = Meter(device)
+        meter.base()  # only now all modules are there
+        before = meter.peak()
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
-        self._built: Built = build_parts(description)
+        with needing("the files and shapes of the scene"):
+            self._built: Built = build_parts(description)
         # Geometry far from the origin would lose its detail in float32 before it can be moved there.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
@@ -100,6 +106,9 @@ class Scene:
             )
             for name, value in self._built.parameters.items()
         }
+        after = meter.peak()
+        #: The most that was held above import while the scene was read; 0 where it is not known.
+        self.peak = after - meter.base() if after > before else 0
         self._space = Space(torch.from_numpy(self._built.centre).to(device), self._built.unit)
         self._lock = threading.RLock()
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
@@ -116,6 +125,13 @@ class Scene:
     def name(self) -> str:
         """Of its file, without folder and ending; "" of a mapping."""
         return Path(self.description.file or "").stem
+
+    @property
+    def told(self) -> str:
+        """Its size in words, for errors."""
+        triangles = sum(len(value) for name, value in self.params.items() if name.endswith(".vertices"))
+        held = sum(value.numel() * value.element_size() for value in self.params.values())
+        return f"{len(self._built.parts)} parts with {triangles} vertices, whose parameters alone take {mb(held)}"
 
     @property
     def built(self) -> Built:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +101,11 @@ class Kernels(Layout):
             except Unsupported as error:
                 reasons[number] = str(error)
         return reasons
+
+    def rows(self, layers: Mapping[str, Any]) -> int:
+        """Rows of 32-bit numbers that a thread keeps for its lanes, see :mod:`torchpt.integrators.loop.chunk`."""
+        shown = sum(len(layer.channels) for layer in layers.values())
+        return 2 * self.state.count + 2 * (self.models + 2) + 3 + shown
 
     # -- vertices of paths
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import ctypes
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
 
 import numpy as np
 import torch
 
+from torchpt.errors import RenderError
 from torchpt.film import Film
-from torchpt.integrators import LAYERS
 from torchpt.integrators.loop.calls import Halted
 from torchpt.integrators.loop.chunk import LANES, Chunk, Worker
 from torchpt.integrators.loop.kernels import Kernels
@@ -22,6 +23,8 @@ from torchpt.integrators.plate import Plate
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.block import WIDTH
 from torchpt.lanes.kernel import HEAD
+from torchpt.native.memory import let_go
+from torchpt.shortage import needing, ran_out
 
 __all__ = ["Loop", "Share"]
 
@@ -34,6 +37,9 @@ NARROW = 128
 #: Seconds after which the thread that asked for the render looks whether it is to end.
 PATIENCE = 0.05
 
+#: A plate, its first pixel and how many, the first sample and how many of each.
+Block = tuple[Plate, int, int, int, int]
+
 
 @dataclass
 class Share:
@@ -44,12 +50,22 @@ class Share:
         samples: camera samples taken.
         lost: samples that were not finite.
         light: before and after the clamp.
+        rest: what memory did not suffice for.
     """
 
     tally: Tally
     samples: int = 0
     lost: Lost = field(default_factory=Lost)
     light: tuple[float, float] = (0.0, 0.0)
+    rest: list[Block] = field(default_factory=list)
+
+
+def _next(shares: SimpleQueue[Share | BaseException]) -> Share | BaseException | None:
+    """What comes next; None after a while."""
+    try:
+        return shares.get(timeout=PATIENCE)
+    except Empty:
+        return None
 
 
 class Loop:
@@ -58,23 +74,26 @@ class Loop:
     Args:
         kernels: of the render.
         threads: how many.
-        lanes: most of a chunk; None: as many as caches like.
         clamp: largest contribution of a path, or None.
         strict: whether a task ends at a sample that is not finite; whoever is told of it ends the render.
+        said: tells the user a line.
+
+    Attributes:
+        lanes: most of a chunk.
     """
 
     def __init__(
         self,
         kernels: Kernels,
         threads: int,
-        lanes: int | None,
         clamp: float | None,
         strict: bool,
+        said: Callable[[str], None],
     ) -> None:
         self.kernels, self.threads, self.clamp, self.strict = kernels, threads, clamp, strict
-        self.lanes = LANES if lanes is None else max(1, min(lanes, LANES))
+        self.said = said
+        self.lanes = LANES
         self._workers: list[Worker] = []
-        self._lock = threading.Lock()
         self._halt = threading.Event()
 
     def run(self, spans: Sequence[tuple[Plate, int, int]], each: Callable[[Share | None], bool]) -> bool:
@@ -93,23 +112,92 @@ class Loop:
             for plate, first, count in spans
             for start, size in self._blocks(plate, count)
         ]
+        while blocks and not self._halt.is_set():
+            blocks = self._round(blocks, each)
+            if blocks:
+                blocks = self._smaller(blocks)
+        return not self._halt.is_set()
+
+    def _round(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> list[Block]:
+        """Takes blocks on threads; returns what of them memory did not suffice for."""
+        todo, shares = deque(blocks), SimpleQueue[Share | BaseException]()
         # Tasks never run in this thread: it looks after signals.
-        pool = ThreadPoolExecutor(min(self.threads, len(blocks)), thread_name_prefix="torchpt")
+        crew = self._crew(min(self.threads, len(blocks)), todo, shares)
+        rest: list[Block] = []
         try:
-            waiting: set[Future[Share]] = {pool.submit(self._task, *block) for block in blocks}
-            while waiting:
-                done, waiting = wait(waiting, PATIENCE, FIRST_COMPLETED)
-                shares = [future.result() for future in done if not future.cancelled()]
-                if any([each(share) for share in shares or [None]]):
+            left = len(blocks)
+            while left and not self._halt.is_set():
+                share = _next(shares)
+                if isinstance(share, BaseException):
+                    raise share
+                if share is not None:
+                    left -= 1
+                    rest += share.rest
+                if each(share):
                     self._halt.set()
-                    for future in waiting:
-                        future.cancel()
-            return not self._halt.is_set()
         except BaseException:
             self._halt.set()
             raise
         finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+            for thread in crew:
+                thread.join()
+        while not shares.empty():  # of tasks that were on their way
+            share = shares.get()
+            if isinstance(share, Share):
+                each(share)
+        return rest
+
+    def _crew(
+        self, size: int, todo: deque[Block], shares: SimpleQueue[Share | BaseException]
+    ) -> list[threading.Thread]:
+        """Threads at work, as many as there is memory for.
+
+        Raises:
+            RenderError: there is none for a single one.
+        """
+
+        def work() -> None:
+            while not self._halt.is_set():
+                try:
+                    block = todo.popleft()
+                except IndexError:
+                    return
+                try:
+                    shares.put(self._task(*block))
+                except BaseException as error:
+                    shares.put(error)
+                    return
+
+        crew: list[threading.Thread] = []
+        for number in range(size):
+            thread = threading.Thread(target=work, name=f"torchpt_{number}")
+            try:
+                thread.start()
+            except (RuntimeError, MemoryError):
+                if not crew:
+                    raise RenderError("not enough memory for a thread that renders") from None
+                break
+            crew.append(thread)
+        return crew
+
+    def _smaller(self, blocks: list[Block]) -> list[Block]:
+        """The blocks that are left, for one thread alone, and for chunks of fewer lanes where that was so already.
+
+        Raises:
+            RenderError: there is no memory for one thread and a vector of lanes.
+        """
+        self.release()
+        if self.threads == 1:
+            if self.lanes <= WIDTH:
+                raise RenderError("not enough memory for the compiled loop on one thread")
+            self.lanes = max(self.lanes // 4, WIDTH)
+        self.threads = 1
+        self.said("torchpt: memory ran out: one thread and fewer lanes from now on, for the same picture")
+        return [
+            (plate, pixel, min(self.lanes, start + size - pixel), first, count)
+            for plate, start, size, first, count in blocks
+            for pixel in range(start, start + size, self.lanes)
+        ]
 
     def _blocks(self, plate: Plate, samples: int) -> Iterator[tuple[int, int]]:
         """Consecutive pixels of each task."""
@@ -120,32 +208,59 @@ class Loop:
         for start in range(0, pixels, size):
             yield start, min(size, pixels - start)
 
+    def release(self) -> None:
+        """Give back what threads keep for their next task."""
+        self._workers.clear()
+        let_go()
+
     def _task(self, plate: Plate, start: int, size: int, first: int, count: int) -> Share:
-        with self._lock:
-            worker = self._workers.pop() if self._workers else Worker(self.kernels, self._halt)
         share = Share(Tally())
+        sample = first
         try:
+            worker = self._worker()
             step = max(self.lanes // size, 1)
-            for sample in range(first, first + count, step):
+            while sample < first + count:
                 chunk = Chunk(start, size, sample, min(step, first + count - sample), plate)
-                if self.kernels.wave.limits is not None:
-                    self._radiance(worker, chunk, plate, share)
-                if plate.layers:
-                    self._layers(worker, chunk, plate, share)
+                self._chunk(worker, chunk, plate, share)
+                sample += chunk.samples
                 share.samples += size * chunk.samples
                 if self.strict and share.lost.count:
                     break
+            self._workers.append(worker)
         except Halted:
             pass  # what was added so far counts
-        finally:
-            with self._lock:
-                self._workers.append(worker)
+        except Exception as error:
+            if not ran_out(error):
+                raise
+            share.rest = [(plate, start, size, sample, first + count - sample)]
         return share
 
+    def _worker(self) -> Worker:
+        try:
+            return self._workers.pop()
+        except IndexError:
+            return Worker(self.kernels, self._halt)
+
+    def _chunk(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
+        """A chunk into the films: all of it, or nothing where memory runs out."""
+        names, light = tuple(plate.layers), self.kernels.wave.limits is not None
+        rays = worker.layers(chunk, names) if names else 0
+        for film in plate.layers.values():
+            self.kernels.deposit(film.channels, False)
+        if light:
+            self.kernels.deposit(3, self.clamp is not None)
+            tally = worker.trace(chunk)
+            share.tally.truncated += tally.truncated
+            rays += tally.rays
+        # From here on a failure would leave half a chunk: what little is allocated must be there, or the render ends.
+        with needing("the sums of a film"):
+            if light:
+                self._radiance(worker, chunk, plate, share)
+            if names:
+                self._layers(worker, chunk, plate)
+        share.tally.rays += rays
+
     def _radiance(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
-        tally = worker.trace(chunk)
-        share.tally.rays += tally.rays
-        share.tally.truncated += tally.truncated
         values = worker.slots.floats
         used = values[:, : chunk.pixels * chunk.samples]
         if self.clamp is None:
@@ -159,16 +274,13 @@ class Loop:
         self._deposit(worker, values, chunk, plate.film, 3, self.clamp)
         share.light = share.light[0] + before, share.light[1] + float(np.ascontiguousarray(used).sum(dtype=np.float64))
 
-    def _layers(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
-        names = tuple(plate.layers)
-        share.tally.rays += worker.layers(chunk, names)
+    def _layers(self, worker: Worker, chunk: Chunk, plate: Plate) -> None:
         assert worker.shown is not None
         first = 0
-        for name in names:
-            channels = len(LAYERS[name].channels)
-            values = worker.shown.floats[first : first + channels]
-            self._deposit(worker, values, chunk, plate.layers[name], channels, None)
-            first += channels
+        for film in plate.layers.values():
+            values = worker.shown.floats[first : first + film.channels]
+            self._deposit(worker, values, chunk, film, film.channels, None)
+            first += film.channels
 
     def _deposit(
         self, worker: Worker, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None

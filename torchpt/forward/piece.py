@@ -1,0 +1,84 @@
+"""A piece of a pass by tensor operations, all or nothing: no allocation that fails leaves half a piece in the films."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from torchpt.errors import RenderError
+from torchpt.forward.schedule import Span
+from torchpt.integrators.base import Tally
+from torchpt.integrators.lost import Lost
+from torchpt.integrators.plate import Plate
+from torchpt.integrators.wave import Wave
+from torchpt.shortage import ran_out
+
+__all__ = ["Piece", "take"]
+
+#: How often it is tried to write what is computed already.
+ATTEMPTS = 16
+
+
+@dataclass
+class Piece:
+    """A piece that is computed and not yet in the films.
+
+    Attributes:
+        tally: rays and paths.
+        lost: samples that were not finite.
+        writes: places, and what they are to hold then.
+    """
+
+    tally: Tally = field(default_factory=Tally)
+    lost: Lost = field(default_factory=Lost)
+    writes: list[tuple[Tensor, Tensor]] = field(default_factory=list)
+
+    def write(self) -> None:
+        """Put it into the films. Nothing is allocated; and as it says what places hold, not what is added, it can be repeated.
+
+        Raises:
+            RenderError: copying failed for want of memory again and again.
+        """
+        for _ in range(ATTEMPTS):
+            if self._written():
+                return
+        raise RenderError("not enough memory to add samples to the film")
+
+    def _written(self) -> bool:
+        try:
+            for place, value in self.writes:
+                place.copy_(value)
+        except Exception as error:
+            if not ran_out(error):
+                raise
+            return False
+        return True
+
+
+def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
+    """Compute a piece of a plate; ``light`` is all light before and after the clamp so far, ``(2,)`` float64."""
+    first, count, sample, samples = span
+    piece = Piece()
+    if wave.integrator.light:
+        radiance, tally = wave.radiance(first, count, sample, samples, plate)
+        piece.tally.rays += tally.rays
+        piece.tally.truncated += tally.truncated
+        finite = torch.isfinite(radiance).all(0)
+        if not bool(finite.all()):
+            piece.lost = Lost.of(radiance, first, sample, wave.crop, plate)
+        radiance = torch.where(finite, radiance, 0.0)
+        clamp = wave.integrator.clamp
+        if clamp is not None:
+            scale = (clamp / radiance.abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
+            clamped = radiance * scale
+            piece.writes.append((light, light + torch.stack((radiance.double().sum(), clamped.double().sum()))))
+            radiance = clamped
+        piece.writes += plate.film.after(radiance, first, sample)
+    if plate.layers:
+        layers = wave.layers(tuple(plate.layers), first, count, sample, samples, plate)
+        piece.tally.rays += count * samples
+        for name, values in layers.items():
+            piece.writes += plate.layers[name].after(values, first, sample)
+    return piece

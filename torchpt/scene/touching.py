@@ -1,0 +1,134 @@
+"""Refracting surfaces of two shapes that lie on each other: a ray meets one of them only, so it is in two media or in none."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.errors import EnergyWarning
+from torchpt.scene.parts import Copy, Part
+
+__all__ = ["warn_of_touching"]
+
+Array = NDArray[np.float64]
+Whole = NDArray[np.int64]
+
+#: How far two planes may lie apart and count as one, as a share of the scene's extent; and how far their normals may differ.
+NEAR, ALIKE = 1e-6, 1e-5
+#: Pairs of faces that are looked at, at most: this is no search for meshes that go through each other.
+PAIRS = 2_000_000
+#: Pairs that looking at one face costs as much as.
+FACE = 100
+
+
+@dataclass(frozen=True)
+class _Faces:
+    """Faces in the scene's space: polygons of as many corners as the part's have, ``(F, K, 3)``, and their shape."""
+
+    shape: str
+    corners: Array
+
+
+def warn_of_touching(parts: Sequence[Part], copies: Sequence[Copy], file: str | None) -> None:
+    """Look for flat faces of two refracting shapes that share a plane and overlap in it.
+
+    Warns:
+        EnergyWarning: two such shapes, once for each pair.
+    """
+    faces = list(_refracting(parts, copies))
+    if len({one.shape for one in faces}) < 2:
+        return
+    points = np.concatenate([one.corners.reshape(-1, 3) for one in faces])
+    centre, extent = 0.5 * (points.max(0) + points.min(0)), float(np.ptp(points, axis=0).max())
+    if not extent > 0.0:
+        return
+    scaled = [_Faces(one.shape, (one.corners - centre) / extent) for one in faces]
+    boxes = [(one.corners.min((0, 1)), one.corners.max((0, 1))) for one in scaled]
+    told: set[tuple[str, str]] = set()
+    for i, j in combinations(range(len(scaled)), 2):
+        pair = scaled[i].shape, scaled[j].shape
+        apart = (boxes[i][0] > boxes[j][1] + NEAR).any() or (boxes[j][0] > boxes[i][1] + NEAR).any()
+        if pair[0] == pair[1] or pair in told or apart:
+            continue
+        if _overlap(scaled[i].corners, scaled[j].corners):
+            told.add(pair)
+            where = f"{file}: {pair[0]}" if file else pair[0]
+            warnings.warn(
+                f"{where}: refracts and lies on {pair[1]}, which refracts too: rays meet one of the two surfaces only, and "
+                "energy is not kept there; leave a gap between them",
+                EnergyWarning,
+                stacklevel=2,
+            )
+
+
+def _refracting(parts: Sequence[Part], copies: Sequence[Copy]) -> Iterator[_Faces]:
+    own: dict[str, Array] = {}
+    for part in parts:
+        if part.kind == "rectangle":
+            flat = np.array([[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]])
+        elif part.vertices is not None and part.faces is not None:
+            flat = part.vertices[part.faces]
+        else:
+            continue
+        own[part.name] = flat
+        if any(material.model.refracts for material in part.material.all()):
+            pose = part.to_world if part.local is None else part.to_world @ part.local
+            yield _Faces(part.name, _moved(flat, pose))
+    for copy in copies:
+        if copy.of in own and any(material.model.refracts for material in copy.material.all()):
+            yield _Faces(copy.name, _moved(own[copy.of], copy.to_world))
+
+
+def _moved(corners: Array, pose: Array) -> Array:
+    return corners @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _planes(corners: Array) -> Array:
+    """Unit normals and distances ``(F, 4)``; both sides of a plane are the same."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    normals = normals / np.where(lengths > 0.0, lengths, 1.0)[:, None]
+    largest = np.take_along_axis(normals, np.abs(normals).argmax(1)[:, None], 1)
+    normals = normals * np.where(largest < 0.0, -1.0, 1.0)
+    return np.concatenate((normals, (normals * corners[:, 0]).sum(1, keepdims=True)), 1)
+
+
+def _overlap(a: Array, b: Array) -> bool:
+    """Whether any face of ``a`` and any of ``b`` lie in one plane and share some of its area."""
+    low, high = np.maximum(a.min((0, 1)), b.min((0, 1))) - NEAR, np.minimum(a.max((0, 1)), b.max((0, 1))) + NEAR
+    a, b = (x[((x.max(1) >= low) & (x.min(1) <= high)).all(1)] for x in (a, b))  # those within both boxes
+    budget = PAIRS
+    first, second = _planes(a), _planes(b)
+    order = np.argsort(second[:, 3])
+    b, second = b[order], second[order]
+    starts = np.searchsorted(second[:, 3], first[:, 3] - NEAR)
+    ends = np.searchsorted(second[:, 3], first[:, 3] + NEAR, "right")
+    for k in np.flatnonzero(ends > starts):
+        near = slice(int(starts[k]), int(ends[k]))
+        budget -= near.stop - near.start + FACE
+        alike = np.abs(second[near, :3] - first[k, :3]).max(1) <= ALIKE
+        if alike.any() and _share_area(a[k], b[near][alike], first[k, :3]):
+            return True
+        if budget < 0:
+            break
+    return False
+
+
+def _share_area(face: Array, others: Array, normal: Array) -> bool:
+    """Whether a convex face ``(K, 3)`` and any of ``(M, L, 3)`` in its plane overlap: no side of either parts them."""
+    axis = int(np.abs(normal).argmax())
+    keep = [k for k in range(3) if k != axis]
+    p, q = face[:, keep], others[:, :, keep]
+    parted = np.zeros(len(q), bool)
+    for sides in (np.broadcast_to(np.roll(p, -1, 0) - p, (len(q), *p.shape)), np.roll(q, -1, 1) - q):
+        across = np.stack((-sides[..., 1], sides[..., 0]), -1)
+        across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-30)
+        own, their = np.einsum("mkc,jc->mkj", across, p), np.einsum("mkc,mjc->mkj", across, q)
+        gap = np.maximum(own.min(-1) - their.max(-1), their.min(-1) - own.max(-1))
+        parted |= (gap >= -NEAR).any(1)
+    return bool((~parted).any())
