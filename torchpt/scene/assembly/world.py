@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.errors import SceneError
-from torchpt.records import Geometry, LaneGeometry, LaneMaterials, LaneTextures, World
+from torchpt.records import Geometry, LaneGeometry, LaneMaterials, LaneTextures, World, tensors_of
 from torchpt.scene.assembly.charts import charts_of
 from torchpt.scene.assembly.copies import copies_of, copy_maps
 from torchpt.scene.assembly.corners import corners_of
@@ -70,8 +70,22 @@ def assemble(
     maps = copy_maps(parts, primitives.sizes, copies, parameters, space) if copies else None
     geometry = primitives.geometry(maps)
     opacity_mapped = any(part.emission is not None and made[part.material.name].opacity_texture for part in parts)
+    # Derivatives by other shapes' places are none of the lights': what is cut out of the whole would seem to have them.
+    moving = any(
+        part.emission is not None and any(x.requires_grad for x in tensors_of(own))
+        for part, own in zip(parts, corners, strict=True)
+    )
     lights = lights_of(
-        parts, sources, primitives, geometry, parameters, space, opacity, dark == 0, opacity_mapped, choice
+        parts,
+        sources,
+        primitives if moving else primitives.still(),
+        geometry,
+        parameters,
+        space,
+        opacity,
+        dark == 0,
+        opacity_mapped,
+        choice,
     )
     world = World(
         geometry=LaneGeometry(
