@@ -97,3 +97,57 @@ def test_no_gradient_as_large_as_the_table_for_each_look_up():
     with Sizes():
         gradient_of(scene, "shapes.plate.vertices", compile="off", spp=1)
     assert Sizes.large < 30  # of the assembly, and one sum for each of its tables
+
+
+@pytest.mark.parametrize("name", [NAME, "shapes.plate.to_world"])
+def test_stages_of_which_no_kernel_can_be_made(monkeypatch, name, capfd):
+    from torchpt.forward.waves import say_once
+    from torchpt.integrators.loop.joint_kernels import JointKernels
+    from torchpt.lanes.graph import Unsupported
+
+    scene = torchpt.load(room(PLATE, lights={"sky": {"type": "constant", "radiance": [0.2, 0.3, 0.4]}}), "cpu")
+    whole, made = gradient_of(scene, name), JointKernels._get
+
+    def get(self: Any, listed: bool, build: Any, *arguments: Any) -> Any:
+        if build.__name__.startswith("back_"):
+            raise Unsupported("an operator of the test's own")
+        return made(self, listed, build, *arguments)
+
+    say_once.cache_clear()
+    monkeypatch.setattr(JointKernels, "_get", get)
+    eager = gradient_of(scene, name)
+    assert float((whole - eager).norm()) < 1e-4 * float(whole.norm())
+    assert "is differentiated by tensor operations, as no kernel can be made of an operator" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_memory_that_runs_out_between_kernels(monkeypatch, threads):
+    scene = torchpt.load(room(PLATE), "cpu")
+    whole, run, calls = gradient_of(scene, NAME, spp=16), sweep.Sweep.run, []
+
+    def failing(*args: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 3:
+            raise MemoryError
+        return run(*args)
+
+    from torchpt.adjoint import loop
+
+    monkeypatch.setattr(loop, "LANES", chunk.LANES // 64)
+    monkeypatch.setattr(sweep.Sweep, "run", failing)
+    found = gradient_of(scene, NAME, spp=16, threads=threads)
+    assert len(calls) >= 3
+    assert torch.allclose(found, whole, rtol=1e-4)
+
+
+def test_gradcheck_of_texels(tmp_path):
+    path = tmp_path / "texels.png"
+    torchpt.write_image(path, 0.2 + 0.6 * torch.rand(2, 2, 3, generator=torch.Generator().manual_seed(0)))
+    scene = torchpt.load(room({"type": "diffuse", "reflectance": {"type": "image", "path": str(path)}}), "cpu")
+    leaf = scene.params[NAME].double().requires_grad_()
+
+    def picture(texels: torch.Tensor) -> torch.Tensor:
+        wish = {"film": {"width": 4, "height": 4}, "integrator": {"type": "path", "max_depth": 4, "rr_depth": 100}}
+        return torchpt.render(scene, params={NAME: texels}, spp=2, seed=3, seed_grad=3, dtype=torch.float64, **wish)
+
+    assert torch.autograd.gradcheck(picture, (leaf,), eps=1e-5, atol=1e-6, fast_mode=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
@@ -22,6 +22,7 @@ from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.graph import Unsupported
 from torchpt.scene import Scene
 from torchpt.settings import Settings
+from torchpt.shortage import ran_out
 
 __all__ = ["compiled_replay"]
 
@@ -44,8 +45,8 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
     kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets)
     models = wave.stages.world.materials.models
     kernels.eager = kernels.probe([k for k, model in enumerate(models) if any(model is x for x in scene.own_models)])
-    pixels = wave.crop[2] * wave.crop[3]
-    chunks = [Chunk(*span) for span in _spans(pixels, settings.render.spp)]
+    threads = _threads(kernels, settings)
+    chunks = [Chunk(*span) for span in _spans(wave.crop[2] * wave.crop[3], settings.render.spp)]
     sweeps: list[Sweep] = []
     lock = threading.Lock()
 
@@ -53,37 +54,48 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
         with lock:
             sweep = sweeps.pop() if sweeps else Sweep(kernels, assembly, settings)
         with torch.no_grad():
-            found = sweep.run(chunk, asked[:, chunk.first_pixel : chunk.first_pixel + chunk.pixels].float())
+            pixels = asked[:, chunk.first_pixel : chunk.first_pixel + chunk.pixels].float()
+            found = sweep.run(chunk, pixels, sums if threads == 1 else None)
         with lock:
             sweeps.append(sweep)
         return found
 
-    threads, again = _threads(kernels, settings), False
+    reason = ""
     try:
-        if threads == 1:
-            for chunk in chunks:
-                sums.merge(task(chunk))
-            chunks = []
-        waiting: deque[Future[ChunkSums]] = deque()
-        with ThreadPoolExecutor(threads, thread_name_prefix="torchpt") as pool:
-            for chunk in chunks:
-                waiting.append(pool.submit(task, chunk))
-                if len(waiting) > 2 * threads:
-                    sums.merge(waiting.popleft().result())
-            while waiting:
-                sums.merge(waiting.popleft().result())
-    except Unsupported as error:
+        for part in _in_order(task, chunks, threads):
+            sums.merge(part)
+    except Exception as error:
+        if not isinstance(error, Unsupported) and not ran_out(error):
+            raise
+        reason = f"no kernel can be made of {error}" if isinstance(error, Unsupported) else "memory ran out"
+    for stage, why in kernels.back_eager.items():
+        model = f" at {models[stage[1]]}" if stage[0] == "bounce" else ""
         say_once(
-            f"torchpt: gradients of this scene are taken by tensor operations, as no kernel can be made of {error}"
+            f"torchpt: {stage[0]}{model} is differentiated by tensor operations, as no kernel can be made of {why}"
         )
+    if reason:
+        say_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
+        sweeps.clear()
         sums.clear()
         replay(assembly, settings, asked, sums)
+
+
+def _in_order(task: Callable[[Chunk], ChunkSums], chunks: Sequence[Chunk], threads: int) -> Iterator[ChunkSums]:
+    """What a task gives for chunks, in their order, by some threads."""
+    if threads == 1:
+        yield from map(task, chunks)
+        return
+    waiting: deque[Future[ChunkSums]] = deque()
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="torchpt")
+    try:
+        for chunk in chunks:
+            waiting.append(pool.submit(task, chunk))
+            if len(waiting) > 2 * threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
     finally:
-        for what, reason in kernels.back_eager.items():
-            say_once(f"torchpt: {what} is differentiated by tensor operations, as no kernel can be made of {reason}")
-    if again:
-        sweeps.clear()
-        replay(assembly, settings, asked, sums)
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _spans(pixels: int, samples: int) -> Iterator[Span]:

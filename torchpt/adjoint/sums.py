@@ -73,13 +73,14 @@ class Sums:
         for number, total in part.dense.items():
             self.total(number).add_(total)
         for number, index, values in part.stream:
-            self._add_rows(number, index, values)
+            self.add_rows(number, index, values)
 
     def clear(self) -> None:
         """Forget what was added."""
         self._totals = [None] * len(self.tables)
 
-    def _add_rows(self, number: int, index: np.ndarray, values: np.ndarray) -> None:
+    def add_rows(self, number: int, index: np.ndarray, values: np.ndarray) -> None:
+        """Add ``values (R, n)`` to the entries ``index (n,)`` of a table on a CPU, in their order."""
         from torchpt.adjoint.kernels import add_at
 
         add_at(self.total(number).numpy(), index, values)
@@ -97,14 +98,15 @@ class ChunkSums:
 
     Args:
         tables: ``(..., M)`` each.
+        whole: where terms of large tables are added at once, as chunks come one after the other; None: they are kept.
 
     Attributes:
         dense: sums ``(M, R)`` float64 by the number of a table.
         stream: numbers of tables, indices ``(n,)`` and values ``(R, n)``.
     """
 
-    def __init__(self, tables: Sequence[Tensor]) -> None:
-        self.tables = tuple(tables)
+    def __init__(self, tables: Sequence[Tensor], whole: Sums | None = None) -> None:
+        self.tables, self._whole = tuple(tables), whole
         self._numbers = {id(table): number for number, table in enumerate(self.tables)}
         self.dense: dict[int, Tensor] = {}
         self.stream: list[tuple[int, np.ndarray, np.ndarray]] = []
@@ -122,7 +124,10 @@ class ChunkSums:
     def add_rows(self, number: int, index: np.ndarray, values: np.ndarray) -> None:
         """Add ``values (R, n)`` to the entries ``index (n,)`` int32 of a table, in their order."""
         if self.tables[number].numel() > DENSE:
-            self.stream.append((number, index.copy(), values.copy()))
+            if self._whole is None:
+                self.stream.append((number, index.copy(), values.copy()))
+            else:
+                self._whole.add_rows(number, index, values)
             return
         from torchpt.adjoint.kernels import add_at
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
-from torchpt.adjoint.sums import ChunkSums
+from torchpt.adjoint.sums import ChunkSums, Sums
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Before, Behind
 from torchpt.integrators.loop.chunk import Chunk, Worker
@@ -77,10 +77,10 @@ class Sweep(Worker):
         kernels = self.kernels
         return Level(Memory(kernels.state.count), [Memory(1) for _ in range(kernels.models + 2)])
 
-    def run(self, chunk: Chunk, pixels: Tensor) -> ChunkSums:
-        """Derivatives of a chunk, of what is asked of its pixels ``(3, n)``."""
+    def run(self, chunk: Chunk, pixels: Tensor, whole: Sums | None) -> ChunkSums:
+        """Derivatives of a chunk, of what is asked of its pixels ``(3, n)``; ``whole``: see :class:`ChunkSums`."""
         self.start(chunk)
-        self.sums = ChunkSums((*self.assembly.leaves, *self.assembly.held))
+        self.sums = ChunkSums((*self.assembly.leaves, *self.assembly.held), whole)
         n = chunk.pixels * chunk.samples
         self._chunk = chunk
         marks = self._forward(Mark(1, None), None)
