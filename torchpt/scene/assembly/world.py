@@ -23,6 +23,7 @@ from torchpt.scene.assembly.materials import Groups, groups_of, node_map_of, opa
 from torchpt.scene.assembly.primitives import Primitives, primitives_of
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.scene.space import FARTHEST, Space
+from torchpt.shapes.primitive import Corners
 from torchpt.textures import tables_of
 
 __all__ = ["assemble"]
@@ -70,15 +71,10 @@ def assemble(
     maps = copy_maps(parts, primitives.sizes, copies, parameters, space) if copies else None
     geometry = primitives.geometry(maps)
     opacity_mapped = any(part.emission is not None and made[part.material.name].opacity_texture for part in parts)
-    # Derivatives by other shapes' places are none of the lights': what is cut out of the whole would seem to have them.
-    moving = any(
-        part.emission is not None and any(x.requires_grad for x in tensors_of(own))
-        for part, own in zip(parts, corners, strict=True)
-    )
     lights = lights_of(
         parts,
         sources,
-        primitives if moving else primitives.still(),
+        _lit_by(parts, corners, primitives),
         geometry,
         parameters,
         space,
@@ -113,6 +109,15 @@ def assemble(
         lights=lights,
     )
     return world, geometry
+
+
+def _lit_by(parts: Sequence[Part], corners: Sequence[Corners], primitives: Primitives) -> Primitives:
+    """The primitives, without derivatives where no part that emits has any: what is cut out of the whole would seem to."""
+    moving = any(
+        part.emission is not None and any(x.requires_grad for x in tensors_of(own))
+        for part, own in zip(parts, corners, strict=True)
+    )
+    return primitives if moving else primitives.still()
 
 
 def _materials(
