@@ -41,7 +41,7 @@ def _triangle(p, row, o, d, axes):
     inside = (e >= 0 and f >= 0 and g >= 0) or (e <= 0 and f <= 0 and g <= 0)
     away = row[0] * o[0] + row[1] * o[1] + row[2] * o[2] + row[3]
     plane = -away / (row[0] * d[0] + row[1] * d[1] + row[2] * d[2])
-    if not (inside and det != 0 and plane > 0 and plane < INF):
+    if not (inside and det != 0 and plane == plane):
         return np.float32(np.nan), ZERO, ZERO
     a, b, c = q[0, 2] * sz, q[1, 2] * sz, q[2, 2] * sz
     return min(max(plane, min(min(a, b), c)), max(max(a, b), c)), f / det, g / det

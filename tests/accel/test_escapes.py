@@ -123,6 +123,19 @@ def test_no_ray_escapes_the_other_searches(kind, name, place, count):
         assert accel.occluded(o, d, far).all()
 
 
+@pytest.mark.parametrize("kind", ["numba", "torch"])
+def test_triangles_that_are_seen_edge_on_make_no_hole(kind):
+    """Rays that each left by a triangle whose plane, as float32 has it, lay behind them."""
+    vertices, faces = sphere_mesh(144)
+    accel = build(triangles((vertices * 1000 + np.array(FAR)).astype(np.float32), faces), kind)
+    o = [[148262.578125, 1372.1507568359375, -223656.578125], [148247.734375, 1461.7618408203125, -223442.78125]]
+    d = [[103.84375, 865.6185302734375, 124.0625], [90.328125, -1231.2860107421875, 41.6875]]
+    found = accel.intersect(
+        torch.tensor(o).T.contiguous(), torch.tensor(d).T.contiguous(), torch.full((2,), float("inf"))
+    )
+    assert (found[1] >= 0).all() and (found[0] > 0.9).all()
+
+
 def test_a_hole_is_seen():
     """The count above is not zero by construction."""
     vertices, faces = sphere_mesh(20)

@@ -280,6 +280,25 @@ def test_points_in_the_plane_and_lights_without_area_are_sampled_by_area(name):
                 torch.testing.assert_close(uv, uniform_triangle(u) if code(name) == TRIANGLE else u)
 
 
+@pytest.mark.parametrize("near", [1e-5, 1e-7, 1e-9, 1e-12])
+@pytest.mark.parametrize("name", list(LIGHTS))
+def test_points_drawn_from_beside_an_edge_are_on_the_light(name, near):
+    """Its ends are seen in opposite directions there, of which float64 keeps no angle between."""
+    p0, e1, e2 = LIGHTS[name]
+    g = torch.Generator().manual_seed(0)
+    along, away = torch.rand(1, 4096, generator=g), near * (2.0 * torch.rand(3, 4096, generator=g) - 1.0)
+    u = torch.rand(2, 4096, generator=g)
+    for start, edge in ((p0, e1), (p0, e2), (p0 + e1, e2 - e1)):
+        x = start + along * edge + away * e1.norm()
+        for form, angles in (
+            (solid_angle.sample, solid_angle.angles),
+            (solid_angle.tensor_sample, solid_angle.tensor_angles),
+        ):
+            uv, angle = form(table(name), None, x, u)
+            assert torch.isfinite(angle).all() and (uv >= 0).all() and (uv <= 1).all()
+            assert angle.equal(angles(table(name), None, x))
+
+
 @pytest.mark.parametrize("scale", [1e-18, 1.0, 1e18])
 @pytest.mark.parametrize("name", list(LIGHTS))
 def test_the_unit_of_length_does_not_matter(name, scale):

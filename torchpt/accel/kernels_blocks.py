@@ -67,7 +67,6 @@ FLOOR = np.float32(1.0 - 2.0**-17)
 #: In place of an id: an any-hit ray has met surfaces that may let light pass, and no others yet.
 MAY_PASS = np.int32(-2)
 _ZERO = np.float32(0.0)
-_INF = np.float32(np.inf)
 
 
 @part(forceinline=True)
@@ -151,10 +150,9 @@ def planes(tree, base, o, d, za, zb, zc, sz, floor):
     away = n0 * splat(o[0], 8) + n1 * splat(o[1], 8) + n2 * splat(o[2], 8) + load(tree, base + PLANES + 24, 8)
     along = n0 * splat(d[0], 8) + n1 * splat(d[1], 8) + n2 * splat(d[2], 8)
     plane = -away / along
-    ahead = (plane > zero) & (plane < splat(_INF, 8))
     za, zb, zc = za * sz, zb * sz, zc * sz
     t = minimum(maximum(plane, minimum(minimum(za, zb), zc)), maximum(maximum(za, zb), zc))
-    return maximum(t, splat(floor, 8)), ahead & (t > zero)
+    return maximum(t, splat(floor, 8)), (plane == plane) & (t > zero)
 
 
 @part(forceinline=True)

@@ -14,7 +14,7 @@ __all__ = ["FOURTH", "RECTANGLES", "RULED", "others"]
 #: Where the rectangles of a leaf begin: three corners as in a leaf, then the fourth ones, then planes.
 RECTANGLES = LEAF * LINE
 FOURTH, RULED = 72, 96
-_ZERO, _INF = np.float32(0.0), np.float32(np.inf)
+_ZERO = np.float32(0.0)
 
 
 @part(forceinline=True)
@@ -42,7 +42,7 @@ def _rectangles(tree, at, axes, o, d, p, s):
     h, k = qx * by - qy * bx, cx * qy - cy * qx
     low, high = minimum(minimum(f, g), minimum(h, k)), maximum(maximum(f, g), maximum(h, k))
     det = minimum(absolute(f + h), absolute(g + k))  # a product would be the fourth power of a length
-    met = ((low >= zero) | (high <= zero)) & (det != zero) & (plane > zero) & (plane < splat(_INF, 8))
+    met = ((low >= zero) | (high <= zero)) & (det != zero) & (plane == plane)
     near, far = minimum(minimum(minimum(az, bz), cz), qz), maximum(maximum(maximum(az, bz), cz), qz)
     t = minimum(maximum(plane, near), far)
     return met & (t > zero), t, f / (f + h), g / (g + k)

@@ -136,7 +136,7 @@ def _triangle(tree, at, axes, s, o, d, floor):
         plane = -(n0 * o[0] + n1 * o[1] + n2 * o[2] + c) / (n0 * d[0] + n1 * d[1] + n2 * d[2])
         za, zb, zc = za * s[2], zb * s[2], zc * s[2]
         t = minimum(maximum(plane, minimum(minimum(za, zb), zc)), maximum(maximum(za, zb), zc))
-        m = m & (plane > zero) & (plane < splat(_INF, 16)) & (t > zero)
+        m = m & (plane == plane) & (t > zero)
         t = maximum(t, floor)
     return m, t, f, g, det
 
@@ -157,7 +157,7 @@ def _rectangle(tree, at, axes, s, o, d):
     h, k = qx * by - qy * bx, cx * qy - cy * qx
     low, high = minimum(minimum(f, g), minimum(h, k)), maximum(maximum(f, g), maximum(h, k))
     det = minimum(absolute(f + h), absolute(g + k))  # a product would be the fourth power of a length
-    m = ((low >= zero) | (high <= zero)) & (det != zero) & (plane > zero) & (plane < splat(_INF, 16))
+    m = ((low >= zero) | (high <= zero)) & (det != zero) & (plane == plane)
     near, far = minimum(minimum(minimum(az, bz), cz), qz), maximum(maximum(maximum(az, bz), cz), qz)
     t = minimum(maximum(plane, near), far)
     return m & (t > zero), t, f / (f + h), g / (g + k)

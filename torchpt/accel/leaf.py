@@ -3,7 +3,8 @@
 Triangles and parallelograms are watertight after Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection", JCGT
 2013: corners are sheared into the ray's frame, where an edge function's sign depends on the edge alone, not on the
 primitive. Products round monotonically, so a computed edge function is of the right sign or zero; zero counts as
-inside. That holds without fused operations only. The distance comes from the plane, within the corners' depths.
+inside. That holds without fused operations only. The distance comes from the plane, within the corners' depths: of a
+primitive that is seen edge-on the plane may lie anywhere, behind the ray too, and must not make a hole.
 The numba kernels (kernels_leaf.py) do the same operations in the same order.
 """
 
@@ -72,9 +73,9 @@ def distances(
     away = row[0] * o[0] + row[1] * o[1] + row[2] * o[2] + row[3]
     along = row[0] * d[0] + row[1] * d[1] + row[2] * d[2]
     plane = -away / along
-    plane = torch.where((plane > 0) & torch.isfinite(plane), plane, torch.nan)
     t, u, v = _polygon(rays, corner, plane, (prim >= counts[0]) if counts[1] else None)
     if counts[2]:
+        plane = torch.where((plane > 0) & torch.isfinite(plane), plane, torch.nan)
         x, y, z = (o + plane * d).unbind(0)
         a = row[4] * x + row[5] * y + row[6] * z + row[7]
         b = row[8] * x + row[9] * y + row[10] * z + row[11]

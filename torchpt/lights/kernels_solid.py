@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.lights.solid_angle import LEAST, MOST, OTHER, RECTANGLE, TRIANGLE
+from torchpt.lights.solid_angle import LEAST, MOST, OPPOSITE, OTHER, RECTANGLE, TRIANGLE
 from torchpt.math.angles import SERIES
 from torchpt.native.jit import jit, launch
 from torchpt.native.threads import thread_count
@@ -94,9 +94,10 @@ def _corner(ax: Any, ay: Any, az: Any) -> Any:
 
 @jit(forceinline=True)
 def _excess(volume: Any, ab: Any, bc: Any, ca: Any) -> Any:
-    """Half the solid angle of three unit vectors (van Oosterom and Strackee, 1983)."""
+    """Half the solid angle of three unit vectors (van Oosterom and Strackee, 1983); NaN where it is rounding only."""
     half = _azimuth(1.0 + ab + bc + ca, volume)
-    return half if half <= math.pi else 0.0
+    half = half if half <= math.pi else 0.0
+    return half if 1.0 + min(min(ab, bc), ca) >= OPPOSITE else math.nan
 
 
 @jit(forceinline=True)

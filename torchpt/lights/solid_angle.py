@@ -33,6 +33,7 @@ __all__ = [
     "LEAST",
     "MOST",
     "NEAR",
+    "OPPOSITE",
     "OTHER",
     "RECTANGLE",
     "SKEW",
@@ -50,6 +51,9 @@ __all__ = [
 TRIANGLE, RECTANGLE, SKEW, OTHER = 0, 1, 2, 3
 #: Solid angles, in steradians, beyond which lights are sampled by area.
 LEAST, MOST = 3e-4, 2.0 * math.pi - 1e-5
+#: One plus the cosine between two corners of a triangle below which float64 loses the angle: seen from a millionth of an
+#: edge's length away, its ends lie in opposite directions. Then the triangle is sampled by area.
+OPPOSITE = 1e-12
 #: Farther than this from its centre, in units of the radius about it, a light is sampled by area.
 NEAR = 2.0
 #: Cosine of the edges below which a parallelogram is a rectangle: rounding of its corners in float32.
@@ -215,9 +219,10 @@ def _unit(a: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _excess(volume: Tensor, ab: Tensor, bc: Tensor, ca: Tensor) -> Tensor:
-    """Half the solid angle of three unit vectors."""
+    """Half the solid angle of three unit vectors; NaN where rounding is all there is of it."""
     half = azimuth(1.0 + ab + bc + ca, volume)
-    return torch.where(half <= math.pi, half, 0.0)
+    told = 1.0 + torch.minimum(torch.minimum(ab, bc), ca) >= OPPOSITE
+    return torch.where(told, torch.where(half <= math.pi, half, 0.0), math.nan)
 
 
 def _arc(
