@@ -104,8 +104,9 @@ def render(
         accel, compile, threads, max_memory: of ``render``.
         device: must be the scene's own; load the scene on the device where it is to render.
         dtype: of the lanes. float64 is for checking derivatives; the search stays float32.
-        adjoint: how gradients are taken: ``autograd`` (the default) runs each chunk of pixels again under a tape in the
-            backward pass, so memory is that of a chunk.
+        adjoint: how gradients are taken: ``replay`` (the default) traces paths again in the backward pass and goes back along
+            them vertex by vertex, so that memory grows with neither depth nor samples; ``autograd`` runs each chunk of
+            pixels again under a plain tape.
         seed_grad, spp_grad: of the backward pass. By default it draws samples of its own, as many as the forward pass took:
             shared samples would bias the gradient of a squared loss.
         edges: whether silhouettes and shadow edges that move are differentiated (docs/gradients.md); False warns.
@@ -135,7 +136,7 @@ def render(
         check_denoiser()
     scene.check(params)
     backward = {"seed": seed_grad, "spp": spp_grad, "edges": edge_spp if edges else 0}
-    rendering = _rendered(scene, settings, backward, params or {}, dtype, adjoint or "autograd")
+    rendering = _rendered(scene, settings, backward, params or {}, dtype, adjoint or adjoints.KINDS[0])
     return rendering if full else rendering.image
 
 
@@ -233,26 +234,29 @@ def _differentiable(
         made.append(render_scene(scene, settings, params=given_by(*tensors), dtype=dtype))
         return made[-1].image
 
-    def chunks(work: Callable[[adjoints.Chunk], None], *tensors: Tensor) -> None:
-        spp = taken[0] if backward["spp"] is None else backward["spp"]
-        again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
-        adjoints.chunks(scene, again, given_by(*tensors), wanted, dtype, attached, work)
+    def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor]:
+        given, of_edges = given_by(*tensors), edges_taken()
+        found = adjoints.gradients(scene, again(), given, wanted, dtype, attached, adjoint, cotangent)
+        if of_edges and concerns(scene, wanted):
+            _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+            moved = add_gradients(
+                scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges
+            )
+            found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
+        return found
+
+    def again(spp: int | None = None) -> Settings:
+        spp = spp or backward["spp"] or taken[0]
+        return replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
 
     def edges_taken() -> int:
         return 0 if backward["edges"] == 0 else backward["edges"] or backward["spp"] or taken[0]
 
-    def moved(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
-        again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=1))
-        return add_gradients(scene, again, given_by(*tensors), wanted, dtype, cotangent, edges_taken())
-
     def asked() -> Asked:
-        spp = taken[0] if backward["spp"] is None else backward["spp"]
-        again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
-        return Asked(scene, again, wanted, dtype, edges_taken())
+        return Asked(scene, again(), wanted, dtype, edges_taken())
 
-    with_edges = moved if backward["edges"] != 0 and concerns(scene, wanted) else None
     tensors = tuple(params[name] for name in wanted)
-    image = adjoints.KINDS[adjoint](forward, chunks, tensors, scene.weights(), with_edges)
+    image = adjoints.on_tape(forward, backward_pass, tensors, scene.weights())
     rendering = made.pop()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
     names = followed(settings)

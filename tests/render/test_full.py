@@ -144,13 +144,13 @@ def test_the_backward_pass_takes_what_the_forward_pass_took(scene: torchpt.Scene
     from torchpt import adjoint
 
     taken: list[int] = []
-    chunks = adjoint.chunks
+    gradients = adjoint.gradients
 
     def spied(scene: Any, settings: Any, *rest: Any) -> Any:
         taken.append(settings.render.spp)
-        return chunks(scene, settings, *rest)
+        return gradients(scene, settings, *rest)
 
-    monkeypatch.setattr(adjoint, "chunks", spied)
+    monkeypatch.setattr(adjoint, "gradients", spied)
     name = "materials.grey.reflectance"
     wishes: list[dict[str, Any]] = [{"spp": 3}, {"spp": 3, "spp_grad": 2}, {"spp": 10**6, "target_error": 0.2}]
     for wish in wishes:

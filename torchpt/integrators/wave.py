@@ -93,10 +93,10 @@ class Wave:
         """Radiance ``(3, N)`` that camera rays bring, weighted by the filter, and what it took."""
         radiance, tally = self.integrator.radiance(self.stages, self.accel, state, self.first)
         if self.filter.signed:
-            radiance = radiance * self._weight(state)
+            radiance = radiance * self.weight(state)
         return radiance, tally
 
-    def _weight(self, state: PathState) -> Tensor:
+    def weight(self, state: PathState) -> Tensor:
         """What the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""
         draws = Draws(self.stages.plan.sampler, state.key, salts(0, self.centre.device))
         return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.stages.plan.dtype)
@@ -119,5 +119,5 @@ class Wave:
         search = Search(self.accel, world, plan.sampler, plan.dtype)
         found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel, slide)
         if self.filter.signed:
-            found = aov.weighted(found, self._weight(state))
+            found = aov.weighted(found, self.weight(state))
         return {name: value.view(len(value), samples, pixels) for name, value in found.items()}
