@@ -236,11 +236,15 @@ def _differentiable(
 
     def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor]:
         given, of_edges = given_by(*tensors), edges_taken()
-        found = adjoints.gradients(scene, again(), given, wanted, dtype, attached, adjoint, cotangent)
+        # One pass that is a derivative of the very estimator takes its own samples again.
+        render = again().render
+        exact = render.seed == settings.render.seed and render.spp == taken[0]
+        held = not exact and adjoints.suits(scene, settings, wanted)
+        found = adjoints.gradients(scene, again(), given, wanted, dtype, attached, adjoint, cotangent, held)
         if of_edges and concerns(scene, wanted):
             _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
             moved = add_gradients(
-                scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges
+                scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held
             )
             found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
         return found

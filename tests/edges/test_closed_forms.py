@@ -154,7 +154,7 @@ def test_gradients_are_the_same_for_any_threads_and_memory() -> None:
     shapes = {"it": {"type": "cube", "transform": [{"scale": 0.6}]}, "ball": {"type": "sphere", "center": [1, 1, 2]}}
     scene = torchpt.load({**BASE, "integrator": {"type": "path", "max_depth": 4}, "shapes": shapes}, "cpu")
     found = []
-    wishes: list[dict[str, Any]] = [{}, {"threads": 2}, {"max_memory": "400MB"}]
+    wishes: list[dict[str, Any]] = [{}, {"threads": 2}, {"max_memory": "3GB"}]
     for wish in wishes:
         leaf = scene.params["shapes.it.to_world"].clone().requires_grad_()
         torchpt.render(scene, params={"shapes.it.to_world": leaf}, spp=4, edge_spp=16, **wish).mean().backward()

@@ -130,10 +130,11 @@ class Pinhole(Camera):
 
     def film_of(self, p: Tensor) -> Tensor | None:
         """See :meth:`Camera.film_of`."""
-        if self.lens:
-            return None
+        return None if self.lens else self.placed(p - self.origin())
+
+    def placed(self, away: Tensor) -> Tensor:
+        """:meth:`film_of` of points that lie ``away (3, N)`` from the origin."""
         right, up, ahead = self.axes()
-        away = p - self.origin()
         half, depth = self.half_width(), (away * ahead).sum(0)
         width, height = self.film[0], self.film[1]
         across, along = (away * right).sum(0) / half, (away * up).sum(0) / half

@@ -89,8 +89,11 @@ class Boundary:
         by_name = dict(zip(self.leaves, grads, strict=True))
         return [by_name.get(name) for name in wanted]
 
-    def primary(self, spp: int, look: Look) -> Iterator[Samples]:
-        """Samples of the edges that the camera sees, chunk by chunk; ``look``: what rays beside them see."""
+    def primary(self, spp: int, look: Look, held: bool = False) -> Iterator[Samples]:
+        """Samples of the edges that the camera sees, chunk by chunk; ``look``: what rays beside them see.
+
+        ``held``: they count as they move over what is seen beside them.
+        """
         total = spp * self.pixels
         if self.moving.keys() <= {"lights"}:  # none of which is seen
             return
@@ -100,7 +103,7 @@ class Boundary:
             return
         primary = primary_of(self.still, pieces, self.traced, Numbers(self.settings.render.seed, 0))
         for first, count in self._chunks(total):
-            yield primary.samples(first, count, total, self.worth, look)
+            yield primary.samples(first, count, total, self.worth, look, held)
 
     def shadows(self, spp: int) -> Iterator[Samples]:
         """Samples of the edges of shadows: of lights, then of what surfaces reflect."""
@@ -185,6 +188,7 @@ def add_gradients(
     dtype: torch.dtype,
     cotangent: Tensor,
     samples: int,
+    held: bool = False,
 ) -> list[Tensor | None]:
     """What moving edges add to the gradients of ``wanted``; None for those that move none.
 
@@ -196,6 +200,8 @@ def add_gradients(
         dtype: of the lanes.
         cotangent: ``(H, W, 3)`` of the picture.
         samples: of each estimator, a pixel of the picture.
+        held: whether the interior holds in place what the camera sees (:mod:`torchpt.adjoint.held`): edges count as they
+            move over that.
 
     Raises:
         SceneError: settings that this scene cannot be rendered with.
@@ -206,7 +212,8 @@ def add_gradients(
             return [None] * len(wanted)
 
         def every() -> Iterator[Samples]:
-            yield from boundary.primary(samples, boundary.traced.radiance)
-            yield from boundary.shadows(samples)
+            yield from boundary.primary(samples, boundary.traced.radiance, held)
+            if not held:  # shadows move with what they fall on
+                yield from boundary.shadows(samples)
 
         return boundary.gradients(every(), wanted)

@@ -38,14 +38,25 @@ Look = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Along:
-    """Samples along curves on the film: the derivative of the loss is that of ``(weight * places(held)).sum()``."""
+    """Samples along curves on the film: the derivative of the loss is that of ``(weight * places(held)).sum()``.
+
+    Where what is seen is held in place, that of ``beside`` is taken away: where rays ended ``(3, M)``, or, where they met
+    nothing, infinity and their directions, and weights ``(2, M)``.
+    """
 
     held: Held
     weight: Tensor  # (2, N)
+    beside: tuple[Tensor, Tensor, Tensor] | None = None
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Differentiable in ``bodies``; of no meaning but for its derivative."""
-        return (film_places(bodies.camera, bodies.points(self.held)) * self.weight).sum()
+        total = (film_places(bodies.camera, bodies.points(self.held)) * self.weight).sum()
+        if self.beside is None:
+            return total
+        origin, away, weight = self.beside
+        # What is infinitely far moves along with the camera.
+        at = torch.where(torch.isfinite(origin), origin, bodies.camera.origin()) + away
+        return total - (film_places(bodies.camera, at) * weight).sum()
 
 
 def step_of(bodies: Bodies) -> float:
@@ -75,8 +86,11 @@ class Primary:
     numbers: Numbers
 
     @torch.no_grad()
-    def samples(self, first: int, count: int, total: int, worth: Worth, look: Look) -> Along:
-        """Samples ``first .. first + count`` of ``total``: those that are seen."""
+    def samples(self, first: int, count: int, total: int, worth: Worth, look: Look, over: bool = False) -> Along:
+        """Samples ``first .. first + count`` of ``total``: those that are seen.
+
+        ``over``: they count as they move over what is seen on both sides, which is held in place.
+        """
         number = torch.arange(first, first + count, device=self.pieces.weight.device)
         u = (number.double() + self.numbers.of(number, 0)) / total
         index, rest, chance = self.choice.draw(u)
@@ -100,8 +114,15 @@ class Primary:
         values = look(o, d, torch.cat((key, key), 1)) if len(index) else torch.zeros(len(value), 0).to(value)
         jump = values[:, : len(index)] - values[:, len(index) :]
         worthy = (take(value, index) * jump).sum(0) * take(share, seen)
-        weight = worthy / (take(chance * density, index) * total)
-        return Along(held.taken(index), take(normal, seen) * weight)
+        chance, normal = take(chance * density, index) * total, take(normal, seen)
+        beside = None
+        if over:
+            each = (take(value, index).repeat(1, 2) * values).sum(0) * (take(share, seen) / chance).repeat(2)
+            each = torch.cat((each[: len(index)], -each[len(index) :]))
+            t, prim = self.traced.nearest(o, d)
+            met = prim >= 0
+            beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, normal.repeat(1, 2) * each
+        return Along(held.taken(index), normal * (worthy / chance), beside)
 
     def _beside(self, s: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
         """Rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
