@@ -1,4 +1,4 @@
-"""Gradients against known ones, see ``scripts/gradient_pairs.py``: a quick form, and the whole one of what needs no edges."""
+"""Gradients against known ones, see ``scripts/gradient_pairs.py``: a quick form, and the whole one."""
 
 from __future__ import annotations
 
@@ -8,9 +8,18 @@ import pytest
 from inverse_tasks import TASKS
 from known_gradients import PAIRS
 
-#: Of those in which edges move: the camera's gradient follows what is seen, so that few edges matter.
-SEEN = ("camera_x_room", "camera_z_room", "camera_turn_room", "fov_room", "camera_x_ball")
-QUICK = ("albedo_room", "roughness", "sky_turned", "free_lamp", "fov_room", "camera_x_room")
+#: What is not done yet: the edge along which shapes cut through each other; surfaces that move near others, in reflected light.
+NOT_DONE = ("cylinder_pose", "block_pose_room_indirect")
+QUICK = (
+    "albedo_room",
+    "roughness",
+    "sky_scale",
+    "free_lamp",
+    "fov_room",
+    "camera_x_sky",
+    "sphere_radius_sky",
+    "spot_position",
+)
 
 
 def test_truths_are_known():
@@ -33,14 +42,14 @@ def test_gradient_is_the_known_one(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name, pair in PAIRS.items() if not pair.edges or name in SEEN])
+@pytest.mark.parametrize("name", [name for name in PAIRS if name not in NOT_DONE])
 def test_gradient_is_the_known_one_closely(name):
     row = gradient_pairs.measured(name, gradient_pairs.truths()[name], {})
     assert row["passes"], row
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name, task in TASKS.items() if not task.edges or name == "camera"])
+@pytest.mark.parametrize("name", list(TASKS))
 def test_task_is_solved(name):
     row = gradient_tasks.solved(name, {"threads": 1})
     assert row["passes"], row["errors"][::10]

@@ -37,7 +37,7 @@ def _reduce(op: str, boolean: bool = False) -> Any:
                 summed = totals(tracer, nodes, k, DTYPES[out.dtype])
                 nodes = np.expand_dims(summed, k) if keepdim else summed
                 continue
-            parts: list[Any] = [np.take(nodes, j, k) for j in range(nodes.shape[k])]
+            parts: list[Any] = [np.squeeze(np.take(nodes, [j], k), k) for j in range(nodes.shape[k])]
             if not parts:
                 shape = (*nodes.shape[:k], *nodes.shape[k + 1 :])
                 parts = [np.full(shape, _nothing(graph, op, DTYPES[out.dtype]), object)]
