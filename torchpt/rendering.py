@@ -116,13 +116,8 @@ def render(
         SceneError: a setting or parameter that is not accepted.
         RenderError: a device, compiler or denoiser that is not there.
     """
-    _check(
-        scene,
-        device,
-        dtype,
-        adjoint,
-        {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1), "edge_spp": (edge_spp, 1)},
-    )
+    numbers = {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1), "edge_spp": (edge_spp, 1)}
+    _check(scene, device, dtype, adjoint, numbers)
     given = {
         "spp": spp, "seed": seed, "accel": accel, "compile": compile, "threads": threads, "max_memory": max_memory,
         "time_limit": time_limit, "target_error": target_error, "pilots": pilots,

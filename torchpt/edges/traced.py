@@ -66,8 +66,8 @@ class Traced:
 def traced_of(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Traced:
     """The wave of a scene under ``params``, eager; its numbers are independent from sample to sample."""
     render = settings.render
-    if scene.device.type == "cpu" and render.accel in ("auto", "brute"):
-        render = render.but(accel="numba")  # packets widen primitives by their rounding, further than edges look beside
-    plain = replace(settings, sampler=Described(SAMPLERS["independent"], {}), render=render)
+    plain = replace(settings, sampler=Described(SAMPLERS["independent"], {}))
     wave = make_wave(scene, plain, params, dtype)
+    if wave.accel.name == "brute":  # packets widen primitives by their rounding, further than edges look beside
+        wave = make_wave(scene, replace(plain, render=render.but(accel="numba")), params, dtype)
     return Traced(replace(wave, sampler=Sampler(wave.sampler.points, settings.render.seed)), settings.integrator.clamp)
