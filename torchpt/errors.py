@@ -93,7 +93,7 @@ class RenderError(TorchptError):
 
 
 class EdgeWarning(UserWarning):
-    """A gradient with respect to geometry leaves out visibility edges: silhouettes and shadow edges that move."""
+    """A gradient with respect to geometry leaves out visibility edges: all of them, or some that the scene has."""
 
 
 class EnergyWarning(UserWarning):

@@ -350,8 +350,10 @@ class PathState:
 R = TypeVar("R", PathState, Hit, Quadrics, Copies)
 
 
-def rows(record: R, index: Tensor) -> R:
-    """The lanes ``index`` of a record of tensors; what is static stays."""
+def rows(record: R, index: Tensor | None) -> R:
+    """The lanes ``index`` of a record of tensors (None: all); what is static stays."""
+    if index is None:
+        return record
     values: dict[str, Any] = {f.name: getattr(record, f.name) for f in fields(record)}
     static = (tuple, type(None))
     lanes: dict[str, Any] = {

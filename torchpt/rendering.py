@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt import adjoint as adjoints
+from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
@@ -46,6 +47,8 @@ class Wishes(TypedDict, total=False):
     adjoint: str | None
     seed_grad: int | None
     spp_grad: int | None
+    edges: bool
+    edge_spp: int | None
 
 
 @overload
@@ -78,6 +81,8 @@ def render(
     adjoint: str | None = None,
     seed_grad: int | None = None,
     spp_grad: int | None = None,
+    edges: bool = True,
+    edge_spp: int | None = None,
 ) -> Tensor | Rendering:
     """Render a scene to linear RGB ``(H, W, 3)`` on the scene's device; differentiable in ``params``.
 
@@ -99,17 +104,20 @@ def render(
         accel, compile, threads, max_memory: of ``render``.
         device: must be the scene's own; load the scene on the device where it is to render.
         dtype: of the lanes. float64 is for checking derivatives; the search stays float32.
-        adjoint: how gradients are taken: ``autograd`` (the default) runs each chunk of pixels again under a tape in the
-            backward pass, so memory is that of a chunk.
+        adjoint: how gradients are taken: ``replay`` (the default) traces paths again in the backward pass and goes back along
+            them vertex by vertex, so that memory grows with neither depth nor samples; ``autograd`` runs each chunk of
+            pixels again under a plain tape.
         seed_grad, spp_grad: of the backward pass. By default it draws samples of its own, as many as the forward pass took:
-            shared samples would bias the gradient of a squared loss. Visibility edges that move (silhouettes, shadow
-            edges) are not differentiated; see docs/gradients.md.
+            shared samples would bias the gradient of a squared loss.
+        edges: whether silhouettes and shadow edges that move are differentiated (docs/gradients.md); False warns.
+        edge_spp: samples of edges a pixel, for each of their estimators; by default as many as the backward pass takes.
 
     Raises:
         SceneError: a setting or parameter that is not accepted.
         RenderError: a device, compiler or denoiser that is not there.
     """
-    _check(scene, device, dtype, adjoint, {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1)})
+    numbers = {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1), "edge_spp": (edge_spp, 1)}
+    _check(scene, device, dtype, adjoint, numbers)
     given = {
         "spp": spp, "seed": seed, "accel": accel, "compile": compile, "threads": threads, "max_memory": max_memory,
         "time_limit": time_limit, "target_error": target_error, "pilots": pilots,
@@ -124,16 +132,30 @@ def render(
     if torch.is_grad_enabled():
         params = {name: value for name, value in scene.params.items() if value.requires_grad} | dict(params or {})
     scene.check(params)
-    wanted = tuple(name for name, value in (params or {}).items() if value.requires_grad)
+    backward = {"seed": seed_grad, "spp": spp_grad, "edges": edge_spp if edges else 0}
+    rendering = _rendered(scene, settings, backward, params or {}, dtype, adjoint or adjoints.KINDS[0])
+    return rendering if full else rendering.image
+
+
+def _rendered(
+    scene: Scene,
+    settings: Settings,
+    backward: Mapping[str, int | None],
+    params: Mapping[str, Tensor],
+    dtype: torch.dtype,
+    adjoint: str,
+) -> Rendering:
+    """A rendering, on a tape where one is wanted, and denoised where that is; ``backward``: see :func:`_differentiable`."""
+    wanted = tuple(name for name, value in params.items() if value.requires_grad)
     if not (wanted or scene.weights()) or not torch.is_grad_enabled():
         rendering = render_scene(scene, settings, params=params, dtype=dtype)
     else:
-        backward = {"seed": settings.render.seed ^ 0x5DEECE66D if seed_grad is None else seed_grad, "spp": spp_grad}
-        rendering = _differentiable(scene, settings, backward, params or {}, wanted, dtype, adjoint or "autograd")
+        seed = settings.render.seed ^ 0x5DEECE66D if backward["seed"] is None else backward["seed"]
+        rendering = _differentiable(scene, settings, {**backward, "seed": seed}, params, wanted, dtype, adjoint)
     if settings.film.denoise:
         with limited_threads(settings.render.threads):
             rendering.denoised = denoise(rendering.image.detach(), **rendering.guides)
-    return rendering if full else rendering.image
+    return rendering
 
 
 def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
@@ -189,7 +211,8 @@ def _differentiable(
 ) -> Rendering:
     """A rendering whose picture is on a tape from the parameters ``wanted``.
 
-    ``backward`` has the backward pass's own seed and samples a pixel; None: as many as the forward pass took.
+    ``backward`` has the backward pass's own seed, its samples a pixel and its samples of edges a pixel (0: none); None: as
+    many as the forward pass took.
     """
     if not settings.integrator.light:
         radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
@@ -197,32 +220,64 @@ def _differentiable(
     if settings.render.checkpoint is not None:
         raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
     attached = adjoints.attached(scene, wanted)
-    if attached or adjoints.casts(scene, wanted):
-        warnings.warn(
-            "the gradient with respect to what moves or bends rays leaves out visibility edges (silhouettes and shadow edges "
-            "that move); see docs/gradients.md",
-            EdgeWarning,
-            stacklevel=3,
-        )
+    if concerns(scene, wanted):
+        _warn_of_edges(scene, settings, backward["edges"] == 0)
     fixed = {name: value for name, value in params.items() if name not in wanted}
     made: list[Rendering] = []
     taken: list[int] = []
 
+    def given_by(*tensors: Tensor) -> dict[str, Tensor]:
+        return {**fixed, **dict(zip(wanted, tensors, strict=True))}
+
     def forward(*tensors: Tensor) -> Tensor:
-        given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
-        made.append(render_scene(scene, settings, params=given, dtype=dtype))
+        made.append(render_scene(scene, settings, params=given_by(*tensors), dtype=dtype))
         return made[-1].image
 
-    def chunks(work: Callable[[adjoints.Chunk], None], *tensors: Tensor) -> None:
-        given = {**fixed, **dict(zip(wanted, tensors, strict=True))}
-        spp = taken[0] if backward["spp"] is None else backward["spp"]
-        again = replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
-        adjoints.chunks(scene, again, given, wanted, dtype, attached, work)
+    def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor]:
+        given, of_edges = given_by(*tensors), edges_taken()
+        # One pass that is a derivative of the very estimator takes its own samples again.
+        render = again().render
+        exact = render.seed == settings.render.seed and render.spp == taken[0]
+        held = not exact and adjoints.suits(scene, settings, wanted)
+        found = adjoints.gradients(scene, again(), given, wanted, dtype, attached, adjoint, cotangent, held)
+        if of_edges and concerns(scene, wanted):
+            _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+            moved = add_gradients(
+                scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held
+            )
+            found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
+        return found
 
-    image = adjoints.KINDS[adjoint](forward, chunks, tuple(params[name] for name in wanted), scene.weights())
+    def again(spp: int | None = None) -> Settings:
+        spp = spp or backward["spp"] or taken[0]
+        return replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
+
+    def edges_taken() -> int:
+        return 0 if backward["edges"] == 0 else backward["edges"] or backward["spp"] or taken[0]
+
+    def asked() -> Asked:
+        return Asked(scene, again(), wanted, dtype, edges_taken())
+
+    tensors = tuple(params[name] for name in wanted)
+    image = adjoints.on_tape(forward, backward_pass, tensors, scene.weights())
     rendering = made.pop()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
+    names = followed(settings)
+    if names:
+        values = {name: rendering.layers[name] for name in names}
+        rendering.layers |= on_tape(values, tensors, asked, given_by)
     return replace(rendering, image=image)
+
+
+def _warn_of_edges(scene: Scene, settings: Settings, every: bool) -> None:
+    """Say which visibility edges (``every`` one, or those of this scene that are not done) a gradient leaves out."""
+    edges = "all visibility edges (silhouettes and shadow edges that move)"
+    if not every:
+        missing = left_out(scene, settings)
+        if not missing:
+            return
+        edges = f"some edges: {'; '.join(missing)}"
+    warnings.warn(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning, stacklevel=5)
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:

@@ -172,6 +172,23 @@ CASES = [
         "div", [*pairs(torch.div, *COMPARED), *each(lambda x: x / 3, "fdilu"), *each(lambda x: 1.0 / (x + 0.5), "fdi")]
     ),
     Case("div", [lambda x: x.f / 8.0, lambda x: x.d / -0.25, lambda x: x.f / 2.0**-130, lambda x: 0.1 / x.f]),
+    Case(
+        "select_backward slice_backward",
+        [
+            lambda x: aten.select_backward(x.f, [3, x.f.shape[0]], 0, 1),
+            lambda x: aten.select_backward(x.w[0], list(x.w.shape), 0, -1),
+            lambda x: aten.slice_backward(x.p[:2], list(x.p.shape), 0, 1, 3, 1),
+            lambda x: aten.slice_backward(x.p, list(x.p.shape), 1, 0, 1 << 62, 1),
+        ],
+    ),
+    Case("sgn", each(torch.sgn, "fdi")),
+    Case("threshold_backward", [lambda x: aten.threshold_backward(x.f, x.g, 0.0)]),
+    Case(
+        "tanh_backward sigmoid_backward",
+        [lambda x: aten.tanh_backward(x.p, x.q), lambda x: aten.sigmoid_backward(x.p, x.q)],
+        2,
+        1e-6,
+    ),
     Case("true_divide", [lambda x: aten.true_divide(x.f, x.g), lambda x: aten.true_divide(x.i, x.j)], inference=True),
     Case(
         "div floor_divide remainder fmod",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -139,8 +140,8 @@ def test_other_errors_are_not_taken_for_it(box):
 # -- gradients
 
 
-def gradient(scene: torchpt.Scene, which: Callable[[int], bool] = lambda k: False) -> tuple[torch.Tensor, int]:
-    """The gradient of a small picture; operations of the backward pass fail."""
+def gradient(scene: torchpt.Scene, adjoint: str) -> torch.Tensor:
+    """The gradient of a small picture, by tensor operations."""
     name = "materials.white.reflectance"
     colour = scene.params[name].clone().requires_grad_()
     wish: dict[str, Any] = {
@@ -148,46 +149,43 @@ def gradient(scene: torchpt.Scene, which: Callable[[int], bool] = lambda k: Fals
         "film": film_of(4, 3),
         "spp": 2,
         "threads": 1,
+        "compile": "off",
+        "adjoint": adjoint,
     }
     image = torchpt.render(scene, params={name: colour}, **wish)
-    with Fails(which, MemoryError) as mode:
-        image.sum().backward()
+    image.sum().backward()
     assert colour.grad is not None
-    return colour.grad, mode.count
+    return colour.grad
 
 
-def backward_failing(scene: torchpt.Scene, which: Callable[[int], bool], monkeypatch: Any) -> tuple[torch.Tensor, int]:
-    """As :func:`gradient`, where operations within chunks fail."""
-    from torchpt import adjoint
+def backward_failing(
+    scene: torchpt.Scene, adjoint: str, which: Callable[[int], bool], monkeypatch: Any
+) -> tuple[torch.Tensor, int]:
+    """The gradient where operations within chunks fail, and how many operations there were."""
+    module = importlib.import_module("torchpt.adjoint." + {"autograd": "tape", "replay": "replay"}[adjoint])
+    counted, original = [0], module.piece
 
-    counted, original = [0], adjoint.chunks
-
-    def chunks(*args: Any) -> None:
-        work = args[-1]
-
-        def failing(chunk: Any) -> None:
-            with Fails(lambda k: which(counted[0] + k), MemoryError) as mode:
-                try:
-                    work(chunk)
-                finally:
-                    counted[0] += mode.count
-
-        original(*args[:-1], failing)  # pyright: ignore[reportCallIssue]
+    def failing(*args: Any) -> Any:
+        with Fails(lambda k: which(counted[0] + k), MemoryError) as mode:
+            try:
+                return original(*args)
+            finally:
+                counted[0] += mode.count
 
     with monkeypatch.context() as patched:
-        patched.setattr(adjoint, "chunks", chunks)
-        found, _ = gradient(scene)
-    return found, counted[0]
+        patched.setattr(module, "piece", failing)
+        return gradient(scene, adjoint), counted[0]
 
 
-def test_a_failure_anywhere_in_the_backward_pass_changes_rounding_at_most(box, monkeypatch):
-    whole, count = backward_failing(box, lambda k: False, monkeypatch)
+@pytest.mark.parametrize("adjoint", ["autograd", "replay"])
+def test_a_failure_anywhere_in_the_backward_pass_changes_rounding_at_most(box, adjoint, monkeypatch):
+    whole, count = backward_failing(box, adjoint, lambda k: False, monkeypatch)
     assert count > 300 and float(whole.abs().min()) > 0
-    for number in range(0, count, 31):
-        found, _ = backward_failing(box, lambda k, number=number: k == number, monkeypatch)
+    for number in range(0, count, 97):
+        found, _ = backward_failing(box, adjoint, lambda k, number=number: k == number, monkeypatch)
         assert torch.allclose(found, whole, rtol=1e-5), number
-    with pytest.raises(RenderError, match="the tape of a single lane"):
-        backward_failing(box, lambda k: True, monkeypatch)
+    with pytest.raises(RenderError, match="of a single lane"):
+        backward_failing(box, adjoint, lambda k: True, monkeypatch)
 
 
 # -- the compiled loop

@@ -25,6 +25,7 @@ class Camera(ABC):
         parameters: what it declares; those that are traced are differentiable.
         lens: whether rays also depend on a place on a lens.
         reaches: parameters that say how far from its origin a camera's rays may start.
+        projects: whether :meth:`project` says where a point is seen.
         sized_by: what errors say instead, where a pose has a scale.
         to_world: pose ``(4, 4)``; its scale is ignored, as only the axes' directions and the origin matter.
         resolution: width and height of the whole film in pixels.
@@ -39,6 +40,7 @@ class Camera(ABC):
     parameters: ClassVar[Mapping[str, Spec]] = POSES
     lens: ClassVar[bool] = False
     reaches: ClassVar[tuple[str, ...]] = ()
+    projects: ClassVar[bool] = False
     sized_by: ClassVar[str] = ""
 
     @classmethod
@@ -79,6 +81,28 @@ class Camera(ABC):
         ``spread`` a pixel's side at distance 1 where the camera looks; of parallel rays ``e`` is the unit direction
         against them, ``w`` is 0, and ``spread`` a pixel's side. Of a pixel that is no square, the root of its area.
         """
+
+    def project(self, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Where points are seen, differentiable in them and in the camera; asked for only where it ``projects``.
+
+        Args:
+            offset: from the camera's origin to points before it ``(3, N)``, or directions, of any length.
+
+        Returns:
+            The film position ``x, y`` in pixels, each ``(N,)``, as :meth:`rays` takes it, and the scale ``(N,)`` of areas: a
+            surface element ``dA`` with the unit normal ``n`` covers ``scale |n . offset| dA`` square pixels, and a solid
+            angle ``dw`` about unit directions ``scale dw``.
+        """
+        raise NotImplementedError
+
+    def film_of(self, p: Tensor) -> Tensor | None:
+        """Where points ``(3, N)`` of the world lie on the film: ``x h``, ``y h``, ``h`` and their depth, ``(4, N)``.
+
+        Affine in ``p``: a line of the world is one on the film. ``x, y`` are pixels as :meth:`rays` takes them; with
+        ``h`` or the depth not positive a point lies behind the camera. None: a picture that no such map makes (a lens that
+        blurs it), so that edges on it are not differentiated.
+        """
+        return None
 
     def intrinsics(self) -> Tensor | None:
         """OpenCV's ``K (3, 3)`` in pixels, see :mod:`torchpt.cameras.opencv`; None where no such matrix says it."""

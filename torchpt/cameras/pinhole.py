@@ -128,6 +128,25 @@ class Pinhole(Camera):
             up = up / self.pixel_aspect
         return right * half, up * half
 
+    def film_of(self, p: Tensor) -> Tensor | None:
+        """See :meth:`Camera.film_of`."""
+        return None if self.lens else self.placed(p - self.origin())
+
+    def placed(self, away: Tensor) -> Tensor:
+        """:meth:`film_of` of points that lie ``away (3, N)`` from the origin."""
+        right, up, ahead = self.axes()
+        half, depth = self.half_width(), (away * ahead).sum(0)
+        width, height = self.film[0], self.film[1]
+        across, along = (away * right).sum(0) / half, (away * up).sum(0) / half
+        if self.pixel_aspect is not None:
+            along = along * self.pixel_aspect
+        x, y = 0.5 * width * (across + depth), 0.5 * (height * depth - width * along)
+        if self.principal_point_offset_x is not None:
+            x = x - self.principal_point_offset_x * width * depth
+        if self.principal_point_offset_y is not None:
+            y = y - self.principal_point_offset_y * height * depth
+        return torch.stack((x, y, depth, depth))
+
     def pixel(self) -> Tensor:
         """See :meth:`Camera.pixel`."""
         spread = self.half_width() * (2.0 / self.film[0])

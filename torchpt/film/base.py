@@ -30,11 +30,13 @@ class Filter(ABC):
         radius: half width in pixels, beyond which it is zero.
         signed: whether it is negative anywhere, so that samples have weights; else every weight is 1.
         tabulated: whether lanes read its inverse from a table.
+        jumps: whether it ends at its radius by a jump.
     """
 
     name: ClassVar[str] = ""
     parameters: ClassVar[Mapping[str, Spec]] = {}
     tabulated: ClassVar[bool] = False
+    jumps: ClassVar[bool] = False
     signed: bool = False
 
     def __init__(self, values: Mapping[str, Any], device: torch.device) -> None:

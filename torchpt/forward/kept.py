@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 from torchpt.integrators.base import Integrator
@@ -28,12 +28,14 @@ class Kept:
         stages: compiled by torch, by what was asked of them.
         first: the integrator and the world that this was made of, and what happens at first surfaces.
         dark: a world, and the same without lights.
+        outlines: the edges of its meshes, as :mod:`torchpt.edges.topology` finds them.
     """
 
     kernels: Kernels | None = None
     stages: dict[Plan, CompiledStages] = field(default_factory=dict)
     first: tuple[Integrator, World, FirstSurface] | None = None
     dark: tuple[World, World] | None = None
+    outlines: dict[str, Any] = field(default_factory=dict)
 
 
 _scenes: WeakKeyDictionary[Scene, Kept] = WeakKeyDictionary()

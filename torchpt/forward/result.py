@@ -22,8 +22,8 @@ class Rendering:
     ``rendering["rgb"]`` is the picture, and ``rendering["depth"]`` the layer of that name; ``dict(rendering)`` has all of them.
 
     Attributes:
-        image: ``(H, W, 3)`` linear RGB; alone of all it carries gradients, where they are wanted.
-        layers: what ``film.aovs`` asked for, each ``(H, W, C)``.
+        image: ``(H, W, 3)`` linear RGB; it carries gradients, where they are wanted.
+        layers: what ``film.aovs`` asked for, each ``(H, W, C)``; those of first surfaces that are averaged carry gradients too.
         guides: what the denoiser looks at beside the picture, by the names of its arguments, each ``(H, W, 3)``; empty
             without ``film.denoise``.
         denoised: the picture without its noise ``(H, W, 3)``; None where nobody denoised it. No number here is about it.

@@ -77,7 +77,8 @@ def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, T
 
     The search structure stays.
     """
-    world, _ = scene.world(wave.stages.plan.dtype, params, choice=settings.light_choice)
+    uv = any(layer.uv for layer in surface_layers(settings).values())
+    world, _ = scene.world(wave.stages.plan.dtype, params, uv, settings.light_choice)
     if not wave.integrator.lit:
         world = replace(world, lights=None)
     camera = scene.camera(settings.film, scene.merged(params), wave.stages.plan.dtype)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -10,7 +12,7 @@ from torchpt.integrators.layer import Seen, SurfaceLayer
 from torchpt.integrators.path import partition
 from torchpt.integrators.search import Search
 from torchpt.integrators.surfaces import texture_point_at
-from torchpt.math.vectors import take
+from torchpt.math.vectors import dot, take
 from torchpt.records import Hit, PathState, World, rows
 from torchpt.shapes import interact
 
@@ -32,10 +34,11 @@ def first_hit(
     centre: Tensor,
     dtype: torch.dtype,
     pixel: Tensor | None = None,
+    slide: bool = False,
 ) -> dict[str, Tensor]:
     """The layers ``names``, each ``(C, N)``, for camera rays ``state``; a miss is 0 in all of them.
 
-    ``pixel``: see ``surfaces.texture_point_at``.
+    ``pixel``: see ``surfaces.texture_point_at``. ``slide``: whether points follow the rays and the geometry, for derivatives.
     """
     hit = search.nearest(state, 1)
     n, device = len(hit.t), centre.device
@@ -43,7 +46,7 @@ def first_hit(
     _, groups = partition(world, hit)
     for model, index in groups:
         o, d = take(state.o, index), take(state.d, index)
-        here = values(names, world, model, o, d, rows(hit, index), centre, dtype, pixel)
+        here = values(names, world, model, o, d, rows(hit, index), centre, dtype, pixel, slide)
         for name, value in here.items():
             layers[name].scatter_(1, index.expand(len(value), -1), value)
     return layers
@@ -59,11 +62,15 @@ def values(
     centre: Tensor,
     dtype: torch.dtype,
     pixel: Tensor | None,
+    slide: bool = False,
 ) -> dict[str, Tensor]:
     """The layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of one model; see :func:`first_hit`."""
-    at = interact(world, o, d, hit)
+    at = interact(world, o, d, hit, slide)
+    if slide:
+        hit = replace(hit, t=dot(at.p - o, d))
     seen = Seen(world, model, d, hit, at, texture_point_at(world, model, at, pixel), centre, dtype)
-    return {name: surface_layer(name).values(seen) for name in names}
+    found = {name: surface_layer(name).values(seen) for name in names}
+    return found if hit.chance is None else {name: value * hit.chance for name, value in found.items()}
 
 
 def weighted(layers: dict[str, Tensor], weight: Tensor) -> dict[str, Tensor]:

@@ -53,7 +53,7 @@ def shade(
         reflected = kind.eval(surface.parameters, surface.wo, wi)
     weight = held_back(weight, world, model, at, surface, light.wi, wi)
     radiance = state.throughput * reflected * light_radiance(world, light) * weight
-    return surface, _shadow_ray(plan, world, at, light, radiance)
+    return surface, _shadow_ray(plan, world, at, light, radiance, weight)
 
 
 def held_back(
@@ -119,11 +119,16 @@ def light_radiance(world: World, light: LightSample) -> Tensor:
     return light.radiance * (share if light.bare is None else torch.where(light.bare, 1.0, share))
 
 
-def _shadow_ray(plan: Plan, world: World, at: Interaction, light: LightSample, radiance: Tensor) -> Shadow:
-    """The ray to a point on a light that brings ``radiance``; of length 0 where that is none."""
+def _shadow_ray(
+    plan: Plan, world: World, at: Interaction, light: LightSample, radiance: Tensor, weight: Tensor
+) -> Shadow:
+    """The ray to a point on a light that brings ``radiance``; of length 0 where that is none.
+
+    Under a tape it is of length 0 where the sample has no ``weight (n,)``: a colour that is 0 has a derivative.
+    """
     o = offset_origin(world, at, light.wi)
     d = light.target - o
-    lit = largest(radiance.detach().abs()) > 0
+    lit = (weight.detach() if plan.tape else largest(radiance.detach().abs())) > 0
     t_max = lit.to(plan.dtype) * (1.0 - SHORTEN)
     if light.distant is not None:
         d = torch.where(light.distant, light.wi, d)

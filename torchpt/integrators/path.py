@@ -16,12 +16,13 @@ from torchpt import lights
 from torchpt.accel import Accel
 from torchpt.integrators.base import Integrator, Limits, Tally
 from torchpt.integrators.compiled import Stages
+from torchpt.integrators.plan import Plan
 from torchpt.integrators.search import Search
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, joined
 from torchpt.samplers import salts
 
-__all__ = ["ENDLESS", "Limits", "PathIntegrator", "Tally", "gather_light", "partition", "trace"]
+__all__ = ["ENDLESS", "Limits", "PathIntegrator", "Tally", "gather_light", "partition", "slides", "trace"]
 
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
 #: paths that lose nothing none comes so far (``DEEP_CAP``): only those are cut that roulette was told to leave alone.
@@ -38,21 +39,29 @@ class PathIntegrator(Integrator):
         return trace(stages, self.limits, accel, state)
 
 
-def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tuple[Tensor, Tally]:
-    """Radiance ``(3, N)`` carried back along camera rays ``state``, and what it took."""
+def trace(
+    stages: Stages,
+    limits: Limits,
+    accel: Accel,
+    state: PathState,
+    lanes: int | None = None,
+    depth: int = 1,
+    hit: Hit | None = None,
+) -> tuple[Tensor, Tally]:
+    """Radiance ``(3, N)`` carried back along camera rays ``state``, and what it took.
+
+    ``lanes, depth, hit``: of paths that go on from a vertex: of how many camera rays they are, the vertex, and what they met.
+    """
     plan, world = stages.plan, stages.world
     tally = Tally()
     n = len(state.lane)
-    gathered = torch.zeros_like(state.radiance)
+    gathered = state.radiance.new_zeros(3, n if lanes is None else lanes)
 
     search = Search(accel, world, plan.sampler, plan.dtype)
-    if any(model.refracts for model in world.materials.models):
+    if depth == 1 and any(model.refracts for model in world.materials.models):
         state = replace(state, eta=torch.ones_like(state.t_max))
-    if lights.local(world.lights):
+    if depth == 1 and lights.local(world.lights):
         state = replace(state, p=state.o.clone(), n=torch.zeros_like(state.o))
-    # Where a delta sends a ray on, its next point slides along it as the camera's does.
-    exact = plan.attached or plan.dtype == torch.float64
-    sliding = exact and any(model.delta for model in world.materials.models)
 
     def retire(index: Tensor) -> None:
         if len(index):
@@ -60,16 +69,13 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
             gathered.scatter_(1, lanes.expand(3, -1), take(state.radiance, index))
 
     last = limits.max_depth if limits.max_depth >= 0 else ENDLESS
-    depth, hit = 1, None
     while n and depth <= last:
         tally.rays += len(state.lane)
         if hit is None:
             hit = search.nearest(state, depth)
         if stages.met(depth, state, hit):
             break
-        # Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64
-        # the camera's point is found anew, since the search rounds it to float32.
-        slide = sliding or (depth == 1 and exact)
+        slide = slides(plan, world, depth)
         ends, groups = partition(world, hit)
         gather_light(stages, state, hit, ends, slide)
         retire(ends.missed)
@@ -96,6 +102,17 @@ def trace(stages: Stages, limits: Limits, accel: Accel, state: PathState) -> tup
         hit = joined([found for _, found in parts if found is not None]) if plan.attached else None
         depth += 1
     return gathered, tally
+
+
+def slides(plan: Plan, world: World, depth: int) -> bool:
+    """Whether points at a vertex slide along their rays; see :func:`torchpt.shapes.interact`.
+
+    Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64 the camera's
+    point is found anew, since the search rounds it to float32. Where a delta sends a ray on, its next point slides along it as
+    the camera's does.
+    """
+    exact = plan.attached or plan.dtype == torch.float64
+    return exact and (depth == 1 or any(model.delta for model in world.materials.models))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchpt.samplers import Dimension, Draws
 
-__all__ = ["DEEP", "DEEP_CAP", "chance_of", "survived"]
+__all__ = ["DEEP", "DEEP_CAP", "LEAST", "chance_of", "survived"]
 
 #: Where nothing else ends paths, those of more vertices than this may be ended whatever they carry. Before it a cap below 1
 #: would only cost: each vertex of a path that loses nothing multiplies its variance by one over the cap.
@@ -15,6 +15,9 @@ DEEP = 1000
 #: The most that those survive with. A path that loses the share ``a`` of its light has finite variance where the cap is above
 #: ``(1 - a)^2``, and a thousand more vertices on average end one that loses nothing.
 DEEP_CAP = 0.999
+#: The least chance that paths survive with where derivatives are wanted. What a path carries says little of its derivative:
+#: that by a colour of 0 is all of what a path would carry if the colour were 1.
+LEAST = 0.25
 
 
 def survived(
@@ -25,6 +28,7 @@ def survived(
     throughput: Tensor,
     brightest: Tensor,
     eta: Tensor | None,
+    tape: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Which paths are alive after roulette ``(N,)``, and their throughput ``(3, N)``.
 
@@ -36,8 +40,11 @@ def survived(
         throughput: before.
         brightest: its largest component ``(N,)``.
         eta: index of refraction along the path ``(N,)``, where there is refraction.
+        tape: whether derivatives are wanted: no path is then ended because it carries little, see :data:`LEAST`.
     """
     survival = chance_of(chance, cap, brightest, eta)
+    if tape and chance is None:
+        survival = survival.clamp_min(min(LEAST, cap))
     alive = alive & (draws.one(Dimension.ROULETTE) < survival)
     return alive, throughput / torch.where(alive, survival, 1.0)
 

@@ -136,12 +136,13 @@ def carry_on(plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws
         weight = weight * surface.relief.shadowing(drawn.d)
     throughput = state.throughput * weight
     brightest = largest(throughput.detach())
-    alive = torch.minimum(drawn.least, brightest) > 0
+    # Under a tape a path that carries nothing goes on: what it would meet is the derivative by a colour that is 0.
+    alive = (drawn.least if plan.tape else torch.minimum(drawn.least, brightest)) > 0
     eta = state.eta
     if eta is not None and drawn.eta is not None:
         eta = eta * drawn.eta.detach()
     if roulette:
-        alive, throughput = survived(plan.rr_prob, roulette, draws, alive, throughput, brightest, eta)
+        alive, throughput = survived(plan.rr_prob, roulette, draws, alive, throughput, brightest, eta, plan.tape)
     return Onward(alive, throughput, eta)
 
 

@@ -43,13 +43,13 @@ def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, k
     return PathState(o.expand(3, n).clone(), d, forever, ones, torch.zeros_like(d), forever.clone(), lane, key)
 
 
-def emit(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
-    """Radiance ``(3, n)`` that the paths at ``index`` gather from the emitters they hit, weighted by MIS."""
+def emit(world: World, state: PathState, hit: Hit, index: Tensor | None, slide: bool) -> Tensor:
+    """Radiance ``(3, n)`` that the paths at ``index`` (None: all) gather from the emitters they hit, weighted by MIS."""
     radiance, pdf = shining(world, state, hit, index, slide)
     return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
 
 
-def shining(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool) -> tuple[Tensor, Tensor]:
+def shining(world: World, state: PathState, hit: Hit, index: Tensor | None, slide: bool) -> tuple[Tensor, Tensor]:
     """Radiance ``(3, n)`` of the emitters that the paths at ``index`` hit, and the density of sampling it ``(n,)``."""
     assert world.lights is not None
     o, d = take(state.o, index), take(state.d, index)
@@ -62,14 +62,14 @@ def shining(world: World, state: PathState, hit: Hit, index: Tensor, slide: bool
     return radiance, pdf
 
 
-def escape(world: World, state: PathState, hit: Hit, index: Tensor) -> Tensor:
-    """Radiance ``(3, n)`` that the paths at ``index`` gather from the environment they escape to."""
+def escape(world: World, state: PathState, hit: Hit, index: Tensor | None) -> Tensor:
+    """Radiance ``(3, n)`` that the paths at ``index`` (None: all) gather from the environment they escape to."""
     assert world.lights is not None
     radiance, pdf = lights.environment(world.lights, take(state.d, index))
     return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
 
 
-def _arrived(state: PathState, hit: Hit, index: Tensor) -> Tensor:
+def _arrived(state: PathState, hit: Hit, index: Tensor | None) -> Tensor:
     """Throughput ``(3, n)`` with the derivative of the chance that the rays came here."""
     throughput = take(state.throughput, index)
     return throughput if hit.chance is None else throughput * take(hit.chance, index)
@@ -89,7 +89,7 @@ def bounce(
     search: Callable[[PathState], Hit],
     state: PathState,
     hit: Hit,
-    index: Tensor,
+    index: Tensor | None,
     salts: Tensor,
     pixel: Tensor | None = None,
 ) -> tuple[PathState, Hit | None, Shadow | None]:
@@ -104,7 +104,7 @@ def bounce(
         search: finds hits; called only where ``plan.attached``.
         state: of the whole wave.
         hit: of the whole wave.
-        index: lanes concerned ``(n,)``.
+        index: lanes concerned ``(n,)``; None: all.
         salts: names of this depth's dimensions.
         pixel: see :func:`torchpt.integrators.surfaces.texture_point_at`.
 

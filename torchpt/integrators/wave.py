@@ -93,10 +93,10 @@ class Wave:
         """Radiance ``(3, N)`` that camera rays bring, weighted by the filter, and what it took."""
         radiance, tally = self.integrator.radiance(self.stages, self.accel, state, self.first)
         if self.filter.signed:
-            radiance = radiance * self._weight(state)
+            radiance = radiance * self.weight(state)
         return radiance, tally
 
-    def _weight(self, state: PathState) -> Tensor:
+    def weight(self, state: PathState) -> Tensor:
         """What the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""
         draws = Draws(self.stages.plan.sampler, state.key, salts(0, self.centre.device))
         return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.stages.plan.dtype)
@@ -109,14 +109,15 @@ class Wave:
         first_sample: int,
         samples: int,
         plate: Plate | None = None,
+        slide: bool = False,
     ) -> dict[str, Tensor]:
-        """The layers ``names``, each ``(C, samples, pixels)``."""
+        """The layers ``names``, each ``(C, samples, pixels)``; ``slide``: see :func:`torchpt.integrators.aov.first_hit`."""
         from torchpt.integrators import aov
 
         state = self.rays(first_pixel, pixels, first_sample, samples, plate)
         plan, world = self.stages.plan, self.stages.world
         search = Search(self.accel, world, plan.sampler, plan.dtype)
-        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel)
+        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel, slide)
         if self.filter.signed:
-            found = aov.weighted(found, self._weight(state))
+            found = aov.weighted(found, self.weight(state))
         return {name: value.view(len(value), samples, pixels) for name, value in found.items()}

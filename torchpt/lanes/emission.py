@@ -293,6 +293,13 @@ def _arena(block: Block, ty: str, extra: int) -> str:
     return _from_memory(block, ty, held)
 
 
+def _slot(block: Block, ty: str, place: str, extra: int) -> str:
+    """A row of the slots, at a place."""
+    element = MEMORY[ty]
+    start = block.at("%slots", element, block.op(f"mul i64 %stride, {extra}")) if extra else "%slots"
+    return _from_memory(block, ty, block.gather(element, start, place))
+
+
 def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
     """Row ``k`` of an input tensor at the lane's own place."""
     slot, k = extra
@@ -342,5 +349,6 @@ _HANDLERS: dict[str, Callable[..., str]] = {
     "iota": _iota,
     "place": _place,
     "arena": _arena,
+    "slot": _slot,
     "tensor": _tensor,
 }

@@ -49,12 +49,14 @@ class Graph:
         nodes: in an order in which arguments come before their users.
         origins: for each node the files of the package that asked for it first, innermost first.
         origin: those of the nodes made next.
+        derivatives: whether a backward pass is traced: sums over lanes are then named, and signs of zeros are of no account.
     """
 
     def __init__(self) -> None:
         self.nodes: list[tuple[str, str, tuple[int, ...], Any]] = []
         self.origins: list[tuple[str, ...]] = []
         self.origin: tuple[str, ...] = ()
+        self.derivatives = False
         self._known: dict[tuple[str, str, tuple[int, ...], Any], int] = {}
 
     def node(self, op: str, ty: str, *arguments: int, extra: Any = None) -> int:
@@ -124,6 +126,8 @@ class Graph:
         if ty in INTEGERS and op == "add" and a == 0:
             return y
         if ty in FLOATS:
+            if self.derivatives and op == "add" and (a == 0 or b == 0):
+                return y if a == 0 else x
             if op in ("max", "min"):
                 for constant in (a, b):
                     if constant is not None and math.isnan(constant):

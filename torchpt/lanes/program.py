@@ -34,6 +34,7 @@ class Program:
         results: how many result tensors.
         shadows: how many shadow rays each lane asks for.
         nodes: how many of its nodes each file of the package asked for.
+        sums: what rows of its results are derivatives by, see :mod:`torchpt.integrators.loop.joint`.
     """
 
     call: Any
@@ -49,6 +50,7 @@ class Program:
     results: int
     shadows: int
     nodes: Mapping[str, int]
+    sums: Sequence[Sequence[Any]] = ()
 
     def leaves(self) -> set[str]:
         """Paths of the leaves that enter its tables."""

@@ -6,13 +6,13 @@ So other tables of the same shapes can take the place of those that a stage was 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["Guard", "Source", "Step", "Table", "replayed"]
+__all__ = ["Guard", "Source", "Step", "Table", "pruned", "replayed"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,42 @@ class Guard:
 
     source: Source
     value: Any
+
+
+def pruned(
+    tables: Sequence[Table], steps: Sequence[Step], guards: Sequence[Guard]
+) -> tuple[tuple[Table, ...], tuple[Step, ...], tuple[Guard, ...]]:
+    """The same without the steps that nothing asks for."""
+    needed: set[int] = set()
+
+    def asked(value: Any) -> None:
+        if isinstance(value, Source):
+            if value.kind == "step" and int(value.name) not in needed:
+                needed.add(int(value.name))
+                step = steps[int(value.name)]
+                asked((step.args, tuple(step.kwargs.values())))
+        elif isinstance(value, list | tuple):
+            for x in value:
+                asked(x)
+
+    asked([table.source for table in tables])
+    asked([guard.source for guard in guards])
+    numbers = {old: new for new, old in enumerate(sorted(needed))}
+
+    def renamed(value: Any) -> Any:
+        if isinstance(value, Source):
+            return replace(value, name=numbers[int(value.name)]) if value.kind == "step" else value
+        return type(value)(renamed(x) for x in value) if isinstance(value, list | tuple) else value
+
+    kept = [steps[old] for old in sorted(needed)]
+    return (
+        tuple(replace(table, source=renamed(table.source)) for table in tables),
+        tuple(
+            replace(step, args=renamed(step.args), kwargs={k: renamed(v) for k, v in step.kwargs.items()})
+            for step in kept
+        ),
+        tuple(replace(guard, source=renamed(guard.source)) for guard in guards),
+    )
 
 
 def replayed(steps: Sequence[Step], held: Sequence[Tensor], leaves: Mapping[str, Tensor]) -> Any:

@@ -27,7 +27,7 @@ __all__ = ["key_of", "load", "store"]
 
 #: Largest tensor of a program's own that is written.
 _MOST = 1 << 16
-_PLAIN = ("uniforms", "lists", "counters", "tensors", "results", "shadows", "nodes")
+_PLAIN = ("uniforms", "lists", "counters", "tensors", "results", "shadows", "nodes", "sums")
 
 
 class _NotKept(Exception):

@@ -8,6 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchpt.math.gathers import gatherer
+
 __all__ = ["affine", "cross", "dot", "largest", "luminance", "normalize", "safe_reciprocal", "take"]
 
 
@@ -60,9 +62,18 @@ def luminance(rgb: Tensor) -> Tensor:
     return 0.212671 * rgb[0] + 0.715160 * rgb[1] + 0.072169 * rgb[2]
 
 
-def take(table: Tensor, index: Tensor) -> Tensor:
-    """Columns of a table: ``(C, M), (N,) -> (C, N)`` or ``(M,), (N,) -> (N,)``. Several times faster than ``[:, index]``."""
+def take(table: Tensor, index: Tensor | None) -> Tensor:
+    """Columns of a table: ``(C, M), (N,) -> (C, N)`` or ``(M,), (N,) -> (N,)``. Several times faster than ``[:, index]``.
+
+    ``index`` None: all of them.
+    """
+    if index is None:
+        return table
     if torch.compiler.is_compiling():
         # Known not to be negative, an index needs no code for counting from the end.
         index = index.clamp_min(0)
+    elif table.requires_grad and (gathers := gatherer()) is not None and torch.is_grad_enabled():
+        taken = gathers.take(table, index)
+        if taken is not None:
+            return taken
     return torch.index_select(table, table.dim() - 1, index)

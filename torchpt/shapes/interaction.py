@@ -15,7 +15,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import affine, cross, dot, normalize, take
+from torchpt.math.vectors import affine, cross, dot, largest, normalize, take
 from torchpt.records import Hit, Interaction, World
 from torchpt.shapes.primitive import Place, Primitive, Rays, place_of
 
@@ -24,6 +24,8 @@ __all__ = ["OFFSET", "interact", "offset_origin", "reattach"]
 #: Rays leave a surface ``OFFSET * LaneGeometry.bound`` off its plane. Re-deriving a point and evaluating its plane in the
 #: search each round by less than ``4 * 2^-24 * 2 bound``; this is two and a half times their sum, and free of world units.
 OFFSET = 2.0**-19
+#: Points nearer to each other than this share of their coordinates have no derivative by their distance.
+NEAR = 2.0**-15
 
 
 def _slide(o: Tensor, d: Tensor, p0: Tensor, e1: Tensor, e2: Tensor) -> tuple[Tensor, Tensor]:
@@ -124,13 +126,18 @@ def reattach(world: World, x: Tensor, hit: Hit, wi: Tensor) -> tuple[Tensor, Ten
             y, area = torch.where(mine, held.p, y), torch.where(mine, held.area, area)
     offset = torch.where(missed, wi, y - x)
     square = dot(offset, offset)
+    # Where two surfaces touch, the derivative grows with one over the distance. Points as near as rounding leaves them are not
+    # told apart: a ray that leaves beside an edge may meet the other side of that edge.
+    least = largest(torch.maximum(x.detach().abs(), y.detach().abs())) * NEAR
+    apart = missed | (square.detach() > least * least)
+    square = torch.where(apart, square, 1.0)
     direction = offset / square.sqrt()
     measure = dot(direction, torch.where(missed, wi, area)).abs() / torch.where(missed, 1.0, square)
     value = measure.detach()
-    usable = ~missed & (value > 0)
+    usable = apart & ~missed & (value > 0)
     ratio = torch.where(usable, measure / torch.where(usable, value, 1.0), 1.0)
     # The value stays the traced direction's own: only its derivative is new.
-    return wi + (direction - direction.detach()), ratio
+    return torch.where(apart, wi + (direction - direction.detach()), wi), ratio
 
 
 def offset_origin(world: World, at: Interaction, w: Tensor) -> Tensor:

@@ -39,6 +39,15 @@ class Orthographic(Camera):
         o = self.origin() + up * (along * half) + right * (across * half)
         return o, ahead.expand_as(o).clone()
 
+    def film_of(self, p: Tensor) -> Tensor:
+        """See :meth:`Camera.film_of`."""
+        right, up, ahead = self.axes()
+        away = p - self.origin()
+        width, height = self.film[0], self.film[1]
+        x = 0.5 * width + (away * right).sum(0) * (width / self.width)
+        y = 0.5 * height - (away * up).sum(0) * (width / self.width)
+        return torch.stack((x, y, torch.ones_like(x), (away * ahead).sum(0)))
+
     def pixel(self) -> Tensor:
         """See :meth:`Camera.pixel`."""
         spread = self.width / self.film[0]

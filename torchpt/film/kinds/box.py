@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
@@ -15,6 +17,7 @@ class Box(Filter):
     """The pixel's own square."""
 
     name = "box"
+    jumps: ClassVar[bool] = True
 
     def half_width(self) -> float:
         """See :class:`Filter`."""

@@ -16,6 +16,7 @@ from torchpt.lanes import engine, operators, shelf  # noqa: F401  (the operators
 from torchpt.lanes.kernel import text
 from torchpt.lanes.packet import packet_search
 from torchpt.lanes.program import Program, holds
+from torchpt.lanes.prologue import pruned
 from torchpt.lanes.sinks import Sinks
 from torchpt.lanes.tracing import Tracer, lanes_for
 
@@ -51,6 +52,7 @@ def program_of(
             program = _traced(leaves, layout, build, listed)
             if name is not None:
                 shelf.store(name, program)
+        if _programs.get(whole) is not program:
             _programs.pop(whole, None)
             _programs[whole] = program
             if len(_programs) > MOST_PROGRAMS:
@@ -73,6 +75,7 @@ def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], lis
         search = packet_search(kinds_of(layout.world), engine.estimates())
     ir, needed = text(tracer.graph, sinks, len(tracer.tables), len(trace.uniforms), trace.tensors, listed, search)
     made = engine.compiled(ir)
+    tables, steps, guards = pruned(tracer.tables, tracer.steps, tracer.guards)
     nodes: dict[str, int] = {}
     for node in needed:
         for file in tracer.graph.origins[node]:
@@ -80,10 +83,10 @@ def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], lis
     return Program(
         call=made.call,
         code=made.key,
-        tables=tuple(tracer.tables),
-        steps=tuple(tracer.steps),
+        tables=tables,
+        steps=steps,
         held=tuple(tracer.held),
-        guards=tuple(tracer.guards),
+        guards=guards,
         uniforms=tuple(trace.uniforms),
         lists=sinks.lists(),
         counters=sinks.counters(),
@@ -91,4 +94,5 @@ def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], lis
         results=len(sinks.store),
         shadows=sinks.shadows,
         nodes=nodes,
+        sums=tuple(trace.sums),
     )

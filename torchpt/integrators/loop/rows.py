@@ -70,8 +70,11 @@ class Rows:
         """The first row of a field."""
         return self._first[name]
 
-    def read(self, tracer: Tracer, *names: str) -> dict[str, Tensor]:
-        """Fields as inputs of a trace; those that there are not are left out."""
+    def read(self, tracer: Tracer, *names: str, place: int | None = None) -> dict[str, Tensor]:
+        """Fields as inputs of a trace; those that there are not are left out.
+
+        ``place``: node of where they lie in the slots; None: they are the arena's, at the lane's own place.
+        """
         inputs: dict[str, Tensor] = {}
         for name in names:
             if name not in self._fields:
@@ -83,6 +86,8 @@ class Rows:
             like = torch.rand(size) + 0.25 if dtype.is_floating_point else torch.zeros(size, dtype=dtype)
 
             def node(k: int, first: int = first, ty: str = ty) -> int:
+                if place is not None:
+                    return tracer.graph.node("slot", ty, place, extra=first + k)
                 return tracer.graph.node("arena", ty, extra=first + k)
 
             inputs[name] = tracer.lane(like, node)

@@ -7,6 +7,7 @@ The functions of :mod:`~torchpt.integrators.loop.vertex`, :mod:`~torchpt.integra
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,12 +34,14 @@ class Trace:
     Attributes:
         uniforms: names of the inputs that all lanes share, in the order of their slots.
         tensors: how many inputs are tensors instead of rows of an arena.
+        sums: of :class:`torchpt.lanes.program.Program`.
     """
 
     def __init__(self, tracer: Tracer, layout: Layout) -> None:
         self.tracer, self.layout = tracer, layout
         self.uniforms: list[str] = []
         self.tensors = 0
+        self.sums: list[tuple[Any, ...]] = []
 
     # -- what a stage reads
 

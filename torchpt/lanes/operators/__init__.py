@@ -3,6 +3,6 @@
 To add one: a function marked ``@handles("its aten name")`` in one of the files here.
 """
 
-from torchpt.lanes.operators import arithmetic, choices, gathers, reductions, views
+from torchpt.lanes.operators import arithmetic, choices, derivatives, gathers, reductions, views
 
-__all__ = ["arithmetic", "choices", "gathers", "reductions", "views"]
+__all__ = ["arithmetic", "choices", "derivatives", "gathers", "reductions", "views"]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchpt.lanes.graph import DTYPES, Unsupported
 from torchpt.lanes.operators.arithmetic import binary
+from torchpt.lanes.operators.derivatives import totals
 from torchpt.lanes.operators.nodes import cast_all, type_of
 from torchpt.lanes.tracing import Tracer, handles
 
@@ -31,8 +32,12 @@ def _reduce(op: str, boolean: bool = False) -> Any:
         nodes = value.nodes
         for k in reversed(_axes(axis, nodes.ndim)):
             if k == value.lane:
-                raise Unsupported("a reduction over lanes")
-            parts: list[Any] = [np.take(nodes, j, k) for j in range(nodes.shape[k])]
+                if op != "add" or not tracer.graph.derivatives:
+                    raise Unsupported("a reduction over lanes")
+                summed = totals(tracer, nodes, k, DTYPES[out.dtype])
+                nodes = np.expand_dims(summed, k) if keepdim else summed
+                continue
+            parts: list[Any] = [np.squeeze(np.take(nodes, [j], k), k) for j in range(nodes.shape[k])]
             if not parts:
                 shape = (*nodes.shape[:k], *nodes.shape[k + 1 :])
                 parts = [np.full(shape, _nothing(graph, op, DTYPES[out.dtype]), object)]

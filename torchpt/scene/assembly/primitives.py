@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -36,6 +36,11 @@ class Primitives:
     bound: Tensor
     frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of the quadrics
     quadrics: Quadrics | None
+
+    def still(self) -> Primitives:
+        """The same without derivatives."""
+        own = {name: getattr(self, name) for name in ("p0", "p1", "p2", "e1", "e2", "face", "sign", "normal", "bound")}
+        return replace(self, **{name: value.detach() for name, value in own.items()})
 
     def spread(self, values: Sequence[int]) -> Tensor:
         """One value a part, and where given one a copy, as rows ``(P,)`` or ``(P + I,)`` by primitive and copy."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpt.bsdfs.resolved import ResolvedMaterial
 from torchpt.errors import SceneError
-from torchpt.records import Geometry, LaneGeometry, LaneMaterials, LaneTextures, World
+from torchpt.records import Geometry, LaneGeometry, LaneMaterials, LaneTextures, World, tensors_of
 from torchpt.scene.assembly.charts import charts_of
 from torchpt.scene.assembly.copies import copies_of, copy_maps
 from torchpt.scene.assembly.corners import corners_of
@@ -23,6 +23,7 @@ from torchpt.scene.assembly.materials import Groups, groups_of, node_map_of, opa
 from torchpt.scene.assembly.primitives import Primitives, primitives_of
 from torchpt.scene.parts import Copy, Part, Source
 from torchpt.scene.space import FARTHEST, Space
+from torchpt.shapes.primitive import Corners
 from torchpt.textures import tables_of
 
 __all__ = ["assemble"]
@@ -71,7 +72,16 @@ def assemble(
     geometry = primitives.geometry(maps)
     opacity_mapped = any(part.emission is not None and made[part.material.name].opacity_texture for part in parts)
     lights = lights_of(
-        parts, sources, primitives, geometry, parameters, space, opacity, dark == 0, opacity_mapped, choice
+        parts,
+        sources,
+        _lit_by(parts, corners, primitives),
+        geometry,
+        parameters,
+        space,
+        opacity,
+        dark == 0,
+        opacity_mapped,
+        choice,
     )
     world = World(
         geometry=LaneGeometry(
@@ -99,6 +109,15 @@ def assemble(
         lights=lights,
     )
     return world, geometry
+
+
+def _lit_by(parts: Sequence[Part], corners: Sequence[Corners], primitives: Primitives) -> Primitives:
+    """The primitives, without derivatives where no part that emits has any: what is cut out of the whole would seem to."""
+    moving = any(
+        part.emission is not None and any(x.requires_grad for x in tensors_of(own))
+        for part, own in zip(parts, corners, strict=True)
+    )
+    return primitives if moving else primitives.still()
 
 
 def _materials(

@@ -1,0 +1,152 @@
+"""Gradients by the camera, taken with what is seen held in place: see ``torchpt/adjoint/held.py``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from few_lanes import few_lanes
+
+import torchpt
+from torchpt.adjoint import held
+from torchpt.math.vectors import dot
+from torchpt.records import Hit
+from torchpt.shapes import reattach
+
+pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
+
+#: A corner under a lamp that fills the view: nothing hides anything, creases and box corners are in view.
+CORNER: dict[str, Any] = {
+    "camera": {"origin": [0.1, 1.5, 3], "target": [0.2, 0.6, -1], "fov": 40},
+    "film": {"width": 8, "height": 6, "filter": "box"},
+    "integrator": {"type": "path", "max_depth": 3, "rr_depth": 100},
+    "render": {"threads": 1},
+    "materials": {
+        "grey": {"type": "diffuse", "reflectance": [0.8, 0.7, 0.6]},
+        "metal": {"type": "roughconductor", "eta": 0.4, "k": 3, "alpha": 0.3},
+    },
+    "shapes": {
+        "floor": {
+            "type": "rectangle",
+            "material": "metal",
+            "transform": [{"scale": 6}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"translate": [0, 0, 5]}],
+        },
+        "wall": {"type": "rectangle", "material": "grey", "transform": [{"scale": 6}, {"translate": [0, 6, -1]}]},
+        "lamp": {
+            "type": "rectangle",
+            "emission": [20, 18, 15],
+            "transform": [{"scale": 0.4}, {"rotate": {"axis": [1, 0, 0], "angle": 90}}, {"translate": [0.9, 2.3, 0.2]}],
+        },
+    },
+}
+WEIGHT = (0.2 + torch.arange(6.0)[:, None, None] ** 2 + torch.arange(8.0)[None, :, None]) * torch.tensor([1, 0.8, 0.6])
+SHIFT = {"principal_point_offset_x": 0.1, "principal_point_offset_y": -0.2, "pixel_aspect": 1.3}
+
+
+def loss(picture: torch.Tensor) -> torch.Tensor:
+    return (picture.double() * WEIGHT).mean()
+
+
+def camera_of(**more: Any):
+    scene = torchpt.load({**CORNER, "camera": {**CORNER["camera"], **more}}, "cpu")
+    settings = torchpt.format.description.settings(scene.description, {})
+    return scene.camera(settings.film, scene.merged(None), torch.float64)
+
+
+@pytest.mark.parametrize("more", [{}, {"fov_axis": "diagonal"}, SHIFT])
+def test_projects_points_to_where_rays_meet_them(more):
+    camera = camera_of(**more)
+    x, y = torch.rand(2, 50, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 7
+    _, d = camera.rays(x, y, None)
+    found = camera.project(d * torch.linspace(0.1, 30, 50, dtype=torch.float64))
+    assert torch.allclose(found[0], x) and torch.allclose(found[1], y)
+
+
+@pytest.mark.parametrize("more", [{}, SHIFT])
+def test_scale_of_areas_is_that_of_the_projection(more):
+    camera = camera_of(**more)
+    generator = torch.Generator().manual_seed(3)
+    p = torch.rand(3, 1, generator=generator, dtype=torch.float64) - camera.axes()[2] * -3.0
+    along = [torch.rand(3, 1, generator=generator, dtype=torch.float64).requires_grad_() for _ in range(2)]
+
+    def place(u: torch.Tensor) -> torch.Tensor:
+        x, y, _ = camera.project(p + u[0] * along[0].detach() + u[1] * along[1].detach())
+        return torch.stack((x[0], y[0]))
+
+    jacobian = torch.autograd.functional.jacobian(place, torch.zeros(2, dtype=torch.float64))
+    assert isinstance(jacobian, torch.Tensor)
+    area = torch.linalg.cross(along[0].detach(), along[1].detach(), dim=0)
+    _, _, scale = camera.project(p)
+    assert torch.allclose(torch.linalg.det(jacobian).abs(), scale * dot(area, p).abs())
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("tent", "mitchell")]
+
+
+@pytest.mark.parametrize("filter", ["box", "gaussian", *SLOW])
+def test_agrees_with_differences(filter):
+    scene = torchpt.load({**CORNER, "film": {**CORNER["film"], "filter": filter}}, "cpu")
+    name, step = "camera.to_world", 0.04
+    base, exact, difference = scene.params[name], [], []
+    shift = torch.zeros_like(base)
+    shift[0, 3] = step
+    for seed in range(6):
+        leaf = base.clone().requires_grad_()
+        loss(torchpt.render(scene, params={name: leaf}, spp=1, spp_grad=128, seed=seed)).backward()
+        assert leaf.grad is not None
+        exact.append(leaf.grad[0, 3])
+        ends = [loss(torchpt.render(scene, params={name: base + s * shift}, spp=512, seed=seed)) for s in (1, -1)]
+        difference.append((ends[0] - ends[1]) / (2 * step))
+    a, b = torch.stack(exact), torch.stack(difference)
+    error = float((a.var() / 6 + b.var() / 6).sqrt())
+    assert error < 0.03 * abs(float(b.mean()))
+    assert abs(float(a.mean() - b.mean())) < 4.5 * error + 0.01 * abs(float(b.mean()))
+
+
+def test_does_not_depend_on_chunks():
+    scene = torchpt.load(CORNER, "cpu")
+    pose, grads = scene.params["camera.to_world"].clone().requires_grad_(), []
+    for lanes in (None, 62):
+        with few_lanes(lanes):
+            picture = torchpt.render(scene, params={"camera.to_world": pose}, spp=8)
+            grads.append(torch.autograd.grad(loss(picture), pose)[0])
+    assert torch.allclose(*grads, rtol=1e-3, atol=1e-5)
+
+
+def test_materials_beside_the_camera_have_their_own_gradient():
+    scene = torchpt.load(CORNER, "cpu")
+    grads = []
+    for names in (("materials.grey.reflectance",), ("materials.grey.reflectance", "camera.fov")):
+        leaves = {name: scene.params[name].clone().requires_grad_() for name in names}
+        picture = torchpt.render(scene, params=leaves, spp=32)
+        grads.append(torch.autograd.grad(loss(picture), leaves[names[0]])[0])
+    assert torch.allclose(*grads, rtol=1e-4)
+
+
+def test_is_left_to_shapes_where_these_move_too(monkeypatch):
+    scene = torchpt.load(CORNER, "cpu")
+    taken = []
+    monkeypatch.setattr(held, "interior", lambda *a: taken.append(a))
+    names = ("shapes.wall.to_world", "camera.to_world")
+    leaves = {name: scene.params[name].clone().requires_grad_() for name in names}
+    torchpt.render(scene, params=leaves, spp=1).sum().backward()
+    assert not taken and all(leaf.grad is not None for leaf in leaves.values())
+
+
+def test_points_that_touch_have_no_derivative_by_their_distance():
+    scene = torchpt.load(CORNER, "cpu")
+    world, _ = scene.world(torch.float64, None)
+    prim = torch.tensor([0, 0, 0, -1])
+    half = torch.full((4,), 0.5, dtype=torch.float64)
+    hit = Hit(t=half * 0, prim=prim, u=half, v=half)
+    d = torch.tensor([[0.0, -1.0, 0.0]], dtype=torch.float64).T.expand(3, 4)
+    middle = world.geometry.p0[:, :1] + 0.5 * world.geometry.e1[:, :1] + 0.5 * world.geometry.e2[:, :1]
+    away = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 1e-7, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    x = (middle + away).requires_grad_()
+    direction, ratio = reattach(world, x, hit, d)
+    (gradient,) = torch.autograd.grad(direction.sum() + ratio.sum(), x)
+    assert torch.isfinite(gradient).all()
+    assert (gradient[:, :2] == 0).all()
+    assert gradient[:, 2].abs().sum() > 0.1
+    assert torch.equal(direction.detach(), d) and (ratio.detach() == 1).all()

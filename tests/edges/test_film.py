@@ -1,0 +1,72 @@
+"""Where points lie on the film, and what places of it are worth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+import torchpt
+from torchpt.edges.film import Worth, film_places
+from torchpt.format.description import settings
+
+PLACE = {"origin": [1, 2, 3], "target": [0, 0.5, 0], "up": [0, 1, 0.2]}
+CAMERAS: dict[str, dict[str, Any]] = {
+    "perspective": {"fov": 50},
+    "of height": {"fov": 50, "fov_axis": "y"},
+    "off its axis": {"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.1, "pixel_aspect": 1.3},
+    "orthographic": {"type": "orthographic", "width": 3},
+}
+
+
+def scene_of(camera: dict[str, Any], **film: Any) -> torchpt.Scene:
+    shapes = {"ball": {"type": "sphere"}}
+    camera = {"type": "perspective", **PLACE, **camera}
+    return torchpt.load({"camera": camera, "film": {"width": 24, "height": 16, **film}, "shapes": shapes}, "cpu")
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_points_of_rays_lie_where_the_rays_do(name: str) -> None:
+    scene = scene_of(CAMERAS[name])
+    camera = scene.camera(settings(scene.description).film, scene.params, torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    s = torch.rand(2, 50, generator=generator, dtype=torch.float64) * torch.tensor([[24.0], [16.0]])
+    o, d = camera.rays(s[0], s[1], None)
+    far = torch.rand(50, generator=generator, dtype=torch.float64) + 0.1
+    torch.testing.assert_close(film_places(camera, o + d * far), s, rtol=0, atol=1e-5)  # axes are float32
+    behind = camera.film_of(o - d * far)
+    assert behind is not None and bool((torch.minimum(behind[2], behind[3]) < 0).all())
+
+
+@pytest.mark.parametrize("filter", ["box", "tent", "gaussian", "mitchell"])
+def test_worth_is_what_samples_bring(filter: str) -> None:
+    """Of a cotangent, the mean over samples drawn by the filter of a function is the integral of the function's worth."""
+    film = settings(scene_of({}, filter=filter, crop=[3, 2, 12, 9]).description).film
+    kind = film.filter.kind(film.filter.values, torch.device("cpu"))
+    cotangent = torch.rand(1, 9, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    worth = Worth(cotangent, kind, (3, 2, 12, 9))
+
+    def function(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        return torch.exp(0.1 * x) * torch.cos(0.5 * y)
+
+    steps = torch.arange(400, dtype=torch.float64) / 400 + 1 / 800
+    u = torch.cartesian_prod(steps, steps).T.float()
+    offset, weight = kind.offset(u).double(), kind.weight(u).double()
+    summed = 0.0
+    for row in range(9):
+        for column in range(12):
+            values = function(column + 3.5 + offset[0], row + 2.5 + offset[1]) * weight
+            summed += float(cotangent[0, row, column] * values.mean())
+    low_x, high_x, low_y, high_y = worth.bounds()
+    x = low_x + (high_x - low_x) * steps
+    y = low_y + (high_y - low_y) * steps
+    s = torch.cartesian_prod(x, y).T
+    area = (high_x - low_x) * (high_y - low_y) / len(s[0])
+    assert float((worth.at(s)[0] * function(s[0], s[1])).sum() * area) == pytest.approx(summed, rel=2e-3)
+
+
+def test_a_lens_has_no_edges() -> None:
+    scene = scene_of({"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2})
+    camera = scene.camera(settings(scene.description).film, scene.params, torch.float64)
+    assert camera.film_of(torch.zeros(3, 1, dtype=torch.float64)) is None

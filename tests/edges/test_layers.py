@@ -1,0 +1,70 @@
+"""Layers of first surfaces have gradients: what they show, and the edges of what shows."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+import torchpt
+
+SCENE: dict[str, Any] = {
+    "camera": {"type": "perspective", "origin": [0, 0.4, 5], "target": [0, 0, 0], "fov": 40},
+    "film": {"width": 12, "height": 12, "filter": "gaussian", "aovs": ["alpha", "depth", "normal", "position", "albedo", "uv"]},
+    "integrator": {"type": "path", "max_depth": 2},
+    "render": {"threads": 1},
+    "materials": {"grey": {"type": "diffuse", "reflectance": [0.8, 0.5, 0.3]}},
+    "lights": {"sky": {"type": "constant"}},
+    "shapes": {
+        "ball": {"type": "sphere", "radius": 0.9, "material": "grey"},
+        "cube": {
+            "type": "cube",
+            "transform": [{"scale": 0.4}, {"rotate": {"axis": [1, 2, 3], "angle": 50}}, {"translate": [0.9, 0.4, 1]}],
+        },
+    },
+}  # fmt: skip
+
+
+def weights(channels: int) -> torch.Tensor:
+    x = torch.linspace(0.0, 1.0, 12, dtype=torch.float64)
+    return torch.stack([torch.cos((2 + c) * x)[:, None] * torch.sin(1 + (3 - c) * x)[None] for c in range(channels)], 2)
+
+
+def test_alpha_of_a_disk_that_grows() -> None:
+    camera = {"type": "orthographic", "origin": [0, 0, 5], "target": [0, 0, 0], "width": 4}
+    film = {"width": 16, "height": 16, "filter": "box", "aovs": ["alpha"]}
+    scene = torchpt.load({**SCENE, "camera": camera, "film": film, "shapes": {"it": {"type": "disk"}}}, "cpu")
+    pose = scene.params["shapes.it.to_world"].double().requires_grad_()
+    rendering = torchpt.render(scene, params={"shapes.it.to_world": pose}, spp=4, edge_spp=32, full=True)
+    rendering.layers["alpha"].double().sum().backward()
+    assert pose.grad is not None
+    assert float(pose.grad[0, 0] + pose.grad[1, 1]) / 16 == pytest.approx(2 * math.pi, rel=2e-3)
+
+
+@pytest.mark.parametrize("name", ["alpha", "depth", "normal", "position", "albedo", "uv"])
+@pytest.mark.parametrize("moved", ["camera.to_world", "shapes.cube.to_world", "shapes.ball.to_world"])
+def test_agree_with_central_differences(name: str, moved: str) -> None:
+    scene = torchpt.load({**SCENE, "film": {**SCENE["film"], "aovs": [name]}}, "cpu")
+    base, shift = scene.params[moved].double(), torch.zeros(4, 4, dtype=torch.float64)
+    shift[0, 3] = 0.03
+
+    def loss(value: torch.Tensor, **wish: Any) -> torch.Tensor:
+        layer = torchpt.render(scene, params={moved: value}, full=True, **wish).layers[name].double()
+        return (layer * weights(layer.shape[2])).mean()
+
+    leaf = base.clone().requires_grad_()
+    loss(leaf, spp=64, edge_spp=64).backward()
+    assert leaf.grad is not None
+    with torch.no_grad():
+        ends = [loss(base + s * shift, spp=2048) for s in (1, -1)]
+    expected = float(ends[0] - ends[1]) / 0.06
+    assert float(leaf.grad[0, 3]) == pytest.approx(expected, rel=0.03, abs=0.004)
+
+
+def test_names_of_things_stay_off_the_tape() -> None:
+    scene = torchpt.load({**SCENE, "film": {**SCENE["film"], "aovs": ["object_id", "depth"]}}, "cpu")
+    pose = scene.params["shapes.ball.to_world"].requires_grad_()
+    layers = torchpt.render(scene, params={"shapes.ball.to_world": pose}, spp=2, full=True).layers
+    assert layers["depth"].requires_grad and not layers["object_id"].requires_grad

@@ -1,0 +1,407 @@
+"""Scenes with one parameter that moves each, whose derivative is known: what gradients are judged by.
+
+The loss is linear in the picture, a fixed smooth weight times each number, so that a gradient has a mean that does
+not depend on the forward pass. The derivative goes along one direction in the parameter's space. True values lie in
+``known_gradients.json``, central differences of many samples with common random numbers: ``python
+scripts/gradient_pairs.py --truths`` makes them.
+
+Lengths are about 1, lamps are soft where nothing else is said, and paths are no longer than the pair needs: at depth
+2 only edges seen by the camera and those of direct shadows move, a pair called ``..._indirect`` has those of indirect
+shadows too.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import torchpt
+from torchpt.scene import Scene
+
+__all__ = ["PAIRS", "SIZE", "Pair", "loaded", "loss_of", "weights"]
+
+#: Width and height of the pictures.
+SIZE = 24
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A scene and a way to move in one of its parameters.
+
+    Attributes:
+        scene: of a description; ``$FILES`` in a path is the folder of :attr:`files`.
+        parameter: its name in ``scene.params``.
+        direction: of the parameter's shape, as ``{index: value}`` or as a function of the parameter.
+        step: of the finer difference; the other one is twice as wide.
+        edges: whether edges of visibility move.
+        spp: samples a pixel of one gradient.
+        depth: of the paths.
+        files: pictures ``(H, W, 3)`` by file name.
+        turns: whether the direction turns a pose, which then stays rigid.
+    """
+
+    scene: Mapping[str, Any]
+    parameter: str
+    direction: Mapping[tuple[int, ...], float] | Callable[[Tensor], Tensor]
+    step: float
+    edges: bool
+    spp: int = 64
+    depth: int = 2
+    files: Mapping[str, Callable[[], Tensor]] = field(default_factory=dict)
+    turns: bool = False
+
+    def along(self, base: Tensor) -> Tensor:
+        """The direction, as a tensor like the parameter ``base``."""
+        if callable(self.direction):
+            return self.direction(base)
+        direction = torch.zeros_like(base)
+        for index, value in self.direction.items():
+            direction[index] = value
+        return direction
+
+    def at(self, base: Tensor, step: float) -> Tensor:
+        """The parameter ``step`` away from ``base``."""
+        if not self.turns:
+            return base + step * self.along(base)
+        return (torch.matrix_exp(step * self.along(base).double() @ base.double().inverse()) @ base.double()).to(base)
+
+
+def loaded(pair: Pair) -> Scene:
+    """The scene of a pair."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, made in pair.files.items():
+            torchpt.write_image(str(Path(folder) / name), made())
+        scene = {
+            **in_folder(pair.scene, folder),
+            "film": {"width": SIZE, "height": SIZE, "filter": "box"},
+            "integrator": {"type": "path", "max_depth": pair.depth, "rr_depth": 100},
+        }
+        return torchpt.load(scene, "cpu")
+
+
+def in_folder(value: Any, folder: str) -> Any:
+    if isinstance(value, Mapping):
+        return {key: in_folder(entry, folder) for key, entry in value.items()}
+    return value.replace("$FILES", folder) if isinstance(value, str) else value
+
+
+@cache
+def weights() -> Tensor:
+    """What the loss weighs the picture with, ``(SIZE, SIZE, 3)`` float64: smooth, and alike in no two places."""
+    at = (torch.arange(SIZE, dtype=torch.float64) + 0.5) / SIZE
+    x, y = at[None, :, None], at[:, None, None]
+    colour = torch.tensor([1.0, 0.8, 0.6], dtype=torch.float64)
+    return (0.2 + 2.0 * x * x + 0.7 * y * y + 0.2 * torch.sin(4.0 * x * y)) * colour / (3 * SIZE * SIZE)
+
+
+def loss_of(picture: Tensor) -> Tensor:
+    """The loss of a picture ``(SIZE, SIZE, 3)``, a number in float64."""
+    return (picture.double() * weights()).sum()
+
+
+def quad(*corners: list[float], **more: Any) -> dict[str, Any]:
+    """A flat mesh of four corners, counterclockwise seen from its front."""
+    return {"type": "mesh", "vertices": list(corners), "faces": [[0, 1, 2], [0, 2, 3]], "face_normals": True, **more}
+
+
+def turned(axis: list[float], angle: float) -> dict[str, Any]:
+    return {"rotate": {"axis": axis, "angle": angle}}
+
+
+def moved(*by: float) -> dict[str, Any]:
+    return {"translate": list(by)}
+
+
+def diffuse(*colour: float) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": list(colour)}
+
+
+def without(scene: Mapping[str, Any], *names: str, **more: Any) -> dict[str, Any]:
+    """A scene without some of its shapes, and with others."""
+    shapes = {name: shape for name, shape in scene["shapes"].items() if name not in names}
+    return {**scene, "shapes": {**shapes, **more}}
+
+
+def with_shapes(scene: Mapping[str, Any], **more: Any) -> dict[str, Any]:
+    return without(scene, **more)
+
+
+WHITE, RED, GREEN = diffuse(0.7, 0.7, 0.7), diffuse(0.6, 0.1, 0.1), diffuse(0.15, 0.5, 0.1)
+DOWN = turned([1, 0, 0], 90)
+LAMP = {"type": "rectangle", "emission": [9, 8, 6], "transform": [{"scale": 0.3}, DOWN, moved(0.1, 0.93, -0.2)]}
+BLOCK = {
+    "type": "cube",
+    "material": WHITE,
+    "transform": [{"scale": 0.3}, turned([0, 1, 0], 25), moved(0.35, -0.6, 0.1)],
+}
+ROOM: dict[str, Any] = {
+    "camera": {"origin": [0.1, 0.1, 3.4], "target": [0, 0, 0], "fov": 42},
+    "materials": {"white": WHITE, "red": RED, "green": GREEN},
+    "shapes": {
+        "floor": quad([-1, -1, 1], [1, -1, 1], [1, -1, -1], [-1, -1, -1], material="white"),
+        "ceiling": quad([-1, 1, -1], [1, 1, -1], [1, 1, 1], [-1, 1, 1], material="white"),
+        "back": quad([-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], material="white"),
+        "left": quad([-1, -1, 1], [-1, -1, -1], [-1, 1, -1], [-1, 1, 1], material="red"),
+        "right": quad([1, -1, -1], [1, -1, 1], [1, 1, 1], [1, 1, -1], material="green"),
+        "block": BLOCK,
+        "lamp": LAMP,
+    },
+}
+#: A floor under a lamp, wide enough to fill the view; what is judged stands on it.
+FLOOR = quad([-6, 0, 6], [6, 0, 6], [6, 0, -9], [-6, 0, -9], material=WHITE)
+OVERHEAD = {
+    "type": "rectangle",
+    "emission": [30, 28, 25],
+    "transform": [{"scale": 0.4}, DOWN, turned([0, 0, 1], -20), moved(-0.8, 3, 0.4)],
+}
+TABLE: dict[str, Any] = {
+    "camera": {"origin": [0.3, 2.2, 4], "target": [0.1, 0.4, 0], "fov": 42},
+    "shapes": {"floor": FLOOR, "lamp": OVERHEAD},
+}
+ORANGE = diffuse(0.8, 0.5, 0.2)
+BLUE = diffuse(0.05, 0.1, 0.3)
+BALL = {"type": "sphere", "center": [0.1, 0.65, 0], "radius": 0.5, "material": BLUE}
+CANVAS = {"floor": FLOOR}
+#: The same without the lamp, for lights that are points or directions.
+DARK = {**TABLE, "shapes": CANVAS}
+SCREEN = quad([-0.5, 1.1, 0.4], [0.6, 1.1, 0.3], [0.5, 1.2, -0.5], [-0.4, 1.2, -0.6], material=BLUE)
+
+
+def fan() -> dict[str, Any]:
+    """A small bent mesh with smooth normals."""
+    count, ring = 6, []
+    for k in range(count):
+        angle = 2 * math.pi * k / count
+        ring.append([0.1 + 0.7 * math.cos(angle), 0.5 + 0.15 * math.sin(2 * angle), -0.5 * math.sin(angle)])
+    faces = [[0, 1 + k, 1 + (k + 1) % count] for k in range(count)]
+    return {"type": "mesh", "vertices": [[0.1, 0.95, 0.05], *ring], "faces": faces, "material": BLUE}
+
+
+def painted() -> Tensor:
+    """A picture of 8 x 8 texels."""
+    return 0.2 + 0.6 * torch.rand(8, 8, 3, generator=torch.Generator().manual_seed(3))
+
+
+def sky() -> Tensor:
+    """A map of all directions, 8 x 16 texels, brighter above and to one side."""
+    rows, columns = torch.arange(8.0)[:, None, None], torch.arange(16.0)[None, :, None]
+    level = 0.3 + 1.2 * torch.exp(-0.5 * ((rows - 2) / 1.2) ** 2 - 0.5 * ((columns - 10) / 2.0) ** 2)
+    return (level * torch.tensor([1.0, 0.9, 0.7])).float().contiguous()
+
+
+def noise(base: Tensor) -> Tensor:
+    """Another weight for each entry, all positive."""
+    return torch.rand(base.shape, generator=torch.Generator().manual_seed(11)).to(base)
+
+
+def turn(base: Tensor) -> Tensor:
+    """A pose turned about the world's y axis, by radians."""
+    about = torch.zeros_like(base)
+    about[0, 2], about[2, 0] = 1.0, -1.0
+    return about @ base
+
+
+def about_own_y(base: Tensor) -> Tensor:
+    """A pose turned about its own y axis, by radians."""
+    about = torch.zeros_like(base)
+    about[0, 2], about[2, 0] = 1.0, -1.0
+    return base @ about
+
+
+def grown(base: Tensor) -> Tensor:
+    """A sphere whose radius grows, by its pose: its middle stays."""
+    direction = torch.zeros_like(base)
+    direction[:3, :3] = base[:3, :3] / base[:3, 0].norm()
+    return direction
+
+
+X = {(0, 3): 1.0}
+Y = {(1, 3): 1.0}
+Z = {(2, 3): 1.0}
+PAINTED = {**CANVAS["floor"], "uvs": [[0, 0], [3, 0], [3, 3], [0, 3]]}
+PAINTED |= {"material": {"type": "diffuse", "reflectance": {"type": "image", "path": "$FILES/paint.exr"}}}
+BRUSHED = {"type": "roughconductor", "eta": [0.3, 0.6, 1.2], "k": [3, 2.5, 2], "alpha": 0.25}
+PRINCIPLED = {"type": "principled", "base_color": [0.7, 0.4, 0.2], "roughness": 0.45, "metallic": 0.6, "specular": 0.5}
+SKY = {"sky": {"type": "envmap", "path": "$FILES/sky.exr"}}
+ALONE: dict[str, Any] = {"camera": {"origin": [0, 0, 4], "target": [0.1, 0.05, 0], "fov": 30}}
+BUST = {"type": "sphere", "center": [0.1, 0.1, 0], "radius": 0.7}
+UNDER_SKY = {**ALONE, "shapes": {"ball": {**BUST, "material": BRUSHED}}, "lights": SKY}
+#: Glass over the whole view; behind it a wall, under a lamp to the side that shines on it alone.
+GLASS: dict[str, Any] = {
+    "camera": {"origin": [0.6, 0.4, 5], "target": [0.45, 0.3, 0], "fov": 6},
+    "materials": {"glass": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}},
+    "shapes": {
+        "ball": {"type": "sphere", "material": "glass"},
+        "wall": {"type": "rectangle", "material": ORANGE, "transform": [{"scale": 50}, moved(0, 0, -3)]},
+        "lamp": {
+            "type": "rectangle",
+            "transform": [{"scale": 0.3}, turned([0, 1, 0], 180), moved(2, 1.4, -2)],
+            "emission": [40, 50, 60],
+        },
+    },
+}
+SUN = {"sun": {"type": "directional", "direction": [0.3, -1, -0.2], "irradiance": [3, 3, 2.5]}}
+SPOT = {
+    "spot": {
+        "type": "spot", "position": [-1, 3.2, 0.8], "target": [0.1, 0.5, 0],
+        "intensity": [25, 24, 20], "cutoff_angle": 35, "beam_width": 28,
+    }
+}  # fmt: skip
+BULB = {"bulb": {"type": "point", "position": [-0.9, 2.6, 0.7], "intensity": [14, 13, 11]}}
+STANDING = {"material": BLUE, "transform": [turned([0, 0, 1], 20), moved(0.1, 0.1, 0)]}
+BOX = {"type": "cube", "material": BLUE, "transform": [{"scale": 0.35}, turned([0, 1, 0], 30), moved(0.1, 0.45, 0)]}
+COPY = {"type": "instance", "of": "block", "material": RED, "transform": [{"scale": 0.3}, turned([0, 1, 0], 10)]}
+COPY |= {"transform": [*COPY["transform"], moved(0.6, 0.5, 0.5)]}
+SMALL_BOX = {"type": "cube", "material": BLUE, "transform": [{"scale": 0.25}, moved(-0.6, 0.3, -0.3)]}
+TILTED = [{"scale": 0.6}, turned([1, 0, 0], -65), moved(0.1, 0.8, 0)]
+#: A lamp that nothing hides, which does not come into view.
+FREE = {**DARK, "shapes": {"floor": FLOOR, "lamp": {**OVERHEAD, "transform": [{"scale": 0.3}, DOWN, moved(0.8, 3, 1)]}}}
+
+PAIRS: dict[str, Pair] = {
+    # Nothing becomes visible or hidden.
+    "albedo_room": Pair(ROOM, "materials.red.reflectance", {(0,): 1.0, (1,): 0.5}, 0.05, False, depth=4),
+    "emission_room": Pair(ROOM, "shapes.lamp.emission", {(0,): 1.0, (2,): -0.4}, 0.5, False, depth=4),
+    "texels": Pair(
+        with_shapes(TABLE, floor=PAINTED, ball=BALL),
+        "shapes.floor.material.reflectance",
+        noise,
+        0.05,
+        False,
+        depth=3,
+        files={"paint.exr": painted},
+    ),
+    "roughness": Pair(
+        with_shapes(TABLE, floor={**FLOOR, "material": BRUSHED}),
+        "shapes.floor.material.alpha",
+        {(): 1.0},
+        0.01,
+        False,
+    ),
+    "metal_eta": Pair(
+        UNDER_SKY, "shapes.ball.material.eta", {(0,): 1.0, (1,): 0.5}, 0.05, False, files={"sky.exr": sky}
+    ),
+    "principled_roughness": Pair(
+        with_shapes(TABLE, floor={**FLOOR, "material": PRINCIPLED}),
+        "shapes.floor.material.roughness",
+        {(): 1.0},
+        0.02,
+        False,
+    ),
+    "principled_metallic": Pair(
+        with_shapes(TABLE, floor={**FLOOR, "material": PRINCIPLED}),
+        "shapes.floor.material.metallic",
+        {(): 1.0},
+        0.05,
+        False,
+    ),
+    "glass_index": Pair(GLASS, "materials.glass.int_ior", {(): 1.0}, 0.01, False, depth=4, spp=256),
+    "sky_texels": Pair(UNDER_SKY, "lights.sky.texels", noise, 0.05, False, depth=3, files={"sky.exr": sky}),
+    "sky_scale": Pair(UNDER_SKY, "lights.sky.scale", {(): 1.0}, 0.1, False, depth=3, files={"sky.exr": sky}),
+    "sky_turned": Pair(UNDER_SKY, "lights.sky.to_world", turn, 0.01, False, files={"sky.exr": sky}, turns=True),
+    "free_lamp": Pair(FREE, "shapes.lamp.to_world", X, 0.05, False),
+    "floor_tilt": Pair(FREE, "shapes.floor.vertices", {(2, 1): 1.0, (3, 1): 0.6}, 0.05, False),
+    "smooth_vertex_up": Pair(
+        with_shapes(FREE, bent={**fan(), "material": ORANGE}), "shapes.bent.vertices", {(0, 1): 1.0}, 0.02, True
+    ),
+    # The camera moves.
+    "camera_x_room": Pair(ROOM, "camera.to_world", X, 0.006, True, depth=4),
+    "camera_z_room": Pair(ROOM, "camera.to_world", Z, 0.006, True, depth=4),
+    "camera_turn_room": Pair(ROOM, "camera.to_world", about_own_y, 0.003, True, depth=4, turns=True),
+    "fov_room": Pair(ROOM, "camera.fov", {(): 1.0}, 0.1, True, depth=4),
+    "camera_x_ball": Pair(with_shapes(TABLE, ball=BALL), "camera.to_world", X, 0.01, True),
+    "camera_x_sky": Pair(
+        {
+            **ALONE,
+            "shapes": {"ball": {**BUST, "material": diffuse(0.1, 0.2, 0.3)}},
+            "lights": {"sky": {"type": "constant"}},
+        },
+        "camera.to_world",
+        X,
+        0.01,
+        True,
+    ),
+    # Shapes move.
+    "lamp_pose_room": Pair(ROOM, "shapes.lamp.to_world", X, 0.006, True),
+    "lamp_pose_room_indirect": Pair(ROOM, "shapes.lamp.to_world", X, 0.006, True, depth=4),
+    "block_pose_room_indirect": Pair(ROOM, "shapes.block.to_world", Y, 0.01, True, depth=4),
+    "ball_pose": Pair(with_shapes(TABLE, ball=BALL), "shapes.ball.to_world", Z, 0.02, True),
+    "ball_pose_indirect": Pair(with_shapes(TABLE, ball=BALL), "shapes.ball.to_world", Z, 0.02, True, depth=3),
+    "ball_pose_bulb": Pair({**with_shapes(DARK, ball=BALL), "lights": BULB}, "shapes.ball.to_world", Y, 0.02, True),
+    "silhouette_vertex": Pair(with_shapes(TABLE, screen=SCREEN), "shapes.screen.vertices", {(1, 0): 1.0}, 0.02, True),
+    "sphere_radius_sky": Pair(
+        {
+            **ALONE,
+            "shapes": {"ball": {**BUST, "material": diffuse(0.1, 0.2, 0.3)}},
+            "lights": {"sky": {"type": "constant"}},
+        },
+        "shapes.ball.to_world",
+        grown,
+        0.01,
+        True,
+    ),
+    "ball_under_sky": Pair(
+        {**with_shapes(DARK, ball=BALL), "lights": SKY},
+        "shapes.ball.to_world",
+        X,
+        0.02,
+        True,
+        files={"sky.exr": sky},
+    ),
+    "cylinder_pose": Pair(
+        with_shapes(TABLE, it={"type": "cylinder", "radius": 0.4, "height": 0.9, **STANDING}),
+        "shapes.it.to_world",
+        Y,
+        0.02,
+        True,
+    ),
+    "cone_pose": Pair(
+        with_shapes(TABLE, it={"type": "cone", "apex": [0, 1.1, 0], "height": -1, "slope": 0.5, **STANDING}),
+        "shapes.it.to_world",
+        Z,
+        0.02,
+        True,
+    ),
+    "disk_pose": Pair(
+        with_shapes(TABLE, it={"type": "disk", "material": BLUE, "transform": TILTED}),
+        "shapes.it.to_world",
+        Z,
+        0.02,
+        True,
+    ),
+    "rectangle_pose": Pair(
+        with_shapes(TABLE, it={"type": "rectangle", "material": BLUE, "transform": TILTED}),
+        "shapes.it.to_world",
+        Z,
+        0.02,
+        True,
+    ),
+    "cube_pose": Pair(with_shapes(TABLE, it=BOX), "shapes.it.to_world", Y, 0.02, True),
+    "instance_pose": Pair(
+        with_shapes(TABLE, block=SMALL_BOX, copy=COPY),
+        "shapes.copy.to_world",
+        Z,
+        0.02,
+        True,
+    ),
+    "smooth_normals": Pair(
+        with_shapes(TABLE, bent=fan()), "shapes.bent.vertices", {(1, 0): 1.0, (2, 2): 0.5}, 0.02, True
+    ),
+    # Lights move whose shadows have hard edges.
+    "spot_position": Pair(
+        {**with_shapes(DARK, screen=SCREEN), "lights": SPOT}, "lights.spot.position", {(0,): 1.0}, 0.03, True
+    ),
+    "point_position": Pair(
+        {**with_shapes(DARK, ball=BALL), "lights": BULB}, "lights.bulb.position", {(0,): 1.0}, 0.03, True
+    ),
+    "sun_direction": Pair(
+        {**with_shapes(DARK, box=BOX), "lights": SUN}, "lights.sun.direction", {(0,): 1.0}, 0.02, True
+    ),
+}

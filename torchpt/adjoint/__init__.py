@@ -1,0 +1,86 @@
+"""How gradients are taken: an argument of ``render``, not another integrator; and what of a render they go through.
+
+=================  ==============================================================================
+``function.py``    a picture on autograd's tape; its backward pass is ``gradients`` below
+``assembly.py``    from parameters to what waves read, differentiated once a backward pass
+``loop.py``        ``replay``, the default, by kernels over threads: start here
+``sweep.py``       a chunk of that: paths traced again, and gone back along vertex by vertex
+``replay.py``      the same by tensor operations: on CUDA, in float64, and where no kernels can be made
+``held.py``        what the camera's gradient is where no surface moves: what it sees is held in place
+``tape.py``        ``autograd``: chunks rendered again under a plain tape
+``samples.py``     what a loss asks of single samples
+``sums.py``        sums of gradients, in the order of their terms
+``attachment.py``  what parameters move
+=================  ==============================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torchpt.adjoint.assembly import Assembly
+from torchpt.adjoint.attachment import attached, casts
+from torchpt.adjoint.function import on_tape
+from torchpt.adjoint.held import by_film, follows, suits
+from torchpt.adjoint.loop import compiled_replay
+from torchpt.adjoint.tape import tape
+from torchpt.forward import limited_threads
+from torchpt.forward.budget import check_memory
+from torchpt.forward.need import loaded, need_of
+from torchpt.integrators.path import PathIntegrator
+from torchpt.scene import Scene
+from torchpt.settings import Settings
+
+__all__ = ["KINDS", "attached", "casts", "gradients", "on_tape", "suits"]
+
+#: By name, the default first.
+KINDS = ("replay", "autograd")
+
+
+def gradients(
+    scene: Scene,
+    settings: Settings,
+    params: Mapping[str, Tensor],
+    wanted: tuple[str, ...],
+    dtype: torch.dtype,
+    attached: bool,
+    kind: str,
+    asked: Tensor,
+    held: bool = False,
+) -> list[Tensor]:
+    """Derivatives by the parameters ``wanted`` and by the weights of the caller's own models.
+
+    Args:
+        scene: what is rendered.
+        settings: of the backward pass: its seed, its samples.
+        params: tensors in place of the scene's.
+        wanted: names of those that are differentiated.
+        dtype: of the lanes.
+        attached: whether geometry is differentiated.
+        kind: one of :data:`KINDS`.
+        asked: derivatives of a loss by the pixels ``(3, H W)``.
+        held: whether what the camera sees is held in place (:func:`suits`), and the picture moves over it.
+
+    Raises:
+        SceneError: ``render.max_memory`` is too small for it.
+        RenderError: not even a single lane fits in memory.
+    """
+    with limited_threads(settings.render.threads):
+        attached = follows(scene, wanted) if held else attached
+        assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached)
+        if settings.render.max_memory is not None:
+            need = need_of(settings, scene.device, "tape", len(assembly.wave.stages.world.materials.models))
+            check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)
+        sums = assembly.sums()
+        # Integrators that end at the first surface have but one vertex to keep.
+        if held:
+            by_film(assembly, settings, asked, sums)
+        elif kind == "replay" and isinstance(assembly.wave.integrator, PathIntegrator):
+            compiled_replay(scene, assembly, settings, asked, sums)
+        else:
+            tape(assembly, settings, asked, sums)
+        loaded("tape")
+        return assembly.gradients(sums)

@@ -1,0 +1,135 @@
+"""From parameters to what waves read, differentiated once a backward pass.
+
+The *assembly* makes world, camera and what belongs to them of the parameters (:mod:`torchpt.scene.assembly`). Chunks of lanes
+are differentiated with respect to its tensors, and their sums go back through it at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.adjoint.sums import Sums
+from torchpt.forward.wave import make_wave
+from torchpt.integrators.compiled import Stages
+from torchpt.integrators.wave import Wave
+from torchpt.records import tensors_of
+from torchpt.scene import Scene
+from torchpt.settings import Settings
+
+__all__ = ["Assembly", "rebuilt"]
+
+
+class Assembly:
+    """What the waves of a backward pass read, as a function of parameters.
+
+    Args:
+        scene: whose.
+        settings: of the backward pass.
+        params: tensors in place of the scene's.
+        wanted: names of those that are differentiated.
+        held: tensors that stages use by themselves, such as weights of modules.
+        dtype: of the lanes.
+        attached: whether geometry is differentiated.
+
+    Attributes:
+        wave: with plain tensors.
+        taped: the same with leaves in place of those tensors that depend on the parameters.
+        leaves: these leaves; ``held`` follow them in the sums.
+        plain: the tensors that they stand for.
+        held: see above.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        settings: Settings,
+        params: Mapping[str, Tensor],
+        wanted: Sequence[str],
+        held: Sequence[Tensor],
+        dtype: torch.dtype,
+        attached: bool,
+    ) -> None:
+        self._inputs = [params[name].detach().requires_grad_() for name in wanted]
+        given = {name: value.detach() for name, value in params.items()} | dict(zip(wanted, self._inputs, strict=True))
+        with torch.enable_grad():
+            made = make_wave(scene, settings, given, dtype, True, attached)
+        self._outputs: list[Tensor] = []
+        self.leaves: list[Tensor] = []
+        self.plain: list[Tensor] = []
+        self.held = tuple(held)
+        plain: dict[int, Tensor] = {}
+        leaves: dict[int, Tensor] = {}
+
+        def detached(tensor: Tensor) -> Tensor:
+            if not tensor.requires_grad or (tensor.is_leaf and id(tensor) not in inputs):
+                return tensor
+            if id(tensor) not in plain:
+                plain[id(tensor)] = tensor.detach()
+                self._outputs.append(tensor)
+            return plain[id(tensor)]
+
+        def leaf(tensor: Tensor) -> Tensor:
+            return leaves.get(id(tensor), tensor)
+
+        inputs = {id(tensor) for tensor in self._inputs}
+        self.wave = _over(made, detached)
+        for tensor in self._outputs:
+            one = plain[id(tensor)]
+            leaves[id(one)] = one.detach().requires_grad_()
+            self.leaves.append(leaves[id(one)])
+            self.plain.append(one)
+        self.taped = _over(self.wave, leaf)
+
+    @property
+    def passing(self) -> bool:
+        """Whether it is differentiated by what lets rays pass surfaces."""
+        world = self.taped.stages.world
+        opacity, maps = world.materials.opacity, world.textures.opacity
+        if opacity is None:
+            return False
+        read = [] if maps is None else [x for k in maps.tables for x in tensors_of(world.textures.tables[k])]
+        return any(x.requires_grad for x in (opacity, *read))
+
+    def sums(self) -> Sums:
+        """Sums of the gradients of the leaves, and of what is held."""
+        return Sums((*self.leaves, *self.held))
+
+    def gradients(self, sums: Sums) -> list[Tensor]:
+        """Gradients of the parameters, and of what is held, from those of the leaves."""
+        found = sums.gradients()
+        pairs = [(y, g) for y, g in zip(self._outputs, found, strict=False) if g is not None]
+        own: Sequence[Tensor | None] = [None] * len(self._inputs)
+        if pairs and self._inputs:
+            own = torch.autograd.grad([y for y, _ in pairs], self._inputs, [g for _, g in pairs], allow_unused=True)
+        given = zip((*self._inputs, *self.held), (*own, *found[len(self.leaves) :]), strict=True)
+        return [torch.zeros_like(tensor) if gradient is None else gradient for tensor, gradient in given]
+
+
+def _over(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
+    """A wave with other tensors; stages run as tensor operations."""
+    stages = wave.stages
+    world, pixel, camera, first = rebuilt((stages.world, stages.pixel, wave.camera, wave.first), change)
+    return replace(wave, stages=Stages(stages.plan, world, pixel), camera=camera, first=first)
+
+
+def rebuilt(record: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """A record with other tensors in place of its own; what holds none of these stays itself."""
+    if isinstance(record, Tensor):
+        return change(record)
+    if isinstance(record, dict):
+        made = {name: rebuilt(value, change) for name, value in record.items()}
+        return made if any(made[name] is not value for name, value in record.items()) else record
+    if isinstance(record, tuple | list):
+        parts = [rebuilt(value, change) for value in record]
+        return type(record)(parts) if any(a is not b for a, b in zip(parts, record, strict=True)) else record
+    if is_dataclass(record) and not isinstance(record, torch.nn.Module | type):
+        own = {field.name: getattr(record, field.name) for field in fields(record)}
+        new = {name: rebuilt(value, change) for name, value in own.items()}
+        new = {name: value for name, value in new.items() if value is not own[name]}
+        return replace(record, **new) if new else record
+    return record

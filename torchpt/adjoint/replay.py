@@ -1,0 +1,282 @@
+"""Paths are traced again from their random numbers, without a tape, and then gone back along vertex by vertex.
+
+Of a chunk of lanes the states at its vertices are kept, some 120 bytes a lane each; a vertex is differentiated alone
+(:mod:`torchpt.integrators.joint`), from the last one to the first. What is handed from vertex to vertex lies by lanes: each
+path has one, and reads there what those behind it ask of the ray that left. Paths of many vertices are traced again in parts,
+from marks on the way, so that memory does not grow with depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from torchpt.adjoint.assembly import Assembly
+from torchpt.adjoint.samples import asked_of
+from torchpt.adjoint.sums import Sums
+from torchpt.forward.budget import Budget
+from torchpt.forward.schedule import Span
+from torchpt.forward.waves import Waves
+from torchpt.integrators import joint
+from torchpt.integrators.compiled import Stages
+from torchpt.integrators.joint import Behind
+from torchpt.integrators.path import ENDLESS, Ends, partition, slides, trace
+from torchpt.integrators.search import Search
+from torchpt.math.gathers import gathered_by
+from torchpt.math.vectors import take
+from torchpt.records import Hit, PathState, Shadow, rows
+from torchpt.samplers import salts
+from torchpt.settings import Settings
+
+__all__ = ["replay"]
+
+#: Lanes of a chunk. Always the same: sums of other chunks would be rounded otherwise.
+LANES = {"cpu": 1 << 16, "cuda": 1 << 20}
+#: Vertices that are kept at once, and marks beyond them.
+KEPT, MARKS = 24, 8
+
+
+@dataclass
+class Vertex:
+    """The paths of a chunk at a vertex, and how much of the light of their shadow rays got through, group by group."""
+
+    depth: int
+    state: PathState
+    hit: Hit
+    clear: list[Tensor] = field(default_factory=list)
+
+
+class Keeper(Stages):
+    """Stages that keep the vertices which they pass: the first ones all, of those behind some as marks."""
+
+    def __init__(self, stages: Stages, end: int | None) -> None:
+        super().__init__(stages.plan, stages.world, stages.pixel)
+        self.kept: list[Vertex] = []
+        self.marks: list[Vertex] = []
+        self._end, self._step = end, KEPT
+        self._now: Vertex | None = None
+
+    def met(self, depth: int, state: PathState, hit: Hit) -> bool:
+        """See :class:`Stages`; ends where another part begins."""
+        if depth == self._end:
+            return True
+        self._now = Vertex(depth, state, hit)
+        if len(self.kept) < KEPT:
+            self.kept.append(self._now)
+        elif (depth - self.kept[-1].depth - 1) % self._step == 0:
+            self.marks.append(self._now)
+            if len(self.marks) > MARKS:
+                self.marks = self.marks[::2]
+                self._step *= 2
+        return False
+
+    def cleared(self, clear: Tensor) -> None:
+        """See :class:`Stages`."""
+        assert self._now is not None
+        self._now.clear.append(clear)
+
+
+def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
+    """Reverse mode by replaying paths; as :func:`torchpt.adjoint.tape.tape`, but memory does not grow with depth.
+
+    Chunks have fewer lanes only where an allocation failed.
+    """
+    wave = assembly.wave
+
+    def whole(span: Span) -> None:
+        sums.join(piece(assembly, settings, asked, span))
+
+    device = wave.centre.device
+    budget = Budget(None, device, LANES.get(device.type, LANES["cpu"]), 0)
+    for _ in Waves(budget, "the vertices of a single lane").through(
+        whole, wave.crop[2] * wave.crop[3], 0, settings.render.spp
+    ):
+        pass
+
+
+def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:
+    """The sums of a chunk."""
+    sums = assembly.sums()
+    _Chunk(assembly, settings, span, sums).run(asked[:, span[0] : span[0] + span[1]])
+    return sums
+
+
+class _Chunk:
+    """A chunk of lanes.
+
+    Args:
+        assembly: what waves read.
+        settings: of the backward pass.
+        span: its samples.
+        sums: what is added to.
+    """
+
+    def __init__(self, assembly: Assembly, settings: Settings, span: Span, sums: Sums) -> None:
+        self.assembly, self.settings, self.span, self.sums = assembly, settings, span, sums
+        self.wave, self.taped = assembly.wave, assembly.taped
+        self.plan = self.wave.stages.plan
+        self.world = self.taped.stages.world
+        self.tensors = [*assembly.leaves, *assembly.held]
+        self.passing = assembly.passing
+        self.search = Search(self.wave.accel, self.world, self.plan.sampler, self.plan.dtype)
+
+    def run(self, pixels: Tensor) -> None:
+        """Add what a loss asks, by pixels ``(3, n)``, to the sums."""
+        with torch.no_grad():
+            start = self.wave.rays(*self.span)
+            radiance, keeper = self._trace(start, 1, None, None)
+            samples = self.span[3]
+            weight = self.wave.weight(start) if self.wave.filter.signed else None
+            brought = radiance if weight is None else radiance * weight
+            asked = asked_of(self.settings, brought.view(3, samples, -1), pixels.to(radiance.dtype)).reshape(3, -1)
+            # What the rest of its path asks of each lane's ray, and what that ray met.
+            self.radiance = asked if weight is None else asked * weight
+            self.behind = {name: torch.zeros_like(asked) for name in ("throughput", "o", "d")[: self._rows]}
+            n = asked.shape[1]
+            zero = torch.zeros(n, dtype=asked.dtype, device=asked.device)
+            self.met = Hit(zero.clone(), torch.full_like(start.lane, -1), zero.clone(), zero.clone())
+            self._back(keeper)
+        self._camera(start)
+
+    @property
+    def _rows(self) -> int:
+        return 3 if self.plan.attached else 1
+
+    # -- forward
+
+    def _trace(self, state: PathState, depth: int, hit: Hit | None, end: int | None) -> tuple[Tensor, Keeper]:
+        keeper = Keeper(self.wave.stages, end)
+        limits = self.wave.limits
+        assert limits is not None
+        lanes = self.span[1] * self.span[3]
+        radiance, _ = trace(keeper, limits, self.wave.accel, state, lanes, depth, hit)
+        return radiance, keeper
+
+    # -- back
+
+    def _back(self, keeper: Keeper, end: int | None = None) -> None:
+        """Back from vertex ``end`` (None: from the last)."""
+        marks = keeper.marks
+        for k in reversed(range(len(marks))):
+            mark, until = marks[k], marks[k + 1].depth if k + 1 < len(marks) else end
+            state = replace(mark.state, radiance=torch.zeros_like(mark.state.radiance))
+            _, part = self._trace(state, mark.depth, mark.hit, until)
+            self._back(part, until)
+        for vertex in reversed(keeper.kept):
+            self._vertex(vertex)
+
+    def _vertex(self, vertex: Vertex) -> None:
+        state, hit, depth = vertex.state, vertex.hit, vertex.depth
+        slide = slides(self.plan, self.world, depth)
+        ends, groups = partition(self.world, hit)
+        chance, asked = self._chance(vertex)
+        hit = replace(hit, chance=chance)
+        limits = self.wave.limits
+        assert limits is not None
+        last = limits.max_depth if limits.max_depth >= 0 else ENDLESS
+        clear = iter(vertex.clear)
+        if depth < last:
+            for model, index in groups:
+                self._bounce(model, depth, slide, clear, state, hit, index, asked)
+        self._light(ends, slide, state, hit, asked)
+        if chance is not None and asked is not None:
+            found = torch.autograd.grad(chance, self.tensors, asked, allow_unused=True)
+            self._add(found)
+        if self.plan.attached:
+            for name in ("t", "prim", "u", "v"):
+                getattr(self.met, name).index_copy_(0, state.lane, getattr(hit, name))
+
+    def _chance(self, vertex: Vertex) -> tuple[Tensor | None, Tensor | None]:
+        """The chance to get here under a tape, where it has derivatives, and zeros for what is asked of it."""
+        if not self.passing:
+            return None, None
+        with torch.enable_grad(), gathered_by(self.sums):
+            chance = self.search.nearest(vertex.state, vertex.depth).chance
+        if chance is None or not chance.requires_grad:
+            return None, None
+        return chance, torch.zeros_like(chance)
+
+    def _bounce(
+        self,
+        model: int,
+        depth: int,
+        slide: bool,
+        clear: object,
+        state: PathState,
+        hit: Hit,
+        index: Tensor,
+        asked: Tensor | None,
+    ) -> None:
+        lane = take(state.lane, index)
+        following = rows(self.met, lane) if self.plan.attached else None
+        behind = Behind(
+            take(self.radiance, lane),
+            take(self.behind["throughput"], lane),
+            *(take(self.behind[name], lane) if self.plan.attached else None for name in ("o", "d")),
+        )
+
+        def passed(shadow: Shadow) -> Tensor:
+            kept = next(clear)  # type: ignore[call-overload]
+            return self.search.clear(shadow) if self.passing else kept
+
+        limits = self.wave.limits
+        assert limits is not None
+        with gathered_by(self.sums):
+            before = joint.bounce(
+                self.plan, self.world, model, limits.roulette(depth), slide, following, passed, rows(state, index),
+                rows(hit, index), behind, salts(depth, lane.device), self.taped.stages.pixel, self._others,
+            )  # fmt: skip
+        for name, rows_ in self.behind.items():
+            found = getattr(before, name)
+            rows_.index_copy_(1, lane, torch.zeros_like(behind.throughput) if found is None else found)
+        self._add(before.others)
+        if asked is not None and before.chance is not None:
+            asked.index_add_(0, index, before.chance)
+
+    def _light(self, ends: Ends, slide: bool, state: PathState, hit: Hit, asked: Tensor | None) -> None:
+        """Back through light that was met by chance; what a bounce asks of the same lanes is there already."""
+        table = self.world.lights
+        if table is None:
+            return
+        for index, here in ((ends.emissive, True), (ends.missed, False)):
+            if not len(index) or (not here and table.environment is None):
+                continue
+            lane = take(state.lane, index)
+            given = rows(state, index), rows(hit, index), take(self.radiance, lane), self._others
+            with gathered_by(self.sums):
+                before = (
+                    joint.emit(self.plan, self.world, slide, *given)
+                    if here
+                    else joint.escape(self.plan, self.world, *given)
+                )
+            for name, rows_ in self.behind.items():
+                found = getattr(before, name)
+                if found is not None:
+                    rows_.index_copy_(1, lane, take(rows_, lane) + found)
+            self._add(before.others)
+            if asked is not None and before.chance is not None:
+                asked.index_add_(0, index, before.chance)
+
+    def _camera(self, start: PathState) -> None:
+        """Back through the camera rays."""
+        if not self.plan.attached:
+            return
+        with torch.enable_grad(), gathered_by(self.sums):
+            state = self.taped.rays(*self.span)
+            pairs = [(x, self.behind[name]) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
+            if pairs:
+                found = torch.autograd.grad(
+                    [x for x, _ in pairs], self.tensors, [g for _, g in pairs], allow_unused=True
+                )
+                self._add(found)
+
+    def _others(self) -> Sequence[Tensor]:
+        return self.tensors
+
+    def _add(self, found: Sequence[Tensor | None]) -> None:
+        for number, gradient in enumerate(found):
+            if gradient is not None:
+                self.sums.add(number, gradient)

@@ -1,0 +1,170 @@
+"""Sums of gradients with respect to tables, in the order in which terms are added."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["Sums"]
+
+#: Tables of more numbers than this are summed in the lanes' own precision: few paths meet in one of so many places.
+WIDE = 1 << 20
+#: A chunk sums tables of no more numbers than this by itself.
+DENSE = 1 << 15
+
+
+class Sums:
+    """What was added up of the gradients of some tables.
+
+    Args:
+        tables: ``(..., M)`` each.
+    """
+
+    def __init__(self, tables: Sequence[Tensor]) -> None:
+        self.tables = tuple(tables)
+        self._numbers = {id(table): number for number, table in enumerate(self.tables)}
+        self._totals: list[Tensor | None] = [None] * len(self.tables)
+
+    def take(self, table: Tensor, index: Tensor) -> Tensor | None:
+        """See :class:`torchpt.math.gathers.Gathers`: the derivative of the look-up goes straight to the sums."""
+        number = self._numbers.get(id(table))
+        return None if number is None else _Taken.apply(table, index, self, number)
+
+    def total(self, number: int) -> Tensor:
+        """The sum of a table as ``(M, R)``, R numbers an entry."""
+        found = self._totals[number]
+        if found is None:
+            table = self.tables[number]
+            entries, width = _form(table)
+            dtype = torch.float64 if table.numel() <= WIDE else table.dtype
+            found = self._totals[number] = torch.zeros(entries, width, dtype=dtype, device=table.device)
+        return found
+
+    def add_at(self, number: int, index: Tensor, values: Tensor) -> None:
+        """Add ``values (..., n)`` to the entries ``index (n,)`` of a table, in their order."""
+        total = self.total(number)
+        values = values.reshape(total.shape[1], -1)
+        if total.device.type == "cpu":
+            from torchpt.adjoint.kernels import add_at
+
+            add_at(total.numpy(), index.numpy(), values.numpy())
+        else:
+            total.index_add_(0, index, values.T.to(total.dtype))
+
+    def add(self, number: int, gradient: Tensor) -> None:
+        """Add a gradient as large as the table."""
+        total = self.total(number)
+        total += gradient.reshape(total.shape[1], total.shape[0]).T
+
+    def join(self, part: Sums) -> None:
+        """Add the sums of a piece: all of them, or nothing where there is no memory for that."""
+        own = [
+            total if more is None else more if total is None else total + more
+            for total, more in zip(self._totals, part._totals, strict=True)
+        ]
+        self._totals = own
+
+    def merge(self, part: ChunkSums) -> None:
+        """Add the sums of a chunk."""
+        for number, total in part.dense.items():
+            self.total(number).add_(total)
+        for number, index, values in part.stream:
+            self.add_rows(number, index, values)
+
+    def clear(self) -> None:
+        """Forget what was added."""
+        self._totals = [None] * len(self.tables)
+
+    def add_rows(self, number: int, index: np.ndarray, values: np.ndarray) -> None:
+        """Add ``values (R, n)`` to the entries ``index (n,)`` of a table on a CPU, in their order."""
+        from torchpt.adjoint.kernels import add_at
+
+        add_at(self.total(number).numpy(), index, values)
+
+    def gradients(self) -> list[Tensor | None]:
+        """The sums in the shapes of their tables; None where nothing was added."""
+        return [
+            None if total is None else total.T.reshape(table.shape).to(table.dtype)
+            for total, table in zip(self._totals, self.tables, strict=True)
+        ]
+
+
+class ChunkSums:
+    """Sums of one chunk: dense ones of small tables, and of large ones the terms themselves.
+
+    Args:
+        tables: ``(..., M)`` each.
+        whole: where terms of large tables are added at once, as chunks come one after the other; None: they are kept.
+
+    Attributes:
+        dense: sums ``(M, R)`` float64 by the number of a table.
+        stream: numbers of tables, indices ``(n,)`` and values ``(R, n)``.
+    """
+
+    def __init__(self, tables: Sequence[Tensor], whole: Sums | None = None) -> None:
+        self.tables, self._whole = tuple(tables), whole
+        self._numbers = {id(table): number for number, table in enumerate(self.tables)}
+        self.dense: dict[int, Tensor] = {}
+        self.stream: list[tuple[int, np.ndarray, np.ndarray]] = []
+
+    def take(self, table: Tensor, index: Tensor) -> Tensor | None:
+        """See :class:`torchpt.math.gathers.Gathers`."""
+        number = self._numbers.get(id(table))
+        return None if number is None else _Taken.apply(table, index, self, number)
+
+    def add_at(self, number: int, index: Tensor, values: Tensor) -> None:
+        """See :class:`Sums`."""
+        _, width = _form(self.tables[number])
+        self.add_rows(number, index.to(torch.int32).numpy(), values.reshape(width, -1).numpy())
+
+    def add_rows(self, number: int, index: np.ndarray, values: np.ndarray) -> None:
+        """Add ``values (R, n)`` to the entries ``index (n,)`` int32 of a table, in their order."""
+        if self.tables[number].numel() > DENSE:
+            if self._whole is None:
+                self.stream.append((number, index.copy(), values.copy()))
+            else:
+                self._whole.add_rows(number, index, values)
+            return
+        from torchpt.adjoint.kernels import add_at
+
+        add_at(self._total(number).numpy(), index, values)
+
+    def add_all(self, number: int, values: np.ndarray) -> None:
+        """Add the sums over lanes of ``values (all numbers of a table, n)``."""
+        table = self.tables[number]
+        self.add(number, torch.from_numpy(values.sum(1, dtype=np.float64)).reshape(table.shape))
+
+    def add(self, number: int, gradient: Tensor) -> None:
+        """Add a gradient as large as the table."""
+        total = self._total(number)
+        total += gradient.reshape(total.shape[1], total.shape[0]).T
+
+    def _total(self, number: int) -> Tensor:
+        if number not in self.dense:
+            self.dense[number] = torch.zeros(*_form(self.tables[number]), dtype=torch.float64)
+        return self.dense[number]
+
+
+def _form(table: Tensor) -> tuple[int, int]:
+    """Entries and numbers of an entry: the last axis is the one that is looked up."""
+    return (table.shape[-1], math.prod(table.shape[:-1])) if table.dim() else (1, 1)
+
+
+class _Taken(torch.autograd.Function):
+    """Columns of a table, whose derivative is added to sums instead of being handed on."""
+
+    @staticmethod
+    def forward(ctx, table: Tensor, index: Tensor, sums: Sums | ChunkSums, number: int) -> Tensor:
+        ctx.save_for_backward(index)
+        ctx.sums, ctx.number = sums, number
+        return torch.index_select(table, table.dim() - 1, index)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[None, None, None, None]:  # pyright: ignore
+        (index,) = ctx.saved_tensors
+        ctx.sums.add_at(ctx.number, index, gradient)
+        return None, None, None, None

@@ -1,0 +1,147 @@
+"""Layers of first surfaces on a tape: their values under a tape of their own, and the edges that the camera sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from torchpt.edges.gradients import Boundary, boundary_of
+from torchpt.forward import limited_threads, make_wave, rebound
+from torchpt.integrators import LAYERS, aov
+from torchpt.integrators.layer import SurfaceLayer
+from torchpt.integrators.search import Search
+from torchpt.scene import Scene
+from torchpt.settings import Settings
+
+__all__ = ["Asked", "followed", "on_tape"]
+
+#: Lanes of a chunk of the interior.
+LANES = 1 << 15
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Whose gradients are wanted, and how.
+
+    Attributes:
+        scene: whose layers.
+        settings: of the backward pass.
+        wanted: names of the parameters.
+        dtype: of the lanes.
+        edges: samples of edges a pixel; 0: none.
+    """
+
+    scene: Scene
+    settings: Settings
+    wanted: tuple[str, ...]
+    dtype: torch.dtype
+    edges: int
+
+
+class _Layers(torch.autograd.Function):
+    """Layers as they were rendered; the backward pass looks at first surfaces again."""
+
+    @staticmethod
+    def forward(ctx: Any, work: Callable[..., Any], values: tuple[Tensor, ...], *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.work = work
+        ctx.save_for_backward(*tensors)
+        return tuple(value.clone() for value in values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return (None, None, *ctx.work(cotangents, *(t.detach() for t in ctx.saved_tensors)))
+
+
+def followed(settings: Settings) -> tuple[str, ...]:
+    """The layers that have gradients: of first surfaces, and no names of things."""
+    kinds = {name: LAYERS[name] for name in settings.film.aovs}
+    return tuple(name for name, kind in kinds.items() if issubclass(kind, SurfaceLayer) and kind.averaged)
+
+
+def on_tape(
+    layers: Mapping[str, Tensor],
+    tensors: tuple[Tensor, ...],
+    asked: Callable[[], Asked],
+    given: Callable[..., dict[str, Tensor]],
+) -> dict[str, Tensor]:
+    """The layers as functions of ``tensors``.
+
+    Args:
+        layers: as they were rendered, by name.
+        tensors: that are differentiated.
+        asked: what the backward pass is to do, once it is known.
+        given: from ``tensors`` to all parameters that replace the scene's.
+    """
+    names = tuple(layers)
+
+    def work(cotangents: tuple[Tensor, ...], *values: Tensor) -> list[Tensor | None]:
+        return _gradients(asked(), names, given(*values), cotangents)
+
+    found = _Layers.apply(work, tuple(layers.values()), *tensors)
+    assert found is not None
+    return dict(zip(names, found, strict=True))
+
+
+def _gradients(
+    asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], cotangents: tuple[Tensor, ...]
+) -> list[Tensor | None]:
+    """The gradients of the parameters that are wanted."""
+    scene, settings, unit = asked.scene, asked.settings, asked.scene.space.unit
+    kinds = [aov.surface_layer(name) for name in names]
+    worth = torch.cat([c * (unit if kind.length else 1.0) for c, kind in zip(cotangents, kinds, strict=True)], 2)
+    worth = worth.permute(2, 0, 1).to(asked.dtype)
+    with limited_threads(settings.render.threads):
+        total = _interior(asked, names, params, worth)
+        if not asked.edges:
+            return list(total)
+
+        def look(boundary: Boundary) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
+            traced, wave = boundary.traced, boundary.traced.wave
+            plan, world = wave.stages.plan, wave.stages.world
+            search = Search(wave.accel, world, plan.sampler, plan.dtype)
+
+            def values(o: Tensor, d: Tensor, key: Tensor) -> Tensor:
+                state = traced.state(o, d, key)
+                found = aov.first_hit(names, world, search, state, wave.centre, plan.dtype, wave.stages.pixel)
+                return torch.cat([found[name] for name in names]).double()
+
+            return values
+
+        boundary = boundary_of(scene, settings, params, asked.wanted, asked.dtype, worth)
+        if boundary is None:
+            return list(total)
+        moved = boundary.gradients(boundary.primary(asked.edges, look(boundary)), asked.wanted)
+    return [a if b is None else a + b.to(a.dtype) for a, b in zip(total, moved, strict=True)]
+
+
+def _interior(asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], worth: Tensor) -> tuple[Tensor, ...]:
+    """What the values at first surfaces bring, a chunk of pixels at a time."""
+    scene, settings = asked.scene, asked.settings
+    plain = {name: value.detach() for name, value in params.items()}
+    with torch.no_grad():
+        still = make_wave(scene, settings, plain, asked.dtype, True, True)
+    total = tuple(torch.zeros_like(plain[name]) for name in asked.wanted)
+    flat, spp = worth.reshape(len(worth), -1), settings.render.spp
+    pixels, samples = flat.shape[1], min(spp, LANES)
+    step = max(LANES // samples, 1)
+    for sample in range(0, spp, samples):
+        many = min(samples, spp - sample)
+        for first in range(0, pixels, step):
+            count = min(step, pixels - first)
+            with torch.enable_grad():
+                leaves = [plain[name].clone().requires_grad_() for name in asked.wanted]
+                wave = rebound(still, scene, settings, {**plain, **dict(zip(asked.wanted, leaves, strict=True))})
+                found = wave.layers(names, first, count, sample, many, slide=True)
+                mean = torch.cat([found[name] for name in names]).sum(1) / spp
+            if mean.requires_grad:
+                grads = torch.autograd.grad(mean, leaves, flat[:, first : first + count], allow_unused=True)
+                for sum_, grad in zip(total, grads, strict=True):
+                    if grad is not None:
+                        sum_ += grad
+    return total

@@ -1,0 +1,313 @@
+"""Edges of shadows: curves on surfaces along which light from one point begins to pass an edge.
+
+For a point y that light comes from, held on its surface, and a place p on an outline as y sees it, the ray from y past p meets
+a receiver at x: there, for this y, light begins. Seen by the camera the curve lies on the film, ``s = camera(x)``, and moves as
+y, p, the receiver and the camera do: see :mod:`torchpt.edges.primary`. Seen by way of further surfaces it lies on the receiver,
+``x`` against the point that is held there (the material form of Zhang, Miller, Yan, Gkioulekas, Zhao, *Path-Space
+Differentiable Rendering*, 2020, whose boundary segments these are): from x light is followed on toward the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.edges.bodies import Bodies, Held
+from torchpt.edges.curves import View
+from torchpt.edges.draws import Numbers
+from torchpt.edges.film import Worth, film_places, slopes
+from torchpt.edges.lit import Beam, Sources
+from torchpt.edges.occluders import Occluders, Passed
+from torchpt.edges.traced import Traced
+from torchpt.edges.vertices import Spot, met
+from torchpt.math.vectors import cross, dot, take
+from torchpt.math.warps import uniform_sphere
+
+__all__ = ["Cast", "Shadows"]
+
+#: Rays past an edge go so far beside it, against the way to it.
+_STEP = 2.0**-16
+#: What ends so close to an edge, against the way to it, ends at it.
+_NEAR = 2.0**-10
+#: The same where it ends at the edge's own surface, which may come forward quickly.
+_OWN = 2.0**-6
+#: Where a ray from a light begins, against the way to the edge.
+_BEGIN = 2.0**-12
+#: Vertices after which light that reaches no camera is given up where paths have no limit of their own.
+_MOST = 32
+#: From this vertex on roulette plays.
+_ROULETTE = 3
+
+
+@dataclass(frozen=True)
+class Cast:
+    """Samples of shadow edges; the derivative of the loss is that of :meth:`sum`.
+
+    Attributes:
+        beam: where light comes from.
+        source: ``(N,)`` column of ``Bodies.lights``, -1 for what is held on a surface, -2 for what does not move.
+        edge: the places past which it goes.
+        receiver: the points where it arrives.
+        normal: of the receiver ``(3, N)``.
+        film: weights ``(2, N)`` of places on the film.
+        surface: weights ``(3, N)`` of places against the receiver's own points; None where nobody asks.
+    """
+
+    beam: Beam
+    source: Tensor
+    edge: Held
+    receiver: Held
+    normal: Tensor
+    film: Tensor
+    surface: Tensor | None
+
+    def sum(self, bodies: Bodies) -> Tensor:
+        """Differentiable in ``bodies``; of no meaning but for its derivative."""
+        e, w = self._from(bodies), self.beam.view.w
+        p, held = bodies.points(self.edge), bodies.points(self.receiver)
+        toward = e - p * w
+        x = p - toward * (dot(self.normal, p - held) / dot(self.normal, toward))
+        value = (film_places(bodies.camera, x) * self.film).sum()
+        return value if self.surface is None else value + ((x - held) * self.surface).sum()
+
+    def _from(self, bodies: Bodies) -> Tensor:
+        e = torch.where(self.source == -1, bodies.points(self.beam.held), self.beam.view.e)
+        if not bodies.lights.shape[1]:
+            return e
+        own = take(bodies.lights, self.source.clamp_min(0))
+        far = torch.as_tensor(self.beam.view.w, device=e.device) == 0
+        return torch.where(self.source >= 0, torch.where(far, -own, own), e)
+
+
+@dataclass(frozen=True)
+class Shadows:
+    """The estimator of one render.
+
+    Attributes:
+        bodies: detached.
+        occluders: what throws shadows.
+        sources: the lights; None: what surfaces reflect.
+        traced: what sees.
+        numbers: of samples.
+        reach: radius of the scene.
+        depth: vertices of paths at most; -1: any number.
+        onward: whether light that reaches the camera by way of further surfaces counts too.
+    """
+
+    bodies: Bodies
+    occluders: Occluders
+    sources: Sources | None
+    traced: Traced
+    numbers: Numbers
+    reach: float
+    depth: int
+    onward: bool
+
+    @torch.no_grad()
+    def samples(self, first: int, count: int, total: int, worth: Worth) -> Cast | None:
+        """Samples ``first .. first + count`` of ``total``; None where none of them counts."""
+        number = torch.arange(first, first + count, device=self.bodies.p0.device)
+        u = (number.double() + self.numbers.of(number, 0)) / total
+        index, rest, chance = self.occluders.draw(u)
+        coin = self.numbers.of(number, 1)
+        if self.sources is not None:
+            beam = self.sources.draw(self.numbers, number)
+            passed = self.occluders.place(index, rest, chance, coin, beam.view)
+            beam = beam.taken(passed.lane)
+        else:
+            beam, passed = self._reflected(number, index, rest, chance, coin)
+        beam, passed, spot, outward = self._past(beam, passed)
+        if not len(passed.lane):
+            return None
+        return self._cast(take(number, passed.lane), beam, passed, spot, outward, worth, total)
+
+    def _reflected(
+        self, number: Tensor, index: Tensor, rest: Tensor, chance: Tensor, coin: Tensor
+    ) -> tuple[Beam, Passed]:
+        """Points of surfaces, by a direction from the edge; of edges that are the same from everywhere."""
+        away = uniform_sphere(torch.stack((self.numbers.of(number, 12), self.numbers.of(number, 13))))
+        known = (take(self.occluders.form, index) < 0).nonzero().squeeze(1)
+        index, rest, chance, coin, away = (take(x, known) for x in (index, rest, chance, coin, away))
+        passed = self.occluders.place(index, rest, chance, coin, View(away, 0.0))
+        away = take(away, passed.lane)
+        aside = cross(passed.along, away)
+        aside = aside / dot(aside, aside).sqrt() * (_STEP * self.reach)
+        spots = [met(self.traced, passed.p + aside * side, away) for side in (1.0, -1.0)]
+        far = [torch.where(spot.hit.prim >= 0, spot.hit.t, -1.0) for spot in spots]
+        first = far[0] >= far[1]
+        prim = torch.where(first, spots[0].hit.prim, spots[1].hit.prim)
+        y = torch.where(first, spots[0].p, spots[1].p).double()
+        numbers = [torch.where(first, getattr(spots[0].hit, k), getattr(spots[1].hit, k)) for k in ("u", "v")]
+        some = (prim >= 0).nonzero().squeeze(1)
+        prim, y = take(prim, some), take(y, some)
+        held = self._held(prim, take(torch.stack(numbers), some), y)
+        passed = passed.taken(some)
+        row = torch.full_like(prim, -1)
+        one = torch.ones_like(y[0])
+        beam = Beam(View(y, one), held, row, torch.zeros_like(y[:2]), one / (4.0 * math.pi))
+        lane = take(known, passed.lane)
+        return beam, Passed(lane, passed.held, passed.mate, passed.p, passed.along, passed.density)
+
+    def _past(self, beam: Beam, passed: Passed) -> tuple[Beam, Passed, Spot, Tensor]:
+        """Rays past edges: what they meet, and unit vectors ``(3, N)`` across the edge to the side that is lit."""
+        toward = beam.view.toward(passed.p)
+        w = torch.as_tensor(beam.view.w, device=toward.device).expand(toward.shape[1])
+        length = dot(toward, toward).sqrt()
+        o = torch.where(w > 0, passed.p + toward * (1.0 - _BEGIN), passed.p + toward * (4.0 * self.reach / length))
+        way = passed.p - o
+        aside = cross(passed.along, toward)
+        aside = aside / dot(aside, aside).sqrt()
+        step = aside * (dot(way, way).sqrt() * _STEP)
+        n = len(passed.lane)
+        t, prim = self.traced.nearest(torch.cat((o, o), 1), torch.cat((way + step, way - step), 1))
+        t, prim = t.view(2, n), prim.view(2, n)
+        own = (prim == passed.held.prim) | ((prim == passed.mate) & (passed.mate >= 0))
+        hidden = t < torch.where(own, 1.0 - _OWN, 1.0 - _NEAR)
+        near = (t < 1.0 + _NEAR) & ~hidden
+        far = (t > 1.0 + _NEAR) & (prim >= 0)
+        good = (near[0] & far[1]) | (near[1] & far[0])
+        index = good.nonzero().squeeze(1)
+        side = torch.where(take(far[0], index), 1.0, -1.0)
+        outward = take(aside, index) * side
+        spot = met(self.traced, take(o, index), take(way, index) + take(step, index) * side)
+        some = (spot.hit.prim >= 0).nonzero().squeeze(1)
+        index = take(index, some)
+        return beam.taken(index), passed.taken(index), spot.taken(some), take(outward, some)
+
+    def _cast(
+        self, number: Tensor, beam: Beam, passed: Passed, spot: Spot, outward: Tensor, worth: Worth, total: int
+    ) -> Cast:
+        x, n = spot.p.double(), spot.n.double()
+        toward = beam.view.toward(x)
+        wi = toward / dot(toward, toward).sqrt()
+        leaving = beam.view.toward(passed.p)
+        slope = dot(n, leaving)
+        stretch = 1.0 + dot(n, passed.p - x) / slope * beam.view.w
+
+        def follow(v: Tensor) -> Tensor:
+            return (v - leaving * (dot(n, v) / slope)) * stretch
+
+        along, across = follow(passed.along), follow(outward)
+        light = dot(n, wi).abs() / (passed.density * total)
+        if self.sources is not None:
+            brought = [self.sources.brought(beam, x) * light]
+        else:
+            brought = self._bounced(number, beam, passed, x, wi, light)
+        direct = self._seen(spot, wi, brought[0], worth)
+        _, jacobian = slopes(self.bodies.camera, x)
+        ds = (jacobian * along).sum(1)
+        normal = torch.stack((ds[1], -ds[0]))
+        sign = torch.sign((normal * (jacobian * across).sum(1)).sum(0))
+        film = torch.where(direct != 0, -normal * (sign * direct), 0.0)
+        surface = None
+        if self.onward:
+            edge = cross(n, along)
+            sign = torch.sign(dot(edge, across))
+            surface = -edge * (sign * self._followed(number, spot, wi, brought, worth))
+        receiver = self._held(spot.hit.prim, torch.stack((spot.hit.u, spot.hit.v)), x)
+        return Cast(beam, self._source(beam), passed.held, receiver, n, film, surface)
+
+    def _source(self, beam: Beam) -> Tensor:
+        """Columns of ``Bodies.lights``; see :class:`Cast`."""
+        if self.sources is None:
+            return beam.row
+        column = beam.row - self.sources.surfaces
+        around = self.sources.world.lights
+        assert around is not None
+        still = -1 if around.environment is None else len(around.area) - 1
+        return torch.where(column < 0, -1, torch.where(beam.row == still, -2, column))
+
+    def _bounced(
+        self, number: Tensor, beam: Beam, passed: Passed, x: Tensor, wi: Tensor, light: Tensor
+    ) -> list[Tensor]:
+        """What surfaces reflect from y to x, for paths of one vertex more each on the way from x to the camera."""
+        to = beam.view.e - passed.p
+        whole = beam.view.e - x
+        factor = light * dot(to, to) / (dot(whole, whole) * beam.chance)
+        integrator, key = self.traced.wave.integrator, self.traced.key(number, 2)
+        o = x + whole * _BEGIN
+        black = self.traced.radiance(o, wi, key, 1)
+        most = integrator.limits.max_depth
+        depths = [most] if most < 0 else [most - k for k in range(1, min(most - 1, 4))]
+        return [(self.traced.radiance(o, wi, key, depth) - black) * factor for depth in depths]
+
+    def _camera(self, spot: Spot) -> tuple[Tensor, Tensor, Tensor]:
+        """Which points the camera sees ``(n,)``, their places on the film, and directions to the camera."""
+        camera, x = self.bodies.camera, spot.p.double()
+        seen = camera.film_of(x)
+        assert seen is not None
+        s = film_places(camera, x)
+        width, height = camera.resolution
+        margin = 16.0  # pixels, for wide filters
+        good = (seen[2] > 0) & (seen[3] > 0) & (s > -margin).all(0) & (s[0] < width + margin) & (s[1] < height + margin)
+        index = good.nonzero().squeeze(1)
+        s, x = take(s, index), take(x, index)
+        o, d = camera.rays(s[0], s[1], None)
+        o = o.expand_as(d)
+        away = x - o
+        t, prim = self.traced.nearest(o, d)
+        reach = dot(away, d)
+        off = (t - reach).abs() / reach
+        visible = ((prim == take(spot.hit.prim, index)) & (off < _NEAR)) | (off < 2.0**-14)
+        some = visible.nonzero().squeeze(1)
+        return take(index, some), take(s, some), -take(d, some)
+
+    def _seen(self, spot: Spot, wi: Tensor, brought: Tensor, worth: Worth) -> Tensor:
+        """What light that arrives from ``wi`` is worth where the camera sees it ``(N,)``, by area of the film."""
+        found = torch.zeros_like(wi[0])
+        index, s, wo = self._camera(spot)
+        if len(index):
+            sent = spot.taken(index).sent(wo.to(spot.p), take(wi, index).to(spot.p)).double()
+            found[index] = (worth.at(s) * sent * take(brought, index)).sum(0)
+        return found
+
+    def _followed(self, number: Tensor, spot: Spot, wi: Tensor, brought: list[Tensor], worth: Worth) -> Tensor:
+        """What it is worth by way of further surfaces ``(N,)``, by area of the receiver."""
+        found, key = torch.zeros_like(wi[0]), self.traced.key(number, 1)
+        lane = torch.arange(len(number), device=number.device)
+        carried = torch.ones_like(wi)
+        limit = self.depth if self.depth >= 0 else _MOST
+        first = 1 if self.sources is not None else 2
+        for k in range(2, limit - first + 1):
+            o, d, weight = spot.scattered(wi.to(spot.p), take(key, lane), k)
+            weight = weight.double()
+            if k > _ROULETTE:
+                alive = weight.amax(0).clamp(0.0, 1.0)
+                lucky = self.numbers.of(take(number, lane), 20 + k) < alive
+                weight = torch.where(lucky, weight / torch.where(alive > 0, alive, 1.0), 0.0)
+            carried = carried * weight
+            on = (carried.amax(0) > 0).nonzero().squeeze(1)
+            lane, carried = take(lane, on), take(carried, on)
+            spot = met(self.traced, take(o, on), take(d, on))
+            some = (spot.hit.prim >= 0).nonzero().squeeze(1)
+            lane, carried, spot = take(lane, some), take(carried, some), spot.taken(some)
+            if not len(lane):
+                break
+            wi = -spot.d.double()
+            power = brought[min(k, len(brought)) - 1]
+            index, s, wo = self._camera(spot)
+            if not len(index):
+                continue
+            part = spot.taken(index)
+            sent = part.sent(wo.to(spot.p), take(wi, index).to(spot.p)).double()
+            _, jacobian = slopes(self.bodies.camera, part.p.double())
+            grown = dot(cross(jacobian[0], jacobian[1]), part.n.double()).abs()
+            back = take(lane, index)
+            value = (worth.at(s) * sent * take(carried, index) * take(power, back)).sum(0) * grown
+            found.index_add_(0, back, value)
+        return found
+
+    def _held(self, prim: Tensor, uv: Tensor, x: Tensor) -> Held:
+        """Points of surfaces, held there."""
+        a = torch.cat((uv.double(), torch.zeros_like(x[:1])))
+        bodies = self.bodies
+        if bodies.counts[3] or bodies.counts[4]:
+            bent = ((prim >= bodies.first_sphere) & (prim < sum(bodies.counts))).nonzero().squeeze(1)
+            p0, *axes = bodies.place(take(prim, bent))
+            faces = [cross(axes[1], axes[2]), cross(axes[2], axes[0]), cross(axes[0], axes[1])]
+            away, det = take(x, bent) - p0, dot(axes[0], faces[0])
+            a[:, bent] = torch.stack([dot(face, away) / det for face in faces])
+        return Held(prim, a)

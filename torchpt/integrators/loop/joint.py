@@ -1,0 +1,194 @@
+"""Vertices of paths gone back along, as kernels: each traces a stage of :mod:`torchpt.integrators.joint`, its tape included.
+
+The operators of the backward pass are nodes as those of the stage are. A look-up in a table that is differentiated is taken
+for an input of the lane, and its derivative is written to a row beside a row of the index: whoever runs the kernel adds them
+up. What is handed from vertex to vertex lies in *slots*, by the samples' own numbers: each path reads there what those behind
+it ask of the ray that left, and leaves what it asks of the ray that came.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.integrators import joint
+from torchpt.integrators.joint import Before, Behind
+from torchpt.integrators.loop.rows import HIT, Fields, Rows
+from torchpt.integrators.loop.trace import Trace
+from torchpt.lanes.graph import Unsupported
+from torchpt.lanes.operators.derivatives import summands
+from torchpt.lanes.sinks import Scatter, Sinks
+from torchpt.lanes.tracing import Tracer
+from torchpt.math.gathers import gathered_by
+from torchpt.records import Hit, PathState, Shadow
+
+if TYPE_CHECKING:
+    from torchpt.integrators.loop.joint_kernels import JointKernels
+
+__all__ = ["SLOTS", "back_bounce", "back_emit", "back_escape", "report"]
+
+#: What lies in slots: what is asked of a sample's radiance and of its ray, how much of the light of its latest shadow ray got
+#: through, and what its next ray met.
+SLOTS: Fields = {
+    "radiance": ((3,), "f"),
+    "throughput": ((3,), "f"),
+    "o": ((3,), "f"),
+    "d": ((3,), "f"),
+    "clear": ((), "f"),
+    **HIT,
+}
+
+
+class _Noted:
+    """Look-ups of a trace in tables that are differentiated."""
+
+    def __init__(self, tracer: Tracer, kernels: JointKernels) -> None:
+        self.tracer, self.kernels = tracer, kernels
+        self.taken: list[tuple[int, Tensor, Tensor]] = []
+        self._known: dict[tuple[int, int], Tensor] = {}
+
+    def take(self, table: Tensor, index: Tensor) -> Tensor | None:
+        """See :class:`torchpt.math.gathers.Gathers`."""
+        number = self.kernels.numbers_of.get(id(table))
+        if number is None or not self.tracer.is_traced(index):
+            return None
+        key = number, id(index)
+        if key not in self._known:
+            plain = self.kernels.plain[number]
+            with torch.no_grad():
+                found = torch.index_select(plain, plain.dim() - 1, index)
+            self._known[key] = found.detach().requires_grad_()
+            self.taken.append((number, index, self._known[key]))
+        return self._known[key]
+
+    def leaves(self) -> list[Tensor]:
+        """Inputs of the lane, then the tables themselves."""
+        return [*(leaf for _, _, leaf in self.taken), *self.kernels.tapes]
+
+
+def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks:
+    """See :func:`torchpt.integrators.joint.bounce`."""
+    kernels, tracer = _begun(trace)
+    salts = trace.salts()
+    state, hit, rows = _given(trace)
+    behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"))
+    following = Hit(*(rows[name] for name in HIT)) if kernels.joint_plan.attached else None
+
+    def clear(_: Shadow) -> Tensor:
+        return rows["clear"]
+
+    noted = _Noted(tracer, kernels)
+    with tracer, gathered_by(noted):
+        before = joint.bounce(
+            kernels.joint_plan, kernels.taped, model, roulette, slide, following, clear, state, hit, behind, salts,
+            kernels.taped_pixel, noted.leaves,
+        )  # fmt: skip
+    return _ended(trace, noted, state, before, {})
+
+
+def back_emit(trace: Trace, slide: bool) -> Sinks:
+    """See :func:`torchpt.integrators.joint.emit`."""
+    kernels, tracer = _begun(trace)
+    state, hit, rows = _given(trace)
+    noted = _Noted(tracer, kernels)
+    with tracer, gathered_by(noted):
+        before = joint.emit(kernels.joint_plan, kernels.taped, slide, state, hit, rows["radiance"], noted.leaves)
+    return _ended(trace, noted, state, before, rows)
+
+
+def back_escape(trace: Trace) -> Sinks:
+    """See :func:`torchpt.integrators.joint.escape`."""
+    kernels, tracer = _begun(trace)
+    state, hit, rows = _given(trace)
+    noted = _Noted(tracer, kernels)
+    with tracer, gathered_by(noted):
+        before = joint.escape(kernels.joint_plan, kernels.taped, state, hit, rows["radiance"], noted.leaves)
+    return _ended(trace, noted, state, before, rows)
+
+
+def report(trace: Trace) -> Sinks:
+    """What the rays and shadow rays of an arena met, for the vertex before."""
+    layout, tracer = trace.layout, trace.tracer
+    lane = layout.state.read(tracer, "lane")["lane"]
+    hit = layout.state.read(tracer, *HIT)
+    light = layout.state.read(tracer, "clear", "blocked")
+    slots = Rows(SLOTS)
+    with tracer:
+        clear = light["clear"] if "clear" in light else torch.zeros(tracer.lanes)
+        if "blocked" in light and "clear" not in light:
+            clear = (light["blocked"] == 0).to(torch.float32)
+    rows = tuple(slots.nodes(tracer, clear=clear, **hit))
+    return Sinks(scatter=[Scatter(-1, trace.node(lane), rows, slots=True)])
+
+
+def _begun(trace: Trace) -> tuple[Any, Tracer]:
+    trace.tracer.graph.derivatives = True
+    return trace.layout, trace.tracer
+
+
+def _given(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
+    """State, hit, and what lies in the slots."""
+    state, _ = trace.state()
+    hit = trace.hit()
+    tracer, lane, slots = trace.tracer, trace.node(state.lane), Rows(SLOTS)
+    kernels: Any = trace.layout
+    names = tuple(SLOTS) if kernels.joint_plan.attached else ("radiance", "throughput", "clear")
+    return state, hit, slots.read(tracer, *names, place=lane)
+
+
+def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added: dict[str, Tensor]) -> Sinks:
+    """Rows of derivatives by tables, and what is asked of the ray that came; ``added`` to what lies there."""
+    kernels: Any = trace.layout
+    tracer, graph = trace.tracer, trace.tracer.graph
+    fields: dict[str, Tensor] = {}
+    with tracer:
+        for name in ("throughput", "o", "d") if kernels.joint_plan.attached else ("throughput",):
+            found = getattr(before, name)
+            if found is None and added:
+                continue
+            found = torch.zeros_like(state.throughput) if found is None else found
+            fields[name] = found + added[name] if added else found
+    sinks = Sinks()
+    if fields:
+        rows = tuple(Rows(SLOTS).nodes(tracer, **fields))
+        sinks.scatter.append(Scatter(-1, trace.node(state.lane), rows, slots=True))
+    columns: dict[tuple[int, int], list[int]] = {}
+    for (number, index, _), gradient in zip(noted.taken, before.others, strict=False):
+        if gradient is None:
+            continue
+        places = tracer.get(index).nodes.reshape(-1)
+        values: Any = tracer.get(gradient).nodes.reshape(-1, len(places))
+        for k, place in enumerate(places):
+            key = number, graph.cast(place, "i")
+            mine, known = [int(x) for x in values[:, k]], columns.get(key)
+            if known is not None:
+                mine = [graph.binary("add", "f", a, b) for a, b in zip(known, mine, strict=True)]
+            columns[key] = mine
+    places_of: dict[int, int] = {}  # rows of indices
+
+    def written(nodes: list[int]) -> int:
+        """Rows of their own, side by side; returns the first."""
+        first = len(sinks.write)
+        sinks.write += [(first + k, node) for k, node in enumerate(nodes)]
+        return first
+
+    zero = graph.constant("f", 0)
+    for (number, place), nodes in columns.items():
+        if all(node == zero for node in nodes):
+            continue
+        if place not in places_of:
+            places_of[place] = written([place])
+        trace.sums.append((number, places_of[place], written(nodes), len(nodes)))
+    for number, gradient in enumerate(before.others[len(noted.taken) :]):
+        if gradient is None:
+            continue
+        nodes = np.broadcast_to(tracer.get(gradient).nodes, tuple(kernels.plain[number].shape)).reshape(-1)
+        lanes = [summands(graph, int(node)) for node in nodes]
+        if any(node is not None for node in lanes):
+            if len(lanes) > 64:
+                raise Unsupported("a derivative by all of a table in every lane")
+            trace.sums.append((number, -1, written([zero if node is None else node for node in lanes]), len(lanes)))
+    return sinks

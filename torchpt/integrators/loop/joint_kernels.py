@@ -1,0 +1,76 @@
+"""The kernels of a backward pass: those of the paths as they are traced again, and those that go back along them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from torch import Tensor
+
+from torchpt.integrators.compiled import Stages
+from torchpt.integrators.loop import joint
+from torchpt.integrators.loop.kernels import Kernel, Kernels
+from torchpt.integrators.loop.rows import Rows
+from torchpt.integrators.wave import Wave
+from torchpt.lanes.graph import Unsupported
+
+__all__ = ["JointKernels"]
+
+_STAGES = {"bounce": joint.back_bounce, "emit": joint.back_emit, "escape": joint.back_escape}
+
+
+class JointKernels(Kernels):
+    """The kernels of one backward pass.
+
+    Args:
+        wave: with plain tensors.
+        taped: the same with leaves in place of those that are differentiated.
+        plain: tensors that are differentiated, as the wave has them.
+        tapes: their leaves.
+        packets: see :class:`~torchpt.integrators.loop.layout.Layout`.
+
+    Attributes:
+        joint_plan: of the vertices that are gone back along.
+        taped: their world.
+        taped_pixel: see :func:`torchpt.integrators.surfaces.texture_point_at`.
+        numbers_of: which of the leaves a tensor is, by its id.
+        back_eager: stages that no kernel can be made of, and why.
+        slots: rows of :data:`torchpt.integrators.loop.joint.SLOTS`.
+    """
+
+    def __init__(
+        self, wave: Wave, taped: Wave, plain: Sequence[Tensor], tapes: Sequence[Tensor], packets: bool
+    ) -> None:
+        self.joint_plan = wave.stages.plan
+        # Paths are traced as they are where no geometry is differentiated: the same values, and hits found between stages.
+        plan = replace(self.joint_plan, attached=False)
+        still = replace(wave, stages=Stages(plan, wave.stages.world, wave.stages.pixel))
+        super().__init__(still, packets, False)
+        self.taped, self.taped_pixel = taped.stages.world, taped.stages.pixel
+        self.plain, self.tapes = tuple(plain), tuple(tapes)
+        self.numbers_of = {id(tape): number for number, tape in enumerate(tapes)}
+        paths = [self._leaves.ids[id(one)][0] if id(one) in self._leaves.ids else None for one in plain]
+        for path, tape in zip(paths, tapes, strict=True):
+            if path is not None:
+                self._leaves.ids[id(tape)] = path, tape
+        self._structure = (*self._structure, self.joint_plan.attached, tuple(paths))
+        self.slots = Rows(joint.SLOTS)
+        self.back_eager: dict[tuple[Any, ...], str] = {}
+
+    def back_kernel(self, key: tuple[Any, ...]) -> Kernel | None:
+        """The kernel of ``("bounce", model, roulette, slide)``, ``("emit", slide)`` or ``("escape",)`` gone back through.
+
+        None: none can be made; :attr:`back_eager` says why.
+        """
+        if key in self.back_eager:
+            return None
+        try:
+            return self._get(True, _STAGES[key[0]], *key[1:])
+        except Unsupported as error:
+            self.back_eager[key] = str(error)
+            return None
+
+    def report(self) -> Kernel:
+        """See :func:`torchpt.integrators.loop.joint.report`."""
+        return self._get(False, joint.report)
