@@ -159,17 +159,17 @@ def _rendered(
 
 
 def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
-    """Settings of a render that returns a tensor; a scene file's wishes for layers and to denoise are about files.
+    """Settings of a render that returns a tensor; a scene file's wishes for layers and to denoise are for files.
 
     Raises:
         SceneError: such a wish of the caller's own.
     """
-    if (film or {}).get("aovs"):
+    if (film or {}).get("aovs") and settings.integrator.light:  # else the picture is a layer
         raise SceneError("film.aovs", settings.film.aovs, "none, or full=True: a tensor is one picture, without layers")
     if (film or {}).get("denoise") and settings.film.denoise:
         expected = "false, or full=True: a tensor is one picture; hand it to torchpt.denoise with its layers"
         raise SceneError("film.denoise", True, expected)
-    return replace(settings, film=settings.film.but(denoise=False, aovs=()))
+    return replace(settings, film=settings.film.but(denoise=False))
 
 
 def _check(

@@ -47,14 +47,17 @@ SCENE: dict[str, Any] = {
 }
 
 
-class Grey(torchpt.Bsdf, torch.nn.Module):
+class Grey(torchpt.Bsdf):
     """A model of the user's own that holds a weight."""
 
     name = "grey"
 
     def __init__(self) -> None:
-        torch.nn.Module.__init__(self)
-        self.shade = torch.nn.Parameter(torch.tensor(0.5))
+        self.own = torch.nn.ParameterDict({"shade": torch.tensor(0.5)})
+
+    @property
+    def shade(self) -> Tensor:
+        return self.own["shade"]
 
     def eval(self, parameters: Any, wo: Tensor, wi: Tensor) -> Tensor:
         return (self.shade / torch.pi * wi[2].clamp_min(0.0) * (wo[2] > 0)).expand(3, -1)
@@ -62,7 +65,7 @@ class Grey(torchpt.Bsdf, torch.nn.Module):
     def pdf(self, parameters: Any, wo: Tensor, wi: Tensor) -> Tensor:
         return wi[2].clamp_min(0.0) / torch.pi * (wo[2] > 0)
 
-    def sample(self, parameters: Any, wo: Tensor, lobe: Tensor, u: Tensor) -> BsdfSample:
+    def sample(self, parameters: Any, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
         wi = cosine_hemisphere(u)
         pdf = self.pdf(parameters, wo, wi)
         return BsdfSample(wi, pdf, self.shade.expand(3, wo.shape[1]) * (pdf > 0))
@@ -153,9 +156,9 @@ def test_parameters_that_require_gradients_are_differentiated_as_they_are():
     scene = torchpt.load(SCENE, "cpu")
     given = scene.params[RED].clone().requires_grad_()
     torchpt.render(scene, params={RED: given}).sum().backward()
-    scene.params[RED].requires_grad_()
+    own = scene.params[RED].requires_grad_()
     torchpt.render(scene).sum().backward()
-    assert given.grad is not None and scene.params[RED].grad.equal(given.grad)
+    assert given.grad is not None and own.grad is not None and own.grad.equal(given.grad)
     with torch.no_grad():
         assert not torchpt.render(scene).requires_grad
     fixed = scene.params[RED].detach().clone()
