@@ -170,8 +170,8 @@ def counting(*args):
 programs._traced = counting
 scene = torchpt.load("cornell_box", "cpu")
 wish = dict(film={"width": 16, "height": 16, "aovs": ["albedo"]}, threads=1)
-image = torchpt.render(scene, spp=4, **wish)
-torchpt.render(scene, spp=300, seed=5, **wish)
+image = torchpt.render(scene, spp=4, full=True, **wish).image
+torchpt.render(scene, spp=300, seed=5, full=True, **wish)
 print(*engine.counts(), traced[0], float(image.double().sum()).hex())
 """
 

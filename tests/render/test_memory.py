@@ -92,7 +92,7 @@ def same(a: Any, b: Any) -> bool:
     )
 
 
-@pytest.mark.parametrize("step", [53, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [211, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_failure_at_any_operation_of_a_piece_changes_no_bit(box, step):
     """Each operation of a render fails once, the copies into the films included."""
     with in_pieces(lambda k: False, MemoryError) as counted:
@@ -276,7 +276,7 @@ def limited(mode: str, more: int) -> tuple[str, str]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
-@pytest.mark.parametrize("mode", ["off", "on"])
+@pytest.mark.parametrize("mode", [pytest.param("off", marks=pytest.mark.slow), "on"])
 def test_under_a_limit_of_addresses_the_bits_are_the_same_or_it_is_one_line(mode):
     whole, _ = limited(mode, 0)
     same_bits = 0
@@ -319,7 +319,9 @@ WISHES = {
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
-@pytest.mark.parametrize("name", WISHES)
+@pytest.mark.parametrize(
+    "name", ["compiled", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pilots", "eager"))]
+)
 def test_too_small_a_limit_names_the_least_that_works(name):
     measured("8GB", WISHES[name])  # kernels are compiled once a machine, which takes memory of its own
     said, _ = measured("1MB", WISHES[name])
