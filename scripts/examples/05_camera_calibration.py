@@ -21,7 +21,7 @@ from torch import Tensor
 import torchpt
 
 EYE, FOV = [0.35, 0.2, 2.7], 46.0
-TURN, SHIFT, FOV_AT_START = torch.tensor([0.06, -0.08, 0.07]), torch.tensor([0.25, -0.2, 0.3]), 54.0
+TURN, SHIFT, FOV_AT_START = torch.tensor([0.05, -0.06, 0.05]), torch.tensor([0.2, -0.15, 0.25]), 52.0
 AHEAD = 3.0
 
 
