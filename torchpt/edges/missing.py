@@ -42,5 +42,5 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
 
 
 def _sharp(scene: Scene, name: str) -> bool:
-    cutoff, beam = (float(scene.params[f"{name}.{key}"]) for key in ("cutoff_angle", "beam_width"))
+    cutoff, beam = (float(scene.params[f"{name}.{key}"].detach()) for key in ("cutoff_angle", "beam_width"))
     return beam > 0.999 * cutoff

@@ -9,6 +9,7 @@ import numpy as np
 from torchpt.format.description import Description
 from torchpt.lights import order
 from torchpt.records import KINDS
+from torchpt.scene.coordinates import check_coordinates
 from torchpt.scene.materials import declare, resolved
 from torchpt.scene.parameters import Parameters
 from torchpt.scene.parts import Copy, Part, Source
@@ -63,6 +64,7 @@ def build_parts(description: Description) -> Built:
     sources = sources_of(description, parameters)
     sources = sorted([*sources, *builder.sources], key=lambda source: order(source.kind))
     parameters.declare_all("camera", description.camera.kind, description.camera.values)
+    check_coordinates(parts, parameters.stated, description.file)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)
     warn_of_touching(parts, copies, description.file)

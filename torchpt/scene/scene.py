@@ -21,6 +21,7 @@ from torchpt.cameras import Camera, PinholeMatrices
 from torchpt.cameras.opencv import extrinsics
 from torchpt.errors import RenderError, SceneError
 from torchpt.format.description import Description, Source, read_description, settings
+from torchpt.format.tensors import Tensors
 from torchpt.native.memory import Meter, mb
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
@@ -29,6 +30,7 @@ from torchpt.scene.build import Built, build_parts
 from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, middle_of
+from torchpt.scene.traced import traced, widened
 from torchpt.settings import Film, Settings
 from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
@@ -48,7 +50,9 @@ def load(
 
     Args:
         source: the name of a scene that ships, a path ending in ``.yaml``, an open file, YAML text (of more than one line),
-            or a dict of the same schema. Relative paths in it start at the file's folder, else at the current one.
+            or a dict of the same schema. Relative paths in it start at the file's folder, else at the current one. In a dict
+            numbers, colours, poses, texels and vertices may be arrays, and tensors on any device: those that require
+            gradients get them from every picture (docs/scenes.md, *Tensors in dicts*).
         device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
             ``render.device``, which is ``auto`` where it does not say.
         bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
@@ -59,9 +63,11 @@ def load(
         RenderError: the device is not there.
     """
     start = time.perf_counter()
-    description = read_description(source, bsdfs)
+    tensors = Tensors()
+    description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
     chosen = device_of(settings(description).render.device if device is None else device)
-    scene = Scene(description, chosen, tuple((bsdfs or {}).values()))
+    scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()))
+    scene.params |= traced(tensors, scene.description, scene.params)
     scene.load_seconds = time.perf_counter() - start
     return scene
 
@@ -77,6 +83,11 @@ def device_of(name: str | torch.device) -> torch.device:
         found = f"{torch.cuda.device_count()} CUDA devices" if torch.cuda.is_available() else "no CUDA device"
         raise RenderError(f"render.device: {name} is not available; this machine has {found}")
     return device
+
+
+def _leaf(value: Tensor) -> Tensor:
+    """A parameter as a copy apart from its tape has it: one made of others becomes a tensor of its own."""
+    return value if value.is_leaf else value.detach().requires_grad_()
 
 
 class Scene:
@@ -144,7 +155,7 @@ class Scene:
     def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
         """Another scene of copied tensors and models; what its description came to never changes, and is shared."""
         return self._copied(
-            self.device, {name: copy.deepcopy(value, memo) for name, value in self.params.items()}, memo
+            self.device, {name: copy.deepcopy(_leaf(value), memo) for name, value in self.params.items()}, memo
         )
 
     def _copied(self, device: torch.device, params: dict[str, Tensor], memo: dict[int, Any] | None) -> Scene:
@@ -160,7 +171,8 @@ class Scene:
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy in another process is made of: files are not read again."""
-        return {name: getattr(self, name) for name in _KEPT}
+        held = {name: getattr(self, name) for name in _KEPT}
+        return held | {"params": {name: _leaf(value) for name, value in self.params.items()}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         settle()

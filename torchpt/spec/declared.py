@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import create_model
 
 from torchpt.errors import NotBuiltError, SceneError
@@ -188,6 +189,8 @@ def _reader(spec: Spec, texture: ReadTexture | None) -> Callable[[Any], Any]:
     def read(value: Any) -> Any:
         if isinstance(value, str) and isinstance(spec, Map):
             value = {"texture": value}
+        elif isinstance(value, np.ndarray) and value.ndim > 1:
+            value = {"type": "image", "data": value}
         return texture(value, spec) if isinstance(value, Mapping) else spec.read(value)
 
     return read
