@@ -20,7 +20,7 @@ from torchpt.errors import (
 )
 
 if TYPE_CHECKING:
-    from torchpt import ibl
+    from torchpt import cameras, ibl
     from torchpt.bsdfs import Bsdf
     from torchpt.forward import Rendering
     from torchpt.images import metrics, read_header, read_image, read_layers, write_image
@@ -42,6 +42,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "TorchptError",
+    "cameras",
     "denoise",
     "from_trimesh",
     "ibl",
@@ -70,7 +71,7 @@ _LAZY = {
 }
 
 #: Public modules.
-_MODULES = {"ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics"}
+_MODULES = {"cameras": "torchpt.cameras", "ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics"}
 
 
 def __getattr__(name: str) -> Any:

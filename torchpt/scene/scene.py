@@ -298,6 +298,11 @@ class Scene:
         pose = torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype)
         return camera.kind.on(pose, (film.width, film.height), values)
 
+    def film_size(self, film: Mapping[str, Any] | None = None) -> tuple[int, int]:
+        """Width and height in pixels of the whole film, under film settings in place of the scene's own."""
+        wished = settings(self.description, {"film": film or {}}).film
+        return wished.width, wished.height
+
     def pinhole(
         self,
         params: Mapping[str, Tensor] | None = None,
