@@ -227,7 +227,7 @@ def to_pytorch3d(
 def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
     """Numbers in float64, of a shape or a batch of one."""
     try:
-        found = torch.as_tensor(value).double()
+        found = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
         raise SceneError(key, value, "numbers") from None
     if shape is not None and found.shape == (1, *shape):
@@ -240,7 +240,7 @@ def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
 def _pose(matrix: Any) -> Tensor:
     """``(3, 4)`` of a ``(4, 4)`` or ``(3, 4)``, its axes of length 1."""
     try:
-        found = torch.as_tensor(matrix).double()
+        found = torch.as_tensor(matrix, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError):
         raise SceneError("matrix", matrix, "a matrix (4, 4) or (3, 4)") from None
     if found.shape not in ((4, 4), (3, 4)):
