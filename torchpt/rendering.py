@@ -18,6 +18,7 @@ from torchpt.forward import Progress, Rendering, Run, limited_threads
 from torchpt.images.denoiser import check_denoiser, denoise
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.scene import Scene
+from torchpt.scene.textured import with_texels
 from torchpt.settings import FILTERS, Settings
 from torchpt.spec.declared import Described
 
@@ -90,7 +91,8 @@ def render(
         scene: from :func:`torchpt.load`.
         spp: samples a pixel; the most of them where ``time_limit`` or ``target_error`` may end it.
         seed: any integer from 0; the same seed gives the same picture.
-        params: tensors in place of ``scene.params`` by dotted name. Where one of them requires gradients, so does the picture.
+        params: tensors in place of ``scene.params`` by dotted name; in a material's number or colour also texels ``(H, W, C)``.
+            Where one of them requires gradients, so does the picture.
         full: True returns a :class:`torchpt.Rendering`: picture, layers, error, counts and seconds as one object.
 
     Other arguments, all as in the scene file; ``None`` keeps the scene's own wish:
@@ -131,6 +133,7 @@ def render(
         check_denoiser()
     if torch.is_grad_enabled():
         params = {name: value for name, value in scene.params.items() if value.requires_grad} | dict(params or {})
+    scene = with_texels(scene, params)
     scene.check(params)
     backward = {"seed": seed_grad, "spp": spp_grad, "edges": edge_spp if edges else 0}
     rendering = _rendered(scene, settings, backward, params or {}, dtype, adjoint or adjoints.KINDS[0])

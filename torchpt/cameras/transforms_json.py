@@ -145,6 +145,10 @@ def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
         raise AssetError(path, f"{key}.transform_matrix: expected {error.expected}") from None
 
 
+def _numbers(value: Any) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float64).detach().cpu()
+
+
 def _row(frame: Frame, key: str) -> dict[str, Any]:
     """A frame as the file has it."""
     camera, size = frame.camera, frame.size
@@ -157,18 +161,18 @@ def _row(frame: Frame, key: str) -> dict[str, Any]:
             sorted(camera),
             "to_world or R and t, and K or fov: as frame_of and read_transforms give them",
         )
-    given = [torch.as_tensor(camera[name], dtype=torch.float64).detach().cpu() for name in ("to_world", "R", "t") if name in camera]
+    given = [_numbers(camera[name]) for name in ("to_world", "R", "t") if name in camera]
     pose = given[0] if len(given) == 1 else opencv_pose(*given)
     wide, tall = size
     if camera.get("K") is not None:
-        inner = torch.as_tensor(camera["K"], dtype=torch.float64).detach().cpu()
+        inner = _numbers(camera["K"])
         scale = wide / camera.get("size", size)[0]
         (fx, fy), (cx, cy) = (inner.diagonal()[:2] * scale).tolist(), (inner[:2, 2] * scale).tolist()
     else:
         axis = camera.get("fov_axis", "x")
         if axis not in ("x", "y"):
             raise SceneError(f"{key}.camera.fov_axis", axis, "x or y")
-        half = math.radians(float(torch.as_tensor(camera["fov"], dtype=torch.float64).detach())) * 0.5
+        half = math.radians(float(_numbers(camera["fov"]))) * 0.5
         fx = fy = 0.5 * (wide if axis == "x" else tall) / math.tan(half)
         cx, cy = 0.5 * wide, 0.5 * tall
     matrix = pose * pose.new_tensor([-1.0, 1.0, -1.0, 1.0]) + 0.0  # no -0.0

@@ -134,6 +134,7 @@ class Scene:
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
         self._state: dict[str, tuple[Tensor, int]] = {}
+        self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.textured`
 
     def to(self, device: str | torch.device) -> Scene:
         """The scene on a device, which may be ``auto``: itself where it is there already, else a copy.
@@ -196,6 +197,10 @@ class Scene:
         held = sum(value.numel() * value.element_size() for value in self.params.values())
         return f"{len(self._built.parts)} parts with {triangles} vertices, whose parameters alone take {mb(held)}"
 
+    def use(self, built: Built) -> None:
+        """Come to something else, of the same parameters by name, before anything was made of them."""
+        self._built = built
+
     @property
     def built(self) -> Built:
         """What its description came to, static."""
@@ -223,7 +228,8 @@ class Scene:
             shape = self.params[name].shape
             if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
                 found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
-                raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}")
+                texels = ", or texels (H, W, C)" if self.spec(name).texture else ""
+                raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}{texels}")
             self._check(name, value.detach())
         check_sources(self._built.sources, params or {}, self.merged(params))
 

@@ -1,0 +1,96 @@
+"""Texels where a scene has a number or a colour: the scene with a texture in that place, made once and kept beside it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchpt.bsdfs.resolved import ResolvedMaterial
+from torchpt.errors import NotBuiltError, SceneError
+from torchpt.format.textures import texture_of
+from torchpt.scene.build import Built
+from torchpt.scene.coordinates import check_coordinates
+from torchpt.scene.parameters import Parameters
+from torchpt.scene.scene import Scene
+from torchpt.scene.texels import Opener
+from torchpt.spec import Refused
+from torchpt.textures import Node
+
+__all__ = ["with_texels"]
+
+
+def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
+    """The scene itself, or where texels are given for numbers and colours of its materials one that reads them there.
+
+    The second one shares the tensors, meshes and pictures of the first; its search structures are its own.
+
+    Args:
+        scene: as it was loaded.
+        params: tensors in place of its own.
+
+    Raises:
+        SceneError: texels where the scene's materials cannot read any, that are out of range, or on a mesh without uvs.
+        NotBuiltError: texels for what a material tabulates.
+    """
+    loaded = scene.built.parameters
+    given = {**scene.params, **(params or {})}
+    texels = {name: value for name, value in given.items() if name in loaded and _is_texels(value, loaded[name].ndim)}
+    if not texels:
+        return scene
+    key = tuple(sorted((name, value.shape[2]) for name, value in texels.items()))
+    made = scene.textured.get(key)
+    if made is None:
+        made = copy.copy(scene)
+        made.use(_built(scene, texels))
+        scene.textured[key] = made
+    for name in made.params:
+        made.params[name] = given[name].detach() if name in texels else scene.params[name]
+    return made
+
+
+def _is_texels(value: object, dimensions: int) -> bool:
+    return dimensions < 2 and isinstance(value, Tensor) and value.dim() == 3 and value.is_floating_point()
+
+
+def _built(scene: Scene, texels: Mapping[str, Tensor]) -> Built:
+    """What the scene came to, with nodes in place of numbers."""
+    before, file = scene.built, scene.description.file
+    parameters = Parameters()
+    parameters |= before.parameters
+    parameters.specs |= before.parameters.specs
+    parameters.stated |= before.parameters.stated | texels.keys()
+    opener = Opener({}, scene.description.resolve, parameters, file)
+    materials = {m.name: m for owner in (*before.parts, *before.copies) for m in owner.material.all()}
+    nodes: dict[str, dict[str, Node]] = {}
+    for name, value in texels.items():
+        stem, _, slot = name.rpartition(".")
+        material, spec = materials.get(stem), before.parameters.specs[name]
+        if material is None or slot not in material.values or not spec.texture:
+            expected = f"a floating tensor of shape {before.parameters[name].shape}, not texels"
+            raise SceneError(f"params.{name}", f"shape {tuple(value.shape)}", expected)
+        if slot in material.model.tabulated:
+            expected = f"a number, as {material.model.name} tabulates what depends on it"
+            raise NotBuiltError(f"params.{name}", "a texture", expected)
+        if slot == "weight" and any(inner.model.sheer or inner.opacity != 1.0 for inner in material.inner):
+            raise NotBuiltError(f"params.{name}", "a texture", "a number where light passes one of the two by chance")
+        del parameters[name], parameters.specs[name]
+        array = value.detach().to("cpu", torch.float32).numpy()
+        try:
+            texture = texture_of({"type": "image", "data": array}, spec)
+        except Refused as error:
+            raise SceneError(f"params.{name}", error.value, error.expected) from None
+        nodes.setdefault(stem, {})[slot] = opener(texture, name)
+    parts = tuple(replace(part, material=_reading(part.material, nodes)) for part in before.parts)
+    copies = tuple(replace(copied, material=_reading(copied.material, nodes)) for copied in before.copies)
+    check_coordinates([*parts], texels, file)
+    return replace(before, parts=parts, copies=copies, parameters=parameters)
+
+
+def _reading(material: ResolvedMaterial, nodes: Mapping[str, Mapping[str, Node]]) -> ResolvedMaterial:
+    """A material that reads nodes, by its name and their slots; so do those that it blends."""
+    inner = tuple(_reading(one, nodes) for one in material.inner)
+    return replace(material, values={**material.values, **nodes.get(material.name, {})}, inner=inner)
