@@ -39,6 +39,7 @@ SCENE: dict[str, Any] = {
         "pipe": {"type": "cylinder", "center": [-1.0, 0.0, 0.0], "radius": 0.2, "height": 1.0, "material": "tiles"},
         "hat": {"type": "cone", "apex": [1.0, 0.8, 0.0], "height": -0.7, "slope": 0.5, "emission": [0.2, 0.1, 0.3]},
         "quad": {"type": "mesh", "vertices": QUAD, "faces": [[0, 1, 2], [0, 2, 3]],
+                 "normals": [[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.1, 0.1, 1.0], [0.0, 0.1, 1.0]],
                  "uvs": [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]],
                  "material": {"type": "diffuse", "reflectance": {"type": "image", "data": [[0.2, 0.4], [0.6, 0.8]]}},
                  "transform": [{"look_at": {"origin": [0.0, 0.0, -2.0], "target": [0.1, 0.0, 0.0]}}]},
@@ -92,6 +93,8 @@ PLACES = {
     "shapes.hat.emission": "shapes.hat.emission",
     "shapes.quad.vertices": "shapes.quad.vertices",
     "shapes.quad.vertices.2": "shapes.quad.vertices",
+    "shapes.quad.normals": "shapes.quad.normals",
+    "shapes.quad.uvs": "shapes.quad.uvs",
     "shapes.quad.material.reflectance.data": "shapes.quad.material.reflectance",
     "shapes.quad.transform.0.look_at.origin": "shapes.quad.to_world",
     "shapes.quad.transform.0.look_at.target": "shapes.quad.to_world",
@@ -106,15 +109,19 @@ PLACES = {
 }
 
 
-def placed(key: str, change: Callable[[Any], Any], scene: dict[str, Any] = SCENE) -> dict[str, Any]:
-    """The scene with what stands at a dotted key changed."""
-    scene = copy.deepcopy(scene)
-    owner: Any = scene
+def put(key: str, change: Callable[[Any], Any], scene: dict[str, Any]) -> dict[str, Any]:
+    """The scene, in which what stands at a dotted key is changed; its tensors stay what they are."""
     *path, last = [int(part) if part.isdecimal() else part for part in key.split(".")]
+    owner: Any = scene
     for part in path:
         owner = owner[part]
-    owner[last] = change(owner[last])
+    owner[last] = change(owner.get(last) if isinstance(owner, dict) else owner[last])  # pyright: ignore
     return scene
+
+
+def placed(key: str, change: Callable[[Any], Any], scene: dict[str, Any] = SCENE) -> dict[str, Any]:
+    """A copy of the scene with what stands at a dotted key changed."""
+    return put(key, change, copy.deepcopy(scene))
 
 
 def wanted(value: Any, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -149,6 +156,8 @@ def test_parameters_follow_the_tensors_they_are_made_of(key: str, plain: torchpt
 
     def moved(sign: float) -> Tensor:
         other = torchpt.load(placed(key, lambda x: np.asarray(x) + sign * step * way.numpy()), "cpu")
+        if name.endswith((".normals", ".uvs")):  # parameters only where they are asked for
+            return torch.from_numpy(np.asarray(other.description.shapes["quad"][name.rpartition(".")[2]]))
         return torch.from_numpy(np.asarray(other.built.parameters[name], np.float64))
 
     expected = ((moved(1.0) - moved(-1.0)) * weight).sum() / (2.0 * step)
@@ -172,7 +181,7 @@ def test_a_picture_is_differentiated_as_by_params() -> None:
     plain["shapes"]["ball"] = {**SCENE["shapes"]["ball"], "material": "red"}
     scene = copy.deepcopy(plain)
     for key in keys:
-        scene = _put(key, tensor, scene)
+        scene = put(key, tensor, scene)
     loaded, still = torchpt.load(scene, "cpu"), torchpt.load(plain, "cpu")
     picture = torchpt.render(loaded, seed_grad=3, edges=False)
     names = [name for name, value in loaded.params.items() if value.requires_grad]
@@ -188,14 +197,37 @@ def test_a_picture_is_differentiated_as_by_params() -> None:
         assert torch.allclose(value.grad, gradient, rtol=1e-5, atol=1e-6 * float(gradient.abs().max())), key
 
 
-def _put(key: str, change: Callable[[Any], Any], scene: dict[str, Any]) -> dict[str, Any]:
-    """As :func:`placed`, in the scene itself: its tensors stay what they are."""
-    owner: Any = scene
-    *path, last = [int(part) if part.isdecimal() else part for part in key.split(".")]
-    for part in path:
-        owner = owner[part]
-    owner[last] = change(owner[last])
-    return scene
+def test_normals_and_texture_coordinates_have_the_pictures_gradients() -> None:
+    """Against differences; a pixel's change is smooth, as texels are as wide as several of them."""
+    paint = torch.linspace(0.1, 0.9, 12).reshape(2, 2, 3).flip(0)
+    plain: dict[str, Any] = {
+        **{key: SIMPLE[key] for key in ("film", "render", "camera")},
+        "integrator": {"type": "direct"},
+        "shapes": {"quad": {"type": "mesh", "vertices": QUAD, "faces": [[0, 1, 2], [0, 2, 3]],
+                            "normals": [[0.0, 0.1, 1.0], [0.1, 0.0, 1.0], [-0.1, 0.0, 1.0], [0.0, -0.1, 1.0]],
+                            "uvs": [[0.3, 0.3], [0.7, 0.3], [0.7, 0.7], [0.3, 0.7]],
+                            "material": {"type": "diffuse", "reflectance": paint}}},
+        "lights": {"lamp": {"type": "point", "position": [1.0, 1.0, 3.0], "intensity": 10.0}},
+    }  # fmt: skip
+    weight = torch.linspace(0.2, 1.4, 16 * 16 * 3).reshape(16, 16, 3)
+    for key in ("shapes.quad.normals", "shapes.quad.uvs"):
+        tensor = wanted(_at(key, plain))
+        way = torch.linspace(1.0, -0.6, tensor.numel(), dtype=torch.float64).reshape(tensor.shape)
+        scene = torchpt.load(placed(key, lambda _, t=tensor: t, plain), "cpu")
+        (torchpt.render(scene, seed_grad=0, dtype=torch.float64, edges=False) * weight).sum().backward()
+        found = []
+        for step in (1e-3, -1e-3):
+            moved = placed(key, lambda _, x=tensor.detach() + step * way: x, plain)
+            found.append((torchpt.render(torchpt.load(moved, "cpu"), dtype=torch.float64) * weight).sum())
+        assert tensor.grad is not None
+        assert torch.isclose((tensor.grad * way).sum(), (found[0] - found[1]) / 2e-3, rtol=2e-3), key
+
+
+def _at(key: str, scene: dict[str, Any]) -> Any:
+    found: Any = scene
+    for part in key.split("."):
+        found = found[part]
+    return found
 
 
 def test_a_tensor_that_fits_is_the_parameter_itself() -> None:
@@ -266,7 +298,9 @@ WRONG = {
     "lights.sky.data": (torch.full((2, 2, 3), -1.0), "sky.data: expected numbers >= 0"),
     "lights.spot.intensity": (torch.tensor([True, False, True]), "intensity: expected"),
     "film.width": (torch.tensor(16.0, requires_grad=True), "film.width: expected numbers without gradients"),
-    "shapes.quad.uvs": (torch.rand(4, 2, requires_grad=True), "quad.uvs: expected numbers without gradients"),
+    "lights.spot": ({"type": "constant", "radiance": [torch.rand((), requires_grad=True), 2, "a"]}, "radiance: expected"),
+    "textures.squares.scale": (torch.tensor(4.0, requires_grad=True), "squares.scale: expected numbers without gradients"),
+    "camera.size": (torch.tensor([8, 8]), "camera.size: expected a size only beside K"),
     "materials.mix.weight": (torch.rand(2, 2).to_sparse(), "weight: expected a dense tensor"),
     "shapes.hat.emission": (torch.rand(2, 2, 3), "emission: expected"),
 }  # fmt: skip
@@ -283,7 +317,7 @@ def test_what_is_wrong_with_a_tensor_is_one_line(key: str) -> None:
 def test_gradients_of_a_feature_that_is_left_out_are_refused() -> None:
     none = torch.tensor(0.0, requires_grad=True)
     with pytest.raises(SceneError, match=r"red.metallic: expected numbers without gradients"):
-        torchpt.load(_put("materials.red.metallic", lambda _: none, _with("materials.red", metallic=0.0)), "cpu")
+        torchpt.load(put("materials.red.metallic", lambda _: none, _with("materials.red", metallic=0.0)), "cpu")
 
 
 def _with(key: str, **more: Any) -> dict[str, Any]:
@@ -292,7 +326,7 @@ def _with(key: str, **more: Any) -> dict[str, Any]:
 
 def test_texels_where_a_number_or_a_colour_stands() -> None:
     texels, rough = wanted(torch.rand(3, 2, 3).tolist(), torch.float32), wanted([[0.3, 0.6]], torch.float32)
-    scene = _put("materials.red.roughness", lambda _: rough, _with("materials.red", base_color=None))
+    scene = put("materials.red.roughness", lambda _: rough, _with("materials.red", base_color=None))
     scene["materials"]["red"]["base_color"] = texels
     loaded = torchpt.load(scene, "cpu")
     assert loaded.params["materials.red.base_color"] is texels
@@ -330,3 +364,15 @@ def test_opencv_matrices_keep_their_gradients() -> None:
     gradients = torch.autograd.grad(found.K[:2].sum() + found.t.sum(), (matrix, move))
     assert torch.allclose(gradients[0][[0, 0, 1, 1], [0, 2, 1, 2]], torch.ones(4, dtype=torch.float64), atol=1e-5)
     assert torch.allclose(gradients[1], torch.ones(3, dtype=torch.float64), atol=1e-5)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("at", "scene_on"), [("cuda", "cpu"), ("cpu", "cuda")])
+def test_tensors_may_lie_on_another_device(at: str, scene_on: str) -> None:
+    """Gradients go back to where they came from."""
+    given = [torch.tensor(value, device=at, requires_grad=True) for value in ([0.7, 0.1, 0.1], 0.7)]
+    scene = put("materials.red.reflectance", lambda _: given[0], copy.deepcopy(SIMPLE))
+    loaded = torchpt.load(put("shapes.ball.radius", lambda _: given[1], scene), scene_on)
+    assert all(value.device.type == scene_on for value in loaded.params.values())
+    torchpt.render(loaded).sum().backward()
+    assert all(value.grad is not None and value.grad.device.type == at and value.grad.any() for value in given)

@@ -1,14 +1,24 @@
-"""Texels that a scene states itself lie by texture coordinates: a mesh without any is refused, once all materials are known."""
+"""Texture coordinates and normals of meshes: those that gradients are wanted of, and meshes that lack what texels need."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
 from torchpt.errors import SceneError
+from torchpt.scene.parameters import Parameters
 from torchpt.scene.parts import Part
+from torchpt.spec import Corners
 from torchpt.textures.atlas import ImageNode
 
-__all__ = ["check_coordinates"]
+__all__ = ["check_coordinates", "declare_corners"]
+
+
+def declare_corners(parts: Sequence[Part], traced: Collection[str], parameters: Parameters) -> None:
+    """Make normals and texture coordinates of meshes parameters, those that are asked for by name."""
+    for part in parts if traced else ():
+        for key, value in (("normals", part.normals), ("uvs", part.uvs)):
+            if value is not None and f"{part.name}.{key}" in traced:
+                parameters.declare(f"{part.name}.{key}", value, Corners())
 
 
 def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str | None) -> None:

@@ -6,7 +6,7 @@ import copy
 import difflib
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from torchpt.scene.build import Built, build_parts
 from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, middle_of
-from torchpt.scene.traced import traced, widened
+from torchpt.scene.traced import corners_in, traced, widened
 from torchpt.settings import Film, Settings
 from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
@@ -66,7 +66,7 @@ def load(
     tensors = Tensors()
     description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
     chosen = device_of(settings(description).render.device if device is None else device)
-    scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()))
+    scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
     scene.params |= traced(tensors, scene.description, scene.params)
     scene.load_seconds = time.perf_counter() - start
     return scene
@@ -104,7 +104,13 @@ class Scene:
             ``torchpt.render(scene, params=...)``.
     """
 
-    def __init__(self, description: Description, device: torch.device, own_models: tuple[Bsdf, ...] = ()) -> None:
+    def __init__(
+        self,
+        description: Description,
+        device: torch.device,
+        own_models: tuple[Bsdf, ...] = (),
+        traced: Collection[str] = (),
+    ) -> None:
         settle()
         meter = Meter(device)
         meter.base()  # only now all modules are there
@@ -112,7 +118,7 @@ class Scene:
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
         with needing("the files and shapes of the scene"):
-            self._built: Built = build_parts(description)
+            self._built: Built = build_parts(description, traced)
         # Geometry far from the origin would lose its detail in float32 before it can be moved there.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {

@@ -23,7 +23,7 @@ from torchpt.shapes.base import Place, Size
 from torchpt.spec import parameters_of
 from torchpt.spec.declared import Described
 
-__all__ = ["traced", "widened"]
+__all__ = ["corners_in", "traced", "widened"]
 
 _POSES = ("origin", "target", "up", "to_world", "R", "t")
 #: A number of a pinhole that ``K`` says is left out where it is this one.
@@ -32,6 +32,9 @@ _EXPECTED = (
     "numbers without gradients (detach() them): no parameter of the scene is made of them, or none with the value that they "
     "have; scene.params lists what is differentiable"
 )
+
+#: Of a mesh, what is a parameter only where its gradients are wanted.
+_CORNERS = ("normals", "uvs")
 
 Params = Mapping[str, Tensor]
 
@@ -44,6 +47,11 @@ def widened(description: Description, tensors: Tensors) -> Description:
     values = {**camera.values, **angles(camera["K"], camera["size"])}
     values |= {key: plain for key, plain in _PLAIN.items() if values[key] is None}
     return replace(description, camera=Described(camera.kind, values, camera.given))
+
+
+def corners_in(tensors: Tensors) -> set[str]:
+    """Names of meshes' normals and texture coordinates whose gradients are wanted: parameters of no other scene."""
+    return {_dotted(("shapes", *key[:2])) for key in tensors.under("shapes") if len(key) > 1 and key[1] in _CORNERS}
 
 
 def traced(tensors: Tensors, description: Description, params: Params) -> dict[str, Tensor]:
@@ -136,8 +144,8 @@ def _shape(
         for prefix in stems:
             yield from _named(key, tensors, params, lambda n, p=prefix: p + n.removeprefix(f"{stem}.material."))
         assert inner
-    elif part == "vertices" and shape["displacement"] is None:
-        yield f"{stem}.vertices", _value(key[:3], tensors, device)
+    elif part in ("vertices", *_CORNERS) and shape["displacement"] is None:
+        yield f"{stem}.{part}", _value(key[:3], tensors, device)
     elif part == "emission":
         yield from _named(key, tensors, params)
 

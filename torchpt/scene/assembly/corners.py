@@ -14,10 +14,15 @@ from torchpt.shapes.primitive import PRIMITIVES, Corners
 __all__ = ["Corners", "corners_of"]
 
 
+#: Arrays of a mesh that may be parameters.
+_OWN = ("vertices", "normals", "uvs")
+
+
 def corners_of(part: Part, parameters: Mapping[str, Tensor], space: Space, dtype: torch.dtype) -> Corners:
     """Place a part in the lanes' coordinates."""
     # They are folded into the pose in float64, before anything is rounded to the lanes' dtype.
     pose = parameters[f"{part.name}.to_world"].double()
     if part.local is not None:
         pose = pose @ torch.from_numpy(part.local).to(pose.device)
-    return PRIMITIVES[part.kind].corners(part, space.pose(pose), dtype, parameters.get(f"{part.name}.vertices"))
+    own = {key: parameters[f"{part.name}.{key}"] for key in _OWN if f"{part.name}.{key}" in parameters}
+    return PRIMITIVES[part.kind].corners(part, space.pose(pose), dtype, own)

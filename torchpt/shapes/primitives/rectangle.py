@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -22,7 +23,7 @@ class Rectangle(Primitive):
     name = "rectangle"
 
     @classmethod
-    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, vertices: Tensor | None) -> Corners:
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
         """See :class:`Primitive`: Mitsuba's unit shape [-1, 1]^2 from its lower corner."""
         move, x, y, mirrored = axes_of(pose)
         x, y = 2.0 * x, 2.0 * y
