@@ -217,7 +217,8 @@ def test_normals_and_texture_coordinates_have_the_pictures_gradients() -> None:
         (torchpt.render(scene, seed_grad=0, dtype=torch.float64, edges=False) * weight).sum().backward()
         found = []
         for step in (1e-3, -1e-3):
-            moved = placed(key, lambda _, x=tensor.detach() + step * way: x, plain)
+            other = tensor.detach() + step * way
+            moved = placed(key, lambda _, x=other: x, plain)
             found.append((torchpt.render(torchpt.load(moved, "cpu"), dtype=torch.float64) * weight).sum())
         assert tensor.grad is not None
         assert torch.isclose((tensor.grad * way).sum(), (found[0] - found[1]) / 2e-3, rtol=2e-3), key

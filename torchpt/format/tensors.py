@@ -22,6 +22,7 @@ Key = tuple[str | int, ...]
 
 #: One-dimensional arrays up to this length are read as lists, as the vectors and pairs of a file are.
 _LISTED = 64
+_PLAIN = frozenset({int, float, str, bool, type(None)})
 
 
 class Tensors:
@@ -65,7 +66,7 @@ class Tensors:
         if isinstance(item, dict):
             return {name: self._read(value, (*key, name)) for name, value in item.items()}
         if isinstance(item, list):
-            if all(type(value) in (int, float) for value in item):  # the rows of an inline mesh
+            if _PLAIN.issuperset(map(type, item)):  # the rows of an inline mesh
                 return item
             return [self._read(value, (*key, index)) for index, value in enumerate(item)]
         if isinstance(item, Tensor):
