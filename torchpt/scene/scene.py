@@ -67,7 +67,7 @@ def load(
     description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
     chosen = device_of(settings(description).render.device if device is None else device)
     scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
-    scene.params |= traced(tensors, scene.description, scene.params)
+    scene.params |= traced(tensors, scene.description, scene.built, scene.params)
     scene.load_seconds = time.perf_counter() - start
     return scene
 
