@@ -59,10 +59,14 @@ def test_texels_by_params_are_those_of_the_dict() -> None:
 def test_other_sizes_and_other_parameters_follow() -> None:
     scene = torchpt.load(SCENE, "cpu")
     torchpt.render(scene, params={WALL: TEXELS})
+    torchpt.render(scene, params={WALL: TEXELS * 0.5})
+    assert len(scene.textured) == 1  # made once
     larger = torch.rand(7, 4, 3)
     scene.params["lights.sky.radiance"].mul_(0.5)
     found = torchpt.render(scene, params={WALL: larger})
-    assert len(scene.textured) == 1  # made once
+    for size in range(1, 7):
+        torchpt.render(scene, spp=1, params={WALL: torch.rand(size, 2, 3)})
+    assert len(scene.textured) == 4
     other = written(larger, 0.4)
     other.params["lights.sky.radiance"].mul_(0.5)
     assert found.equal(torchpt.render(other))

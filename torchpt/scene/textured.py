@@ -23,6 +23,10 @@ from torchpt.textures import Node
 __all__ = ["with_texels"]
 
 
+#: Scenes with texels that are kept beside one, the latest.
+KEPT = 4
+
+
 def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
     """The scene itself, or where texels are given for numbers and colours of its materials one that reads them there.
 
@@ -41,11 +45,14 @@ def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
     texels = {name: value for name, value in given.items() if name in loaded and _is_texels(value, loaded[name].ndim)}
     if not texels:
         return scene
-    key = tuple(sorted((name, value.shape[2]) for name, value in texels.items()))
+    # By size, so that threads that render with different ones at a time do not share a scene.
+    key = tuple(sorted((name, tuple(value.shape)) for name, value in texels.items()))
     made = scene.textured.get(key)
     if made is None:
         made = copy.copy(scene)
         made.use(_built(scene, texels))
+        for oldest in list(scene.textured)[: max(0, len(scene.textured) + 1 - KEPT)]:
+            scene.textured.pop(oldest, None)
         scene.textured[key] = made
     for name in made.params:
         made.params[name] = given[name].detach() if name in texels else scene.params[name]
