@@ -75,11 +75,11 @@ class Sums:
         self._totals = own
 
     def merge(self, part: ChunkSums) -> None:
-        """Add the sums of a chunk."""
-        for number, total in part.dense.items():
-            self.total(number).add_(total)
+        """Add the sums of a chunk: its terms of large tables first, as they come where they are added at once."""
         for number, index, values in part.stream:
             self.add_rows(number, index, values)
+        for number, total in part.dense.items():
+            self.total(number).add_(total)
 
     def clear(self) -> None:
         """Forget what was added."""
