@@ -12,7 +12,9 @@ from torchpt.errors import (
     AssetError,
     EdgeWarning,
     EnergyWarning,
+    LostRankError,
     NotBuiltError,
+    OtherRankError,
     OutputError,
     RenderError,
     SceneError,
@@ -20,7 +22,7 @@ from torchpt.errors import (
 )
 
 if TYPE_CHECKING:
-    from torchpt import ibl
+    from torchpt import ibl, ranks
     from torchpt.bsdfs import Bsdf
     from torchpt.forward import Rendering
     from torchpt.images import metrics, read_header, read_image, read_layers, write_image
@@ -35,7 +37,9 @@ __all__ = [
     "Bsdf",
     "EdgeWarning",
     "EnergyWarning",
+    "LostRankError",
     "NotBuiltError",
+    "OtherRankError",
     "OutputError",
     "RenderError",
     "Rendering",
@@ -47,6 +51,7 @@ __all__ = [
     "ibl",
     "load",
     "metrics",
+    "ranks",
     "read_header",
     "read_image",
     "read_layers",
@@ -70,7 +75,7 @@ _LAZY = {
 }
 
 #: Public modules.
-_MODULES = {"ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics"}
+_MODULES = {"ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics", "ranks": "torchpt.ranks"}
 
 
 def __getattr__(name: str) -> Any:

@@ -125,8 +125,7 @@ def by_film(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -
     for part, count, samples in parts:
         budget = budget_of(settings, wave.centre.device, tape_per_lane(settings))
         budget.most = min(budget.most, max(TAPE // tape_per_lane(settings), 1))
-        for _ in Waves(budget, "the tape of a single lane").through(partial(add, part), count, 0, samples):
-            pass
+        assembly.through(Waves(budget, "the tape of a single lane"), partial(add, part), count, samples)
 
 
 @dataclass(frozen=True)

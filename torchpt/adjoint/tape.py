@@ -40,10 +40,9 @@ def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> N
 
     budget = budget_of(settings, wave.centre.device, tape_per_lane(settings))
     budget.most = min(budget.most, max(TAPE // tape_per_lane(settings), 1))
-    for _ in Waves(budget, "the tape of a single lane").through(
-        whole, wave.crop[2] * wave.crop[3], 0, settings.render.spp
-    ):
-        pass
+    assembly.through(
+        Waves(budget, "the tape of a single lane"), whole, wave.crop[2] * wave.crop[3], settings.render.spp
+    )
 
 
 def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:
