@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpt import __version__
-from torchpt.commands import collector, keys
+from torchpt.commands import collector, keys, ranked
 from torchpt.commands.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.commands.compare import HELP as HELP_COMPARE
 from torchpt.commands.compare import compare
@@ -31,7 +31,7 @@ from torchpt.commands.streams import ready, speaking
 from torchpt.commands.stress import HELP as HELP_STRESS
 from torchpt.commands.stress import stress
 from torchpt.commands.sweep_folder import sweep_folder
-from torchpt.errors import TorchptError
+from torchpt.errors import LostRankError, OtherRankError, TorchptError
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -87,7 +87,7 @@ def run() -> None:
     """The console script."""
     collector.pause()
     ready()
-    sys.exit(main())
+    sys.exit(ranked.main_of_ranks(main, sys.argv[1:]) if ranked.several() else main())
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -156,7 +156,7 @@ def _say(text: str) -> int:
 
 
 def _refuse(line: str) -> int:
-    print("torchpt: " + " ".join(line.split("\n")), file=sys.stderr)
+    ranked.say("torchpt: " + " ".join(line.split("\n")))
     return 2
 
 
@@ -198,6 +198,8 @@ class _Task:
                 if self.debug:
                     return debug(job, Wish.read(self.debug), interrupt, self.json)
                 return info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
+            except (LostRankError, OtherRankError) as error:
+                return ranked.parted(error)
             except TorchptError as error:
                 return _refuse(str(error))
             except Interrupted as interrupted:

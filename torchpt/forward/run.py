@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchpt.errors import RenderError
+from torchpt.errors import LostRankError, RenderError
 from torchpt.film import Film
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.budget import check_memory
@@ -124,9 +124,14 @@ class Run:
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, or as many as the rules or ``on_progress`` let."""
         self.on_progress = on_progress
-        with needing("a render"):
-            self._all()
-            self._join()
+        try:
+            with needing("a render"):
+                self._all()
+                self._join()
+        except LostRankError as error:
+            if not self.keeps:
+                raise
+            raise LostRankError(f"{error}; render.resume=true goes on from the last checkpoint") from None
         loaded("eager" if self.loop is None else "compiled")
         return self._picture()
 
