@@ -11,7 +11,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.errors import LostRankError, OtherRankError, TorchptError
@@ -66,13 +66,17 @@ def main_of_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
         with Interrupt() as interrupt:
             from torchpt.ranks.launch import Started
 
-            _started = Started(interrupt.check)
-    except TorchptError as error:
+            _started = Started()
+            _started.meet(interrupt.check)
+    except LostRankError as error:
+        _leave(parted(error))
+    except TorchptError as error:  # of the environment, which is the same for all
         if first:
             print(f"torchpt: {error}", file=sys.stderr)
         return 2
     except Interrupted as interrupted:
-        return interrupted.exit_code
+        say("torchpt: stopped by a signal, before all ranks were there", about="lost")
+        _leave(interrupted.exit_code)
     _stderr = sys.stderr
     if not first:
         sys.stdout = sys.stderr = open(os.devnull, "w")  # to the end of the process
@@ -81,7 +85,6 @@ def main_of_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
     except BaseException:
         traceback.print_exc(file=_stderr)
         _leave(1)
-    return 1
 
 
 def _ended(main: Callable[[list[str]], int], words: list[str]) -> int:
@@ -100,10 +103,9 @@ def _ended(main: Callable[[list[str]], int], words: list[str]) -> int:
         except LostRankError as error:  # while it wrote the picture, say
             code = parted(error)
     _leave(code)
-    return code
 
 
-def _leave(code: int) -> None:
+def _leave(code: int) -> NoReturn:
     """End the process at once: threads of connections that are broken might keep it."""
     for stream in (sys.stdout, sys.stderr, _stderr):
         if stream is not None:

@@ -54,7 +54,7 @@ class Run:
     ) -> None:
         self.start = time.perf_counter()
         self.split = None if group is None or group.size == 1 else Split(group)
-        self.shared = 0, 1  # samples before this pass, and how many ranks take it
+        self.shared: tuple[int, int] = 0, 1  # samples before this pass, and how many ranks take it
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
         meter = Meter(self.device)

@@ -60,7 +60,7 @@ class Group:
             raise RenderError("ranks: this process is not in the process group")
         # One of its own: what others send over theirs is never mixed up with it.
         try:
-            self._of = dist.new_group(
+            own = dist.new_group(
                 members,
                 timedelta(seconds=timeout),
                 "gloo",
@@ -68,7 +68,8 @@ class Group:
             )
         except RuntimeError as error:
             raise LostRankError(f"ranks: no connection between all of them ({_first_line(error)})") from None
-        self._dist = dist
+        assert isinstance(own, dist.ProcessGroup)
+        self._dist, self._of = dist, own
         self.rank, self.size, self.timeout, self.over = members.index(dist.get_rank()), len(members), timeout, False
 
     # -- a few numbers
