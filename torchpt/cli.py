@@ -68,6 +68,8 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
                       writes x_0.exr, x_1.exr, ...
   --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
 
+  torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/ranks.md)
+
 The last line on stdout is a summary in JSON. Samples that are not finite count as black, and stderr says why.
 Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the partial picture saved.
 """
