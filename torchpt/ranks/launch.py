@@ -87,9 +87,9 @@ class Started:
         timeout = timedelta(seconds=self._timeout)
         store, rank, size = next(iter(rendezvous("env://", timeout=timeout)))
         # torchrun keeps its store where it starts all ranks again, with the addresses of those that are gone.
-        store = PrefixStore(f"torchpt/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
-        self._store = store.clone()  # a connection of its own: who waits by one keeps it for himself
-        dist.init_process_group("gloo", store=store, rank=rank, world_size=size, timeout=timeout)
+        own: Any = PrefixStore(f"torchpt/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
+        self._store = own.clone()  # a connection of its own: who waits by one keeps it for himself
+        dist.init_process_group("gloo", store=own, rank=rank, world_size=size, timeout=timeout)
         self.group = Group(timeout=self._timeout)
         local = os.environ.get("LOCAL_RANK", "")
         if torch.cuda.is_available() and local.isdigit():  # `auto` and `cuda` are one GPU for each rank of a machine
