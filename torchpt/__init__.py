@@ -12,7 +12,9 @@ from torchpt.errors import (
     AssetError,
     EdgeWarning,
     EnergyWarning,
+    LostRankError,
     NotBuiltError,
+    OtherRankError,
     OutputError,
     RenderError,
     SceneError,
@@ -20,7 +22,7 @@ from torchpt.errors import (
 )
 
 if TYPE_CHECKING:
-    from torchpt import cameras, ibl
+    from torchpt import cameras, ibl, ranks
     from torchpt.bsdfs import Bsdf
     from torchpt.forward import Rendering
     from torchpt.images import metrics, read_header, read_image, read_layers, write_image
@@ -35,7 +37,9 @@ __all__ = [
     "Bsdf",
     "EdgeWarning",
     "EnergyWarning",
+    "LostRankError",
     "NotBuiltError",
+    "OtherRankError",
     "OutputError",
     "RenderError",
     "Rendering",
@@ -48,6 +52,7 @@ __all__ = [
     "ibl",
     "load",
     "metrics",
+    "ranks",
     "read_header",
     "read_image",
     "read_layers",
@@ -71,7 +76,12 @@ _LAZY = {
 }
 
 #: Public modules.
-_MODULES = {"cameras": "torchpt.cameras", "ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics"}
+_MODULES = {
+    "cameras": "torchpt.cameras",
+    "ibl": "torchpt.ibl",
+    "metrics": "torchpt.images.metrics",
+    "ranks": "torchpt.ranks",
+}
 
 
 def __getattr__(name: str) -> Any:

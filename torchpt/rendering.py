@@ -15,8 +15,10 @@ from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
+from torchpt.forward.split import stamp
 from torchpt.images.denoiser import check_denoiser, denoise
 from torchpt.integrators import KINDS as INTEGRATORS
+from torchpt.ranks import Group, together
 from torchpt.scene import Scene
 from torchpt.scene.textured import with_texels
 from torchpt.settings import FILTERS, Settings
@@ -50,6 +52,7 @@ class Wishes(TypedDict, total=False):
     spp_grad: int | None
     edges: bool
     edge_spp: int | None
+    ranks: Group | None
 
 
 @overload
@@ -84,6 +87,7 @@ def render(
     spp_grad: int | None = None,
     edges: bool = True,
     edge_spp: int | None = None,
+    ranks: Group | None = None,
 ) -> Tensor | Rendering:
     """Render a scene to linear RGB ``(H, W, 3)`` on the scene's device; differentiable in ``params``.
 
@@ -113,10 +117,11 @@ def render(
             shared samples would bias the gradient of a squared loss.
         edges: whether silhouettes and shadow edges that move are differentiated (docs/gradients.md); False warns.
         edge_spp: samples of edges a pixel, for each of their estimators; by default as many as the backward pass takes.
+        ranks: a :class:`torchpt.ranks.Group` whose processes share the work; each gets all of the picture (docs/ranks.md).
 
     Raises:
         SceneError: a setting or parameter that is not accepted.
-        RenderError: a device, compiler or denoiser that is not there.
+        RenderError: a device, compiler or denoiser that is not there; a rank that is lost, or at something else.
     """
     numbers = {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1), "edge_spp": (edge_spp, 1)}
     _check(scene, device, dtype, adjoint, numbers)
@@ -136,7 +141,7 @@ def render(
     scene = with_texels(scene, params)
     scene.check(params)
     backward = {"seed": seed_grad, "spp": spp_grad, "edges": edge_spp if edges else 0}
-    rendering = _rendered(scene, settings, backward, params or {}, dtype, adjoint or adjoints.KINDS[0])
+    rendering = _rendered(scene, settings, backward, params or {}, dtype, adjoint or adjoints.KINDS[0], ranks)
     return rendering if full else rendering.image
 
 
@@ -147,14 +152,15 @@ def _rendered(
     params: Mapping[str, Tensor],
     dtype: torch.dtype,
     adjoint: str,
+    ranks: Group | None,
 ) -> Rendering:
     """A rendering, on a tape where one is wanted, and denoised where that is; ``backward``: see :func:`_differentiable`."""
     wanted = tuple(name for name, value in params.items() if value.requires_grad)
     if not (wanted or scene.weights()) or not torch.is_grad_enabled():
-        rendering = render_scene(scene, settings, params=params, dtype=dtype)
+        rendering = render_scene(scene, settings, params=params, dtype=dtype, ranks=ranks)
     else:
         seed = settings.render.seed ^ 0x5DEECE66D if backward["seed"] is None else backward["seed"]
-        rendering = _differentiable(scene, settings, {**backward, "seed": seed}, params, wanted, dtype, adjoint)
+        rendering = _differentiable(scene, settings, {**backward, "seed": seed}, params, wanted, dtype, adjoint, ranks)
     if settings.film.denoise:
         with limited_threads(settings.render.threads):
             rendering.denoised = denoise(rendering.image.detach(), **rendering.guides)
@@ -211,6 +217,7 @@ def _differentiable(
     wanted: tuple[str, ...],
     dtype: torch.dtype,
     adjoint: str,
+    ranks: Group | None,
 ) -> Rendering:
     """A rendering whose picture is on a tape from the parameters ``wanted``.
 
@@ -236,20 +243,24 @@ def _differentiable(
         return {**fixed, **dict(zip(wanted, tensors, strict=True))}
 
     def forward(*tensors: Tensor) -> Tensor:
-        made.append(render_scene(scene, settings, params=given_by(*tensors), dtype=dtype))
+        made.append(render_scene(scene, settings, params=given_by(*tensors), dtype=dtype, ranks=ranks))
         return made[-1].image
 
     def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor]:
+        with together(ranks, "the loss", lambda: cotangent.detach().cpu().contiguous().numpy().tobytes()):
+            return gradients(cotangent, *tensors)
+
+    def gradients(cotangent: Tensor, *tensors: Tensor) -> list[Tensor]:
         given, of_edges = given_by(*tensors), edges_taken()
         # One pass that is a derivative of the very estimator takes its own samples again.
         render = again().render
         exact = render.seed == settings.render.seed and render.spp == taken[0]
         held = not exact and adjoints.suits(scene, settings, wanted)
-        found = adjoints.gradients(scene, again(), given, wanted, dtype, attached, adjoint, cotangent, held)
+        found = adjoints.gradients(scene, again(), given, wanted, dtype, attached, adjoint, cotangent, held, ranks)
         if of_edges and concerns(scene, wanted):
             _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
             moved = add_gradients(
-                scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held
+                scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held, ranks
             )
             found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
         return found
@@ -306,6 +317,7 @@ def render_scene(
     on_progress: Callable[[Progress], bool | None] | None = None,
     params: Mapping[str, Tensor] | None = None,
     dtype: torch.dtype = torch.float32,
+    ranks: Group | None = None,
 ) -> Rendering:
     """Render with complete settings.
 
@@ -315,6 +327,7 @@ def render_scene(
         on_progress: called after every chunk; returning True stops early with the picture so far.
         params: tensors in place of the scene's, without gradients.
         dtype: of the lanes.
+        ranks: those that share the work; each gets all of the picture.
 
     Raises:
         SceneError: settings that this scene cannot be rendered with.
@@ -323,4 +336,5 @@ def render_scene(
         OutputError: a checkpoint that cannot be written, or that is there although nobody wishes to go on from it.
     """
     with torch.no_grad(), limited_threads(settings.render.threads):
-        return Run(scene, settings, params, dtype).go(on_progress)
+        with together(ranks, "what is rendered", lambda: stamp(scene, settings, params, dtype)):
+            return Run(scene, settings, params, dtype, ranks).go(on_progress)

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.ranks import Group
+
 __all__ = ["Sums"]
 
 #: Tables of more numbers than this are summed in the lanes' own precision: few paths meet in one of so many places.
@@ -73,6 +75,13 @@ class Sums:
             for total, more in zip(self._totals, part._totals, strict=True)
         ]
         self._totals = own
+
+    def join_ranks(self, ranks: Group) -> None:
+        """Add the sums of all ranks, in their order: every one has the same bits then."""
+        there = torch.tensor([total is not None for total in self._totals], dtype=torch.uint8)
+        for number, count in enumerate(torch.stack(ranks.gather(there)).sum(0).tolist()):
+            if count:
+                self._totals[number] = ranks.sum(self.total(number))
 
     def merge(self, part: ChunkSums) -> None:
         """Add the sums of a chunk: its terms of large tables first, as they come where they are added at once."""
