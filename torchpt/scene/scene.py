@@ -22,6 +22,7 @@ from torchpt.cameras.opencv import extrinsics
 from torchpt.errors import RenderError, SceneError
 from torchpt.format.description import Description, Source, read_description, settings
 from torchpt.native.memory import Meter, mb
+from torchpt.native.modes import lasting
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
@@ -61,7 +62,8 @@ def load(
     start = time.perf_counter()
     description = read_description(source, bsdfs)
     chosen = device_of(settings(description).render.device if device is None else device)
-    scene = Scene(description, chosen, tuple((bsdfs or {}).values()))
+    with lasting():
+        scene = Scene(description, chosen, tuple((bsdfs or {}).values()))
     scene.load_seconds = time.perf_counter() - start
     return scene
 
@@ -217,7 +219,9 @@ class Scene:
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """All parameters, those of ``params`` (once checked) in place of the scene's."""
-        return {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
+        every = {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
+        # Tensors of torch.inference_mode have no place on a tape; their copies have.
+        return {name: value.clone() if value.is_inference() else value for name, value in every.items()}
 
     def spec(self, name: str) -> Spec:
         """What a parameter is."""
@@ -250,8 +254,8 @@ class Scene:
             self._refresh()
             key = dtype, uv, choice
             if key not in self._worlds:
-                with torch.no_grad():
-                    self._worlds[key] = self._assemble(self.params, dtype, uv, choice)
+                with lasting(), torch.no_grad():
+                    self._worlds[key] = self._assemble(self.merged(None), dtype, uv, choice)
             return self._worlds[key]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
@@ -326,12 +330,16 @@ class Scene:
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""
-        state = {name: (value, value._version) for name, value in self.params.items()}
+        # Tensors of torch.inference_mode count no versions, and are taken to have changed.
+        state = {name: (value, -1 if value.is_inference() else value._version) for name, value in self.params.items()}
         # The tensors themselves are kept and compared: an id may be another tensor's by now.
         changed = [
             name
             for name, (value, version) in state.items()
-            if name not in self._state or value is not self._state[name][0] or version != self._state[name][1]
+            if name not in self._state
+            or value is not self._state[name][0]
+            or version != self._state[name][1]
+            or version < 0
         ]
         if not changed and len(state) == len(self._state):
             return
