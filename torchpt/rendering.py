@@ -15,6 +15,7 @@ from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
+from torchpt.graphs import known, opaque
 from torchpt.images.denoiser import check_denoiser, denoise
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.native.modes import undisturbed
@@ -59,6 +60,7 @@ def render(scene: Scene, *, full: Literal[False] = False, **wishes: Unpack[Wishe
 def render(scene: Scene, *, full: Literal[True], **wishes: Unpack[Wishes]) -> Rendering: ...
 @overload
 def render(scene: Scene, *, full: bool, **wishes: Unpack[Wishes]) -> Tensor | Rendering: ...
+@opaque
 def render(
     scene: Scene,
     *,
@@ -302,7 +304,7 @@ def _constant(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dt
 
 def _checked(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Rendering:
     scene.check(params)
-    return render_scene(scene, settings, params=params, dtype=dtype)
+    return known(lambda: render_scene(scene, settings, params=params, dtype=dtype))
 
 
 def _warn_of_edges(scene: Scene, settings: Settings, every: bool) -> None:
@@ -313,7 +315,7 @@ def _warn_of_edges(scene: Scene, settings: Settings, every: bool) -> None:
         if not missing:
             return
         edges = f"some edges: {'; '.join(missing)}"
-    warnings.warn(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning, stacklevel=5)
+    warnings.warn(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning, stacklevel=6)
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:

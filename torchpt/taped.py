@@ -25,6 +25,9 @@ _TWICE = (
     "render has no second derivatives: take the difference of two gradients of one seed_grad,"
     " or torch.func.vjp of the picture for a Gauss-Newton step"
 )
+_BATCHES = (
+    "render takes batches of cotangents by torch.func.jacrev alone, not by vectorize=True or is_grads_batched=True"
+)
 
 
 def on_tape(
@@ -33,7 +36,7 @@ def on_tape(
     """What ``forward`` gives, as a function of ``tensors`` that autograd can go back through.
 
     The functions see plain tensors, whatever transforms of ``torch.func`` are at work. Under ``vmap``, and where
-    cotangents come in batches (``jacrev``, ``is_grads_batched``), they are called once for each element.
+    cotangents come in batches (``jacrev``), they are called once for each element.
 
     Args:
         forward: from ``tensors`` to its results.
@@ -95,7 +98,10 @@ class _Back(torch.autograd.Function):
 
     @staticmethod
     def forward(work: Backward, count: int, *tensors: Tensor) -> tuple[Tensor | None, ...]:
-        plain = tuple(t.detach() for t in tensors)
+        try:
+            plain = tuple(t.detach() for t in tensors)
+        except RuntimeError as error:  # tensors of torch's older vmap, which has no rule for it
+            raise TorchptError(_BATCHES) from error
         with undisturbed(plain[0].device):
             return tuple(work(plain[:count], *plain[count:]))
 

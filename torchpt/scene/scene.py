@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 import difflib
+import itertools
 import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
@@ -23,6 +25,7 @@ from torchpt.errors import RenderError, SceneError
 from torchpt.format.description import Description, Source, read_description, settings
 from torchpt.native.memory import Meter, mb
 from torchpt.native.modes import lasting
+from torchpt.native.operators import outside_graphs
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
@@ -34,12 +37,21 @@ from torchpt.settings import Film, Settings
 from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
-__all__ = ["Scene", "device_of", "load"]
+__all__ = ["Scene", "device_of", "load", "numbered"]
 
 #: Of a scene, what copies of it have: all else is made of it on demand.
 _KEPT = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
 
+_numbers = itertools.count(1)
+_scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 
+
+def numbered(number: int) -> Scene | None:
+    """The scene of a number, where it is still there."""
+    return _scenes.get(number)
+
+
+@outside_graphs
 def load(
     source: Source,
     device: str | torch.device | None = None,
@@ -125,6 +137,9 @@ class Scene:
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
         self._state: dict[str, tuple[Tensor, int]] = {}
+        #: Of all scenes of this process, by which compiled graphs name it.
+        self.number = next(_numbers)
+        _scenes[self.number] = self
 
     def to(self, device: str | torch.device) -> Scene:
         """The scene on a device, which may be ``auto``: itself where it is there already, else a copy.
