@@ -1,9 +1,10 @@
-"""torch's own tools around ``render``: ``torch.func``, ``torch.autograd.functional``, checkpointing, modes, several backward passes."""
+"""torch's own tools around ``render``: ``torch.func``, ``autograd.functional``, checkpointing, several backward passes, modes."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -14,8 +15,8 @@ import torchpt
 from torchpt.errors import SceneError, TorchptError
 
 WALL = "materials.wall.reflectance"
-WISHES = {"spp": 4, "seed": 3, "threads": 1, "compile": "off"}
-ROOM = {
+WISHES: dict[str, Any] = {"spp": 4, "seed": 3, "threads": 1, "compile": "off"}
+ROOM: dict[str, Any] = {
     "camera": {"type": "perspective", "origin": [0, 0, 4], "target": [0, 0, 0], "fov": 40},
     "film": {"width": 6, "height": 5, "filter": "box"},
     "integrator": {"type": "path", "max_depth": 3},
@@ -59,9 +60,9 @@ def gradient(loss: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
 def test_func_grad_and_vjp(picture, loss, colour):
     expected = gradient(loss, colour)
     assert torch.equal(torch.func.grad(loss)(colour), expected)
-    value, back = torch.func.vjp(loss, colour)
+    value, back = torch.func.vjp(loss, colour)[:2]
     assert torch.equal(back(torch.ones(()))[0], expected) and torch.equal(value, loss(colour))
-    _, back = torch.func.vjp(picture, colour)
+    back = torch.func.vjp(picture, colour)[1]
     torch.testing.assert_close(back(2 * picture(colour) / 90)[0], expected)
 
 
@@ -108,7 +109,7 @@ def test_jacobians_by_batches_of_cotangents(picture, colour):
 
 
 def test_functional_vjp(loss, colour):
-    _, found = torch.autograd.functional.vjp(loss, colour)
+    found: Any = torch.autograd.functional.vjp(loss, colour)[1]
     assert torch.equal(found, gradient(loss, colour))
 
 

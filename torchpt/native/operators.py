@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -44,7 +44,8 @@ def outside_graphs(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if torch.compiler.is_compiling():  # not before: this imports the compiler
-            return torch.compiler.disable(function)(*args, **kwargs)
+            outside: Any = torch.compiler.disable(function)
+            return outside(*args, **kwargs)
         return function(*args, **kwargs)
 
     return call
