@@ -20,7 +20,7 @@ from torchpt.errors import (
 )
 
 if TYPE_CHECKING:
-    from torchpt import ibl
+    from torchpt import data, ibl, losses, nn
     from torchpt.bsdfs import Bsdf
     from torchpt.forward import Rendering
     from torchpt.images import metrics, read_header, read_image, read_layers, write_image
@@ -42,11 +42,14 @@ __all__ = [
     "Scene",
     "SceneError",
     "TorchptError",
+    "data",
     "denoise",
     "from_trimesh",
     "ibl",
     "load",
+    "losses",
     "metrics",
+    "nn",
     "read_header",
     "read_image",
     "read_layers",
@@ -70,7 +73,13 @@ _LAZY = {
 }
 
 #: Public modules.
-_MODULES = {"ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics"}
+_MODULES = {
+    "data": "torchpt.data",
+    "ibl": "torchpt.ibl",
+    "losses": "torchpt.losses",
+    "metrics": "torchpt.images.metrics",
+    "nn": "torchpt.nn",
+}
 
 
 def __getattr__(name: str) -> Any:

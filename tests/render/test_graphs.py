@@ -146,7 +146,7 @@ def test_errors_are_those_of_eager_renders(scene):
     with pytest.raises(torchpt.SceneError, match=f"params.{WALL}: expected"):
         compiled(scene, torch.full((3,), 7.0))
     with pytest.raises(torchpt.SceneError, match="spp"):
-        torch.compile(lambda: torchpt.render(scene, **{**WISHES, "spp": -1}), backend="aot_eager")()
+        torch.compile(lambda: torchpt.render(scene, spp=-1), backend="aot_eager")()
 
 
 def test_a_graph_does_not_keep_its_scene(scene):

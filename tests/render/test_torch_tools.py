@@ -1,4 +1,4 @@
-"""torch's own tools around ``render``: ``torch.func``, ``autograd.functional``, checkpointing, several backward passes, modes."""
+"""torch's own tools around ``render``: ``torch.func``, ``autograd.functional``, checkpoints, several backward passes, modes."""
 
 from __future__ import annotations
 
