@@ -52,15 +52,15 @@ class _Items:
         """See :class:`RenderDataset`."""
         number, view = divmod(index, max(len(self.cameras), 1))
         scene, own = self._scene(number)
-        wishes = {**self.wishes, **own}
+        wishes: dict[str, Any] = {**self.wishes, **own}
         film = {**(self.wishes.get("film") or {}), **(own.get("film") or {})}
         params = {**(self.cameras[view] if self.cameras else {}), **(wishes.pop("params", None) or {})}
         params = {name: torch.as_tensor(value, dtype=torch.float32) for name, value in params.items()}
         if get_worker_info() is not None:
             wishes.setdefault("threads", 1)  # workers share the cores
-        wishes = {"spp": self.spp, "seed": self.seed + index, **wishes}
+        wishes = {"spp": self.spp, "seed": self.seed + index, **wishes, "film": {**film, "aovs": list(self.layers)}}
         with torch.no_grad():
-            found = render(scene, params=params, full=True, **{**wishes, "film": {**film, "aovs": list(self.layers)}})
+            found = render(scene, params=params, full=True, **wishes)
             world = scene.merged(params)["camera.to_world"]
             item = {"image": found.image, **{name: found.layers[name] for name in self.layers}, "to_world": world}
             if "camera.fov" in scene.params:

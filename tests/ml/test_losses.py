@@ -78,7 +78,8 @@ def truth(scene) -> Truth:
     params = {WALL: torch.ones(3)}
     single = torch.stack([torchpt.render(scene, params=params, seed=9_000 + k, **WISHES) for k in range(100)])
     # One sample is black or of one brightness b, so that its second moment is m b.
-    mean = torchpt.render(scene, params=params, seed=77, **{**WISHES, "spp": 16_384})
+    many: dict[str, Any] = {**WISHES, "spp": 16_384}
+    mean = torchpt.render(scene, params=params, seed=77, **many)
     bright = single.amax(0)
     assert ((single == 0) | ((single - bright).abs() < 1e-3 * bright)).all()
     return Truth(mean, mean * (bright - mean), 0.3 * mean + 0.05)
@@ -95,7 +96,8 @@ def gradients(scene: torchpt.Scene, loss: Callable[[Callable[..., Tensor]], Tens
             seed = next(seeds)
             if more.pop("shared", False):
                 more["seed_grad"] = seed
-            return torchpt.render(scene, params={WALL: leaf.expand(3)}, seed=seed, **{**WISHES, **more})
+            wishes: dict[str, Any] = {**WISHES, **more}
+            return torchpt.render(scene, params={WALL: leaf.expand(3)}, seed=seed, **wishes)
 
         loss(draw).backward()
         assert leaf.grad is not None

@@ -16,7 +16,7 @@ from torch import Tensor
 import torchpt
 from torchpt.errors import SceneError
 from torchpt.lanes import engine
-from torchpt.native.memory import Meter
+from torchpt.native.memory import Meter, let_go
 from torchpt.nn import Renderer
 from torchpt.nn.ranges import Above, Bounded, Free, Rigid, range_of
 from torchpt.spec import Angle, Color, Index, Scalar
@@ -253,6 +253,32 @@ def test_inside_another_module_and_by_functional_call(renderer):
         torch.testing.assert_close(found[name], value.grad)
 
 
+def test_in_data_parallel_training(renderer, tmp_path):
+    distributed = torch.distributed
+    distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
+    try:
+        moved(torch.nn.parallel.DistributedDataParallel(renderer))  # pyright: ignore[reportArgumentType]
+    finally:
+        distributed.destroy_process_group()
+    assert int(renderer.steps) == 1
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's own, while it compiles
+@pytest.mark.filterwarnings("ignore:The .grad attribute")  # torch 2.13's, at any break that such a tensor crosses
+def test_in_compiled_code(renderer):
+    torch.compiler.reset()
+    expected = copy.deepcopy(renderer)
+    compiled = torch.compile(lambda: renderer(seed=3).square().mean(), backend="aot_eager", fullgraph=True)
+    compiled().backward()
+    expected(seed=3).square().mean().backward()
+    for found, right in zip(renderer.parameters(), expected.parameters(), strict=True):
+        torch.testing.assert_close(found.grad, right.grad, rtol=1e-4, atol=1e-7)
+    counting = torch.compile(lambda: renderer().mean() * 2, backend="aot_eager")  # reads its counter between two graphs
+    for _ in range(3):
+        torch.testing.assert_close(counting(), expected().mean() * 2)
+    torch.compiler.reset()
+
+
 def test_what_print_says(renderer):
     assert WALL in repr(renderer)
 
@@ -265,7 +291,8 @@ def optimized(steps: int, size: int, spp: int, seen: Any = None) -> tuple[float,
     wishes: dict[str, Any] = {"film": {"width": size, "height": size}, "threads": 1, "spp": spp}
     goal = torchpt.load(room(3), "cpu")
     goal.params[LAMP].mul_(0.7)
-    target = torchpt.render(goal, seed=1000, **{**wishes, "spp": 256})
+    many: dict[str, Any] = {**wishes, "spp": 256}
+    target = torchpt.render(goal, seed=1000, **many)
     renderer = Renderer(torchpt.load(room(1), "cpu"), [WALL, LAMP], **wishes)
     optimizer = torch.optim.Adam(renderer.parameters(), 0.05)
 
@@ -311,16 +338,18 @@ def test_a_thousand_steps_take_no_more_memory_than_a_hundred():
     made: list[tuple[int, int]] = []
 
     def seen(step: int) -> None:
-        held.append(meter.now())
         made.append(engine.counts())
+        if step >= 300 and step % 20 == 0:
+            gc.collect()
+            let_go()  # what the allocator keeps for later is no growth
+            held.append(meter.now())
 
     before, after, _ = optimized(1000, 32, 4, seen)
     assert after < 0.01 * before
     assert made[1] == made[-1]
-    steps = torch.arange(100.0, 1000.0, dtype=torch.float64)
-    memory = torch.tensor(held[100:], dtype=torch.float64)
-    slope = float(((steps - steps.mean()) * (memory - memory.mean())).sum() / (steps - steps.mean()).square().sum())
-    spread = float((memory - memory.mean() - slope * (steps - steps.mean())).std())
-    print(f"slope {slope:.1f} bytes a step, spread {spread / 1e6:.3f} MB, loss {before:.5f} -> {after:.7f}")
-    assert abs(slope) * 900 < max(3 * spread, 1e6)
-    assert held[-1] - held[99] < 4e6
+    memory = torch.tensor(held, dtype=torch.float64)
+    step = 20.0 * (torch.arange(len(held), dtype=torch.float64) - (len(held) - 1) / 2)
+    slope = float((step * memory).sum() / step.square().sum())
+    spread = float((memory - memory.mean() - slope * step).std())
+    print(f"slope {slope:.0f} bytes a step, spread {spread / 1e3:.0f} KB, loss {before:.5f} -> {after:.7f}")
+    assert abs(slope) < 1000  # one picture of 32 x 32 takes twelve times that

@@ -58,15 +58,12 @@ class Renderer(nn.Module):
         self.names = _chosen(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
-            self.ranges = nn.ModuleList(
-                range_of(scene.spec(n), start, rigid) for n, start in zip(self.names, starts, strict=True)
-            )
-            self.free = nn.ParameterDict(
-                {
-                    _key(name): nn.Parameter(found.inverse(start).clone())
-                    for name, found, start in zip(self.names, self.ranges, starts, strict=True)
-                }
-            )
+            ranges = [range_of(scene.spec(n), start, rigid) for n, start in zip(self.names, starts, strict=True)]
+            free = {
+                _key(name): nn.Parameter(found.inverse(start).clone())
+                for name, found, start in zip(self.names, ranges, starts, strict=True)
+            }
+        self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
     def forward(self, params: Mapping[str, Tensor] | None = None, *, seed: int | None = None, **wishes: Any) -> Any:
