@@ -328,7 +328,8 @@ def test_thirty_steps_bring_the_loss_down_and_compile_once():
     before, after, renderer = optimized(30, 16, 2, seen)
     assert after < 0.1 * before
     assert int(renderer.steps) == 30
-    assert made[1] == made[-1] and alive[0] == alive[1]
+    assert made[1] == made[-1]
+    assert alive[1] <= alive[0]
 
 
 @pytest.mark.slow
