@@ -136,6 +136,7 @@ def test_the_same_bits_in_workers(expected, method):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # torch's, where there are fewer cores
 @pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
 @pytest.mark.parametrize("workers", [1, 3])
 @pytest.mark.parametrize("wish", [{"compile": "off"}, {"threads": 2}, {"accel": "torch"}], ids=str)
