@@ -22,7 +22,7 @@ from torchpt.errors import (
 )
 
 if TYPE_CHECKING:
-    from torchpt import cameras, ibl, ranks
+    from torchpt import cameras, data, ibl, losses, nn, ranks
     from torchpt.bsdfs import Bsdf
     from torchpt.forward import Rendering
     from torchpt.images import metrics, read_header, read_image, read_layers, write_image
@@ -47,11 +47,14 @@ __all__ = [
     "SceneError",
     "TorchptError",
     "cameras",
+    "data",
     "denoise",
     "from_trimesh",
     "ibl",
     "load",
+    "losses",
     "metrics",
+    "nn",
     "ranks",
     "read_header",
     "read_image",
@@ -78,8 +81,11 @@ _LAZY = {
 #: Public modules.
 _MODULES = {
     "cameras": "torchpt.cameras",
+    "data": "torchpt.data",
     "ibl": "torchpt.ibl",
+    "losses": "torchpt.losses",
     "metrics": "torchpt.images.metrics",
+    "nn": "torchpt.nn",
     "ranks": "torchpt.ranks",
 }
 

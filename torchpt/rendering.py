@@ -16,13 +16,16 @@ from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
 from torchpt.forward.split import stamp
+from torchpt.graphs import known, opaque
 from torchpt.images.denoiser import check_denoiser, denoise
 from torchpt.integrators import KINDS as INTEGRATORS
+from torchpt.native.modes import undisturbed
 from torchpt.ranks import Group, together
 from torchpt.scene import Scene
 from torchpt.scene.textured import with_texels
 from torchpt.settings import FILTERS, Settings
 from torchpt.spec.declared import Described
+from torchpt.taped import in_batch, wants_gradients
 
 __all__ = ["Progress", "Rendering", "Wishes", "first_hit", "render", "render_scene"]
 
@@ -61,6 +64,7 @@ def render(scene: Scene, *, full: Literal[False] = False, **wishes: Unpack[Wishe
 def render(scene: Scene, *, full: Literal[True], **wishes: Unpack[Wishes]) -> Rendering: ...
 @overload
 def render(scene: Scene, *, full: bool, **wishes: Unpack[Wishes]) -> Tensor | Rendering: ...
+@opaque
 def render(
     scene: Scene,
     *,
@@ -136,13 +140,27 @@ def render(
         settings = _of_one_picture(settings, film)
     elif settings.film.denoise:
         check_denoiser()
-    if torch.is_grad_enabled():
-        params = {name: value for name, value in scene.params.items() if value.requires_grad} | dict(params or {})
+    params = _given(scene, params, full)
     scene = with_texels(scene, params)
-    scene.check(params)
     backward = {"seed": seed_grad, "spp": spp_grad, "edges": edge_spp if edges else 0}
-    rendering = _rendered(scene, settings, backward, params or {}, dtype, adjoint or adjoints.KINDS[0], ranks)
+    rendering = _rendered(scene, settings, backward, params, dtype, adjoint or adjoints.KINDS[0], ranks)
     return rendering if full else rendering.image
+
+
+def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
+    """Parameters in place of the scene's, those of its own that want gradients among them.
+
+    Raises:
+        SceneError: an unknown name, or no tensor. All else is checked where they are plain tensors (:mod:`torchpt.taped`).
+    """
+    given = dict(params or {})
+    if any(name not in scene.params or not isinstance(value, Tensor) for name, value in given.items()):
+        scene.check(given)
+    if full and any(in_batch(value) for value in given.values()):
+        raise SceneError("full", True, "False under torch.func.vmap, where a render gives pictures alone")
+    if not torch.is_grad_enabled():
+        return given
+    return {name: value for name, value in scene.params.items() if value.requires_grad} | given
 
 
 def _rendered(
@@ -155,9 +173,9 @@ def _rendered(
     ranks: Group | None,
 ) -> Rendering:
     """A rendering, on a tape where one is wanted, and denoised where that is; ``backward``: see :func:`_differentiable`."""
-    wanted = tuple(name for name, value in params.items() if value.requires_grad)
+    wanted = tuple(name for name, value in params.items() if wants_gradients(value))
     if not (wanted or scene.weights()) or not torch.is_grad_enabled():
-        rendering = render_scene(scene, settings, params=params, dtype=dtype, ranks=ranks)
+        rendering = _constant(scene, settings, params, dtype, ranks)
     else:
         seed = settings.render.seed ^ 0x5DEECE66D if backward["seed"] is None else backward["seed"]
         rendering = _differentiable(scene, settings, {**backward, "seed": seed}, params, wanted, dtype, adjoint, ranks)
@@ -234,23 +252,23 @@ def _differentiable(
         _warn_of_edges(scene, settings, backward["edges"] == 0)
     for name in without_gradient(scene, wanted):
         said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"
-        warnings.warn(said, EdgeWarning, stacklevel=4)
-    fixed = {name: value for name, value in params.items() if name not in wanted}
+        warnings.warn(said, EdgeWarning, stacklevel=5)
+    names = (*wanted, *(name for name in params if name not in wanted))
     made: list[Rendering] = []
     taken: list[int] = []
 
     def given_by(*tensors: Tensor) -> dict[str, Tensor]:
-        return {**fixed, **dict(zip(wanted, tensors, strict=True))}
+        return dict(zip(names, tensors, strict=True))
 
     def forward(*tensors: Tensor) -> Tensor:
-        made.append(render_scene(scene, settings, params=given_by(*tensors), dtype=dtype, ranks=ranks))
+        made.append(_checked(scene, settings, given_by(*tensors), dtype, ranks))
         return made[-1].image
 
-    def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor]:
+    def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
         with together(ranks, "the loss", lambda: cotangent.detach().cpu().contiguous().numpy().tobytes()):
             return gradients(cotangent, *tensors)
 
-    def gradients(cotangent: Tensor, *tensors: Tensor) -> list[Tensor]:
+    def gradients(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
         given, of_edges = given_by(*tensors), edges_taken()
         # One pass that is a derivative of the very estimator takes its own samples again.
         render = again().render
@@ -263,7 +281,7 @@ def _differentiable(
                 scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held, ranks
             )
             found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
-        return found
+        return [*found[: len(wanted)], *(None for _ in names[len(wanted) :]), *found[len(wanted) :]]
 
     def again(spp: int | None = None) -> Settings:
         spp = spp or backward["spp"] or taken[0]
@@ -275,15 +293,39 @@ def _differentiable(
     def asked() -> Asked:
         return Asked(scene, again(), wanted, dtype, edges_taken())
 
-    tensors = tuple(params[name] for name in wanted)
+    tensors = tuple(params[name] for name in names)
     image = adjoints.on_tape(forward, backward_pass, tensors, scene.weights())
-    rendering = made.pop()  # the tape keeps the closures, which are not to keep pictures
+    rendering = made[-1]
+    made.clear()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
-    names = followed(settings)
-    if names:
-        values = {name: rendering.layers[name] for name in names}
+    layers = followed(settings)
+    if layers:
+        values = {name: rendering.layers[name] for name in layers}
         rendering.layers |= on_tape(values, tensors, asked, given_by)
     return replace(rendering, image=image)
+
+
+def _constant(
+    scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype, ranks: Group | None
+) -> Rendering:
+    """A rendering without gradients, of parameters that may still be those of a transform of ``torch.func``."""
+    made: list[Rendering] = []
+
+    def forward(*tensors: Tensor) -> Tensor:
+        made.append(_checked(scene, settings, dict(zip(params, tensors, strict=True)), dtype, ranks))
+        return made[-1].image
+
+    if not params:
+        return _checked(scene, settings, params, dtype, ranks)
+    image = adjoints.on_tape(forward, lambda *_: (), tuple(params.values()), ())
+    return replace(made[-1], image=image)
+
+
+def _checked(
+    scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype, ranks: Group | None
+) -> Rendering:
+    scene.check(params)
+    return known(lambda: render_scene(scene, settings, params=params, dtype=dtype, ranks=ranks))
 
 
 def _warn_of_edges(scene: Scene, settings: Settings, every: bool) -> None:
@@ -294,7 +336,7 @@ def _warn_of_edges(scene: Scene, settings: Settings, every: bool) -> None:
         if not missing:
             return
         edges = f"some edges: {'; '.join(missing)}"
-    warnings.warn(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning, stacklevel=5)
+    warnings.warn(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning, stacklevel=6)
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:
@@ -335,6 +377,6 @@ def render_scene(
         AssetError: a checkpoint that is damaged, or of another render.
         OutputError: a checkpoint that cannot be written, or that is there although nobody wishes to go on from it.
     """
-    with torch.no_grad(), limited_threads(settings.render.threads):
+    with undisturbed(scene.device), limited_threads(settings.render.threads):
         with together(ranks, "what is rendered", lambda: stamp(scene, settings, params, dtype)):
             return Run(scene, settings, params, dtype, ranks).go(on_progress)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import copy
 import difflib
+import itertools
 import threading
 import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
@@ -23,6 +25,8 @@ from torchpt.errors import RenderError, SceneError
 from torchpt.format.description import Description, Source, read_description, settings
 from torchpt.format.tensors import Tensors
 from torchpt.native.memory import Meter, mb
+from torchpt.native.modes import lasting
+from torchpt.native.operators import outside_graphs
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
@@ -35,12 +39,21 @@ from torchpt.settings import Film, Settings
 from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
-__all__ = ["Scene", "device_of", "load"]
+__all__ = ["Scene", "device_of", "load", "numbered"]
 
 #: Of a scene, what copies of it have: all else is made of it on demand.
 _KEPT = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
 
+_numbers = itertools.count(1)
+_scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 
+
+def numbered(number: int) -> Scene | None:
+    """The scene of a number, where it is still there."""
+    return _scenes.get(number)
+
+
+@outside_graphs
 def load(
     source: Source,
     device: str | torch.device | None = None,
@@ -66,7 +79,8 @@ def load(
     tensors = Tensors()
     description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
     chosen = device_of(settings(description).render.device if device is None else device)
-    scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
+    with lasting():
+        scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
     scene.params |= traced(tensors, scene.description, scene.built, scene.params)
     scene.load_seconds = time.perf_counter() - start
     return scene
@@ -141,6 +155,9 @@ class Scene:
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
         self._state: dict[str, tuple[Tensor, int]] = {}
         self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.textured`
+        #: Of all scenes of this process, by which compiled graphs name it.
+        self.number = next(_numbers)
+        _scenes[self.number] = self
 
     def to(self, device: str | torch.device) -> Scene:
         """The scene on a device, which may be ``auto``: itself where it is there already, else a copy.
@@ -241,7 +258,9 @@ class Scene:
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """All parameters, those of ``params`` (once checked) in place of the scene's."""
-        return {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
+        every = {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
+        # Tensors of torch.inference_mode have no place on a tape; their copies have.
+        return {name: value.clone() if value.is_inference() else value for name, value in every.items()}
 
     def spec(self, name: str) -> Spec:
         """What a parameter is."""
@@ -274,8 +293,8 @@ class Scene:
             self._refresh()
             key = dtype, uv, choice
             if key not in self._worlds:
-                with torch.no_grad():
-                    self._worlds[key] = self._assemble(self.params, dtype, uv, choice)
+                with lasting(), torch.no_grad():
+                    self._worlds[key] = self._assemble(self.merged(None), dtype, uv, choice)
             return self._worlds[key]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
@@ -355,12 +374,16 @@ class Scene:
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""
-        state = {name: (value, value._version) for name, value in self.params.items()}
+        # Tensors of torch.inference_mode count no versions, and are taken to have changed.
+        state = {name: (value, -1 if value.is_inference() else value._version) for name, value in self.params.items()}
         # The tensors themselves are kept and compared: an id may be another tensor's by now.
         changed = [
             name
             for name, (value, version) in state.items()
-            if name not in self._state or value is not self._state[name][0] or version != self._state[name][1]
+            if name not in self._state
+            or value is not self._state[name][0]
+            or version != self._state[name][1]
+            or version < 0
         ]
         if not changed and len(state) == len(self._state):
             return

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +19,7 @@ from torchpt.scene.parameters import Parameters
 from torchpt.scene.scene import Scene
 from torchpt.scene.texels import Opener
 from torchpt.spec import Refused
+from torchpt.taped import in_transform, outside_transforms
 from torchpt.textures import Node
 
 __all__ = ["with_texels"]
@@ -40,9 +42,18 @@ def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
         SceneError: texels where the scene's materials cannot read any, that are out of range, or on a mesh without uvs.
         NotBuiltError: texels for what a material tabulates.
     """
-    loaded = scene.built.parameters
     given = {**scene.params, **(params or {})}
-    texels = {name: value for name, value in given.items() if name in loaded and _is_texels(value, loaded[name].ndim)}
+    with outside_transforms():
+        return _reading_texels(scene, given)
+
+
+def _reading_texels(scene: Scene, given: Mapping[str, Tensor]) -> Scene:
+    loaded = scene.built.parameters
+    texels = {
+        name: _plain(value, loaded[name])
+        for name, value in given.items()
+        if name in loaded and _is_texels(value, loaded[name].ndim)
+    }
     if not texels:
         return scene
     # By size, so that threads that render with different ones at a time do not share a scene.
@@ -55,12 +66,19 @@ def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
             scene.textured.pop(oldest, None)
         scene.textured[key] = made
     for name in made.params:
-        made.params[name] = given[name].detach() if name in texels else scene.params[name]
+        made.params[name] = texels.get(name, scene.params[name])
     return made
 
 
 def _is_texels(value: object, dimensions: int) -> bool:
     return dimensions < 2 and isinstance(value, Tensor) and value.dim() == 3 and value.is_floating_point()
+
+
+def _plain(value: Tensor, loaded: np.ndarray) -> Tensor:
+    """Texels apart from their tape; where transforms of ``torch.func`` hide them, others of their shape stand for them."""
+    if in_transform(value):
+        return torch.full(value.shape, float(loaded.mean()), dtype=value.dtype, device=value.device)
+    return value.detach()
 
 
 def _built(scene: Scene, texels: Mapping[str, Tensor]) -> Built:
@@ -85,7 +103,7 @@ def _built(scene: Scene, texels: Mapping[str, Tensor]) -> Built:
         if slot == "weight" and any(inner.model.sheer or inner.opacity != 1.0 for inner in material.inner):
             raise NotBuiltError(f"params.{name}", "a texture", "a number where light passes one of the two by chance")
         del parameters[name], parameters.specs[name]
-        array = value.detach().to("cpu", torch.float32).numpy()
+        array = value.to("cpu", torch.float32).numpy()
         try:
             texture = texture_of({"type": "image", "data": array}, spec)
         except Refused as error:
