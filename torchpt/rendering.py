@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypedDict, Unpack, overload
 
 import torch
@@ -21,18 +21,27 @@ from torchpt.scene import Scene
 from torchpt.settings import FILTERS, Settings
 from torchpt.spec.declared import Described
 
-__all__ = ["Progress", "Rendering", "Wishes", "first_hit", "render", "render_scene"]
+__all__ = [
+    "Common",
+    "Order",
+    "Progress",
+    "Rendering",
+    "Wishes",
+    "first_hit",
+    "ordered",
+    "render",
+    "render_scene",
+    "rendered",
+]
 
 
-class Wishes(TypedDict, total=False):
-    """The other arguments of :func:`render`, for type checkers."""
+class Common(TypedDict, total=False):
+    """Arguments of :func:`render` that are the same for all pictures of a batch, for type checkers."""
 
     spp: int | None
-    seed: int | None
     integrator: str | Mapping[str, Any] | None
     sampler: str | Mapping[str, Any] | None
     film: Mapping[str, Any] | None
-    params: Mapping[str, Tensor] | None
     time_limit: float | None
     target_error: float | None
     pilots: bool | str | None
@@ -49,6 +58,45 @@ class Wishes(TypedDict, total=False):
     spp_grad: int | None
     edges: bool
     edge_spp: int | None
+
+
+class Wishes(Common, total=False):
+    """The other arguments of :func:`render`, for type checkers."""
+
+    seed: int | None
+    params: Mapping[str, Tensor] | None
+
+
+@dataclass(frozen=True)
+class Order:
+    """A picture that was asked for: checked, complete, and not begun.
+
+    Attributes:
+        scene: what is rendered.
+        settings: how.
+        params: tensors in place of the scene's.
+        backward: the backward pass's own seed, its samples a pixel and its samples of edges a pixel (0: none); None: as the
+            forward pass.
+        dtype: of the lanes.
+        adjoint: how gradients are taken.
+    """
+
+    scene: Scene
+    settings: Settings
+    params: Mapping[str, Tensor]
+    backward: Mapping[str, int | None]
+    dtype: torch.dtype
+    adjoint: str
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """Names of the parameters that are differentiated."""
+        return tuple(name for name, value in self.params.items() if value.requires_grad)
+
+    @property
+    def taped(self) -> bool:
+        """Whether the picture is to carry gradients."""
+        return torch.is_grad_enabled() and bool(self.wanted or self.scene.weights())
 
 
 @overload
@@ -116,42 +164,73 @@ def render(
         SceneError: a setting or parameter that is not accepted.
         RenderError: a device, compiler or denoiser that is not there.
     """
-    numbers = {"seed_grad": (seed_grad, 0), "spp_grad": (spp_grad, 1), "edge_spp": (edge_spp, 1)}
-    _check(scene, device, dtype, adjoint, numbers)
-    given = {
-        "spp": spp, "seed": seed, "accel": accel, "compile": compile, "threads": threads, "max_memory": max_memory,
-        "time_limit": time_limit, "target_error": target_error, "pilots": pilots,
-        "checkpoint": checkpoint, "resume": resume,
-    }  # fmt: skip
-    wishes = {"film": film, "integrator": integrator, "sampler": sampler, "render": given}
-    settings = complete(scene.description, wishes)
+    order = ordered(
+        scene, full, spp=spp, seed=seed, integrator=integrator, sampler=sampler, film=film, params=params,
+        time_limit=time_limit, target_error=target_error, pilots=pilots, checkpoint=checkpoint, resume=resume, accel=accel,
+        compile=compile, threads=threads, max_memory=max_memory, device=device, dtype=dtype, adjoint=adjoint,
+        seed_grad=seed_grad, spp_grad=spp_grad, edges=edges, edge_spp=edge_spp,
+    )  # fmt: skip
+    rendering = rendered(order)
+    return rendering if full else rendering.image
+
+
+#: Of the arguments of :func:`render`, those that the block ``render`` of a scene file has too.
+_OF_RENDER = (
+    "spp", "seed", "accel", "compile", "threads", "max_memory", "time_limit", "target_error", "pilots", "checkpoint", "resume",
+)  # fmt: skip
+
+
+def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
+    """What the arguments of :func:`render` ask for.
+
+    Raises:
+        SceneError: one that is not accepted.
+        RenderError: a denoiser that is not there.
+    """
+    dtype, adjoint, film = wishes.get("dtype", torch.float32), wishes.get("adjoint"), wishes.get("film")
+    backward = {"seed": wishes.get("seed_grad"), "spp": wishes.get("spp_grad"), "edges": wishes.get("edge_spp")}
+    numbers = {"seed_grad": (backward["seed"], 0), "spp_grad": (backward["spp"], 1), "edge_spp": (backward["edges"], 1)}
+    _check(scene, wishes.get("device"), dtype, adjoint, numbers)
+    if not wishes.get("edges", True):
+        backward["edges"] = 0
+    given = {name: wishes.get(name) for name in _OF_RENDER}
+    blocks = {"film": film, "integrator": wishes.get("integrator"), "sampler": wishes.get("sampler"), "render": given}
+    settings = complete(scene.description, blocks)
     if not full:
         settings = _of_one_picture(settings, film)
     elif settings.film.denoise:
         check_denoiser()
+    params = wishes.get("params")
     if torch.is_grad_enabled():
         params = {name: value for name, value in scene.params.items() if value.requires_grad} | dict(params or {})
     scene.check(params)
-    backward = {"seed": seed_grad, "spp": spp_grad, "edges": edge_spp if edges else 0}
-    rendering = _rendered(scene, settings, backward, params or {}, dtype, adjoint or adjoints.KINDS[0])
-    return rendering if full else rendering.image
+    return Order(scene, settings, params or {}, backward, dtype, adjoint or adjoints.KINDS[0])
 
 
-def _rendered(
-    scene: Scene,
-    settings: Settings,
-    backward: Mapping[str, int | None],
-    params: Mapping[str, Tensor],
-    dtype: torch.dtype,
-    adjoint: str,
-) -> Rendering:
-    """A rendering, on a tape where one is wanted, and denoised where that is; ``backward``: see :func:`_differentiable`."""
-    wanted = tuple(name for name, value in params.items() if value.requires_grad)
-    if not (wanted or scene.weights()) or not torch.is_grad_enabled():
-        rendering = render_scene(scene, settings, params=params, dtype=dtype)
+def rendered(order: Order, made: list[Rendering] | None = None) -> Rendering:
+    """The rendering that was asked for, on a tape where one is wanted, and denoised where that is.
+
+    ``made``: a list of the rendering alone, without gradients, where it is there already; it is taken out.
+    """
+    scene, settings = order.scene, order.settings
+
+    def render(params: Mapping[str, Tensor]) -> Rendering:
+        return made.pop() if made else render_scene(scene, settings, params=params, dtype=order.dtype)
+
+    if order.taped:
+        seed = settings.render.seed ^ 0x5DEECE66D if order.backward["seed"] is None else order.backward["seed"]
+        rendering = _differentiable(
+            scene,
+            settings,
+            {**order.backward, "seed": seed},
+            order.params,
+            order.wanted,
+            order.dtype,
+            order.adjoint,
+            render,
+        )
     else:
-        seed = settings.render.seed ^ 0x5DEECE66D if backward["seed"] is None else backward["seed"]
-        rendering = _differentiable(scene, settings, {**backward, "seed": seed}, params, wanted, dtype, adjoint)
+        rendering = render(order.params)
     if settings.film.denoise:
         with limited_threads(settings.render.threads):
             rendering.denoised = denoise(rendering.image.detach(), **rendering.guides)
@@ -208,11 +287,11 @@ def _differentiable(
     wanted: tuple[str, ...],
     dtype: torch.dtype,
     adjoint: str,
+    render: Callable[[Mapping[str, Tensor]], Rendering],
 ) -> Rendering:
-    """A rendering whose picture is on a tape from the parameters ``wanted``.
+    """A rendering whose picture is on a tape from the parameters ``wanted``; ``backward``: see :class:`Order`.
 
-    ``backward`` has the backward pass's own seed, its samples a pixel and its samples of edges a pixel (0: none); None: as
-    many as the forward pass took.
+    ``render`` makes it without.
     """
     if not settings.integrator.light:
         radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
@@ -230,14 +309,14 @@ def _differentiable(
         return {**fixed, **dict(zip(wanted, tensors, strict=True))}
 
     def forward(*tensors: Tensor) -> Tensor:
-        made.append(render_scene(scene, settings, params=given_by(*tensors), dtype=dtype))
+        made.append(render(given_by(*tensors)))
         return made[-1].image
 
     def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor]:
         given, of_edges = given_by(*tensors), edges_taken()
         # One pass that is a derivative of the very estimator takes its own samples again.
-        render = again().render
-        exact = render.seed == settings.render.seed and render.spp == taken[0]
+        own = again().render
+        exact = own.seed == settings.render.seed and own.spp == taken[0]
         held = not exact and adjoints.suits(scene, settings, wanted)
         found = adjoints.gradients(scene, again(), given, wanted, dtype, attached, adjoint, cotangent, held)
         if of_edges and concerns(scene, wanted):

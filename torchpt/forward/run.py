@@ -5,13 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpt.errors import RenderError
-from torchpt.film import Film, KnownError
+from torchpt.film import Film
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.budget import check_memory
 from torchpt.forward.causes import causes_of, told
@@ -22,16 +21,17 @@ from torchpt.forward.piece import take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, budget_of
+from torchpt.forward.seen import image_of, layers_of
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
 from torchpt.forward.wave import kernels_of, looped, make_wave, surface_layers
 from torchpt.forward.waves import Waves, say_once
 from torchpt.images.denoiser import GUIDES
-from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
-from torchpt.integrators.loop.schedule import Loop, Share
+from torchpt.integrators.loop.schedule import Block, Loop, Share
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
+from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
 from torchpt.native.memory import Meter, let_go, mb
 from torchpt.scene import Scene
@@ -42,19 +42,24 @@ __all__ = ["Run"]
 
 
 class Run:
-    """One forward render: accumulates chunks into films."""
+    """One forward render: accumulates chunks into films; ``like``: see :func:`torchpt.forward.wave.make_wave`."""
 
     def __init__(
-        self, scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
+        self,
+        scene: Scene,
+        settings: Settings,
+        params: Mapping[str, Tensor] | None,
+        dtype: torch.dtype,
+        like: Wave | None = None,
     ) -> None:
         self.start = time.perf_counter()
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
-        meter = Meter(self.device)
-        before = meter.peak()
+        meter, limit = Meter(self.device), settings.render.max_memory
+        before = 0 if limit is None else meter.peak()
         with needing(lambda: f"a scene of {scene.told}"):
-            self.wave = make_wave(scene, settings, params, dtype)
-        built = meter.peak()
+            self.wave = make_wave(scene, settings, params, dtype, like=like)
+        built = before if limit is None else meter.peak()
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
         self.dtype = dtype
@@ -62,6 +67,7 @@ class Run:
         self.seen = surface_layers(settings)
         self.on_progress: Callable[[Progress], bool | None] | None = None
         self.eager: list[str] = []
+        self.unsupported: Unsupported | None = None
         self.keeper: Keeper | None = None
         if settings.render.checkpoint is not None:
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
@@ -70,11 +76,11 @@ class Run:
         how = "eager" if self.loop is None else "compiled"
         rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
         self.need = need_of(settings, self.device, how, len(self.wave.stages.world.materials.models), rows)
-        if settings.render.max_memory is not None:
+        if limit is not None:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
-            check_memory(settings.render.max_memory, self.device, self.need.least, loading)
+            check_memory(limit, self.device, self.need.least, loading)
             if self.loop is not None:
-                left = self.need.left(settings.render.max_memory, max(meter.now() - meter.base(), 0))
+                left = self.need.left(limit, max(meter.now() - meter.base(), 0))
                 self.loop.threads, self.loop.lanes = shape_of(left, self.loop.threads, rows, self.loop.lanes)
         with needing(lambda: f"films of {self.width} x {self.height} pixels, which take {mb(self.need.films)}"):
             self._begin()
@@ -89,7 +95,7 @@ class Run:
         }
         self.picture = Plate(film, layers, streams)
         self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
-        self.tally, self.done, self.taken, self.ended = Tally(), 0, 0, False
+        self.tally, self.done, self.left, self.taken, self.ended = Tally(), 0, 0, 0, False
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
         self.stop = Stop(self.settings.render, streams.count, None if self.keeper is None else EVERY)
         self.lost = Lost()
@@ -113,8 +119,35 @@ class Run:
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, or as many as the rules or ``on_progress`` let."""
         self.on_progress = on_progress
+        self.stop.watched = on_progress is not None or self.settings.adaptive
         with needing("a render"):
             self._all()
+        loaded("eager" if self.loop is None else "compiled")
+        return self._picture()
+
+    def at_once(self) -> list[tuple[Plate, int, int]] | None:
+        """All samples, to be handed to :meth:`took` as they come, and then :meth:`completed`.
+
+        None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
+        """
+        render = self.settings.render
+        bound = self.keeper is not None or self.stop.open or render.max_memory is not None
+        if self.loop is None or self.twice is not None or bound:
+            return None
+        self.begun = time.perf_counter()
+        return [(self.picture, 0, render.spp)]
+
+    def completed(self, rest: list[Block]) -> Rendering:
+        """The picture of samples that were taken :meth:`at_once`, but for the blocks for which there was no memory."""
+        assert self.loop is not None
+        with needing("a render"):
+            if self.unsupported is not None:
+                self._eagerly(self.unsupported)
+            else:
+                if rest:
+                    self.loop.take_rest(rest, self.took)
+                self.taken = self.settings.render.spp
+                self.stop.told(self.taken, self.seconds_of_sampling(), None)
         loaded("eager" if self.loop is None else "compiled")
         return self._picture()
 
@@ -133,7 +166,6 @@ class Run:
             return self._told()
 
     def _told(self) -> Rendering:
-        """The picture, and why samples of it are not finite."""
         rendering = self.result()
         rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(self.scene, self.wave, self.lost)
         return rendering
@@ -145,11 +177,15 @@ class Run:
         except Unsupported as error:
             if self.loop is None:
                 raise
-            self.eager.append(f"all stages: {error}")
-            say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
-            self.loop = None
-            self._begin()
-            self._complete()
+            self._eagerly(error)
+
+    def _eagerly(self, error: Unsupported) -> None:
+        """All samples, once more, by tensor operations."""
+        self.eager.append(f"all stages: {error}")
+        say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
+        self.loop = None
+        self._begin()
+        self._complete()
 
     # -- which samples
 
@@ -264,30 +300,29 @@ class Run:
         """Samples of plates, with the first one and how many; returns whether all were taken."""
         if not spans:
             return True
-        left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
-
-        def each(share: Share | None) -> bool:
-            nonlocal left
-            if share is None:
-                return self._advanced(0, False)
-            self.tally.rays += share.tally.rays
-            self.tally.truncated += share.tally.truncated
-            self._count(share.lost)
-            if self.integrator.clamp is not None:
-                self.light += torch.tensor(share.light, dtype=torch.float64)
-            left -= share.samples
-            return self._advanced(share.samples, left == 0)
-
+        self.left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
         if self.loop is not None:
-            return self.loop.run(spans, each)
+            return self.loop.run(spans, self.took)
         if self.waves is None:
             self.waves = Waves(budget_of(self.settings, self.device))
         for plate, first, count in spans:
             pixels = plate.film.width * plate.film.height
             for _, n, _, samples in self.waves.through(partial(self._piece, plate), pixels, first, count):
-                if each(Share(Tally(), n * samples)):
+                if self.took(Share(Tally(), n * samples)):
                     return False
         return True
+
+    def took(self, share: Share | None) -> bool:
+        """Count what a task brought; returns whether the render is to stop."""
+        if share is None:
+            return self._advanced(0, False)
+        self.tally.rays += share.tally.rays
+        self.tally.truncated += share.tally.truncated
+        self._count(share.lost)
+        if self.integrator.clamp is not None:
+            self.light += torch.tensor(share.light, dtype=torch.float64)
+        self.left -= share.samples
+        return self._advanced(share.samples, self.left == 0)
 
     def _piece(self, plate: Plate, span: Span) -> None:
         """A piece by tensor operations: all of it, or nothing where it raises."""
@@ -328,15 +363,8 @@ class Run:
     def result(self) -> Rendering:
         """The picture so far."""
         radiant, film = self.integrator.light, self.picture.film
-        layers = self._layers()
-        known = None
-        if radiant:
-            values = film.mean() if self.twice is None else self.twice.picture(film)
-            image, known = values.to(self.dtype), self._known(values)
-        else:
-            shown = layers[next(iter(self.seen))]
-            blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
-            image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else torch.cat((shown, blank), -1)
+        layers = layers_of(self)
+        image, known = image_of(self, layers)
         clamped = None
         if radiant and self.integrator.clamp is not None:
             before, after = self.light.tolist()
@@ -371,26 +399,3 @@ class Run:
             scene=self.name,
             settings=self.settings,
         )
-
-    def _known(self, picture: Tensor) -> KnownError | None:
-        """The picture's own error."""
-        film = self.picture.film
-        if self.twice is not None:
-            return self.twice.known(film, picture)
-        relmse = film.relmse()
-        return None if relmse is None else KnownError(relmse, None, False)
-
-    def _layers(self) -> dict[str, Tensor]:
-        """The layers so far: those of first surfaces, and those that the film makes."""
-        layers = {}
-        film = self.picture.film
-        for name, layer in self.seen.items():
-            seen = self.picture.layers[name]
-            values = seen.mean() * (self.unit if layer.length else 1.0) if layer.averaged else seen.first()
-            layers[name] = values.to(self.dtype)
-        for name in self.settings.film.aovs:
-            if name not in self.seen:
-                made: Any = LAYERS[name]  # a FilmLayer
-                counts = film.counts if self.twice is None else self.twice.counts(film)
-                layers[name] = made.of(film, counts).to(self.dtype)
-        return layers

@@ -44,18 +44,27 @@ def make_wave(
     dtype: torch.dtype,
     tape: bool = False,
     attached: bool = False,
+    like: Wave | None = None,
 ) -> Wave:
-    """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``."""
+    """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``.
+
+    ``like``: a wave of the same scene, settings and parameters, but for those of the camera: what it reads is read again.
+    """
     film, spp = settings.film, settings.render.spp
     integrator = settings.integrator.counted_in(scene.space.unit)
-    uv = any(layer.uv for layer in surface_layers(settings).values())
-    world, geometry = scene.world(dtype, params, uv, settings.light_choice)
-    threads = None if settings.render.threads == "auto" else int(settings.render.threads)
-    moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in params or {})
-    accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
-    own = not params  # the world is the scene's own, and what is made of it may be kept
-    if not integrator.lit:
-        world = _dark(scene, world, own)
+    params = params or {}
+    shaping = {name: value for name, value in params.items() if not name.startswith("camera.")}
+    own = not shaping  # the world is the scene's own, and what is made of it may be kept
+    if like is None:
+        uv = any(layer.uv for layer in surface_layers(settings).values())
+        world, geometry = scene.world(dtype, shaping, uv, settings.light_choice)
+        threads = None if settings.render.threads == "auto" else int(settings.render.threads)
+        moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in shaping)
+        accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
+        if not integrator.lit:
+            world = _dark(scene, world, own)
+    else:
+        world, accel = like.stages.world, like.accel
     points = points_of(settings.sampler)
     plan = integrator.plan(points, dtype, tape, attached)
     camera = scene.camera(film, scene.merged(params), dtype)
@@ -68,7 +77,7 @@ def make_wave(
         sampler=Sampler(points, settings.render.seed, streams_of(settings), spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.space.shift,
-        first=_first(scene, integrator, world, own),
+        first=_first(scene, integrator, world, own) if like is None else like.first,
     )
 
 
@@ -166,7 +175,7 @@ def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kerne
     """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
     packets = wave.accel.name == "brute" and not wave.stages.world.geometry.counts[4]
     fused = packets and wave.stages.world.materials.opacity is None and wave.first is None
-    kernels = Kernels(wave, packets, fused, before)
+    kernels = Kernels(wave, packets, fused, before, fixed=not scene.own_models)
     own = [
         k
         for k, model in enumerate(wave.stages.world.materials.models)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -52,8 +53,12 @@ class Program:
     nodes: Mapping[str, int]
     sums: Sequence[Sequence[Any]] = ()
 
-    def leaves(self) -> set[str]:
+    def leaves(self) -> frozenset[str]:
         """Paths of the leaves that enter its tables."""
+        return self._leaves
+
+    @cached_property
+    def _leaves(self) -> frozenset[str]:
         paths: set[str] = set()
 
         def visit(value: Any) -> None:
@@ -67,7 +72,7 @@ class Program:
         for step in self.steps:
             visit((step.args, tuple(step.kwargs.values())))
         visit([table.source for table in self.tables])
-        return paths
+        return frozenset(paths)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from torchpt.scene.build import Built, build_parts
 from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, middle_of
+from torchpt.scene.view import through
 from torchpt.settings import Film, Settings
 from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
@@ -123,6 +124,27 @@ class Scene:
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
         self._state: dict[str, tuple[Tensor, int]] = {}
+        self._origin: Scene | None = None
+
+    @property
+    def origin(self) -> Scene:
+        """The scene that this is a view of (:meth:`seen_by`), else itself: what is made of either is made of that."""
+        return self if self._origin is None else self._origin
+
+    def seen_by(self, camera: Mapping[str, Any], film: Mapping[str, Any] | None = None) -> Scene:
+        """This scene through another camera. Tensors are shared, and so is all that is made of them: nothing is built again.
+
+        Args:
+            camera: its block, as in a scene file.
+            film: film settings in place of the scene's own, by whose size a ``K`` in pixels is read that does not say its own.
+
+        Raises:
+            SceneError: what is wrong with the camera.
+        """
+        view = object.__new__(type(self))
+        view.__dict__.update(self.__dict__ | through(self.description, self._built, self.params, camera, film or {}))
+        view._origin = self.origin
+        return view
 
     def to(self, device: str | torch.device) -> Scene:
         """The scene on a device, which may be ``auto``: itself where it is there already, else a copy.
@@ -333,13 +355,15 @@ class Scene:
             for name, (value, version) in state.items()
             if name not in self._state or value is not self._state[name][0] or version != self._state[name][1]
         ]
-        if not changed and len(state) == len(self._state):
+        gone = any(name not in state and not name.startswith("camera.") for name in self._state)
+        if not changed and not gone:
             return
         for name in changed:
             if self.spec(name).place and name in self._state:
                 self._check(name, state[name][0].detach())
-        self._state = state
-        if changed and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it
+        self._state.clear()  # views of the scene have the same
+        self._state.update(state)
+        if not gone and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it
             return
         self._worlds.clear()
         self._accels.clear()
