@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchpt.lanes.graph import Unsupported
-from torchpt.lanes.prologue import Guard, Source, Step, Table, replayed
+from torchpt.lanes.prologue import Guard, Source, Step, Table, names_of, replayed
 
 __all__ = ["Program", "Tables", "bound", "holds", "laid_out", "signature"]
 
@@ -56,6 +56,11 @@ class Program:
     def leaves(self) -> frozenset[str]:
         """Paths of the leaves that enter its tables."""
         return self._leaves
+
+    @cached_property
+    def names(self) -> tuple[int | None, ...]:
+        """Of its steps, see :func:`torchpt.lanes.prologue.names_of`."""
+        return names_of(self.steps)
 
     @cached_property
     def _leaves(self) -> frozenset[str]:
@@ -114,6 +119,8 @@ def bound(
     held: Sequence[Tensor],
     leaves: Mapping[str, Tensor],
     known: dict[Any, Tensor] | None = None,
+    names: Sequence[int | None] = (),
+    results: dict[int, Any] | None = None,
 ) -> Tables:
     """The tables of a kernel for one scene.
 
@@ -123,9 +130,11 @@ def bound(
         held: its own tensors.
         leaves: the scene's tensors by path.
         known: leaves that were laid out before, by path and axis; filled.
+        names: of the steps.
+        results: what steps of other kernels came to, see :func:`torchpt.lanes.prologue.replayed`; filled.
     """
     known = {} if known is None else known
-    tensor = replayed(steps, held, leaves)
+    tensor = replayed(steps, held, leaves, names, results)
     words: list[int] = []
     keep: list[Tensor] = []
     for table in tables:
