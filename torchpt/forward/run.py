@@ -21,7 +21,7 @@ from torchpt.forward.piece import take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, budget_of
-from torchpt.forward.seen import image_of, layers_of
+from torchpt.forward.seen import clamped_of, image_of, layers_of
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
 from torchpt.forward.wave import kernels_of, looped, make_wave, surface_layers
@@ -365,10 +365,6 @@ class Run:
         radiant, film = self.integrator.light, self.picture.film
         layers = layers_of(self)
         image, known = image_of(self, layers)
-        clamped = None
-        if radiant and self.integrator.clamp is not None:
-            before, after = self.light.tolist()
-            clamped = 1.0 - after / before if before > 0 else 0.0
         counts = (film if radiant else next(iter(self.picture.layers.values()))).counts
         compile_seconds = 0.0 if self.loop is None else self.loop.kernels.seconds
         names = self.settings.film.aovs or self.integrator.layers
@@ -387,7 +383,7 @@ class Run:
             rays=self.tally.rays,
             nonfinite_samples=self.lost.count,
             truncated_paths=self.tally.truncated,
-            clamped=clamped,
+            clamped=clamped_of(self),
             relmse=None if known is None else known.relmse,
             relmse_interval=None if known is None else known.interval,
             heavy_tailed=known is not None and known.heavy_tailed,

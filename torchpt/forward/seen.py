@@ -1,4 +1,4 @@
-"""What the films of a render come to: the picture with its own error, and its layers."""
+"""What the films of a render come to: the picture with its own error, its layers, what was clamped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchpt.integrators import LAYERS
 if TYPE_CHECKING:
     from torchpt.forward.run import Run
 
-__all__ = ["image_of", "layers_of"]
+__all__ = ["clamped_of", "image_of", "layers_of"]
 
 
 def image_of(run: Run, layers: Mapping[str, Tensor]) -> tuple[Tensor, KnownError | None]:
@@ -26,6 +26,14 @@ def image_of(run: Run, layers: Mapping[str, Tensor]) -> tuple[Tensor, KnownError
     if shown.shape[2] == 1:
         return shown.expand(-1, -1, 3).contiguous(), None
     return torch.cat((shown, torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))), -1), None
+
+
+def clamped_of(run: Run) -> float | None:
+    """The fraction of the light that ``integrator.clamp`` took away; None where it is off."""
+    if not run.integrator.light or run.integrator.clamp is None:
+        return None
+    before, after = run.light.tolist()
+    return 1.0 - after / before if before > 0 else 0.0
 
 
 def _known_error(run: Run, picture: Tensor) -> KnownError | None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchpt.cameras import Camera
+from torchpt.film import Filter
 from torchpt.forward.kept import kept
 from torchpt.forward.schedule import streams_of
 from torchpt.images.denoiser import GUIDES
@@ -67,18 +69,41 @@ def make_wave(
         world, accel = like.stages.world, like.accel
     points = points_of(settings.sampler)
     plan = integrator.plan(points, dtype, tape, attached)
-    camera = scene.camera(film, scene.merged(params), dtype)
+    camera = _camera(scene, settings, params, dtype)
     return Wave(
         stages=_stages(scene, settings, plan, world, _pixel_of(world, camera), own),
         integrator=integrator,
         accel=accel,
         camera=camera,
-        filter=film.filter.kind(film.filter.values, scene.device),
+        filter=_filter(film.filter.kind, tuple(film.filter.values.items()), scene.device),
         sampler=Sampler(points, settings.render.seed, streams_of(settings), spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.space.shift,
         first=_first(scene, integrator, world, own) if like is None else like.first,
     )
+
+
+def _camera(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
+    """The camera on the film; the latest one where it was made of the same."""
+    merged, film = scene.merged(params), settings.film
+    if torch.is_grad_enabled():
+        return scene.camera(film, merged, dtype)
+    given = [value for name, value in merged.items() if name.startswith("camera.")]
+    if any(value.is_inference() for value in given):
+        return scene.camera(film, merged, dtype)
+    # By identity: what the ids are of is held beside them, so that they stay their own.
+    held = (scene.description.camera, *given)
+    made_of = ([id(value) for value in held], [value._version for value in given], film.width, film.height, dtype)
+    keeper = kept(scene)
+    if keeper.camera is None or keeper.camera[0][0] != made_of:
+        keeper.camera = (made_of, held), scene.camera(film, merged, dtype)
+    return keeper.camera[1]
+
+
+@lru_cache(maxsize=64)
+def _filter(kind: type[Filter], values: tuple[tuple[str, Any], ...], device: torch.device) -> Filter:
+    """A filter; renders of the same read the same tensors."""
+    return kind(dict(values), device)
 
 
 def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Wave:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchpt.lanes.graph import Unsupported
-from torchpt.lanes.prologue import Guard, Source, Step, Table, names_of, replayed
+from torchpt.lanes.prologue import Guard, Name, Source, Step, Table, names_of, replayed
 
 __all__ = ["Program", "Tables", "bound", "holds", "laid_out", "signature"]
 
@@ -58,7 +58,7 @@ class Program:
         return self._leaves
 
     @cached_property
-    def names(self) -> tuple[int | None, ...]:
+    def names(self) -> tuple[Name | None, ...]:
         """Of its steps, see :func:`torchpt.lanes.prologue.names_of`."""
         return names_of(self.steps)
 
@@ -119,8 +119,8 @@ def bound(
     held: Sequence[Tensor],
     leaves: Mapping[str, Tensor],
     known: dict[Any, Tensor] | None = None,
-    names: Sequence[int | None] = (),
-    results: dict[int, Any] | None = None,
+    names: Sequence[Name | None] = (),
+    results: dict[Name, Tensor] | None = None,
 ) -> Tables:
     """The tables of a kernel for one scene.
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Guard", "Source", "Step", "Table", "names_of", "pruned", "replayed"]
+__all__ = ["Guard", "Name", "Source", "Step", "Table", "names_of", "pruned", "replayed"]
 
 #: Bytes of a tensor up to which it is kept for other prologues.
 SMALL = 1 << 16
@@ -101,37 +101,51 @@ def pruned(
     )
 
 
-def names_of(steps: Sequence[Step]) -> tuple[int | None, ...]:
-    """A number for each step, the same in all prologues of the process for the same arithmetic on leaves of the same paths.
+@dataclass(frozen=True)
+class Name:
+    """Of a step: the same in all prologues of the process for the same arithmetic on leaves of the same paths.
 
-    None where a tensor of the program's own has part in it, or what its arguments are cannot be told.
+    Attributes:
+        number: tells it from others.
+        leaves: paths of those that enter it.
     """
-    numbers: list[int | None] = []
+
+    number: int
+    leaves: frozenset[str]
+
+
+def names_of(steps: Sequence[Step]) -> tuple[Name | None, ...]:
+    """Names of steps; None where a tensor of the program's own has part in one, or what its arguments are cannot be told."""
+    names: list[Name | None] = []
+    leaves: set[str] = set()  # of the step that is looked at
 
     def told(value: Any) -> Any:
         if isinstance(value, Source):
             if value.kind == "held":
                 raise TypeError("a tensor of the program's own")
             if value.kind == "leaf":
+                leaves.add(str(value.name))
                 return "leaf", value.name
-            number = numbers[int(value.name)]
-            if number is None:
-                raise TypeError("a step that has no number")
-            return "step", number, value.item
+            name = names[int(value.name)]
+            if name is None:
+                raise TypeError("a step that has no name")
+            leaves.update(name.leaves)
+            return "step", name.number, value.item
         if isinstance(value, list | tuple):
             return type(value), tuple(told(x) for x in value)
         return type(value), repr(value) if isinstance(value, float) else value
 
     for step in steps:
+        leaves.clear()
         schema = getattr(step.function, "_schema", None)
         try:
             if schema is None or schema.is_mutable:
                 raise TypeError("what writes into its arguments")
-            key = step.function, told(step.args), tuple((name, told(value)) for name, value in step.kwargs.items())
-            numbers.append(_numbers.setdefault(key, next(_count)))
+            key = step.function, told(step.args), tuple((k, told(value)) for k, value in step.kwargs.items())
+            names.append(Name(_numbers.setdefault(key, next(_count)), frozenset(leaves)))
         except TypeError:  # of what cannot be hashed, too
-            numbers.append(None)
-    return tuple(numbers)
+            names.append(None)
+    return tuple(names)
 
 
 #: Numbers of steps by what they do.
@@ -147,8 +161,8 @@ def replayed(
     steps: Sequence[Step],
     held: Sequence[Tensor],
     leaves: Mapping[str, Tensor],
-    names: Sequence[int | None] = (),
-    known: dict[int, Any] | None = None,
+    names: Sequence[Name | None] = (),
+    known: dict[Name, Tensor] | None = None,
 ) -> Any:
     """Runs a prologue; returns ``tensor(source)``.
 

@@ -81,7 +81,7 @@ class Kernels(Layout):
         alike = before is not None and before._structure == self._structure
         self.handed = before.handed if alike else Handed()  # pyright: ignore[reportOptionalMemberAccess]
         self._laid_out = self.handed.tables(self._leaves)
-        self._results: dict[int, Any] = {}  # of steps that several prologues have
+        self._results = self.handed.results(self._leaves)
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
         self.search = packet_kernels.search_words(wave) if packets else None
@@ -206,5 +206,5 @@ class Kernels(Layout):
             program.tables, program.steps, program.held, leaves, self._laid_out, program.names, self._results
         )
         made = Kernel(program, tables)
-        self.handed.keep(key, made, self._laid_out, self._leaves)
+        self.handed.keep(key, made, self._laid_out, self._results, self._leaves)
         return made
