@@ -69,7 +69,7 @@ def room(k: int, size: int, spp: int, mesh: tuple[np.ndarray, np.ndarray]) -> di
     rectangle("front", [turned([0, 1, 0], 180)], [0, 0, 2], 2, material="white")
     rectangle("left", [turned([0, 1, 0], 90)], [-2, 0, 0], 2, material="red")
     rectangle("right", [turned([0, 1, 0], -90)], [2, 0, 0], 2, material="green")
-    rectangle("lamp", [turned([1, 0, 0], 90)], [0, 0.99, 0], 0.4, emission=[8, 8, 8])
+    rectangle("lamp", [turned([1, 0, 0], 90)], [0, 0.99, 0], 0.4, material="white", emission=[8, 8, 8])
     for i in range(23):
         a = 2.0 * np.pi * i / 23
         where = [float(-1.7 * np.sin(a)), -0.6 + 0.05 * i, float(-1.7 * np.cos(a))]
@@ -77,7 +77,7 @@ def room(k: int, size: int, spp: int, mesh: tuple[np.ndarray, np.ndarray]) -> di
     ball, lump = places(k)
     shapes["ball"] = {"type": "sphere", "center": ball.tolist(), "radius": 0.4, "material": "white"}
     vertices = (0.4 * mesh[0] + lump).astype(np.float32)
-    shapes["lump"] = {"type": "mesh", "vertices": vertices, "faces": mesh[1], "material": "red"}
+    shapes["lump"] = {"type": "mesh", "vertices": vertices, "faces": mesh[1], "face_normals": True, "material": "red"}
     return {
         "camera": {"type": "perspective", "origin": [0, 0.3, 1.8], "target": [0, -0.2, 0], "fov": 70},
         "film": {"width": size, "height": size, "filter": "box"},
@@ -89,16 +89,16 @@ def room(k: int, size: int, spp: int, mesh: tuple[np.ndarray, np.ndarray]) -> di
 
 
 def poses(count: int) -> list[np.ndarray]:
-    """Places of the camera, ``(4, 4)`` as torchpt has them: it looks along -z."""
+    """Places of the camera, ``(4, 4)``: from x to the left, y up and z ahead to the scene."""
     found = []
     for k in range(count):
         origin = np.array([0.6 * np.sin(0.2 * k), 0.3, 1.5 + 0.2 * np.cos(0.2 * k)])
-        back = origin - np.array([0.0, -0.2, 0.0])
-        back /= np.linalg.norm(back)
-        right = np.cross([0.0, 1.0, 0.0], back)
-        right /= np.linalg.norm(right)
+        ahead = np.array([0.0, -0.2, 0.0]) - origin
+        ahead /= np.linalg.norm(ahead)
+        left = np.cross([0.0, 1.0, 0.0], ahead)
+        left /= np.linalg.norm(left)
         pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(back, right), back, origin], 1)
+        pose[:3] = np.stack([left, np.cross(ahead, left), ahead, origin], 1)
         found.append(pose)
     return found
 
@@ -177,11 +177,7 @@ def mitsuba(arguments: argparse.Namespace, scenes: list[dict[str, Any]]) -> dict
         return np.stack([np.asarray(mi.render(loaded(k), spp=arguments.spp, seed=k)) for k in range(len(given))])
 
     one = loaded(0)
-    flip = np.diag([-1.0, 1.0, -1.0, 1.0])  # its cameras look along +z, with x to the left
-    views = [
-        mi.load_dict({**given[0]["sensor"], "to_world": mi.ScalarTransform4f(pose @ flip)})
-        for pose in poses(len(given))
-    ]
+    views = [mi.load_dict({**given[0]["sensor"], "to_world": mi.ScalarTransform4f(pose)}) for pose in poses(len(given))]
 
     def over_cameras() -> np.ndarray:
         return np.stack(
