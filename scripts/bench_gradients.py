@@ -440,7 +440,7 @@ def theirs(case: Case, arguments: argparse.Namespace) -> Take:
     (name,) = names
     weights = mi.TensorXf(weight(arguments.size))
     ours_of = None
-    if name.endswith("vertex_positions"):  # there every corner is a vertex of its own
+    if name.endswith("vertex_positions"):  # there vertices come in another order
         corners = np.asarray(params[name], np.float64).reshape(-1, 1, 3)
         ours_of = ((corners - scene.params[case.parameter].numpy()) ** 2).sum(-1).argmin(1)
 

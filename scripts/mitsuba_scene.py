@@ -514,7 +514,10 @@ def _bare(slot: ResolvedMaterial, opened: Opened) -> dict[str, Any]:
 
 
 def _write_part(file: Path, scene: Scene, part: Part) -> None:
-    """A mesh in the world, each triangle with corners of its own so that Mitsuba interpolates the same normals."""
+    """A mesh in the world, with the normals that are interpolated here; corners that are alike are one vertex.
+
+    Mitsuba takes an edge whose triangles share no vertices for two borders, and counts its silhouette twice.
+    """
     own = Space(torch.zeros(3, dtype=torch.float64), 1.0)
     corners = corners_of(part, scene.params, own, torch.float64)
     columns = [torch.stack((corners.p0, corners.p1, corners.p2))]  # (3 corners, 3, F)
@@ -534,8 +537,9 @@ def _write_part(file: Path, scene: Scene, part: Part) -> None:
         *(("nx", "ny", "nz") if corners.normals is not None else ()),
         *("uv" if part.uvs is not None else ""),
     ]
-    vertices = rows.permute(2, 0, 1).reshape(-1, len(names)).detach().numpy()
-    write_ply(file, vertices, np.arange(len(vertices)).reshape(-1, 3), names)
+    corner = rows.permute(2, 0, 1).reshape(-1, len(names)).detach().float().numpy()
+    vertices, index = np.unique(corner, axis=0, return_inverse=True)
+    write_ply(file, vertices, index.reshape(-1, 3), names)
 
 
 def write_ply(file: Path, vertices: np.ndarray, faces: np.ndarray, names: Sequence[str] = "xyz") -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt import adjoint as adjoints
-from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape
+from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape, without_gradient
 from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Progress, Rendering, Run, limited_threads
@@ -301,6 +301,9 @@ def _differentiable(
     attached = adjoints.attached(scene, wanted)
     if concerns(scene, wanted):
         _warn_of_edges(scene, settings, backward["edges"] == 0)
+    for name in without_gradient(scene, wanted):
+        said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"
+        warnings.warn(said, EdgeWarning, stacklevel=4)
     fixed = {name: value for name, value in params.items() if name not in wanted}
     made: list[Rendering] = []
     taken: list[int] = []

@@ -110,6 +110,27 @@ def test_signed_filters_and_clamps():
     agree(room(COLOUR["plate"]), "materials.plate.reflectance", **wish)
 
 
+@pytest.mark.parametrize("mode", ["auto", "off"])
+def test_clamped_samples_have_the_derivative_of_what_counts(mode):
+    """A grey sample beyond the clamp counts as the clamp, whatever the light: by differences."""
+    scene = torchpt.load(room(COLOUR["plate"]), "cpu")
+    wish: dict[str, Any] = {"integrator": {"type": "path", "clamp": 0.3, "max_depth": 3}, "compile": mode, "threads": 1}
+    base, exact, difference = scene.params["materials.plate.reflectance"], [], []
+    for seed in range(4):
+        leaf = base.clone().requires_grad_()
+        picture = torchpt.render(scene, params={"materials.plate.reflectance": leaf}, spp=64, seed=seed, **wish)
+        exact.append(float(torch.autograd.grad(picture.double().sum(), leaf)[0].sum()))
+        ends = [
+            torchpt.render(scene, params={"materials.plate.reflectance": base + step}, spp=64, seed=seed, **wish)
+            for step in (0.02, -0.02)
+        ]
+        difference.append(float((ends[0].double() - ends[1].double()).sum()) / 0.04)
+    a, b = torch.tensor(exact), torch.tensor(difference)
+    whole = gradient_of(scene, "materials.plate.reflectance", integrator={"type": "path", "max_depth": 3})
+    assert float(whole.norm()) > 0
+    assert abs(float(a.mean() - b.mean())) < 4 * float(a.std() + b.std()) / 2 + 0.01 * abs(float(b.mean()))
+
+
 @pytest.mark.slow
 def test_opacity():
     described = room({**COLOUR["plate"], "opacity": 0.5})

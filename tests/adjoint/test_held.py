@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import pytest
 import torch
-from few_lanes import few_lanes
 
 import torchpt
 from torchpt.adjoint import held
@@ -104,14 +104,88 @@ def test_agrees_with_differences(filter):
     assert abs(float(a.mean() - b.mean())) < 4.5 * error + 0.01 * abs(float(b.mean()))
 
 
-def test_does_not_depend_on_chunks():
+def test_small_chunks_give_the_same_up_to_rounding(monkeypatch):
     scene = torchpt.load(CORNER, "cpu")
     pose, grads = scene.params["camera.to_world"].clone().requires_grad_(), []
     for lanes in (None, 62):
-        with few_lanes(lanes):
-            picture = torchpt.render(scene, params={"camera.to_world": pose}, spp=8)
-            grads.append(torch.autograd.grad(loss(picture), pose)[0])
+        if lanes is not None:
+            monkeypatch.setattr(sys.modules["torchpt.adjoint.tape"], "LANES", {"cpu": lanes})
+        picture = torchpt.render(scene, params={"camera.to_world": pose}, spp=8)
+        grads.append(torch.autograd.grad(loss(picture), pose)[0])
     assert torch.allclose(*grads, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("filter", ["box", "gaussian"])
+def test_bits_do_not_depend_on_threads_nor_memory(filter):
+    """Enough paths for several chunks, each of more lanes than torch gives to one thread."""
+    scene = torchpt.load({**CORNER, "film": {"width": 96, "height": 64, "filter": filter}}, "cpu")
+    pose, grads = scene.params["camera.to_world"].clone().requires_grad_(), []
+    wishes: list[dict[str, Any]] = [{"threads": 1}, {"threads": 3}, {"threads": 1, "max_memory": "3GB"}]
+    for wish in wishes:
+        picture = torchpt.render(scene, params={"camera.to_world": pose}, spp=1, spp_grad=14, edges=False, **wish)
+        grads.append(torch.autograd.grad(picture.square().sum(), pose)[0])
+    assert torch.equal(grads[0], grads[1]) and torch.equal(grads[0], grads[2])
+
+
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
+def test_sheared_axes_are_followed(kind):
+    """Entries of a pose move its axes from their right angles: places on the film stay those of the rays."""
+    scene = torchpt.load({**CORNER, "camera": {**CORNER["camera"], "type": kind, "fov": 40} if kind == "perspective" else
+                          {"type": kind, "origin": [0.1, 1.5, 3], "target": [0.2, 0.6, -1]}}, "cpu")  # fmt: skip
+    settings = torchpt.format.description.settings(scene.description, {})
+    pose = scene.params["camera.to_world"].double()
+    pose[:3, :3] += 0.2 * torch.rand(3, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    camera = scene.camera(settings.film, scene.merged({"camera.to_world": pose}), torch.float64)
+    x, y = torch.rand(2, 50, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 7
+    o, d = camera.rays(x, y, None)
+    seen = camera.film_of(o + d * torch.linspace(0.1, 30, 50, dtype=torch.float64))
+    assert seen is not None and torch.allclose(seen[0] / seen[2], x) and torch.allclose(seen[1] / seen[2], y)
+
+
+def gradients(scene: torchpt.Scene, names: tuple[str, ...], seeds: int = 4, **wish: Any) -> torch.Tensor:
+    """``(seeds, ...)`` by the first of some parameters."""
+    found = []
+    for seed in range(seeds):
+        leaves = {name: scene.params[name].clone().requires_grad_() for name in names}
+        picture = torchpt.render(scene, params=leaves, spp=1, seed=seed, **wish)
+        found.append(torch.autograd.grad(picture.double().mean(), leaves[names[0]])[0])
+    return torch.stack(found)
+
+
+def test_what_lets_rays_pass_is_not_held():
+    """A plate that half of the rays pass fills the view: the gradient by the camera is half of that without it."""
+    ball = {"type": "sphere", "radius": 0.5, "material": {"type": "diffuse", "reflectance": 0}}
+    plate = {"type": "rectangle", "transform": [{"scale": 9}, {"translate": [0, 0, 1.5]}],
+             "material": {"type": "diffuse", "reflectance": 0, "opacity": 0.5}}  # fmt: skip
+    found = []
+    for shapes in ({"ball": ball}, {"ball": ball, "plate": plate}):
+        scene = torchpt.load({
+            "camera": {"origin": [0.6, 0, 4], "target": [0.6, 0, 0], "fov": 20}, "shapes": shapes,
+            "film": {"width": 12, "height": 12, "filter": "box"}, "integrator": {"type": "path", "max_depth": 2},
+            "lights": {"sky": {"type": "constant"}}}, "cpu")  # fmt: skip
+        found.append(gradients(scene, ("camera.to_world",), spp_grad=24)[:, 0, 3])
+    (free, one), (half, other) = ((float(x.mean()), float(x.std()) / 2) for x in found)
+    assert abs(free) > 0.02  # the ball's silhouette is within the picture on one side
+    assert abs(half - 0.5 * free) < 4 * (0.5 * one + other) + 0.01 * abs(free)
+
+
+@pytest.mark.parametrize("name", ["lights.it.position", "lights.it.direction"])
+def test_a_light_beside_the_camera_has_its_shadow_edges(name):
+    lights = {
+        "lights.it.position": {"type": "point", "position": [0.4, 3, 0.3], "intensity": 5},
+        "lights.it.direction": {"type": "directional", "direction": [-0.3, -1, -0.2], "irradiance": 2},
+    }
+    block = {"type": "cube", "transform": [{"scale": 0.3}, {"translate": [0, 0.8, 0]}]}
+    floor = {"type": "rectangle", "transform": [{"scale": 4}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}]}
+    scene = torchpt.load({
+        "camera": {"origin": [0, 3, 4], "target": [0, 0.3, 0], "fov": 40}, "shapes": {"block": block, "floor": floor},
+        "lights": {"it": lights[name]}, "film": {"width": 12, "height": 12, "filter": "box"},
+        "integrator": {"type": "path", "max_depth": 2}}, "cpu")  # fmt: skip
+    alone, beside = (gradients(scene, names, spp_grad=24) for names in ((name,), (name, "camera.fov")))
+    error = (alone.std(0) + beside.std(0)) / 2
+    assert bool(((alone.mean(0) - beside.mean(0)).abs() <= 4 * error + 1e-3 * alone.mean(0).abs().max()).all())
+    without = gradients(scene, (name,), spp_grad=24, edges=False).mean(0)
+    assert float((without - alone.mean(0)).abs().max()) > 0.05 * float(alone.mean(0).abs().max())
 
 
 def test_materials_beside_the_camera_have_their_own_gradient():

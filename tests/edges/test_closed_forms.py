@@ -103,9 +103,13 @@ def test_a_shape_behind_the_camera_gives_nothing() -> None:
         assert float(found.abs().max()) == 0.0
 
 
-def test_two_surfaces_that_meet_count_once() -> None:
-    """A seam between two walls moves with the camera: each of its two edges counts half."""
+@pytest.mark.parametrize("opacity", [1.0, 0.5])
+@pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
+def test_two_surfaces_that_meet_count_once(opacity: float) -> None:
+    """A seam between two walls moves with the camera: each of its two edges counts half, whatever lets light pass elsewhere."""
+    veil = {"type": "diffuse", "opacity": opacity}
     shapes = {
+        "veil": {"type": "sphere", "center": [0, 0, 90], "material": veil},
         "left": {"type": "rectangle", "emission": [1, 1, 1], "transform": [{"translate": [-1, 0, 0]}]},
         "right": {"type": "rectangle", "emission": [3, 3, 3], "transform": [{"translate": [1, 0, 0]}]},
     }
@@ -116,6 +120,20 @@ def test_two_surfaces_that_meet_count_once() -> None:
     assert leaf.grad is not None
     # Four rows of a seam of step 2 in three channels move by 4 pixels a unit.
     assert float(leaf.grad[0, 3]) == pytest.approx(4 * 3 * 2 * 4, rel=1e-3)
+
+
+def test_parameters_that_only_make_jumps_are_named() -> None:
+    board = {"type": "diffuse", "opacity": {"type": "checkerboard"}, "alpha_cutoff": 0.5}
+    spot = {"type": "spot", "position": [0, 0, 3], "target": [0, 0, 0], "cutoff_angle": 20, "beam_width": 20}
+    described = {**BASE, "shapes": {"it": {"type": "rectangle", "material": board}}, "lights": {"spot": spot}}
+    scene = torchpt.load(described, "cpu")
+    for name in ("lights.spot.cutoff_angle", "lights.spot.beam_width", "shapes.it.material.opacity.color0"):
+        leaf = scene.params[name].clone().requires_grad_()
+        with pytest.warns(torchpt.EdgeWarning, match=f"{name} changes the picture by jumps alone"):
+            torchpt.render(scene, params={name: leaf}, spp=1)
+    soft = torchpt.load({**described, "lights": {"spot": {**spot, "beam_width": 10}}}, "cpu")
+    leaf = soft.params["lights.spot.cutoff_angle"].clone().requires_grad_()
+    torchpt.render(soft, params={"lights.spot.cutoff_angle": leaf}, spp=1)
 
 
 def test_what_is_left_out_is_named() -> None:

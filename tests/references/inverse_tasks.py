@@ -7,17 +7,14 @@ rendered from the true numbers with another seed and many samples.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import known_gradients as known
 import torch
 from torch import Tensor
 
-import torchpt
 from torchpt.scene import Scene
 
 __all__ = ["SIZE", "TASKS", "Task", "described"]
@@ -70,15 +67,7 @@ class Task:
 
 def described(task: Task) -> Scene:
     """The true scene of a task."""
-    with tempfile.TemporaryDirectory() as folder:
-        for name, made in task.files.items():
-            torchpt.write_image(str(Path(folder) / name), made())
-        scene = {
-            **known.in_folder(task.scene, folder),
-            "film": {"width": SIZE, "height": SIZE, "filter": "box"},
-            "integrator": {"type": "path", "max_depth": task.depth, "rr_depth": 100},
-        }
-        return torchpt.load(scene, "cpu")
+    return known.opened(task.scene, task.files, SIZE, task.depth)
 
 
 def plain(name: str, start: float, rate: float, **more: Any) -> dict[str, Any]:

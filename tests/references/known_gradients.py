@@ -76,15 +76,20 @@ class Pair:
 
 def loaded(pair: Pair) -> Scene:
     """The scene of a pair."""
+    return opened(pair.scene, pair.files, SIZE, pair.depth)
+
+
+def opened(scene: Mapping[str, Any], files: Mapping[str, Callable[[], Tensor]], size: int, depth: int) -> Scene:
+    """A scene whose pictures are made for it, on a square film, without roulette."""
     with tempfile.TemporaryDirectory() as folder:
-        for name, made in pair.files.items():
+        for name, made in files.items():
             torchpt.write_image(str(Path(folder) / name), made())
-        scene = {
-            **in_folder(pair.scene, folder),
-            "film": {"width": SIZE, "height": SIZE, "filter": "box"},
-            "integrator": {"type": "path", "max_depth": pair.depth, "rr_depth": 100},
+        whole = {
+            **in_folder(scene, folder),
+            "film": {"width": size, "height": size, "filter": "box"},
+            "integrator": {"type": "path", "max_depth": depth, "rr_depth": 100},
         }
-        return torchpt.load(scene, "cpu")
+        return torchpt.load(whole, "cpu")
 
 
 def in_folder(value: Any, folder: str) -> Any:

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from torchpt.cli import main
+from torchpt.errors import SceneError
 from torchpt.stress import Bench, Case, Outcome, Reading, outcome_of
 from torchpt.stress.cases import all_cases
 from torchpt.stress.own_scene import cases_of, moved
+from torchpt.stress.table import line
 
 CASES = {f"{topic}/{case.name}": case for topic, cases in all_cases().items() for case in cases}
 BACKENDS = {
@@ -89,6 +91,22 @@ def test_the_largest_figure_decides() -> None:
     assert not outcome_of(case(figure=lambda b, at: float("nan")), Bench()).passed
     broken = outcome_of(case(figure=failing), Bench())
     assert not broken.passed and broken.worst.problem == "ValueError: two lines"
+
+
+def refusing(bench: Bench, at: float) -> float:
+    if at < 1.0:
+        raise SceneError("render.accel", "brute", "numba")
+    return 0.5
+
+
+def test_a_search_may_refuse_a_scene() -> None:
+    partly = outcome_of(case(figure=refusing, places=(0.1, 1.0)), Bench(accel="brute"))
+    assert partly.passed and partly.refused == 1 and partly.worst == Reading(1.0, 0.5)
+    assert line(partly).endswith("passed, refused at 1 of 2 places")
+    wholly = outcome_of(case(figure=refusing, places=(0.1,)), Bench(accel="brute"))
+    assert wholly.passed and "refused: SceneError: render.accel: expected numba" in line(wholly)
+    beyond = outcome_of(case(figure=refusing, places=(0.1, 1.0), bound=0.1), Bench(accel="brute"))
+    assert not beyond.passed and "FAILED, refused at 1 of 2 places" in line(beyond)
 
 
 def test_places_of_a_quick_run() -> None:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from torchpt.adjoint.assembly import Assembly
-from torchpt.adjoint.attachment import attached, casts
+from torchpt.adjoint.attachment import attached
 from torchpt.adjoint.function import on_tape
 from torchpt.adjoint.held import by_film, follows, suits
 from torchpt.adjoint.loop import compiled_replay
@@ -34,7 +34,7 @@ from torchpt.integrators.path import PathIntegrator
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
-__all__ = ["KINDS", "attached", "casts", "gradients", "on_tape", "suits"]
+__all__ = ["KINDS", "attached", "gradients", "on_tape", "suits"]
 
 #: By name, the default first.
 KINDS = ("replay", "autograd")

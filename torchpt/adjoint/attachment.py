@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from torchpt.scene import Scene
 from torchpt.spec import Moves
 
-__all__ = ["attached", "casts"]
+__all__ = ["attached"]
 
 
 def attached(scene: Scene, names: Iterable[str]) -> bool:
@@ -22,8 +22,3 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
         return moved is Moves.SURFACES
 
     return any(map(moves, names))
-
-
-def casts(scene: Scene, names: Iterable[str]) -> bool:
-    """Whether any of the parameters moves shadow edges."""
-    return any(scene.spec(name).moves is Moves.SHADOWS for name in names)

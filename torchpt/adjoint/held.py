@@ -32,15 +32,14 @@ from torch import Tensor
 
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.attachment import attached
+from torchpt.adjoint.samples import counted
 from torchpt.adjoint.sums import Sums
-from torchpt.adjoint.tape import TAPE, tape_per_lane
-from torchpt.forward.schedule import Span, budget_of
-from torchpt.forward.waves import Waves
+from torchpt.adjoint.tape import chunk_by_chunk
+from torchpt.forward.schedule import Span
 from torchpt.integrators.path import PathIntegrator
 from torchpt.integrators.search import Search
-from torchpt.integrators.wave import Wave
-from torchpt.math.gathers import gathered_by
-from torchpt.math.vectors import dot, normalize
+from torchpt.integrators.wave import Wave, camera_state
+from torchpt.math.vectors import dot, normalize, take
 from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, salts
 from torchpt.scene import Scene
@@ -53,12 +52,20 @@ __all__ = ["by_film", "follows", "suits"]
 #: Makes the seed of paths through borders another one.
 _OTHER = 0x2545F491
 
+#: How samples ``(3, ...)`` count in pixels.
+Count = Callable[[Tensor], Tensor]
+
 
 def suits(scene: Scene, settings: Settings, wanted: Iterable[str]) -> bool:
-    """Whether gradients by the parameters ``wanted`` are taken in this form: the camera moves, and no surface does."""
+    """Whether gradients by the parameters ``wanted`` are taken in this form.
+
+    The camera moves, no surface does, and every ray ends at the first one: what lets some rays pass has no place to be held at.
+    """
     moving = [name for name in wanted if scene.spec(name).moves is Moves.SURFACES]
     of_camera = bool(moving) and all(name.startswith("camera.") for name in moving)
-    return of_camera and scene.description.camera.kind.projects and isinstance(settings.integrator, PathIntegrator)
+    if not of_camera or any(owner.material.opacity != 1.0 for owner in (*scene.built.parts, *scene.built.copies)):
+        return False
+    return scene.description.camera.kind.projects and isinstance(settings.integrator, PathIntegrator)
 
 
 def follows(scene: Scene, wanted: Iterable[str]) -> bool:
@@ -81,52 +88,27 @@ def by_film(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -
         RenderError: not even the tape of a single lane fits in memory.
     """
     still, wave, spp = assembly.wave, assembly.taped, settings.render.spp
-
-    def kept(values: Tensor) -> Tensor:
-        values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
-        clamp = settings.integrator.clamp
-        if clamp is None:
-            return values
-        return values * (clamp / values.detach().abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
+    count = partial(counted, settings)
 
     def inner(span: Span) -> tuple[Tensor, Tensor]:
-        values = kept(interior(still, wave, span)).sum(1) / spp
-        return values, asked[:, span[0] : span[0] + span[1]]
+        return count(interior(still, wave, span)).sum(1) / spp, asked[:, span[0] : span[0] + span[1]]
 
     def splat(span: Span) -> tuple[Tensor, Tensor]:
-        values, places = splats(still, wave, span, spp)
-        return places.picture(kept(values)), asked
+        values = splats(still, wave, span, spp, asked, count)
+        return values, torch.ones_like(values)
 
     def border(upright: bool, each: int, span: Span) -> tuple[Tensor, Tensor]:
-        return borders(still, wave, upright, span, each, kept), asked
+        values = borders(still, wave, upright, span, each, asked, count)
+        return values, torch.ones_like(values)
 
-    def add(part: Callable[[Span], tuple[Tensor, Tensor]], span: Span) -> None:
-        found = assembly.sums()
-        with torch.enable_grad(), gathered_by(found):
-            values, cotangent = part(span)
-        if values.requires_grad:
-            leaves = [*assembly.leaves, *assembly.held]
-            for number, gradient in enumerate(
-                torch.autograd.grad(values, leaves, cotangent.to(values.dtype), allow_unused=True)
-            ):
-                if gradient is not None:
-                    found.add(number, gradient)
-        sums.join(found)
-
-    # What is done with spans of what, how many of it, and samples of each: pixels, cells of the film, borders of pixels.
     _, _, width, height = still.crop
-    parts: list[tuple[Callable[[Span], tuple[Tensor, Tensor]], int, int]]
-    if still.filter.jumps:
-        each = -(-spp // 4)
-        parts = [(inner, width * height, spp)]
-        parts += [(partial(border, upright, each), count, each) for upright, count in borders_of(still)]
-    else:
-        parts = [(splat, cells(still), spp)]
-    for part, count, samples in parts:
-        budget = budget_of(settings, wave.centre.device, tape_per_lane(settings))
-        budget.most = min(budget.most, max(TAPE // tape_per_lane(settings), 1))
-        for _ in Waves(budget, "the tape of a single lane").through(partial(add, part), count, 0, samples):
-            pass
+    if not still.filter.jumps:
+        chunk_by_chunk(assembly, settings, sums, splat, cells(still), spp)
+        return
+    each = -(-spp // 4)
+    chunk_by_chunk(assembly, settings, sums, inner, width * height, spp)
+    for upright, number in borders_of(still):
+        chunk_by_chunk(assembly, settings, sums, partial(border, upright, each), number, each)
 
 
 @dataclass(frozen=True)
@@ -135,7 +117,7 @@ class _Seen:
 
     state: PathState  # camera rays that follow the camera to the points
     x: Tensor  # (N,) where on the film, in pixels, differentiable
-    y: Tensor
+    y: Tensor  # (N,) likewise
     stretch: Tensor  # (N,) of value 1: film area, differentiable
 
 
@@ -153,10 +135,8 @@ def interior(still: Wave, wave: Wave, span: Span) -> Tensor:
     return (_brought(wave, seen.state) * seen.stretch).view(3, span[3], span[1])
 
 
-def borders(
-    still: Wave, wave: Wave, upright: bool, span: Span, samples: int, kept: Callable[[Tensor], Tensor]
-) -> Tensor:
-    """What moves through borders of pixels, ``(3, pixels)`` of the whole picture: values are 0, derivatives are not.
+def borders(still: Wave, wave: Wave, upright: bool, span: Span, samples: int, asked: Tensor, count: Count) -> Tensor:
+    """What moves through borders of pixels is worth, ``(3, N)``: values are 0, derivatives are not.
 
     Args:
         still: a wave of detached parameters.
@@ -164,22 +144,21 @@ def borders(
         upright: borders between neighbours in a row; else in a column.
         span: first border, how many, first sample, how many of them.
         samples: of each border, in all.
-        kept: what of radiance counts.
+        asked: derivatives by the pixels ``(3, H W)``.
+        count: how samples count in pixels.
     """
-    x0, y0, width, height = still.crop
+    x0, y0, width, _ = still.crop
     columns = width + 1 if upright else width
     column, row, offset, key = _cells(still, span, columns, samples, int(upright))
     along = offset[0]
     with torch.no_grad():
         state = _rays(still, column + x0 + (0.0 if upright else along), row + y0 + (along if upright else 0.0), key)
-        brought = _brought(still, state)
+        brought = count(_brought(still, state))
+        before = _of_pixel(asked, column - (1 if upright else 0), row - (0 if upright else 1), width)
+        worth = _of_pixel(asked, column, row, width) - before
     seen = _held(still, wave, state)
     at = seen.x if upright else seen.y
-    moved = kept(brought) * (at - at.detach()) / samples
-    picture = torch.zeros(3, width * height, dtype=moved.dtype, device=moved.device)
-    for back, value in ((0, moved), (1, -moved)):
-        picture = _added(picture, value, column - (back if upright else 0), row - (0 if upright else back), width)
-    return picture
+    return worth.to(brought.dtype) * brought * (at - at.detach()) / samples
 
 
 def borders_of(still: Wave) -> tuple[tuple[bool, int], ...]:
@@ -188,8 +167,8 @@ def borders_of(still: Wave) -> tuple[tuple[bool, int], ...]:
     return (True, (width + 1) * height), (False, width * (height + 1))
 
 
-def splats(still: Wave, wave: Wave, span: Span, samples: int) -> tuple[Tensor, Splat]:
-    """Radiance ``(3, N)`` of places all over the film, and how it comes to pixels, for filters that end without a jump.
+def splats(still: Wave, wave: Wave, span: Span, samples: int, asked: Tensor, count: Count) -> Tensor:
+    """What places all over the film are worth ``(3, N)``, for filters that end without a jump.
 
     Each path counts in all pixels that see its place: what the derivatives of neighbouring filters have in common cancels.
 
@@ -198,16 +177,25 @@ def splats(still: Wave, wave: Wave, span: Span, samples: int) -> tuple[Tensor, S
         wave: the same under a tape.
         span: first cell, how many, first sample, how many of them; cells are those of :func:`cells`.
         samples: of each cell, in all.
+        asked: derivatives by the pixels ``(3, H W)``.
+        count: how samples count in pixels.
     """
     x0, y0, width, _ = still.crop
     beyond = _beyond(still)
     column, row, offset, key = _cells(still, span, width + 2 * beyond, samples, 0)
+    column, row = column - beyond, row - beyond
     with torch.no_grad():
-        state = _rays(still, column + (x0 - beyond) + offset[0], row + (y0 - beyond) + offset[1], key)
+        state = _rays(still, column + x0 + offset[0], row + y0 + offset[1], key)
     seen = _held(still, wave, state)
-    return _brought(wave, seen.state) * seen.stretch, Splat(
-        still, seen.x, seen.y, column - beyond, row - beyond, samples
-    )
+    radiance = count(_brought(wave, seen.state) * seen.stretch)
+    reach = range(-beyond, beyond + 1)
+    across = [_filter(still, seen.x - (column + (x0 + k + 0.5))) for k in reach]
+    down = [_filter(still, seen.y - (row + (y0 + k + 0.5))) for k in reach]
+    worth = torch.zeros_like(radiance)
+    for i, along in zip(reach, down, strict=True):
+        for k, weight in zip(reach, across, strict=True):
+            worth = worth + _of_pixel(asked, column + k, row + i, width).to(worth.dtype) * (weight * along)
+    return radiance * worth / samples
 
 
 def cells(still: Wave) -> int:
@@ -221,39 +209,21 @@ def _beyond(still: Wave) -> int:
     return math.ceil(still.filter.radius - 0.5)
 
 
-@dataclass(frozen=True)
-class Splat:
-    """Places of the film, and the pixels in which they lie."""
+def _filter(still: Wave, away: Tensor) -> Tensor:
+    """The filter's profile ``(N,)`` at distances, of integral 1, differentiable."""
+    filter, place = still.filter, away.detach().cpu().double().numpy()
+    ends = np.linspace(-filter.radius, filter.radius, (1 << 12) + 1, dtype=np.float64)
+    middle = 0.5 * (ends[1:] + ends[:-1])
+    whole, step = filter.profile(middle).mean() * 2.0 * filter.radius, 1e-5 * filter.radius
+    slope = (filter.profile(place + step) - filter.profile(place - step)) / (2.0 * step * whole)
+    value = torch.from_numpy(filter.profile(place) / whole).to(away)
+    return value + torch.from_numpy(slope).to(away) * (away - away.detach())
 
-    still: Wave
-    x: Tensor
-    y: Tensor
-    column: Tensor
-    row: Tensor
-    samples: int
 
-    def picture(self, radiance: Tensor) -> Tensor:
-        """Radiance ``(3, N)`` as ``(3, pixels)`` under the filter, differentiable in the places too."""
-        x0, y0, width, height = self.still.crop
-        reach = range(-_beyond(self.still), _beyond(self.still) + 1)
-        across = [self._filter(self.x - (self.column + (x0 + k + 0.5))) for k in reach]
-        down = [self._filter(self.y - (self.row + (y0 + k + 0.5))) for k in reach]
-        picture = torch.zeros(3, width * height, dtype=radiance.dtype, device=radiance.device)
-        for i, along in zip(reach, down, strict=True):
-            for k, weight in zip(reach, across, strict=True):
-                value = radiance * (weight * along) / self.samples
-                picture = _added(picture, value, self.column + k, self.row + i, width)
-        return picture
-
-    def _filter(self, away: Tensor) -> Tensor:
-        """The filter's profile ``(N,)`` at distances, of integral 1."""
-        filter, place = self.still.filter, away.detach().cpu().double().numpy()
-        ends = np.linspace(-filter.radius, filter.radius, (1 << 12) + 1, dtype=np.float64)
-        middle = 0.5 * (ends[1:] + ends[:-1])
-        whole, step = filter.profile(middle).mean() * 2.0 * filter.radius, 1e-5 * filter.radius
-        slope = (filter.profile(place + step) - filter.profile(place - step)) / (2.0 * step * whole)
-        value = torch.from_numpy(filter.profile(place) / whole).to(away)
-        return value + torch.from_numpy(slope).to(away) * (away - away.detach())
+def _of_pixel(asked: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
+    """What is asked ``(3, N)`` of pixels; nothing beyond the picture."""
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < asked.shape[1] // width)
+    return torch.where(inside, take(asked, torch.where(inside, row * width + column, 0)), 0.0)
 
 
 def _cells(still: Wave, span: Span, columns: int, samples: int, stream: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -272,18 +242,7 @@ def _rays(still: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
     """Camera rays through places of the film."""
     dtype = still.stages.plan.dtype
     o, d = still.camera.rays(x.to(dtype), y.to(dtype), None)
-    n = d.shape[1]
-    forever = torch.full((n,), math.inf, dtype=dtype, device=d.device)
-    lane = torch.arange(n, device=d.device)
-    nothing = torch.zeros_like(d)
-    return PathState(o.expand(3, n).clone(), d, forever, torch.ones_like(d), nothing, forever.clone(), lane, key)
-
-
-def _added(picture: Tensor, value: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
-    """A picture ``(3, pixels)`` with values ``(3, N)`` at pixels, those beyond it left out."""
-    height = picture.shape[1] // width
-    inside = torch.nonzero((column >= 0) & (column < width) & (row >= 0) & (row < height)).squeeze(1)
-    return picture.index_add(1, (row * width + column)[inside], value[:, inside])
+    return camera_state(o.expand_as(d), d, key)
 
 
 def _brought(wave: Wave, state: PathState) -> Tensor:

@@ -184,7 +184,7 @@ class _Chunk:
         self._light(ends, slide, state, hit, asked)
         if chance is not None and asked is not None:
             found = torch.autograd.grad(chance, self.tensors, asked, allow_unused=True)
-            self._add(found)
+            self.sums.add_each(found)
         if self.plan.attached:
             for name in ("t", "prim", "u", "v"):
                 getattr(self.met, name).index_copy_(0, state.lane, getattr(hit, name))
@@ -232,7 +232,7 @@ class _Chunk:
         for name, rows_ in self.behind.items():
             found = getattr(before, name)
             rows_.index_copy_(1, lane, torch.zeros_like(behind.throughput) if found is None else found)
-        self._add(before.others)
+        self.sums.add_each(before.others)
         if asked is not None and before.chance is not None:
             asked.index_add_(0, index, before.chance)
 
@@ -256,7 +256,7 @@ class _Chunk:
                 found = getattr(before, name)
                 if found is not None:
                     rows_.index_copy_(1, lane, take(rows_, lane) + found)
-            self._add(before.others)
+            self.sums.add_each(before.others)
             if asked is not None and before.chance is not None:
                 asked.index_add_(0, index, before.chance)
 
@@ -271,12 +271,7 @@ class _Chunk:
                 found = torch.autograd.grad(
                     [x for x, _ in pairs], self.tensors, [g for _, g in pairs], allow_unused=True
                 )
-                self._add(found)
+                self.sums.add_each(found)
 
     def _others(self) -> Sequence[Tensor]:
         return self.tensors
-
-    def _add(self, found: Sequence[Tensor | None]) -> None:
-        for number, gradient in enumerate(found):
-            if gradient is not None:
-                self.sums.add(number, gradient)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -60,6 +60,12 @@ class Sums:
         total = self.total(number)
         total += gradient.reshape(total.shape[1], total.shape[0]).T
 
+    def add_each(self, gradients: Iterable[Tensor | None]) -> None:
+        """Add gradients as large as their tables, one a table in their order; None adds nothing."""
+        for number, gradient in enumerate(gradients):
+            if gradient is not None:
+                self.add(number, gradient)
+
     def join(self, part: Sums) -> None:
         """Add the sums of a piece: all of them, or nothing where there is no memory for that."""
         own = [
@@ -69,11 +75,11 @@ class Sums:
         self._totals = own
 
     def merge(self, part: ChunkSums) -> None:
-        """Add the sums of a chunk."""
-        for number, total in part.dense.items():
-            self.total(number).add_(total)
+        """Add the sums of a chunk: its terms of large tables first, as they come where they are added at once."""
         for number, index, values in part.stream:
             self.add_rows(number, index, values)
+        for number, total in part.dense.items():
+            self.total(number).add_(total)
 
     def clear(self) -> None:
         """Forget what was added."""
@@ -142,6 +148,12 @@ class ChunkSums:
         """Add a gradient as large as the table."""
         total = self._total(number)
         total += gradient.reshape(total.shape[1], total.shape[0]).T
+
+    def add_each(self, gradients: Iterable[Tensor | None]) -> None:
+        """See :class:`Sums`."""
+        for number, gradient in enumerate(gradients):
+            if gradient is not None:
+                self.add(number, gradient)
 
     def _total(self, number: int) -> Tensor:
         if number not in self.dense:

@@ -235,9 +235,7 @@ class Sweep(Worker):
             found = np.zeros((3, count), np.float32) if found is None else found.numpy()
             held = self._behind.floats[first : first + 3]
             held[:, lane] = found + held[:, lane] if added else found
-        for number, gradient in enumerate(before.others):
-            if gradient is not None:
-                self.sums.add(number, gradient)
+        self.sums.add_each(before.others)
 
     def _tensors(self) -> Sequence[Tensor]:
         return (*self.assembly.leaves, *self.assembly.held)
@@ -252,9 +250,7 @@ class Sweep(Worker):
                 return
             asked = [torch.from_numpy(self._behind.floats[row : row + 3, :n].copy()) for _, row in pairs]
             found = torch.autograd.grad([x for x, _ in pairs], self._tensors(), asked, allow_unused=True)
-        for number, gradient in enumerate(found):
-            if gradient is not None:
-                self.sums.add(number, gradient)
+        self.sums.add_each(found)
 
 
 def joint_names(attached: bool) -> Sequence[str]:

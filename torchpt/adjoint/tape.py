@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
 from torchpt.adjoint.sums import Sums
+from torchpt.forward.budget import Budget
 from torchpt.forward.schedule import BYTES_PER_LANE, Span, budget_of
 from torchpt.forward.waves import Waves
 from torchpt.math.gathers import gathered_by
+from torchpt.math.threads import one_thread
+from torchpt.native.memory import Meter
 from torchpt.settings import Settings
 
-__all__ = ["tape", "tape_per_lane"]
+__all__ = ["chunk_by_chunk", "tape", "tape_per_lane"]
 
+#: Lanes of a chunk. Always the same, as sums of others would be rounded otherwise.
+LANES = {"cpu": 1 << 16, "cuda": 1 << 18}
 #: Bytes of a chunk's tape where memory is not limited.
 TAPE = 1 << 29
+#: Of the memory that is free under a limit, what a chunk is let to use.
+SHARE = 0.88
 #: Vertices of a path that memory is planned for where its depth is without end.
 LONGEST = 64
+
+#: From a chunk to values that depend on the leaves of an assembly, and what is asked of them.
+Part = Callable[[Span], tuple[Tensor, Tensor]]
 
 
 def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
@@ -35,32 +47,55 @@ def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> N
     """
     wave = assembly.taped
 
-    def whole(span: Span) -> None:
-        sums.join(piece(assembly, settings, asked, span))
+    def part(span: Span) -> tuple[Tensor, Tensor]:
+        radiance, _ = wave.radiance(*span)
+        share = asked_of(settings, radiance.detach(), asked[:, span[0] : span[0] + span[1]].to(radiance.dtype))
+        # What is not finite must not meet its share of 0.
+        return torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0), share
 
-    budget = budget_of(settings, wave.centre.device, tape_per_lane(settings))
-    budget.most = min(budget.most, max(TAPE // tape_per_lane(settings), 1))
-    for _ in Waves(budget, "the tape of a single lane").through(
-        whole, wave.crop[2] * wave.crop[3], 0, settings.render.spp
-    ):
+    chunk_by_chunk(assembly, settings, sums, part, wave.crop[2] * wave.crop[3], settings.render.spp)
+
+
+def chunk_by_chunk(assembly: Assembly, settings: Settings, sums: Sums, part: Part, count: int, samples: int) -> None:
+    """Add the derivatives of a part of a loss, chunk by chunk.
+
+    Args:
+        assembly: with the leaves.
+        settings: of the backward pass.
+        sums: what is added to.
+        part: makes the tape of a chunk.
+        count: of what chunks are made of: pixels, say.
+        samples: of each.
+
+    Raises:
+        RenderError: not even the tape of a single lane fits in memory.
+    """
+    leaves = [*assembly.leaves, *assembly.held]
+
+    def add(span: Span) -> None:
+        found = assembly.sums()
+        with torch.enable_grad(), gathered_by(found):
+            values, asked = part(span)
+        if values.requires_grad:  # else nothing in these pixels depends on the parameters
+            with one_thread():  # several round sums over lanes otherwise
+                found.add_each(torch.autograd.grad(values, leaves, asked.to(values.dtype), allow_unused=True))
+        sums.join(found)
+
+    for _ in Waves(_budget(settings, assembly), "the tape of a single lane").through(add, count, 0, samples):
         pass
 
 
-def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:
-    """The sums of a chunk."""
-    sums, wave = assembly.sums(), assembly.taped
-    with torch.enable_grad(), gathered_by(sums):
-        radiance, _ = wave.radiance(*span)
-    if not radiance.requires_grad:  # nothing in these pixels depends on the parameters
-        return sums
-    share = asked_of(settings, radiance.detach(), asked[:, span[0] : span[0] + span[1]].to(radiance.dtype))
-    with torch.enable_grad():  # what is not finite must not meet its share of 0
-        radiance = torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0)
-    found = torch.autograd.grad(radiance, [*assembly.leaves, *assembly.held], share, allow_unused=True)
-    for number, gradient in enumerate(found):
-        if gradient is not None:
-            sums.add(number, gradient)
-    return sums
+def _budget(settings: Settings, assembly: Assembly) -> Budget:
+    """Chunks of always the same size, or, where that is more than ``render.max_memory`` leaves, of what fits."""
+    device, limit, each = assembly.wave.centre.device, settings.render.max_memory, tape_per_lane(settings)
+    lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE // each, 1))
+    if limit is not None:
+        meter = Meter(device)
+        if lanes * each > SHARE * (meter.base() + limit - meter.now()):
+            budget = budget_of(settings, device, each)
+            budget.most = min(budget.most, lanes)
+            return budget
+    return Budget(None, device, lanes, each)
 
 
 def tape_per_lane(settings: Settings) -> int:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self
 
+import torch
 from torch import Tensor
 
 from torchpt.cameras.poses import POSES, pose_of
@@ -123,6 +124,14 @@ class Camera(ABC):
         """Unit vectors ``(3, 1)`` in the world: right in the picture, up, and where the camera looks."""
         axes = normalize(self.to_world[:3, :3])
         return -axes[:, 0:1], axes[:, 1:2], axes[:, 2:3]
+
+    def covectors(self) -> Tensor:
+        """Rows ``(3, 3)`` that tell how far a vector of the world goes along each of the :meth:`axes`.
+
+        Those are the axes themselves where they are at right angles, as poses in files are. Entries of a pose that are
+        differentiated may leave that, and rays follow the axes as they are.
+        """
+        return torch.linalg.inv(torch.cat(self.axes(), 1))
 
     def origin(self) -> Tensor:
         """Where the camera stands ``(3, 1)``."""

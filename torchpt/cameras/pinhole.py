@@ -134,10 +134,9 @@ class Pinhole(Camera):
 
     def placed(self, away: Tensor) -> Tensor:
         """:meth:`film_of` of points that lie ``away (3, N)`` from the origin."""
-        right, up, ahead = self.axes()
-        half, depth = self.half_width(), (away * ahead).sum(0)
-        width, height = self.film[0], self.film[1]
-        across, along = (away * right).sum(0) / half, (away * up).sum(0) / half
+        right, up, depth = self.covectors() @ away
+        half, (width, height) = self.half_width(), self.film
+        across, along = right / half, up / half
         if self.pixel_aspect is not None:
             along = along * self.pixel_aspect
         x, y = 0.5 * width * (across + depth), 0.5 * (height * depth - width * along)

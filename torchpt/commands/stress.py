@@ -124,16 +124,18 @@ def stress(words: list[str]) -> int:
                 found.setdefault(label, {}).setdefault(topic, []).append(outcome)
                 _tell(wishes, line(outcome))
     every = [one for by_topic in found.values() for row in by_topic.values() for one in row]
-    failed = sum(not one.passed for one in every)
+    failed, refused = sum(not one.passed for one in every), sum(one.refused > 0 for one in every)
     told = {
         "cases": len(every),
         "failed": failed,
+        "refused": refused,
         "seconds": round(time.perf_counter() - begun, 1),
         "runs": {label: facts(by_topic) for label, by_topic in found.items()},
     }
     if folder is not None:
         _keep(folder, told, found)
-    _tell(wishes, f"{len(every)} cases, {failed} failed")
+    beside = f", {refused} refused wholly or in part by the search" if refused else ""
+    _tell(wishes, f"{len(every)} cases, {failed} failed{beside}")
     if wishes.json:
         with speaking():
             print(json.dumps(told, allow_nan=False))

@@ -10,6 +10,6 @@ from __future__ import annotations
 
 from torchpt.edges.gradients import add_gradients, concerns
 from torchpt.edges.layers import Asked, followed, on_tape
-from torchpt.edges.missing import left_out
+from torchpt.edges.missing import left_out, without_gradient
 
-__all__ = ["Asked", "add_gradients", "concerns", "followed", "left_out", "on_tape"]
+__all__ = ["Asked", "add_gradients", "concerns", "followed", "left_out", "on_tape", "without_gradient"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from typing import Protocol
 
 import torch
@@ -207,13 +208,17 @@ def add_gradients(
         SceneError: settings that this scene cannot be rendered with.
     """
     with limited_threads(settings.render.threads):
-        boundary = boundary_of(scene, settings, params, wanted, dtype, cotangent.permute(2, 0, 1))
-        if boundary is None:
+        cotangent = cotangent.permute(2, 0, 1)
+        every = boundary_of(scene, settings, params, wanted, dtype, cotangent)
+        if every is None:
             return [None] * len(wanted)
-
-        def every() -> Iterator[Samples]:
-            yield from boundary.primary(samples, boundary.traced.radiance, held)
-            if not held:  # shadows move with what they fall on
-                yield from boundary.shadows(samples)
-
-        return boundary.gradients(every(), wanted)
+        if not held:
+            return every.gradients(chain(every.primary(samples, every.traced.radiance), every.shadows(samples)), wanted)
+        found = every.gradients(every.primary(samples, every.traced.radiance, held=True), wanted)
+        # Shadows move with what they fall on, which is held: only lights move them.
+        lights = [name for name in wanted if not name.startswith("camera.")]
+        thrown = boundary_of(scene, settings, params, lights, dtype, cotangent)
+        if thrown is None:
+            return found
+        more = thrown.gradients(thrown.shadows(samples), wanted)
+        return [b if a is None else a if b is None else a + b for a, b in zip(found, more, strict=True)]

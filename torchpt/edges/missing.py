@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import torch
 
@@ -11,7 +11,10 @@ from torchpt.integrators.path import PathIntegrator
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
-__all__ = ["left_out"]
+__all__ = ["left_out", "without_gradient"]
+
+#: Of a spot: where its light ends, and where it begins to fade.
+_RIM = ("cutoff_angle", "beam_width")
 
 
 def left_out(scene: Scene, settings: Settings) -> list[str]:
@@ -41,6 +44,19 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
         yield f"edges of shadows where the integrator is {settings.integrator.name}"
 
 
+def without_gradient(scene: Scene, wanted: Iterable[str]) -> list[str]:
+    """Those of the parameters of which pictures depend by jumps alone, so that their gradients are 0."""
+    owners = [*scene.built.parts, *scene.built.copies]
+    cut = {material.name for owner in owners for material in owner.material.all() if material.alpha_cutoff is not None}
+    rims = {f"{source.name}.{key}" for source in scene.built.sources if source.kind == "spot" for key in _RIM}
+    return [
+        name
+        for name in wanted
+        if (name in rims and _sharp(scene, name.rpartition(".")[0]))
+        or any(name.startswith(f"{own}.opacity") for own in cut)
+    ]
+
+
 def _sharp(scene: Scene, name: str) -> bool:
-    cutoff, beam = (float(scene.params[f"{name}.{key}"]) for key in ("cutoff_angle", "beam_width"))
+    cutoff, beam = (float(scene.params[f"{name}.{key}"].detach()) for key in _RIM)
     return beam > 0.999 * cutoff

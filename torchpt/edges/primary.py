@@ -134,14 +134,14 @@ class Primary:
     def _share(self, held: Held, mate: Tensor, p: Tensor, s: Tensor, o: Tensor, d: Tensor) -> Tensor:
         """How much of each edge counts ``(N,)``: nothing where it is hidden, a part where others lie on it."""
         n = p.shape[1]
-        if self.traced.wave.stages.world.materials.opacity is not None:
-            return torch.ones_like(p[0])  # what hides may let pass
         t, prim = self.traced.nearest(o, d)
         away = p - o[:, :n]
         reach = (away * d[:, :n]).sum(0)
         t, prim = t.view(2, n), prim.view(2, n)
         own = (prim == held.prim) | (prim == mate)  # a round surface comes forward quickly behind its outline
         seen = (t > reach * torch.where(own, _OWN, _BEFORE)).all(0)
+        if self.traced.wave.stages.world.materials.opacity is not None:
+            seen = torch.ones_like(seen)  # what hides may let pass
         near = (t - reach).abs() < reach * 2.0**-8
         return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step_of(self.bodies)), 0.0)
 

@@ -10,6 +10,7 @@ Differentiable Rendering*, 2020, whose boundary segments these are): from x ligh
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -40,6 +41,9 @@ _BEGIN = 2.0**-12
 _MOST = 32
 #: From this vertex on roulette plays.
 _ROULETTE = 3
+
+#: Light ``(3, n)`` that arrives in lanes ``(n,)``, for paths of ``k`` vertices from there to the camera.
+Brought = Callable[[int, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -193,10 +197,10 @@ class Shadows:
         along, across = follow(passed.along), follow(outward)
         light = dot(n, wi).abs() / (passed.density * total)
         if self.sources is not None:
-            brought = [self.sources.brought(beam, x) * light]
+            brought = self._shone(self.sources.brought(beam, x) * light)
         else:
             brought = self._bounced(number, beam, passed, x, wi, light)
-        direct = self._seen(spot, wi, brought[0], worth)
+        direct = self._seen(spot, wi, brought, worth)
         _, jacobian = slopes(self.bodies.camera, x)
         ds = (jacobian * along).sum(1)
         normal = torch.stack((ds[1], -ds[0]))
@@ -220,19 +224,27 @@ class Shadows:
         still = -1 if around.environment is None else len(around.area) - 1
         return torch.where(column < 0, -1, torch.where(beam.row == still, -2, column))
 
-    def _bounced(
-        self, number: Tensor, beam: Beam, passed: Passed, x: Tensor, wi: Tensor, light: Tensor
-    ) -> list[Tensor]:
-        """What surfaces reflect from y to x, for paths of one vertex more each on the way from x to the camera."""
+    @staticmethod
+    def _shone(light: Tensor) -> Brought:
+        """Of lights, the same for all paths."""
+        return lambda _, lane: take(light, lane)
+
+    def _bounced(self, number: Tensor, beam: Beam, passed: Passed, x: Tensor, wi: Tensor, light: Tensor) -> Brought:
+        """What surfaces reflect from y to x; paths of more vertices on the way to the camera have fewer before."""
         to = beam.view.e - passed.p
         whole = beam.view.e - x
         factor = light * dot(to, to) / (dot(whole, whole) * beam.chance)
         integrator, key = self.traced.wave.integrator, self.traced.key(number, 2)
-        o = x + whole * _BEGIN
-        black = self.traced.radiance(o, wi, key, 1)
-        most = integrator.limits.max_depth
-        depths = [most] if most < 0 else [most - k for k in range(1, min(most - 1, 4))]
-        return [(self.traced.radiance(o, wi, key, depth) - black) * factor for depth in depths]
+        o, most = x + whole * _BEGIN, integrator.limits.max_depth
+
+        def brought(k: int, lane: Tensor) -> Tensor:
+            rays = (take(o, lane), take(wi, lane), take(key, lane))
+            depth = most if most < 0 else most - k
+            if not len(lane) or 0 <= depth < 2:  # nothing but light of sources themselves
+                return torch.zeros_like(rays[1])
+            return (self.traced.radiance(*rays, depth) - self.traced.radiance(*rays, 1)) * take(factor, lane)
+
+        return brought
 
     def _camera(self, spot: Spot) -> tuple[Tensor, Tensor, Tensor]:
         """Which points the camera sees ``(n,)``, their places on the film, and directions to the camera."""
@@ -255,16 +267,16 @@ class Shadows:
         some = visible.nonzero().squeeze(1)
         return take(index, some), take(s, some), -take(d, some)
 
-    def _seen(self, spot: Spot, wi: Tensor, brought: Tensor, worth: Worth) -> Tensor:
+    def _seen(self, spot: Spot, wi: Tensor, brought: Brought, worth: Worth) -> Tensor:
         """What light that arrives from ``wi`` is worth where the camera sees it ``(N,)``, by area of the film."""
         found = torch.zeros_like(wi[0])
         index, s, wo = self._camera(spot)
         if len(index):
             sent = spot.taken(index).sent(wo.to(spot.p), take(wi, index).to(spot.p)).double()
-            found[index] = (worth.at(s) * sent * take(brought, index)).sum(0)
+            found[index] = (worth.at(s) * sent * brought(1, index)).sum(0)
         return found
 
-    def _followed(self, number: Tensor, spot: Spot, wi: Tensor, brought: list[Tensor], worth: Worth) -> Tensor:
+    def _followed(self, number: Tensor, spot: Spot, wi: Tensor, brought: Brought, worth: Worth) -> Tensor:
         """What it is worth by way of further surfaces ``(N,)``, by area of the receiver."""
         found, key = torch.zeros_like(wi[0]), self.traced.key(number, 1)
         lane = torch.arange(len(number), device=number.device)
@@ -287,7 +299,6 @@ class Shadows:
             if not len(lane):
                 break
             wi = -spot.d.double()
-            power = brought[min(k, len(brought)) - 1]
             index, s, wo = self._camera(spot)
             if not len(index):
                 continue
@@ -296,7 +307,7 @@ class Shadows:
             _, jacobian = slopes(self.bodies.camera, part.p.double())
             grown = dot(cross(jacobian[0], jacobian[1]), part.n.double()).abs()
             back = take(lane, index)
-            value = (worth.at(s) * sent * take(carried, index) * take(power, back)).sum(0) * grown
+            value = (worth.at(s) * sent * take(carried, index) * brought(k, back)).sum(0) * grown
             found.index_add_(0, back, value)
         return found
 

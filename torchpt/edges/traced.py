@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchpt.forward import make_wave
+from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.plan import FOREVER
-from torchpt.integrators.wave import Wave
+from torchpt.integrators.wave import Wave, camera_state
 from torchpt.records import PathState
 from torchpt.samplers import Sampler
 from torchpt.scene import Scene
@@ -43,11 +44,7 @@ class Traced:
 
     def state(self, o: Tensor, d: Tensor, key: Tensor) -> PathState:
         """Camera rays; ``d`` of any length."""
-        d = (d / (d * d).sum(0).sqrt()).to(self.dtype)
-        n = d.shape[1]
-        forever = torch.full((n,), torch.inf, dtype=self.dtype, device=d.device)
-        one, lane = torch.ones_like(d), torch.arange(n, device=d.device)
-        return PathState(o.to(self.dtype).clone(), d, forever, one, torch.zeros_like(d), forever.clone(), lane, key)
+        return camera_state(o.to(self.dtype), (d / (d * d).sum(0).sqrt()).to(self.dtype), key)
 
     def radiance(self, o: Tensor, d: Tensor, key: Tensor, depth: int | None = None) -> Tensor:
         """Radiance ``(3, N)`` float64 that rays bring; black where it is not finite, as in pictures.
@@ -59,7 +56,7 @@ class Traced:
         values, _ = integrator.radiance(wave.stages, wave.accel, self.state(o, d, key), wave.first)
         values = torch.where(torch.isfinite(values).all(0), values, 0.0).double()
         if self.clamp is not None:
-            values = values * (self.clamp / values.abs().amax(0).clamp_min(self.clamp)).clamp_max(1.0)
+            values = values * clamp_scale(values, self.clamp)
         return values
 
 

@@ -12,6 +12,7 @@ from torchpt.errors import SceneError
 from torchpt.forward.threads import limited_threads
 from torchpt.forward.wave import make_wave
 from torchpt.integrators import KINDS as INTEGRATORS
+from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.path import PathIntegrator
 from torchpt.integrators.recorder import Bounced, Left, Lit, Met, Recorder, Shone
 from torchpt.records import World
@@ -205,7 +206,7 @@ class _Story:
         value = torch.where(torch.isfinite(brought).all(0), brought, 0.0)
         clamp = settings.integrator.clamp
         if clamp is not None:
-            value = value * (clamp / value.abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
+            value = value * clamp_scale(value, clamp)
         return Path(
             scene=self.scene.name,
             pixel=pixel,

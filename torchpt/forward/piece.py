@@ -10,6 +10,7 @@ from torch import Tensor
 from torchpt.errors import RenderError
 from torchpt.forward.schedule import Span
 from torchpt.integrators.base import Tally
+from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.wave import Wave
@@ -71,8 +72,7 @@ def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
         radiance = torch.where(finite, radiance, 0.0)
         clamp = wave.integrator.clamp
         if clamp is not None:
-            scale = (clamp / radiance.abs().amax(0).clamp_min(clamp)).clamp_max(1.0)
-            clamped = radiance * scale
+            clamped = radiance * clamp_scale(radiance, clamp)
             piece.writes.append((light, light + torch.stack((radiance.double().sum(), clamped.double().sum()))))
             radiance = clamped
         piece.writes += plate.film.after(radiance, first, sample)

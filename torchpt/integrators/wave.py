@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,7 @@ from torchpt.samplers import Dimension, Draws, Sampler, Streams, salts
 if TYPE_CHECKING:
     from torchpt.integrators.first_surface import FirstSurface
 
-__all__ = ["Wave"]
+__all__ = ["Wave", "camera_state"]
 
 
 @dataclass(frozen=True)
@@ -121,3 +122,11 @@ class Wave:
         if self.filter.signed:
             found = aov.weighted(found, self.weight(state))
         return {name: value.view(len(value), samples, pixels) for name, value in found.items()}
+
+
+def camera_state(o: Tensor, d: Tensor, key: Tensor) -> PathState:
+    """Paths that begin with rays ``o, d (3, N)``, d unit, and draw by ``key``."""
+    n = d.shape[1]
+    forever = torch.full((n,), math.inf, dtype=d.dtype, device=d.device)
+    lane, nothing = torch.arange(n, device=d.device), torch.zeros_like(d)
+    return PathState(o.clone(), d, forever, torch.ones_like(d), nothing, forever.clone(), lane, key)

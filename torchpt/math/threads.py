@@ -7,12 +7,13 @@ all elements becomes a sum of the threads' own. What is here gives on any number
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
 
-__all__ = ["in_pieces", "mean_all", "sum_all"]
+__all__ = ["in_pieces", "mean_all", "one_thread", "sum_all"]
 
 #: Elements that one thread computes alone: fewer than torch divides, and a whole number of the vectors of any CPU.
 PIECE = 1 << 14
@@ -36,3 +37,16 @@ def sum_all(x: Tensor) -> Tensor:
 def mean_all(x: Tensor) -> Tensor:
     """The mean ``()`` of all elements."""
     return x.expand(2, *x.shape).mean(tuple(range(1, x.dim() + 1)))[0]
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch use a single thread for a while, where what it sums cannot be reached."""
+    before = torch.get_num_threads()
+    if before > 1:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        if before > 1:
+            torch.set_num_threads(before)

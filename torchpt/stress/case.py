@@ -52,11 +52,13 @@ class Reading:
         at: the place in the sweep.
         figure: NaN where there is none.
         problem: why there is none.
+        refused: whether the search that was asked for says itself that it is not for this scene.
     """
 
     at: float
     figure: float
     problem: str = ""
+    refused: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,13 +77,19 @@ class Outcome:
 
     @property
     def worst(self) -> Reading:
-        """The one that decides: a failure to measure, else the largest figure."""
-        return max(self.readings, key=lambda one: math.inf if math.isnan(one.figure) else one.figure)
+        """The one that decides: a failure to measure, else the largest figure; a refusal where there is nothing else."""
+        measured = [one for one in self.readings if not one.refused] or self.readings
+        return max(measured, key=lambda one: math.inf if math.isnan(one.figure) else one.figure)
 
     @property
     def passed(self) -> bool:
-        """Whether all figures are within the bound."""
-        return all(one.figure <= self.case.bound for one in self.readings)
+        """Whether all figures that there are lie within the bound."""
+        return all(one.refused or one.figure <= self.case.bound for one in self.readings)
+
+    @property
+    def refused(self) -> int:
+        """At how many places the search refused the scene."""
+        return sum(one.refused for one in self.readings)
 
 
 def powers(low: int, high: int, step: int = 1) -> tuple[float, ...]:

@@ -22,10 +22,18 @@ def line(outcome: Outcome) -> str:
     """A case in a line; a failure says why."""
     worst, case = outcome.worst, outcome.case
     at = f"{case.axis} {worst.at:g}" if case.axis else ""
-    verdict = "passed" if outcome.passed else "FAILED"
+    verdict = _verdict(outcome)
     figure = "-" if math.isnan(worst.figure) else f"{worst.figure:.2g}"
     said = _COLUMNS.format(case.name, figure, f"{case.bound:g}", at if len(at) < 15 else f"{worst.at:g}", verdict)
     return f"{said}: {worst.problem[:300]}" if worst.problem else said
+
+
+def _verdict(outcome: Outcome) -> str:
+    """In words."""
+    said = "passed" if outcome.passed else "FAILED"
+    if outcome.refused == len(outcome.readings):
+        return "refused"
+    return f"{said}, refused at {outcome.refused} of {len(outcome.readings)} places" if outcome.refused else said
 
 
 def facts(outcomes: Mapping[str, Sequence[Outcome]]) -> list[dict[str, Any]]:
@@ -40,7 +48,12 @@ def facts(outcomes: Mapping[str, Sequence[Outcome]]) -> list[dict[str, Any]]:
             "passed": outcome.passed,
             "seconds": round(outcome.seconds, 3),
             "readings": [
-                {"at": one.at, "figure": None if math.isnan(one.figure) else one.figure, "problem": one.problem}
+                {
+                    "at": one.at,
+                    "figure": None if math.isnan(one.figure) else one.figure,
+                    "problem": one.problem,
+                    "refused": one.refused,
+                }
                 for one in outcome.readings
             ],
         }
@@ -58,6 +71,7 @@ def markdown(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
             swept = f"{case.axis} {places[0]:g} .. {places[-1]:g}" if case.axis else ""
             figure = "-" if math.isnan(worst.figure) else f"{worst.figure:.1e}"
             at = f"{worst.at:g}" if case.axis else ""
-            failed = "" if outcome.passed else " **failed**"
-            rows.append(f"| {case.name} | {swept} | {case.measures} | {figure}{failed} | {at} | {case.bound:g} |")
+            verdict = _verdict(outcome)
+            said = "" if verdict == "passed" else f" ({verdict})" if outcome.passed else f" **{verdict}**"
+            rows.append(f"| {case.name} | {swept} | {case.measures} | {figure}{said} | {at} | {case.bound:g} |")
     return "\n".join(rows)

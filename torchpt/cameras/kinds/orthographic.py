@@ -41,12 +41,11 @@ class Orthographic(Camera):
 
     def film_of(self, p: Tensor) -> Tensor:
         """See :meth:`Camera.film_of`."""
-        right, up, ahead = self.axes()
-        away = p - self.origin()
+        right, up, depth = self.covectors() @ (p - self.origin())
         width, height = self.film[0], self.film[1]
-        x = 0.5 * width + (away * right).sum(0) * (width / self.width)
-        y = 0.5 * height - (away * up).sum(0) * (width / self.width)
-        return torch.stack((x, y, torch.ones_like(x), (away * ahead).sum(0)))
+        x = 0.5 * width + right * (width / self.width)
+        y = 0.5 * height - up * (width / self.width)
+        return torch.stack((x, y, torch.ones_like(x), depth))
 
     def pixel(self) -> Tensor:
         """See :meth:`Camera.pixel`."""

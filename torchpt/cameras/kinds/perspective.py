@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from torchpt.cameras.pinhole import Pinhole
@@ -30,4 +31,5 @@ class Perspective(Pinhole):
         """See :meth:`Camera.project`."""
         x, y, depth, _ = self.placed(offset)
         scale = (0.5 * self.film[0] / self.half_width()) ** 2 / depth.abs() ** 3
+        scale = scale * torch.linalg.det(self.covectors()).abs()
         return x / depth, y / depth, scale if self.pixel_aspect is None else scale * self.pixel_aspect

@@ -8,6 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from torchpt.lanes.graph import DTYPES, Graph, Unsupported
+from torchpt.lanes.operators.arithmetic import binary
 from torchpt.lanes.operators.nodes import apply, cast_all
 from torchpt.lanes.tracing import Tracer, handles
 
@@ -43,6 +44,14 @@ def _slice_backward(
     place[axis] = slice(start, None if end > 1 << 40 else end, step)
     nodes[tuple(place)] = tracer.get(given).nodes
     tracer.put(out, nodes, lane)
+
+
+@handles("logical_and_")
+def _logical_and_(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
+    """In place: what the derivative of a clamp makes of a comparison that nobody else reads."""
+    binary("and")(tracer, out, a, b)
+    if out is not a:
+        tracer.alias(a, out)
 
 
 @handles("sgn")
