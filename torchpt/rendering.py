@@ -22,17 +22,8 @@ from torchpt.settings import FILTERS, Settings
 from torchpt.spec.declared import Described
 
 __all__ = [
-    "Common",
-    "Order",
-    "Progress",
-    "Rendering",
-    "Wishes",
-    "first_hit",
-    "ordered",
-    "render",
-    "render_scene",
-    "rendered",
-]
+    "Common", "Order", "Progress", "Rendering", "Wishes", "first_hit", "ordered", "render", "render_scene", "rendered",
+]  # fmt: skip
 
 
 class Common(TypedDict, total=False):
