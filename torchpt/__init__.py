@@ -23,6 +23,7 @@ from torchpt.errors import (
 
 if TYPE_CHECKING:
     from torchpt import cameras, data, ibl, losses, nn, ranks
+    from torchpt.batches import Renderings, render_batch
     from torchpt.bsdfs import Bsdf
     from torchpt.forward import Rendering
     from torchpt.images import metrics, read_header, read_image, read_layers, write_image
@@ -43,6 +44,7 @@ __all__ = [
     "OutputError",
     "RenderError",
     "Rendering",
+    "Renderings",
     "Scene",
     "SceneError",
     "TorchptError",
@@ -60,6 +62,7 @@ __all__ = [
     "read_image",
     "read_layers",
     "render",
+    "render_batch",
     "write_image",
 ]
 
@@ -67,6 +70,7 @@ __all__ = [
 _LAZY = {
     "Bsdf": "torchpt.bsdfs",
     "Rendering": "torchpt.forward",
+    "Renderings": "torchpt.batches",
     "Scene": "torchpt.scene",
     "denoise": "torchpt.images.denoiser",
     "from_trimesh": "torchpt.scene.from_trimesh",
@@ -75,6 +79,7 @@ _LAZY = {
     "read_image": "torchpt.images",
     "read_layers": "torchpt.images",
     "render": "torchpt.rendering",
+    "render_batch": "torchpt.batches",
     "write_image": "torchpt.images",
 }
 

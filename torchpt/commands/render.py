@@ -62,7 +62,8 @@ def render(job: Job, interrupt: Interrupt) -> int:
     from torchpt.forward.files import write_rendered
     from torchpt.images import check_writable
     from torchpt.rendering import first_hit, render_scene
-    from torchpt.scene.scene import Scene, device_of
+    from torchpt.scene.devices import device_of
+    from torchpt.scene.scene import Scene
 
     collector.resume()
     start = time.perf_counter()

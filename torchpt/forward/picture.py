@@ -9,15 +9,41 @@ import torch
 from torch import Tensor
 
 from torchpt.film import KnownError
+from torchpt.forward.causes import causes_of
 from torchpt.forward.result import Rendering
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
-from torchpt.native.memory import Meter
+from torchpt.native.memory import Meter, let_go, mb
+from torchpt.shortage import needing, ran_out
 
 if TYPE_CHECKING:
     from torchpt.forward.run import Run
 
-__all__ = ["rendering_of"]
+__all__ = ["final", "rendering_of"]
+
+
+def final(run: Run) -> Rendering:
+    """The picture at the end, and why samples of it are not finite.
+
+    Where memory does not suffice, what else is held is given back first.
+    """
+    try:
+        return _told(run)
+    except Exception as error:
+        if not ran_out(error):
+            raise
+    if run.loop is not None:
+        run.loop.release()
+    let_go()
+    size = mb(run.need.picture)
+    with needing(lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}"):
+        return _told(run)
+
+
+def _told(run: Run) -> Rendering:
+    rendering = rendering_of(run)
+    rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(run.scene, run.wave, run.lost)
+    return rendering
 
 
 def rendering_of(run: Run) -> Rendering:

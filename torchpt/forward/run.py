@@ -13,11 +13,10 @@ from torchpt.errors import LostRankError, RenderError
 from torchpt.film import Film
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.budget import check_memory
-from torchpt.forward.causes import causes_of, told
+from torchpt.forward.causes import told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
-from torchpt.forward.kept import kept
 from torchpt.forward.need import loaded, need_of, shape_of
-from torchpt.forward.picture import rendering_of
+from torchpt.forward.picture import final, rendering_of
 from torchpt.forward.piece import take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.room import check_room
@@ -25,24 +24,28 @@ from torchpt.forward.schedule import Span, budget_of
 from torchpt.forward.split import Split
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
-from torchpt.forward.wave import kernels_of, looped, make_wave, surface_layers
+from torchpt.forward.wave import loop_of, looped, make_wave, surface_layers
 from torchpt.forward.waves import Waves, say_once
 from torchpt.integrators.base import Tally
-from torchpt.integrators.loop.schedule import Loop, Share
+from torchpt.integrators.loop.schedule import Block, Share
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
+from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
-from torchpt.native.memory import Meter, let_go, mb
+from torchpt.native.memory import Meter, mb
 from torchpt.ranks import Group
 from torchpt.scene import Scene
 from torchpt.settings import Settings
-from torchpt.shortage import needing, ran_out
+from torchpt.shortage import needing
 
 __all__ = ["Run"]
 
 
 class Run:
-    """One forward render: accumulates chunks into films; by several ranks where there is a ``group`` of them."""
+    """One forward render: accumulates chunks into films; by several ranks where there is a ``group`` of them.
+
+    ``like``: see :func:`torchpt.forward.wave.make_wave`.
+    """
 
     def __init__(
         self,
@@ -51,17 +54,18 @@ class Run:
         params: Mapping[str, Tensor] | None,
         dtype: torch.dtype,
         group: Group | None = None,
+        like: Wave | None = None,
     ) -> None:
         self.start = time.perf_counter()
         self.split = None if group is None or group.size == 1 else Split(group)
         self.shared: tuple[int, int] = 0, 1  # samples before this pass, and how many ranks take it
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
-        meter = Meter(self.device)
-        before = meter.peak()
+        meter, limit = Meter(self.device), settings.render.max_memory
+        before = 0 if limit is None else meter.peak()
         with needing(lambda: f"a scene of {scene.told}"):
-            self.wave = make_wave(scene, settings, params, dtype)
-        built = meter.peak()
+            self.wave = make_wave(scene, settings, params, dtype, like=like)
+        built = before if limit is None else meter.peak()
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
         self.dtype = dtype
@@ -69,20 +73,21 @@ class Run:
         self.seen = surface_layers(settings)
         self.on_progress: Callable[[Progress], bool | None] | None = None
         self.eager: list[str] = []
+        self.unsupported: Unsupported | None = None
         self.keeper: Keeper | None = None
         self.keeps = settings.render.checkpoint is not None
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.keeper.check(settings.render.resume)
-        self.loop = self._loop(scene) if looped(self.wave, settings, self.device) else None
+        self.loop = loop_of(scene, self.wave, self.eager) if looped(self.wave, settings, self.device) else None
         how = "eager" if self.loop is None else "compiled"
         rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
         self.need = need_of(settings, self.device, how, len(self.wave.stages.world.materials.models), rows)
-        if settings.render.max_memory is not None:
+        if limit is not None:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
-            check_memory(settings.render.max_memory, self.device, self.need.least, loading)
+            check_memory(limit, self.device, self.need.least, loading)
             if self.loop is not None:
-                left = self.need.left(settings.render.max_memory, max(meter.now() - meter.base(), 0))
+                left = self.need.left(limit, max(meter.now() - meter.base(), 0))
                 self.loop.threads, self.loop.lanes = shape_of(left, self.loop.threads, rows, self.loop.lanes)
         with needing(lambda: f"films of {self.width} x {self.height} pixels, which take {mb(self.need.films)}"):
             self._begin()
@@ -97,7 +102,7 @@ class Run:
         }
         self.picture = Plate(film, layers, streams)
         self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
-        self.tally, self.done, self.taken, self.ended = Tally(), 0, 0, False
+        self.tally, self.done, self.left, self.taken, self.ended = Tally(), 0, 0, 0, False
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
         bounded = self.keeps or self.split is not None  # a rank that is gone is noticed after a pass
         self.stop = Stop(self.settings.render, streams.count, EVERY if bounded else None)
@@ -108,22 +113,10 @@ class Run:
         self.waves: Waves | None = None  # of tensor operations
         self.begun: float | None = None
 
-    def _loop(self, scene: Scene) -> Loop:
-        """The compiled loop; its kernels are kept with the scene."""
-        keeper = kept(scene)
-        kernels = keeper.kernels = kernels_of(scene, self.wave, keeper.kernels)
-        for number, reason in kernels.eager.items():
-            name = str(self.wave.stages.world.materials.models[number])
-            self.eager.append(f"{name}: {reason}")
-            say_once(
-                f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}"
-            )
-        integrator = self.integrator
-        return Loop(kernels, torch.get_num_threads(), integrator.clamp, integrator.strict, say_once)
-
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, or as many as the rules or ``on_progress`` let."""
         self.on_progress = on_progress
+        self.stop.watched = on_progress is not None or self.settings.adaptive or self.keeps or self.split is not None
         try:
             with needing("a render"):
                 self._all()
@@ -133,27 +126,33 @@ class Run:
                 raise
             raise LostRankError(f"{error}; render.resume=true goes on from the last checkpoint") from None
         loaded("eager" if self.loop is None else "compiled")
-        return self._picture()
+        return final(self)
 
-    def _picture(self) -> Rendering:
-        """The picture at the end; where memory does not suffice, what else is held is given back first."""
-        try:
-            return self._told()
-        except Exception as error:
-            if not ran_out(error):
-                raise
-        if self.loop is not None:
-            self.loop.release()
-        let_go()
-        size = mb(self.need.picture)
-        with needing(lambda: f"the picture of {self.width} x {self.height} pixels, which takes {size}"):
-            return self._told()
+    def at_once(self) -> list[tuple[Plate, int, int]] | None:
+        """All samples, to be handed to :meth:`took` as they come, and then :meth:`completed`.
 
-    def _told(self) -> Rendering:
-        """The picture, and why samples of it are not finite."""
-        rendering = self.result()
-        rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(self.scene, self.wave, self.lost)
-        return rendering
+        None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
+        """
+        render = self.settings.render
+        bound = self.keeps or self.split is not None or self.stop.open or render.max_memory is not None
+        if self.loop is None or self.twice is not None or bound:
+            return None
+        self.begun = time.perf_counter()
+        return [(self.picture, 0, render.spp)]
+
+    def completed(self, rest: list[Block]) -> Rendering:
+        """The picture of samples that were taken :meth:`at_once`, but for the blocks for which there was no memory."""
+        assert self.loop is not None
+        with needing("a render"):
+            if self.unsupported is not None:
+                self._eagerly(self.unsupported)
+            else:
+                if rest:
+                    self.loop.take_rest(rest, self.took)
+                self.taken = self.settings.render.spp
+                self.stop.told(self.taken, self.seconds_of_sampling(), None)
+        loaded("eager" if self.loop is None else "compiled")
+        return final(self)
 
     def _all(self) -> None:
         """All samples, by tensor operations where there can be no kernels."""
@@ -162,11 +161,15 @@ class Run:
         except Unsupported as error:
             if self.loop is None:
                 raise
-            self.eager.append(f"all stages: {error}")
-            say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
-            self.loop = None
-            self._begin()
-            self._complete()
+            self._eagerly(error)
+
+    def _eagerly(self, error: Unsupported) -> None:
+        """All samples, once more, by tensor operations."""
+        self.eager.append(f"all stages: {error}")
+        say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
+        self.loop = None
+        self._begin()
+        self._complete()
 
     # -- which samples
 
@@ -317,30 +320,29 @@ class Run:
 
     def take_alone(self, spans: list[tuple[Plate, int, int]]) -> bool:
         """The same by this process alone."""
-        left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
-
-        def each(share: Share | None) -> bool:
-            nonlocal left
-            if share is None:
-                return self._advanced(0, False)
-            self.tally.rays += share.tally.rays
-            self.tally.truncated += share.tally.truncated
-            self._count(share.lost)
-            if self.integrator.clamp is not None:
-                self.light += torch.tensor(share.light, dtype=torch.float64)
-            left -= share.samples
-            return self._advanced(share.samples, left == 0 and self.split is None)
-
+        self.left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
         if self.loop is not None:
-            return self.loop.run(spans, each)
+            return self.loop.run(spans, self.took)
         if self.waves is None:
             self.waves = Waves(budget_of(self.settings, self.device))
         for plate, first, count in spans:
             pixels = plate.film.width * plate.film.height
             for _, n, _, samples in self.waves.through(partial(self._piece, plate), pixels, first, count):
-                if each(Share(Tally(), n * samples)):
+                if self.took(Share(Tally(), n * samples)):
                     return False
         return True
+
+    def took(self, share: Share | None) -> bool:
+        """Count what a task brought; returns whether the render is to stop."""
+        if share is None:
+            return self._advanced(0, False)
+        self.tally.rays += share.tally.rays
+        self.tally.truncated += share.tally.truncated
+        self._count(share.lost)
+        if self.integrator.clamp is not None:
+            self.light += torch.tensor(share.light, dtype=torch.float64)
+        self.left -= share.samples
+        return self._advanced(share.samples, self.left == 0 and self.split is None)
 
     def _piece(self, plate: Plate, span: Span) -> None:
         """A piece by tensor operations: all of it, or nothing where it raises."""

@@ -6,7 +6,6 @@ import copy
 import difflib
 import itertools
 import threading
-import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,25 +20,24 @@ from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
 from torchpt.cameras import Camera, PinholeMatrices
 from torchpt.cameras.opencv import extrinsics
-from torchpt.errors import RenderError, SceneError
-from torchpt.format.description import Description, Source, read_description, settings
-from torchpt.format.tensors import Tensors
+from torchpt.errors import SceneError
+from torchpt.format.description import Description, settings
 from torchpt.native.memory import Meter, mb
 from torchpt.native.modes import lasting
-from torchpt.native.operators import outside_graphs
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
+from torchpt.scene.devices import device_of
 from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, middle_of
-from torchpt.scene.traced import corners_in, traced, widened
+from torchpt.scene.view import through
 from torchpt.settings import Film, Settings
 from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
-__all__ = ["Scene", "device_of", "load", "numbered"]
+__all__ = ["Scene", "numbered"]
 
 #: Of a scene, what copies of it have: all else is made of it on demand.
 _KEPT = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
@@ -51,52 +49,6 @@ _scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 def numbered(number: int) -> Scene | None:
     """The scene of a number, where it is still there."""
     return _scenes.get(number)
-
-
-@outside_graphs
-def load(
-    source: Source,
-    device: str | torch.device | None = None,
-    bsdfs: Mapping[str, Bsdf] | None = None,
-) -> Scene:
-    """Load a scene.
-
-    Args:
-        source: the name of a scene that ships, a path ending in ``.yaml``, an open file, YAML text (of more than one line),
-            or a dict of the same schema. Relative paths in it start at the file's folder, else at the current one. In a dict
-            numbers, colours, poses, texels and vertices may be arrays, and tensors on any device: those that require
-            gradients get them from every picture (docs/scenes.md, *Tensors in dicts*).
-        device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
-            ``render.device``, which is ``auto`` where it does not say.
-        bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
-
-    Raises:
-        SceneError: the description is wrong; says where and what is accepted.
-        AssetError: a file that it names is missing or malformed.
-        RenderError: the device is not there.
-    """
-    start = time.perf_counter()
-    tensors = Tensors()
-    description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
-    chosen = device_of(settings(description).render.device if device is None else device)
-    with lasting():
-        scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
-    scene.params |= traced(tensors, scene.description, scene.built, scene.params)
-    scene.load_seconds = time.perf_counter() - start
-    return scene
-
-
-def device_of(name: str | torch.device) -> torch.device:
-    """The device for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
-    if isinstance(name, torch.device):
-        return name
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = torch.device(name)
-    if device.type == "cuda" and (not torch.cuda.is_available() or (device.index or 0) >= torch.cuda.device_count()):
-        found = f"{torch.cuda.device_count()} CUDA devices" if torch.cuda.is_available() else "no CUDA device"
-        raise RenderError(f"render.device: {name} is not available; this machine has {found}")
-    return device
 
 
 def _leaf(value: Tensor) -> Tensor:
@@ -154,10 +106,36 @@ class Scene:
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
         self._state: dict[str, tuple[Tensor, int]] = {}
+        self._origin: Scene | None = None
+        self._number()
+
+    def _number(self) -> None:
+        """Become another scene than any before."""
         self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.textured`
         #: Of all scenes of this process, by which compiled graphs name it.
         self.number = next(_numbers)
         _scenes[self.number] = self
+
+    @property
+    def origin(self) -> Scene:
+        """The scene that this is a view of (:meth:`seen_by`), else itself: what is made of either is made of that."""
+        return self if self._origin is None else self._origin
+
+    def seen_by(self, camera: Mapping[str, Any], film: Mapping[str, Any] | None = None) -> Scene:
+        """This scene through another camera. Tensors are shared, and so is all that is made of them: nothing is built again.
+
+        Args:
+            camera: its block, as in a scene file.
+            film: film settings in place of the scene's own, by whose size a ``K`` in pixels is read that does not say its own.
+
+        Raises:
+            SceneError: what is wrong with the camera.
+        """
+        view = object.__new__(type(self))
+        view.__dict__.update(self.__dict__ | through(self.description, self._built, self.params, camera, film or {}))
+        view._origin = self.origin
+        view._number()
+        return view
 
     def to(self, device: str | torch.device) -> Scene:
         """The scene on a device, which may be ``auto``: itself where it is there already, else a copy.
@@ -385,13 +363,15 @@ class Scene:
             or version != self._state[name][1]
             or version < 0
         ]
-        if not changed and len(state) == len(self._state):
+        gone = any(name not in state and not name.startswith("camera.") for name in self._state)
+        if not changed and not gone:
             return
         for name in changed:
             if self.spec(name).place and name in self._state:
                 self._check(name, state[name][0].detach())
-        self._state = state
-        if changed and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it
+        self._state.clear()  # views of the scene have the same
+        self._state.update(state)
+        if not gone and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it
             return
         self._worlds.clear()
         self._accels.clear()

@@ -161,6 +161,11 @@ class Primitive:
         raise NotImplementedError
 
     @classmethod
+    def corners_of_many(cls, poses: Tensor, dtype: torch.dtype) -> list[Corners] | None:
+        """The corners of parts that are no more than a pose each, ``(N, 3, 4)``, at once; None: one by one."""
+        return None
+
+    @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:
         """Texture coordinates ``(2, P)`` at the corners; zero where :meth:`uv` says them."""
         nothing = torch.zeros_like(corners.p0[:2])
