@@ -61,9 +61,9 @@ $(VENV)/run.stamp: pyproject.toml constraints.txt | $(PY)
 	@touch $@
 
 $(VENV)/dev.stamp: $(VENV)/run.stamp
-	$(PIP) -e ".[dev,formats,video,compare,denoise]"
+	$(PIP) -e ".[dev,formats,video,compare,denoise,sweep]"
 	@touch $@
 
 $(VENV)/bench.stamp: $(VENV)/dev.stamp
-	$(PIP) -e ".[dev,formats,video,compare,denoise,bench]"
+	$(PIP) -e ".[dev,formats,video,compare,denoise,sweep,bench]"
 	@touch $@

@@ -70,13 +70,21 @@ def test_every_extra_is_imported_by_a_feature_when_it_is_asked_for(extra: str) -
 
 
 def test_what_developers_install_is_used() -> None:
-    assert set(EXTRAS) == {*FEATURES, "bench", "dev"}
+    assert set(EXTRAS) == {*FEATURES, "sweep", "bench", "dev"}
     used = {name for folder in ("scripts", "tests") for name, _ in imports(folder)}
     assert modules(EXTRAS["bench"]) - used == set()
     dev = {Requirement(text).name for text in EXTRAS["dev"]}
     assert modules([name for name in dev if name not in TOOLS]) - used == set()
     for name, (file, words) in TOOLS.items():
         assert name in dev and words in (ROOT / file).read_text()
+
+
+def test_the_launcher_of_sweeps_is_tested() -> None:
+    """Hydra finds it by itself: nothing of ours imports it."""
+    (name,) = (Requirement(text).name for text in EXTRAS["sweep"])
+    assert (
+        name == "hydra-joblib-launcher" and "hydra/launcher=joblib" in (ROOT / "tests/cli/test_sweeps.py").read_text()
+    )
 
 
 def test_everything_imported_is_asked_for() -> None:

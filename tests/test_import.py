@@ -26,6 +26,7 @@ NEEDLESS = (
     *("torch._dynamo", "torch._inductor", "torch.onnx", "torch.utils.tensorboard"),
     *("hydra_plugins", "hydra._internal.core_plugins", "PIL.TiffImagePlugin", "logging.config"),
     *(f"torchpt.meshes.{name}" for name in ("gltf", "obj", "ply", "stl")),
+    "torchpt.ranks.launch",
 )
 SMALL = ("render", "scene=cornell_box", "render.spp=1", "film.width=64", "film.height=64")
 

@@ -12,7 +12,9 @@ from torchpt.errors import (
     AssetError,
     EdgeWarning,
     EnergyWarning,
+    LostRankError,
     NotBuiltError,
+    OtherRankError,
     OutputError,
     RenderError,
     SceneError,
@@ -20,7 +22,8 @@ from torchpt.errors import (
 )
 
 if TYPE_CHECKING:
-    from torchpt import ibl
+    from torchpt import cameras, data, ibl, losses, nn, ranks
+    from torchpt.batches import Renderings, render_batch
     from torchpt.bsdfs import Bsdf
     from torchpt.forward import Rendering
     from torchpt.images import metrics, read_header, read_image, read_layers, write_image
@@ -35,22 +38,31 @@ __all__ = [
     "Bsdf",
     "EdgeWarning",
     "EnergyWarning",
+    "LostRankError",
     "NotBuiltError",
+    "OtherRankError",
     "OutputError",
     "RenderError",
     "Rendering",
+    "Renderings",
     "Scene",
     "SceneError",
     "TorchptError",
+    "cameras",
+    "data",
     "denoise",
     "from_trimesh",
     "ibl",
     "load",
+    "losses",
     "metrics",
+    "nn",
+    "ranks",
     "read_header",
     "read_image",
     "read_layers",
     "render",
+    "render_batch",
     "write_image",
 ]
 
@@ -58,6 +70,7 @@ __all__ = [
 _LAZY = {
     "Bsdf": "torchpt.bsdfs",
     "Rendering": "torchpt.forward",
+    "Renderings": "torchpt.batches",
     "Scene": "torchpt.scene",
     "denoise": "torchpt.images.denoiser",
     "from_trimesh": "torchpt.scene.from_trimesh",
@@ -66,11 +79,20 @@ _LAZY = {
     "read_image": "torchpt.images",
     "read_layers": "torchpt.images",
     "render": "torchpt.rendering",
+    "render_batch": "torchpt.batches",
     "write_image": "torchpt.images",
 }
 
 #: Public modules.
-_MODULES = {"ibl": "torchpt.ibl", "metrics": "torchpt.images.metrics"}
+_MODULES = {
+    "cameras": "torchpt.cameras",
+    "data": "torchpt.data",
+    "ibl": "torchpt.ibl",
+    "losses": "torchpt.losses",
+    "metrics": "torchpt.images.metrics",
+    "nn": "torchpt.nn",
+    "ranks": "torchpt.ranks",
+}
 
 
 def __getattr__(name: str) -> Any:

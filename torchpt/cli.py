@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpt import __version__
-from torchpt.commands import collector, keys
+from torchpt.commands import collector, keys, ranked
 from torchpt.commands.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.commands.compare import HELP as HELP_COMPARE
 from torchpt.commands.compare import compare
@@ -31,7 +31,7 @@ from torchpt.commands.streams import ready, speaking
 from torchpt.commands.stress import HELP as HELP_STRESS
 from torchpt.commands.stress import stress
 from torchpt.commands.sweep_folder import sweep_folder
-from torchpt.errors import TorchptError
+from torchpt.errors import LostRankError, OtherRankError, TorchptError
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -68,6 +68,8 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
                       writes x_0.exr, x_1.exr, ...
   --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
 
+  torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/ranks.md)
+
 The last line on stdout is a summary in JSON. Samples that are not finite count as black, and stderr says why.
 Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the partial picture saved.
 """
@@ -87,7 +89,7 @@ def run() -> None:
     """The console script."""
     collector.pause()
     ready()
-    sys.exit(main())
+    sys.exit(ranked.main_of_ranks(main, sys.argv[1:]) if ranked.several() else main())
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -156,7 +158,7 @@ def _say(text: str) -> int:
 
 
 def _refuse(line: str) -> int:
-    print("torchpt: " + " ".join(line.split("\n")), file=sys.stderr)
+    ranked.say("torchpt: " + " ".join(line.split("\n")))
     return 2
 
 
@@ -198,6 +200,8 @@ class _Task:
                 if self.debug:
                     return debug(job, Wish.read(self.debug), interrupt, self.json)
                 return info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
+            except (LostRankError, OtherRankError) as error:
+                return ranked.parted(error)
             except TorchptError as error:
                 return _refuse(str(error))
             except Interrupted as interrupted:

@@ -6,7 +6,9 @@ __all__ = [
     "AssetError",
     "EdgeWarning",
     "EnergyWarning",
+    "LostRankError",
     "NotBuiltError",
+    "OtherRankError",
     "OutputError",
     "RenderError",
     "SceneError",
@@ -90,6 +92,21 @@ class OutputError(TorchptError):
 
 class RenderError(TorchptError):
     """A render that could not be carried out as asked (device, compiler, strict mode)."""
+
+
+class LostRankError(RenderError):
+    """A process of those that render together has ended, or cannot be reached."""
+
+
+class OtherRankError(RenderError):
+    """A process of those that render together failed; its own error says why. ``code`` is its exit code."""
+
+    def __init__(self, text: str, code: int = 2) -> None:
+        self.code = code
+        super().__init__(text)
+
+    def __reduce__(self) -> tuple:
+        return type(self), (str(self), self.code)
 
 
 class EdgeWarning(UserWarning):

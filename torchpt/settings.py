@@ -15,6 +15,7 @@ from torchpt.integrators.base import Integrator
 from torchpt.samplers import KINDS as SAMPLERS
 from torchpt.spec import Choice, Flag, Other, Refused, Scalar, Valued, Whole, parameters_of, reading
 from torchpt.spec.declared import Described, described, refuse_foreign, values_of
+from torchpt.spec.memo import Memo
 from torchpt.spec.validate import check_keys, dotted
 
 __all__ = ["BLOCKS", "FILTERS", "INTEGRATORS", "RECORDS", "SAMPLERS", "TYPED", "Film", "Render", "Settings", "merge"]
@@ -263,6 +264,19 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
         SceneError: an unknown block or key, a key that does nothing for the chosen type, a bad value.
         NotBuiltError: a setting that this version does not build.
     """
+    given = {name: _plain_mappings(blocks) for name, blocks in (("scene", scene), ("overrides", overrides))}
+    return _merged.get(file, given, lambda: _merge(scene, overrides, file))
+
+
+#: Settings by what was said of them: a loop of renders says the same again and again.
+_merged: Memo[Settings] = Memo(256)
+
+
+def _plain_mappings(blocks: Mapping[str, Any]) -> Any:
+    return {name: dict(value) if isinstance(value, Mapping) else value for name, value in blocks.items()}
+
+
+def _merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None) -> Settings:
     check_keys(overrides, BLOCKS, "", "the settings", None)
     blocks: dict[str, Any] = {}
     for block in BLOCKS:

@@ -10,19 +10,20 @@ their depth comes with them, as a layer. Rooms of other numbers are for validati
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from random import Random
 
 import torch
 from example_tools import arguments, grid
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset, Subset
+from torch.utils.data import DataLoader, Subset
 
-import torchpt
+from torchpt.data import RenderDataset
 
 VALIDATION, BATCH, SPP = 32, 4, 8
 
 
-def room(index: int, size: int) -> dict:
+def room(size: int, index: int) -> dict:
     """The description of a room with three boxes and two balls at random places, of random colours."""
     draw = Random(index)
 
@@ -54,24 +55,10 @@ def room(index: int, size: int) -> dict:
         }
     return {
         "camera": {"origin": [0, 0, 1.9], "target": [draw.uniform(-0.2, 0.2), -0.2, 0], "fov": 75},
-        "film": {"width": size, "height": size, "filter": "box", "aovs": ["depth"]},
+        "film": {"width": size, "height": size, "filter": "box"},
         "integrator": {"type": "path", "max_depth": 3},
         "shapes": shapes,
     }
-
-
-class Rooms(Dataset):
-    """Pairs of a picture ``(3, H, W)`` and its depth ``(1, H, W)``, rendered when they are asked for."""
-
-    def __init__(self, count: int, size: int) -> None:
-        self.count, self.size = count, size
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        rendering = torchpt.render(torchpt.load(room(index, self.size)), spp=SPP, seed=index, full=True)
-        return rendering.image.permute(2, 0, 1), rendering["depth"].permute(2, 0, 1)
 
 
 class DepthNetwork(nn.Module):
@@ -100,12 +87,17 @@ class DepthNetwork(nn.Module):
         return torch.exp(self.last(x) + 1.0)
 
 
+def channels_first(batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """Pictures ``(B, 3, H, W)`` and depths ``(B, 1, H, W)`` of a batch of the data set."""
+    return batch["image"].permute(0, 3, 1, 2), batch["depth"].permute(0, 3, 1, 2)
+
+
 def main(argv: Sequence[str] | None = None) -> tuple[float, float]:
     """Train it; the mean error of depth on the validation rooms at the start and at the end, which are also printed."""
     args = arguments(__doc__, steps=600, size=32, argv=argv)
     torch.manual_seed(args.seed)
-    rooms = Rooms(VALIDATION + BATCH * args.steps, args.size)
-    seen, true = next(iter(DataLoader(Subset(rooms, range(VALIDATION)), VALIDATION)))
+    rooms = RenderDataset(partial(room, args.size), VALIDATION + BATCH * args.steps, spp=SPP, layers=["depth"])
+    seen, true = channels_first(next(iter(DataLoader(Subset(rooms, range(VALIDATION)), VALIDATION))))
     batches = DataLoader(Subset(rooms, range(VALIDATION, len(rooms))), BATCH)
 
     network = DepthNetwork()
@@ -116,8 +108,8 @@ def main(argv: Sequence[str] | None = None) -> tuple[float, float]:
         return float((found.detach() - true).abs().mean())
 
     before, mean = error(network(seen)), torch.zeros_like(true[0])
-
-    for step, (pictures, depths) in enumerate(batches):
+    for step, batch in enumerate(batches):
+        pictures, depths = channels_first(batch)
         optimizer.zero_grad()
         # A mirrored room is another room, and costs nothing to render.
         pictures, depths = torch.cat((pictures, pictures.flip(-1))), torch.cat((depths, depths.flip(-1)))
@@ -125,8 +117,8 @@ def main(argv: Sequence[str] | None = None) -> tuple[float, float]:
         optimizer.step()
         schedule.step()
         mean += (depths.mean(0) - mean) / (step + 1)
-        if step % 100 == 0:
-            print(f"after {step} steps: mean error on the validation rooms {error(network(seen)):.3f}")
+        if step % 100 == 99:
+            print(f"after {step + 1} steps: mean error on the validation rooms {error(network(seen)):.3f}")
 
     after = error(network(seen))
     shown = slice(0, 5)

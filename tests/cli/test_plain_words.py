@@ -84,8 +84,10 @@ def test_a_key_given_twice_is_hydras() -> None:
 
 def test_plugins_of_hydra_are_hydras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert compose_plainly([], configs()) is not None
-    (tmp_path / "hydra_plugins").mkdir()
+    (tmp_path / "hydra_plugins" / "hydra_joblib_launcher").mkdir(parents=True)
     monkeypatch.syspath_prepend(tmp_path)
+    assert compose_plainly([], configs()) is not None  # it starts jobs, and changes no composition
+    (tmp_path / "hydra_plugins" / "another").mkdir()
     assert compose_plainly([], configs()) is None
 
 

@@ -266,3 +266,23 @@ def test_nodes_that_place_no_light(tmp_path: Path, node: dict[str, Any], problem
 def test_a_file_of_lights_alone_is_no_mesh(tmp_path: Path) -> None:
     with pytest.raises(AssetError, match="the mesh is empty"):
         load_mesh(write(tmp_path, [BULB], [lit(0)]))
+
+
+def test_lights_follow_a_transform_of_tensors(tmp_path: Path) -> None:
+    """What moves the mesh moves its lights, and so do gradients; directions only turn."""
+    path = write(tmp_path, [BULB, SPOT, SUN])
+    move = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    turn = {"rotate": {"axis": [0, 0, 1], "angle": angle}}
+    made = torchpt.load(scene(path, transform=[*TRANSFORM, turn, {"translate": move}]), "cpu")
+    still = torchpt.load(scene(path), "cpu")
+    assert all(value.allclose(still.params[name], atol=1e-6) for name, value in made.params.items())
+    names = [name for name, value in made.params.items() if value.requires_grad and ".lights." in name]
+    assert {name.rpartition(".")[2] for name in names} == {"position", "target", "direction"}
+    for name in names:
+        own = still.params[name].double()
+        gradients = torch.autograd.grad(made.params[name].sum(), (move, angle), retain_graph=True, allow_unused=True)
+        expected = 0.0 if name.endswith(".direction") else 1.0
+        assert gradients[0] is None or gradients[0].allclose(torch.full_like(move, expected)), name
+        assert gradients[1] is not None
+        assert torch.isclose(gradients[1], (own[0] - own[1]) * math.pi / 180.0, rtol=1e-4, atol=1e-6), name

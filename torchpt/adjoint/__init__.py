@@ -31,6 +31,7 @@ from torchpt.forward import limited_threads
 from torchpt.forward.budget import check_memory
 from torchpt.forward.need import loaded, need_of
 from torchpt.integrators.path import PathIntegrator
+from torchpt.ranks import Group
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
@@ -50,6 +51,7 @@ def gradients(
     kind: str,
     asked: Tensor,
     held: bool = False,
+    ranks: Group | None = None,
 ) -> list[Tensor]:
     """Derivatives by the parameters ``wanted`` and by the weights of the caller's own models.
 
@@ -63,6 +65,7 @@ def gradients(
         kind: one of :data:`KINDS`.
         asked: derivatives of a loss by the pixels ``(3, H W)``.
         held: whether what the camera sees is held in place (:func:`suits`), and the picture moves over it.
+        ranks: those that share the pixels, which are the same on each.
 
     Raises:
         SceneError: ``render.max_memory`` is too small for it.
@@ -70,7 +73,7 @@ def gradients(
     """
     with limited_threads(settings.render.threads):
         attached = follows(scene, wanted) if held else attached
-        assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached)
+        assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks)
         if settings.render.max_memory is not None:
             need = need_of(settings, scene.device, "tape", len(assembly.wave.stages.world.materials.models))
             check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)
@@ -82,5 +85,7 @@ def gradients(
             compiled_replay(scene, assembly, settings, asked, sums)
         else:
             tape(assembly, settings, asked, sums)
+        if ranks is not None:
+            sums.join_ranks(ranks)
         loaded("tape")
         return assembly.gradients(sums)

@@ -14,9 +14,12 @@ import torch
 from torch import Tensor
 
 from torchpt.adjoint.sums import Sums
+from torchpt.forward.schedule import Span
 from torchpt.forward.wave import make_wave
+from torchpt.forward.waves import Waves
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.wave import Wave
+from torchpt.ranks import Group, blocks
 from torchpt.records import tensors_of
 from torchpt.scene import Scene
 from torchpt.settings import Settings
@@ -35,6 +38,7 @@ class Assembly:
         held: tensors that stages use by themselves, such as weights of modules.
         dtype: of the lanes.
         attached: whether geometry is differentiated.
+        ranks: those that share the pixels; None: there is but one process.
 
     Attributes:
         wave: with plain tensors.
@@ -53,7 +57,9 @@ class Assembly:
         held: Sequence[Tensor],
         dtype: torch.dtype,
         attached: bool,
+        ranks: Group | None = None,
     ) -> None:
+        self._ranks = ranks
         self._inputs = [params[name].detach().requires_grad_() for name in wanted]
         given = {name: value.detach() for name, value in params.items()} | dict(zip(wanted, self._inputs, strict=True))
         with torch.enable_grad():
@@ -94,6 +100,20 @@ class Assembly:
             return False
         read = [] if maps is None else [x for k in maps.tables for x in tensors_of(world.textures.tables[k])]
         return any(x.requires_grad for x in (opacity, *read))
+
+    def blocks(self, pixels: int, samples: int) -> list[tuple[int, int]]:
+        """Consecutive pixels, first and how many, that this process takes: the same ones by kernels and without."""
+        return blocks(pixels, samples, self._ranks)
+
+    def through(self, waves: Waves, work: Callable[[Span], None], pixels: int, samples: int) -> None:
+        """Work on them, piece by piece."""
+        for start, count in self.blocks(pixels, samples):
+
+            def moved(span: Span, start: int = start) -> None:
+                work((start + span[0], *span[1:]))
+
+            for _ in waves.through(moved, count, 0, samples):
+                pass
 
     def sums(self) -> Sums:
         """Sums of the gradients of the leaves, and of what is held."""

@@ -3,37 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
-import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+
+from torchpt import taped
 
 __all__ = ["on_tape"]
 
 Forward = Callable[..., Tensor]
-Backward = Callable[..., Sequence[Tensor]]
-
-
-class _Picture(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, forward: Forward, backward: Backward, held: int, *tensors: Tensor) -> Tensor:
-        own = tensors[: len(tensors) - held]
-        ctx.backward_pass = backward
-        ctx.save_for_backward(*own)
-        return forward(*(t.detach() for t in own))
-
-    @staticmethod
-    @once_differentiable
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]: the decorator hides names
-        ctx: Any, *cotangents: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        tensors = tuple(t.detach() for t in ctx.saved_tensors)
-        return (None, None, None, *ctx.backward_pass(cotangents[0].reshape(-1, 3).T, *tensors))
+Backward = Callable[..., Sequence[Tensor | None]]
 
 
 def on_tape(forward: Forward, backward: Backward, tensors: tuple[Tensor, ...], held: tuple[Tensor, ...]) -> Tensor:
-    """A picture that autograd can go back through.
+    """A picture that autograd and ``torch.func`` can go back through (see :func:`torchpt.taped.on_tape`).
 
     Args:
         forward: from detached ``tensors`` to the picture ``(H, W, 3)``.
@@ -41,4 +23,11 @@ def on_tape(forward: Forward, backward: Backward, tensors: tuple[Tensor, ...], h
         tensors: what is handed to both.
         held: what both use by themselves, such as weights of modules.
     """
-    return _Picture.apply(forward, backward, len(held), *tensors, *held)
+
+    def forth(*plain: Tensor) -> tuple[Tensor, ...]:
+        return (forward(*plain),)
+
+    def back(cotangents: tuple[Tensor, ...], *plain: Tensor) -> Sequence[Tensor | None]:
+        return backward(cotangents[0].reshape(-1, 3).T, *plain)
+
+    return taped.on_tape(forth, back, tensors, held)[0]

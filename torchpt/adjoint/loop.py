@@ -46,7 +46,8 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
     models = wave.stages.world.materials.models
     kernels.eager = kernels.probe([k for k, model in enumerate(models) if any(model is x for x in scene.own_models)])
     threads = _threads(kernels, settings)
-    chunks = [Chunk(*span) for span in _spans(wave.crop[2] * wave.crop[3], settings.render.spp)]
+    blocks = assembly.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
+    chunks = [Chunk(*span) for span in _spans(blocks, settings.render.spp)]
     sweeps: list[Sweep] = []
     lock = threading.Lock()
 
@@ -98,13 +99,14 @@ def _in_order(task: Callable[[Chunk], ChunkSums], chunks: Sequence[Chunk], threa
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _spans(pixels: int, samples: int) -> Iterator[Span]:
-    """The chunks of a picture: always the same."""
+def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
+    """The chunks of blocks of pixels, first and how many: always the same."""
     for sample in range(0, samples, LANES):
         count = min(LANES, samples - sample)
         step = max(LANES // count, 1)
-        for pixel in range(0, pixels, step):
-            yield pixel, min(step, pixels - pixel), sample, count
+        for start, pixels in blocks:
+            for pixel in range(start, start + pixels, step):
+                yield pixel, min(step, start + pixels - pixel), sample, count
 
 
 def _threads(kernels: JointKernels, settings: Settings) -> int:

@@ -91,10 +91,8 @@ def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) ->
 
     device = wave.centre.device
     budget = Budget(None, device, LANES.get(device.type, LANES["cpu"]), 0)
-    for _ in Waves(budget, "the vertices of a single lane").through(
-        whole, wave.crop[2] * wave.crop[3], 0, settings.render.spp
-    ):
-        pass
+    waves = Waves(budget, "the vertices of a single lane")
+    assembly.through(waves, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
 def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.ranks import Group
+
 __all__ = ["Sums"]
 
 #: Tables of more numbers than this are summed in the lanes' own precision: few paths meet in one of so many places.
@@ -74,12 +76,19 @@ class Sums:
         ]
         self._totals = own
 
+    def join_ranks(self, ranks: Group) -> None:
+        """Add the sums of all ranks, in their order: every one has the same bits then."""
+        there = torch.tensor([total is not None for total in self._totals], dtype=torch.uint8)
+        for number, count in enumerate(torch.stack(ranks.gather(there)).sum(0).tolist()):
+            if count:
+                self._totals[number] = ranks.sum(self.total(number))
+
     def merge(self, part: ChunkSums) -> None:
-        """Add the sums of a chunk."""
-        for number, total in part.dense.items():
-            self.total(number).add_(total)
+        """Add the sums of a chunk: its terms of large tables first, as they come where they are added at once."""
         for number, index, values in part.stream:
             self.add_rows(number, index, values)
+        for number, total in part.dense.items():
+            self.total(number).add_(total)
 
     def clear(self) -> None:
         """Forget what was added."""

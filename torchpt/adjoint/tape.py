@@ -81,8 +81,7 @@ def chunk_by_chunk(assembly: Assembly, settings: Settings, sums: Sums, part: Par
                 found.add_each(torch.autograd.grad(values, leaves, asked.to(values.dtype), allow_unused=True))
         sums.join(found)
 
-    for _ in Waves(_budget(settings, assembly), "the tape of a single lane").through(add, count, 0, samples):
-        pass
+    assembly.through(Waves(_budget(settings, assembly), "the tape of a single lane"), add, count, samples)
 
 
 def _budget(settings: Settings, assembly: Assembly) -> Budget:

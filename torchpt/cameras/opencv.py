@@ -2,8 +2,9 @@
 
 A point ``X`` of the world lies at ``x = R X + t`` in the camera's space, where +x is right in the picture, +y down and +z
 ahead, and at ``(fx x / z + cx, fy y / z + cy)`` on the film, in pixels from its upper left *corner*: the middle of the first
-pixel is (0.5, 0.5), and the middle of the film (width / 2, height / 2). So count COLMAP, kornia and most of their like.
-``cv2`` itself puts (0, 0) in the middle of the first pixel: 0.5 is to be added to ``cx`` and ``cy`` of its calibrations.
+pixel is (0.5, 0.5), and the middle of the film (width / 2, height / 2). So count COLMAP and its like. ``cv2`` itself and
+kornia put (0, 0) in the middle of the first pixel: 0.5 is to be added to ``cx`` and ``cy`` of their calibrations, which
+:mod:`torchpt.cameras.conventions` does.
 """
 
 from __future__ import annotations

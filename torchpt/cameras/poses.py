@@ -13,9 +13,10 @@ from torchpt.errors import SceneError
 from torchpt.math.transforms import is_usable, look_at
 from torchpt.spec import Other, Point, Pose, Refused, Spec
 
-__all__ = ["POSES", "pose_of"]
+__all__ = ["POSES", "UP", "pose_of"]
 
-_UP = (0.0, 1.0, 0.0)
+#: What is up where a camera does not say.
+UP = (0.0, 1.0, 0.0)
 #: The keys that together say a pose; of each way the first ones are required.
 _WAYS = {"to_world": ("to_world",), "origin, target and up": ("origin", "target", "up"), "R and t": ("R", "t")}
 
@@ -87,6 +88,6 @@ def pose_of(values: Mapping[str, Any], given: frozenset[str], sized_by: str = ""
                 "a point [x, y, z] (a camera needs origin and target, or to_world, or R and t)", None, (name,)
             )
     try:
-        return look_at(values["origin"], values["target"], values["up"] or _UP, key="")
+        return look_at(values["origin"], values["target"], values["up"] or UP, key="")
     except SceneError as error:
         raise Refused(error.expected, error.value, (error.key,)) from None

@@ -60,7 +60,8 @@ def debug(job: Job, wish: Wish, interrupt: Interrupt, as_json: bool = False) -> 
         Interrupted: a signal came.
     """
     from torchpt.forward.one_path import one_path
-    from torchpt.scene.scene import Scene, device_of
+    from torchpt.scene.devices import device_of
+    from torchpt.scene.scene import Scene
 
     collector.resume()
     with notices():

@@ -24,7 +24,8 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
         Interrupted: a signal came.
     """
     from torchpt.forward import loop_facts
-    from torchpt.scene.scene import Scene, device_of
+    from torchpt.scene.devices import device_of
+    from torchpt.scene.scene import Scene
 
     collector.resume()
     with notices():

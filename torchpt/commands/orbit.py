@@ -137,7 +137,8 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
         Interrupted: a signal came before the first frame.
     """
     from torchpt.images.movie import check_movie, write_movie
-    from torchpt.scene.scene import Scene, device_of
+    from torchpt.scene.devices import device_of
+    from torchpt.scene.scene import Scene
 
     collector.resume()
     start = time.perf_counter()

@@ -37,6 +37,10 @@ _LONGEST = 300  # digits; Python refuses to read an int of thousands
 _CONSTANTS = {"true": True, "false": False, "null": None}
 
 
+#: Plugins of Hydra that start jobs, and change nothing else.
+LAUNCHERS = {"hydra_joblib_launcher", "hydra_submitit_launcher", "hydra_ray_launcher"}
+
+
 class _NotPlain(Exception):
     """Something that is left to Hydra."""
 
@@ -48,7 +52,7 @@ def compose_plainly(words: list[str], folder: Path) -> dict[str, Any] | None:
         words: ``key=value`` each.
         folder: the config groups.
     """
-    if find_spec("hydra_plugins") is not None:  # may add to the search path
+    if not _plugins() <= LAUNCHERS:  # may add to the search path
         return None
     chosen, given = dict.fromkeys(GROUPS, "default"), {}
     try:
@@ -67,6 +71,15 @@ def compose_plainly(words: list[str], folder: Path) -> dict[str, Any] | None:
     except (_NotPlain, OSError, ValueError):
         return None
     return composed
+
+
+def _plugins() -> set[str]:
+    """Names of Hydra's plugins that are installed."""
+    found = find_spec("hydra_plugins")
+    if found is None:
+        return set()
+    names = {path.stem for place in found.submodule_search_locations or () for path in Path(place).glob("*")}
+    return {name for name in names if not name.startswith("__")}
 
 
 def _read(path: Path) -> Any:

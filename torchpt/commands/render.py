@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from torchpt.commands import collector
+from torchpt.commands import collector, ranked
 from torchpt.commands.denoised import denoised_files
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.notices import not_finite, notices
@@ -62,10 +62,13 @@ def render(job: Job, interrupt: Interrupt) -> int:
     from torchpt.forward.files import write_rendered
     from torchpt.images import check_writable
     from torchpt.rendering import first_hit, render_scene
-    from torchpt.scene.scene import Scene, device_of
+    from torchpt.scene.devices import device_of
+    from torchpt.scene.scene import Scene
 
     collector.resume()
     start = time.perf_counter()
+    group = ranked.group()
+    first = group is None or group.rank == 0  # which alone writes
     with notices():
         description, wishes = described(job)
         wishes = knowing(wishes)
@@ -73,29 +76,35 @@ def render(job: Job, interrupt: Interrupt) -> int:
         preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
         previews = _preview_files(preview) if preview else []
         denoised = denoised_files(wishes, outs, previews)
-        for path in (*outs, *previews, *denoised):
+        for path in (*outs, *previews, *denoised) if first else ():
             check_writable(path)
         if wishes.render.checkpoint is not None:
             wishes = replace(
                 wishes, render=wishes.render.but(checkpoint=numbered(wishes.render.checkpoint, job.number))
             )
-            Keeper(wishes.render.checkpoint).check(wishes.render.resume)
+            if first:
+                Keeper(wishes.render.checkpoint).check(wishes.render.resume)
         scene = Scene(description, device_of(wishes.render.device))
     scene.load_seconds = time.perf_counter() - start
-    if preview:
+    if preview and first:
         hits = first_hit(scene, wishes)
         for path, name in zip(previews, ("albedo", "normal"), strict=False):
             _write_layer(path, name, hits[name])
 
+    shared: dict[str, Any] = {} if group is None else {"ranks": group}
     with Bar(_name(job.scene)) as bar:
 
         def on_progress(state: Any) -> bool:
             bar.update(state.done, state.total, state.rays, state.seconds)
-            if preview and state.pass_finished and state.done < state.total:
+            if preview and first and state.pass_finished and state.done < state.total:
                 write_rendered(preview, state.snapshot(), wishes.film)
             return interrupt.signum is not None
 
-        rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress))
+        rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress, **shared))
+    if group is not None:  # a signal that any of them heard
+        interrupt.signum = int(max(group.agree("signals", interrupt.signum or 0))[0]) or None
+    if not first:
+        return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)
     summary = {"out": _names(outs), **facts, **rendering.summary()}
     if not rendering.complete:

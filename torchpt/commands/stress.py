@@ -152,7 +152,7 @@ def _benches(wishes: Wishes) -> dict[str, Bench]:
     """One for each combination of what is asked for, by what it is called."""
     import torch
 
-    from torchpt.scene.scene import device_of
+    from torchpt.scene.devices import device_of
     from torchpt.stress import Bench
 
     device, dtype = wishes.given.get("device", "cpu"), wishes.given.get("dtype", "float32")

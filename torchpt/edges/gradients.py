@@ -22,6 +22,7 @@ from torchpt.edges.shadows import Shadows
 from torchpt.edges.traced import Traced, traced_of
 from torchpt.forward import limited_threads
 from torchpt.integrators.path import PathIntegrator
+from torchpt.ranks import Group, share
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 from torchpt.spec import Moves
@@ -60,6 +61,7 @@ class Boundary:
         traced: what sees.
         worth: of places on the film.
         pixels: of the picture.
+        ranks: those that share the samples; None: there is but one process.
     """
 
     scene: Scene
@@ -71,6 +73,7 @@ class Boundary:
     traced: Traced
     worth: Worth
     pixels: int
+    ranks: Group | None = None
 
     def gradients(self, samples: Iterable[Samples], wanted: Iterable[str]) -> list[Tensor | None]:
         """What samples add to the gradients of ``wanted``; None for those that move no edges."""
@@ -85,6 +88,8 @@ class Boundary:
             for name, grad in zip(own, torch.autograd.grad(value, list(own.values()), allow_unused=True), strict=True):
                 if grad is not None:
                     sums[name] += grad
+        if self.ranks is not None:
+            sums = {name: self.ranks.sum(total) for name, total in sums.items()}
         outputs, inputs = list(self.moving.values()), list(self.leaves.values())
         grads = torch.autograd.grad(outputs, inputs, list(sums.values()), allow_unused=True)
         by_name = dict(zip(self.leaves, grads, strict=True))
@@ -140,7 +145,7 @@ class Boundary:
 
     def _chunks(self, total: int) -> Iterator[tuple[int, int]]:
         """First samples and how many."""
-        for first in range(0, total, SAMPLES):
+        for _, first in share(range(0, total, SAMPLES), self.ranks):
             yield first, min(SAMPLES, total - first)
 
 
@@ -151,6 +156,7 @@ def boundary_of(
     wanted: Iterable[str],
     dtype: torch.dtype,
     cotangent: Tensor,
+    ranks: Group | None = None,
 ) -> Boundary | None:
     """What a backward pass knows of edges; None where none of the parameters moves any.
 
@@ -161,6 +167,7 @@ def boundary_of(
         wanted: names of those that are differentiated.
         dtype: of the lanes.
         cotangent: ``(C, H, W)`` of what is differentiated.
+        ranks: those that share the samples.
 
     Raises:
         SceneError: settings that this scene cannot be rendered with.
@@ -178,7 +185,7 @@ def boundary_of(
         traced = traced_of(scene, settings, plain, dtype)
         worth = Worth(cotangent, traced.wave.filter, traced.wave.crop)
     pixels = cotangent.shape[1] * cotangent.shape[2]
-    return Boundary(scene, settings, plain, leaves, moving, still, traced, worth, pixels)
+    return Boundary(scene, settings, plain, leaves, moving, still, traced, worth, pixels, ranks)
 
 
 def add_gradients(
@@ -190,6 +197,7 @@ def add_gradients(
     cotangent: Tensor,
     samples: int,
     held: bool = False,
+    ranks: Group | None = None,
 ) -> list[Tensor | None]:
     """What moving edges add to the gradients of ``wanted``; None for those that move none.
 
@@ -203,13 +211,14 @@ def add_gradients(
         samples: of each estimator, a pixel of the picture.
         held: whether the interior holds in place what the camera sees (:mod:`torchpt.adjoint.held`): edges count as they
             move over that.
+        ranks: those that share the samples, which are the same on each.
 
     Raises:
         SceneError: settings that this scene cannot be rendered with.
     """
     with limited_threads(settings.render.threads):
         cotangent = cotangent.permute(2, 0, 1)
-        every = boundary_of(scene, settings, params, wanted, dtype, cotangent)
+        every = boundary_of(scene, settings, params, wanted, dtype, cotangent, ranks)
         if every is None:
             return [None] * len(wanted)
         if not held:
@@ -217,7 +226,7 @@ def add_gradients(
         found = every.gradients(every.primary(samples, every.traced.radiance, held=True), wanted)
         # Shadows move with what they fall on, which is held: only lights move them.
         lights = [name for name in wanted if not name.startswith("camera.")]
-        thrown = boundary_of(scene, settings, params, lights, dtype, cotangent)
+        thrown = boundary_of(scene, settings, params, lights, dtype, cotangent, ranks)
         if thrown is None:
             return found
         more = thrown.gradients(thrown.shadows(samples), wanted)

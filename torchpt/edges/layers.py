@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from torchpt import taped
 from torchpt.edges.gradients import Boundary, boundary_of
 from torchpt.forward import limited_threads, make_wave, rebound
 from torchpt.integrators import LAYERS, aov
@@ -43,21 +42,6 @@ class Asked:
     edges: int
 
 
-class _Layers(torch.autograd.Function):
-    """Layers as they were rendered; the backward pass looks at first surfaces again."""
-
-    @staticmethod
-    def forward(ctx: Any, work: Callable[..., Any], values: tuple[Tensor, ...], *tensors: Tensor) -> tuple[Tensor, ...]:
-        ctx.work = work
-        ctx.save_for_backward(*tensors)
-        return tuple(value.clone() for value in values)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return (None, None, *ctx.work(cotangents, *(t.detach() for t in ctx.saved_tensors)))
-
-
 def followed(settings: Settings) -> tuple[str, ...]:
     """The layers that have gradients: of first surfaces, and no names of things."""
     kinds = {name: LAYERS[name] for name in settings.film.aovs}
@@ -74,18 +58,20 @@ def on_tape(
 
     Args:
         layers: as they were rendered, by name.
-        tensors: that are differentiated.
+        tensors: those that are differentiated, and behind them all others that replace the scene's.
         asked: what the backward pass is to do, once it is known.
         given: from ``tensors`` to all parameters that replace the scene's.
     """
     names = tuple(layers)
 
-    def work(cotangents: tuple[Tensor, ...], *values: Tensor) -> list[Tensor | None]:
-        return _gradients(asked(), names, given(*values), cotangents)
+    def rendered(*_: Tensor) -> tuple[Tensor, ...]:
+        return tuple(value.clone() for value in layers.values())
 
-    found = _Layers.apply(work, tuple(layers.values()), *tensors)
-    assert found is not None
-    return dict(zip(names, found, strict=True))
+    def work(cotangents: tuple[Tensor, ...], *values: Tensor) -> list[Tensor | None]:
+        found = _gradients(asked(), names, given(*values), cotangents)
+        return [*found, *(None for _ in values[len(found) :])]
+
+    return dict(zip(names, taped.on_tape(rendered, work, tensors), strict=True))
 
 
 def _gradients(

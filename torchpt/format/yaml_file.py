@@ -273,25 +273,26 @@ def plain(source: Any, file: str | None = None) -> Any:
         if len(trail) > MAX_DEPTH:
             raise error("deeper nesting", f"at most {MAX_DEPTH} levels of nesting")
         memo[id(item)] = None
-        copy: Any = {} if isinstance(item, Mapping) else []
+        mapped = item.__class__ is dict or isinstance(item, Mapping)
+        copy: Any = {} if mapped else []
         count = 1
-        for name, value in item.items() if isinstance(item, Mapping) else enumerate(item):
+        for name, value in item.items() if mapped else enumerate(item):
             count += 1
-            if isinstance(item, Mapping):
+            if mapped:
                 if not isinstance(name, str) or not name.strip() or not name.isprintable() or len(name) > MAX_KEY:
                     raise error(name, f"keys that are printable text of at most {MAX_KEY} characters")
                 if name == "_target_":
                     trail.append(name)
                     raise error(value, "no `_target_`: a scene never names Python objects")
-            if isinstance(value, _CONTAINERS):
+            if value.__class__ not in _SCALARS and isinstance(value, _CONTAINERS):
                 trail.append(str(name))
                 value, inside = visit(value)
                 trail.pop()
                 count += inside
-            if isinstance(copy, list):
-                copy.append(value)
-            else:
+            if mapped:
                 copy[name] = value
+            else:
+                copy.append(value)
         if count > MAX_VALUES:
             raise error(count, f"at most {MAX_VALUES} values once aliases are expanded")
         memo[id(item)] = copy, count

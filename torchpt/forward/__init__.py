@@ -7,7 +7,9 @@ large as memory lets them be (``budget``), ``piece`` computes one, ``run`` adds 
 
 from __future__ import annotations
 
+from torchpt.forward.entry import render_scene
 from torchpt.forward.kept import Kept, kept
+from torchpt.forward.many import Entry, render_many
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.run import Run
 from torchpt.forward.schedule import BYTES_PER_LANE, budget_of
@@ -17,6 +19,7 @@ from torchpt.forward.waves import Waves, say_once
 
 __all__ = [
     "BYTES_PER_LANE",
+    "Entry",
     "Kept",
     "Progress",
     "Rendering",
@@ -30,5 +33,7 @@ __all__ = [
     "looped",
     "make_wave",
     "rebound",
+    "render_many",
+    "render_scene",
     "say_once",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -24,10 +26,11 @@ class Shares:
     Args:
         pilots: of the picture.
         film: of the picture.
+        agreed: makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
     """
 
-    def __init__(self, pilots: Pilots, film: Film) -> None:
-        self.pilots = pilots
+    def __init__(self, pilots: Pilots, film: Film, agreed: Callable[[Tensor], Tensor] | None = None) -> None:
+        self.pilots, self._agreed = pilots, agreed
         x, y = torch.arange(film.width) + pilots.corner[0], torch.arange(film.height) + pilots.corner[1]
         rows, columns = pilots.blocks
         #: Block of each pixel.
@@ -41,6 +44,8 @@ class Shares:
         counts = self._of_blocks(picture.film.counts.cpu())
         aims = shared_out(self._errors(twice), counts, self.pixels, mean)
         spans: list[tuple[Plate, int, int]] = []
+        if self._agreed is not None:
+            aims = self._agreed(aims)
         most = int(aims.max()) + 1
         kinds = (counts * most + aims)[aims > counts].unique().tolist()
         pilot_blocks = self.block[self.pilots.places]

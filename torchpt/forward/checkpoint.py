@@ -32,7 +32,7 @@ from torchpt.scene.digest import digest
 from torchpt.scene.scene import Scene
 from torchpt.settings import Settings
 
-__all__ = ["EVERY", "FREE", "Keeper", "State", "identity"]
+__all__ = ["BLOCKS", "EVERY", "FREE", "Keeper", "State", "identity"]
 
 #: Seconds between two checkpoints, at least; and at least so many times as long as it takes to write one.
 EVERY, PATIENCE = 5.0, 20.0
@@ -45,7 +45,7 @@ FREE = {
 _FACTS = "facts"
 _FORMAT = 2
 #: Of a scene's description.
-_BLOCKS = ("camera", "textures", "materials", "shapes", "lights")
+BLOCKS = ("camera", "textures", "materials", "shapes", "lights")
 
 
 @dataclass
@@ -68,7 +68,7 @@ def identity(
     told = settings.plain()
     for group, keys in FREE.items():
         told[group] = {key: value for key, value in told[group].items() if key not in keys}
-    blocks = {name: _hashed(repr(getattr(scene.description, name)).encode()) for name in _BLOCKS}
+    blocks = {name: _hashed(repr(getattr(scene.description, name)).encode()) for name in BLOCKS}
     given = {
         name: _hashed(value.detach().cpu().contiguous().numpy().tobytes()) for name, value in (params or {}).items()
     }

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
+from torchpt.cameras import Camera
 from torchpt.integrators.base import Integrator
 from torchpt.integrators.compiled import CompiledStages
 from torchpt.integrators.loop.kernels import Kernels
@@ -28,6 +29,7 @@ class Kept:
         stages: compiled by torch, by what was asked of them.
         first: the integrator and the world that this was made of, and what happens at first surfaces.
         dark: a world, and the same without lights.
+        camera: the latest one on a film, with what it was made of.
         outlines: the edges of its meshes, as :mod:`torchpt.edges.topology` finds them.
     """
 
@@ -35,6 +37,7 @@ class Kept:
     stages: dict[Plan, CompiledStages] = field(default_factory=dict)
     first: tuple[Integrator, World, FirstSurface] | None = None
     dark: tuple[World, World] | None = None
+    camera: tuple[Any, Camera] | None = None
     outlines: dict[str, Any] = field(default_factory=dict)
 
 
@@ -42,5 +45,5 @@ _scenes: WeakKeyDictionary[Scene, Kept] = WeakKeyDictionary()
 
 
 def kept(scene: Scene) -> Kept:
-    """What is kept for a scene, as long as the scene is."""
-    return _scenes.setdefault(scene, Kept())
+    """What is kept for a scene, as long as the scene is; views of it share it."""
+    return _scenes.setdefault(scene.origin, Kept())

@@ -5,56 +5,67 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchpt.errors import RenderError
-from torchpt.film import Film, KnownError
+from torchpt.errors import LostRankError, RenderError
+from torchpt.film import Film
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.budget import check_memory
-from torchpt.forward.causes import causes_of, told
+from torchpt.forward.causes import told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
-from torchpt.forward.kept import kept
 from torchpt.forward.need import loaded, need_of, shape_of
+from torchpt.forward.picture import final, rendering_of
 from torchpt.forward.piece import take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, budget_of
+from torchpt.forward.split import Split
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
-from torchpt.forward.wave import kernels_of, looped, make_wave, surface_layers
+from torchpt.forward.wave import loop_of, looped, make_wave, surface_layers
 from torchpt.forward.waves import Waves, say_once
-from torchpt.images.denoiser import GUIDES
-from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Tally
-from torchpt.integrators.loop.schedule import Loop, Share
+from torchpt.integrators.loop.schedule import Block, Share
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
+from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
-from torchpt.native.memory import Meter, let_go, mb
+from torchpt.native.memory import Meter, mb
+from torchpt.ranks import Group
 from torchpt.scene import Scene
 from torchpt.settings import Settings
-from torchpt.shortage import needing, ran_out
+from torchpt.shortage import needing
 
 __all__ = ["Run"]
 
 
 class Run:
-    """One forward render: accumulates chunks into films."""
+    """One forward render: accumulates chunks into films; by several ranks where there is a ``group`` of them.
+
+    ``like``: see :func:`torchpt.forward.wave.make_wave`.
+    """
 
     def __init__(
-        self, scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
+        self,
+        scene: Scene,
+        settings: Settings,
+        params: Mapping[str, Tensor] | None,
+        dtype: torch.dtype,
+        group: Group | None = None,
+        like: Wave | None = None,
     ) -> None:
         self.start = time.perf_counter()
+        self.split = None if group is None or group.size == 1 else Split(group)
+        self.shared: tuple[int, int] = 0, 1  # samples before this pass, and how many ranks take it
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
-        meter = Meter(self.device)
-        before = meter.peak()
+        meter, limit = Meter(self.device), settings.render.max_memory
+        before = 0 if limit is None else meter.peak()
         with needing(lambda: f"a scene of {scene.told}"):
-            self.wave = make_wave(scene, settings, params, dtype)
-        built = meter.peak()
+            self.wave = make_wave(scene, settings, params, dtype, like=like)
+        built = before if limit is None else meter.peak()
         self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
         self.dtype = dtype
@@ -62,19 +73,21 @@ class Run:
         self.seen = surface_layers(settings)
         self.on_progress: Callable[[Progress], bool | None] | None = None
         self.eager: list[str] = []
+        self.unsupported: Unsupported | None = None
         self.keeper: Keeper | None = None
-        if settings.render.checkpoint is not None:
+        self.keeps = settings.render.checkpoint is not None
+        if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.keeper.check(settings.render.resume)
-        self.loop = self._loop(scene) if looped(self.wave, settings, self.device) else None
+        self.loop = loop_of(scene, self.wave, self.eager) if looped(self.wave, settings, self.device) else None
         how = "eager" if self.loop is None else "compiled"
         rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
         self.need = need_of(settings, self.device, how, len(self.wave.stages.world.materials.models), rows)
-        if settings.render.max_memory is not None:
+        if limit is not None:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
-            check_memory(settings.render.max_memory, self.device, self.need.least, loading)
+            check_memory(limit, self.device, self.need.least, loading)
             if self.loop is not None:
-                left = self.need.left(settings.render.max_memory, max(meter.now() - meter.base(), 0))
+                left = self.need.left(limit, max(meter.now() - meter.base(), 0))
                 self.loop.threads, self.loop.lanes = shape_of(left, self.loop.threads, rows, self.loop.lanes)
         with needing(lambda: f"films of {self.width} x {self.height} pixels, which take {mb(self.need.films)}"):
             self._begin()
@@ -89,54 +102,57 @@ class Run:
         }
         self.picture = Plate(film, layers, streams)
         self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
-        self.tally, self.done, self.taken, self.ended = Tally(), 0, 0, False
+        self.tally, self.done, self.left, self.taken, self.ended = Tally(), 0, 0, 0, False
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
-        self.stop = Stop(self.settings.render, streams.count, None if self.keeper is None else EVERY)
+        bounded = self.keeps or self.split is not None  # a rank that is gone is noticed after a pass
+        self.stop = Stop(self.settings.render, streams.count, EVERY if bounded else None)
+        if self.split is not None:
+            self.split.begin()
         self.lost = Lost()
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.waves: Waves | None = None  # of tensor operations
         self.begun: float | None = None
 
-    def _loop(self, scene: Scene) -> Loop:
-        """The compiled loop; its kernels are kept with the scene."""
-        keeper = kept(scene)
-        kernels = keeper.kernels = kernels_of(scene, self.wave, keeper.kernels)
-        for number, reason in kernels.eager.items():
-            name = str(self.wave.stages.world.materials.models[number])
-            self.eager.append(f"{name}: {reason}")
-            say_once(
-                f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}"
-            )
-        integrator = self.integrator
-        return Loop(kernels, torch.get_num_threads(), integrator.clamp, integrator.strict, say_once)
-
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, or as many as the rules or ``on_progress`` let."""
         self.on_progress = on_progress
-        with needing("a render"):
-            self._all()
-        loaded("eager" if self.loop is None else "compiled")
-        return self._picture()
-
-    def _picture(self) -> Rendering:
-        """The picture at the end; where memory does not suffice, what else is held is given back first."""
+        self.stop.watched = on_progress is not None or self.settings.adaptive or self.keeps or self.split is not None
         try:
-            return self._told()
-        except Exception as error:
-            if not ran_out(error):
+            with needing("a render"):
+                self._all()
+                self._join()
+        except LostRankError as error:
+            if not self.keeps:
                 raise
-        if self.loop is not None:
-            self.loop.release()
-        let_go()
-        size = mb(self.need.picture)
-        with needing(lambda: f"the picture of {self.width} x {self.height} pixels, which takes {size}"):
-            return self._told()
+            raise LostRankError(f"{error}; render.resume=true goes on from the last checkpoint") from None
+        loaded("eager" if self.loop is None else "compiled")
+        return final(self)
 
-    def _told(self) -> Rendering:
-        """The picture, and why samples of it are not finite."""
-        rendering = self.result()
-        rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(self.scene, self.wave, self.lost)
-        return rendering
+    def at_once(self) -> list[tuple[Plate, int, int]] | None:
+        """All samples, to be handed to :meth:`took` as they come, and then :meth:`completed`.
+
+        None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
+        """
+        render = self.settings.render
+        bound = self.keeps or self.split is not None or self.stop.open or render.max_memory is not None
+        if self.loop is None or self.twice is not None or bound:
+            return None
+        self.begun = time.perf_counter()
+        return [(self.picture, 0, render.spp)]
+
+    def completed(self, rest: list[Block]) -> Rendering:
+        """The picture of samples that were taken :meth:`at_once`, but for the blocks for which there was no memory."""
+        assert self.loop is not None
+        with needing("a render"):
+            if self.unsupported is not None:
+                self._eagerly(self.unsupported)
+            else:
+                if rest:
+                    self.loop.take_rest(rest, self.took)
+                self.taken = self.settings.render.spp
+                self.stop.told(self.taken, self.seconds_of_sampling(), None)
+        loaded("eager" if self.loop is None else "compiled")
+        return final(self)
 
     def _all(self) -> None:
         """All samples, by tensor operations where there can be no kernels."""
@@ -145,11 +161,15 @@ class Run:
         except Unsupported as error:
             if self.loop is None:
                 raise
-            self.eager.append(f"all stages: {error}")
-            say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
-            self.loop = None
-            self._begin()
-            self._complete()
+            self._eagerly(error)
+
+    def _eagerly(self, error: Unsupported) -> None:
+        """All samples, once more, by tensor operations."""
+        self.eager.append(f"all stages: {error}")
+        say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
+        self.loop = None
+        self._begin()
+        self._complete()
 
     # -- which samples
 
@@ -157,8 +177,11 @@ class Run:
         """The picture, and then what it takes to know its error."""
         self._resume()
         self._sample()
-        if self.twice is not None and not self.ended and not self._take(self.twice.look_again(self.picture.film)):
-            self.twice.third = None
+        self._join()
+        if self.twice is not None and not self.ended:
+            again = self.twice.look_again(self.picture.film, None if self.split is None else self.split.places)
+            if not self._take(again):
+                self.twice.third = None
 
     def _sample(self) -> None:
         """Pass by pass, until a rule says that it is enough."""
@@ -170,7 +193,7 @@ class Run:
             if not self._take(spans):
                 return
             self.taken += size
-            self.stop.told(self.taken, self.seconds_of_sampling(), self._decisive())
+            self._reached(self.taken, self.seconds_of_sampling())
             self._keep()
         if self._adapts():
             self._adapt()
@@ -184,7 +207,8 @@ class Run:
     def _adapt(self) -> None:
         """Rounds that double the samples there are, each where pilots say."""
         assert self.twice is not None
-        shares = Shares(self.twice.pilots, self.picture.film)
+        self._join()
+        shares = Shares(self.twice.pilots, self.picture.film, None if self.split is None else self.split.places)
         mean = float(self.picture.film.counts.double().mean())
         while self.stop.going(mean):
             wish = min(2.0 * mean, float(self.settings.render.spp)) - mean
@@ -194,11 +218,12 @@ class Run:
                 self.stop.reason = "spp" if more == wish else "time_limit"
                 break
             whole = self._take(spans)
+            self._join()
             shares.put_back()
             if not whole:
                 break
             mean = float(self.picture.film.counts.double().mean())
-            self.stop.told(mean, self.seconds_of_sampling(), self._decisive())
+            self._reached(mean, self.seconds_of_sampling())
             self._keep()
 
     # -- what a killed render goes on from
@@ -211,9 +236,13 @@ class Run:
 
     def _keep(self, last: bool = False) -> None:
         """Write a checkpoint where it is time for one."""
-        if self.keeper is None or not (last or self.keeper.due()):
+        if not self.keeps:
             return
-        self.keeper.write(self._state())
+        due = self.keeper is not None and (last or self.keeper.due())
+        if due if self.split is None else self.split.due(due):
+            self._join()
+            if self.keeper is not None:
+                self.keeper.write(self._state())
 
     def _state(self) -> State:
         """Where the render is."""
@@ -230,11 +259,14 @@ class Run:
 
     def _resume(self) -> None:
         """Go on from the checkpoint, where that is wished and there is one."""
-        if self.keeper is None or not self.settings.render.resume:
+        if not self.keeps or not self.settings.render.resume:
             return
-        state = self.keeper.read(self._state())
-        if state is None:
+        state = None if self.keeper is None else self.keeper.read(self._state())
+        if state is None and self.keeper is not None:
             say_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
+        if self.split is not None:
+            state = self.split.state(state, self._state())
+        if state is None:
             return
         for name, film in self._films().items():
             film.restore({key: state.arrays[f"{name}.{key}"].to(self.device) for key in film.state()})
@@ -242,7 +274,21 @@ class Run:
         self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
         self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
         mean = float(self.picture.film.counts.double().mean()) if self._adapts() else self.taken
-        self.stop.told(mean, self.before, self._decisive())
+        self._reached(mean, self.before)
+
+    def _reached(self, mean: float, seconds: float) -> None:
+        """Tell the rules what was reached; where ranks share a render, as the first one sees it."""
+        if self.settings.render.target_error is not None:
+            self._join()
+        error = self._decisive()
+        if self.split is not None:
+            seconds, error = self.split.decide(seconds, error)
+        self.stop.told(mean, seconds, error)
+
+    def _join(self) -> None:
+        """Let the films hold what all ranks took."""
+        if self.split is not None:
+            self.split.join()
 
     def _decisive(self) -> float | None:
         """RelMSE as pilots alone tell it, where the render may end by it."""
@@ -264,30 +310,39 @@ class Run:
         """Samples of plates, with the first one and how many; returns whether all were taken."""
         if not spans:
             return True
-        left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
+        if self.split is None:
+            return self.take_alone(spans)
+        whole = self.split.take(self, spans)
+        if self.settings.render.preview is not None:
+            self._join()
+            self._advanced(0, True)
+        return whole
 
-        def each(share: Share | None) -> bool:
-            nonlocal left
-            if share is None:
-                return self._advanced(0, False)
-            self.tally.rays += share.tally.rays
-            self.tally.truncated += share.tally.truncated
-            self._count(share.lost)
-            if self.integrator.clamp is not None:
-                self.light += torch.tensor(share.light, dtype=torch.float64)
-            left -= share.samples
-            return self._advanced(share.samples, left == 0)
-
+    def take_alone(self, spans: list[tuple[Plate, int, int]]) -> bool:
+        """The same by this process alone."""
+        self.left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
         if self.loop is not None:
-            return self.loop.run(spans, each)
+            return self.loop.run(spans, self.took)
         if self.waves is None:
             self.waves = Waves(budget_of(self.settings, self.device))
         for plate, first, count in spans:
             pixels = plate.film.width * plate.film.height
             for _, n, _, samples in self.waves.through(partial(self._piece, plate), pixels, first, count):
-                if each(Share(Tally(), n * samples)):
+                if self.took(Share(Tally(), n * samples)):
                     return False
         return True
+
+    def took(self, share: Share | None) -> bool:
+        """Count what a task brought; returns whether the render is to stop."""
+        if share is None:
+            return self._advanced(0, False)
+        self.tally.rays += share.tally.rays
+        self.tally.truncated += share.tally.truncated
+        self._count(share.lost)
+        if self.integrator.clamp is not None:
+            self.light += torch.tensor(share.light, dtype=torch.float64)
+        self.left -= share.samples
+        return self._advanced(share.samples, self.left == 0 and self.split is None)
 
     def _piece(self, plate: Plate, span: Span) -> None:
         """A piece by tensor operations: all of it, or nothing where it raises."""
@@ -303,18 +358,22 @@ class Run:
         if self.on_progress is None or self.ended:  # tasks of other threads still come in after the wish to stop
             return self.ended
         seconds = time.perf_counter() - self.start
-        state = Progress(self.done, self._total(), self.tally.rays, seconds, ends, self.result)
-        self.ended = bool(self.on_progress(state)) and self.done < self._asked()
+        before, ranks = self.shared  # the others are about as far
+        done = before + ranks * (self.done - before)
+        state = Progress(done, max(self._total(), done), self.tally.rays, seconds, ends, self.result)
+        wish = bool(self.on_progress(state))
+        if samples or ranks > 1 or self.split is None:  # between passes ranks do not part
+            self.ended = wish and self.done < self.asked()
         return self.ended
 
     def _total(self) -> int:
         """Camera samples that there will be, as far as one can tell: fewer where time or error end the render."""
-        asked = self._asked()
+        asked = self.asked()
         if not self.stop.open or self.stop.share <= 0.0:
             return max(asked, self.done)
         return max(min(asked, round(self.done / self.stop.share)), self.done)
 
-    def _asked(self) -> int:
+    def asked(self) -> int:
         """Camera samples that ``render.spp`` comes to."""
         pixels = self.width * self.height + (0 if self.twice is None else len(self.twice.pilots))
         return pixels * self.settings.render.spp
@@ -327,70 +386,4 @@ class Run:
 
     def result(self) -> Rendering:
         """The picture so far."""
-        radiant, film = self.integrator.light, self.picture.film
-        layers = self._layers()
-        known = None
-        if radiant:
-            values = film.mean() if self.twice is None else self.twice.picture(film)
-            image, known = values.to(self.dtype), self._known(values)
-        else:
-            shown = layers[next(iter(self.seen))]
-            blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
-            image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else torch.cat((shown, blank), -1)
-        clamped = None
-        if radiant and self.integrator.clamp is not None:
-            before, after = self.light.tolist()
-            clamped = 1.0 - after / before if before > 0 else 0.0
-        counts = (film if radiant else next(iter(self.picture.layers.values()))).counts
-        compile_seconds = 0.0 if self.loop is None else self.loop.kernels.seconds
-        names = self.settings.film.aovs or self.integrator.layers
-        meter = Meter(self.device)
-        return Rendering(
-            image=image,
-            layers={name: layers[name] for name in names},
-            guides={name: layers[name] for name in GUIDES} if self.settings.film.denoise else {},
-            spp=int(counts.sum()) // len(counts),
-            seconds=time.perf_counter() - self.start,
-            load_seconds=self.load_seconds,
-            build_seconds=self.build_seconds,
-            compile_seconds=compile_seconds,
-            render_seconds=self.seconds_of_sampling(),
-            paths=self.done,
-            rays=self.tally.rays,
-            nonfinite_samples=self.lost.count,
-            truncated_paths=self.tally.truncated,
-            clamped=clamped,
-            relmse=None if known is None else known.relmse,
-            relmse_interval=None if known is None else known.interval,
-            heavy_tailed=known is not None and known.heavy_tailed,
-            stopped_by=self.stop.reason,
-            complete=bool(self.stop.reason) and not self.ended,
-            peak_memory=max(meter.peak() - meter.base(), 0),
-            lanes=self.waves.lanes if self.waves is not None and self.waves.halved else None,
-            eager=tuple(self.eager),
-            scene=self.name,
-            settings=self.settings,
-        )
-
-    def _known(self, picture: Tensor) -> KnownError | None:
-        """The picture's own error."""
-        film = self.picture.film
-        if self.twice is not None:
-            return self.twice.known(film, picture)
-        relmse = film.relmse()
-        return None if relmse is None else KnownError(relmse, None, False)
-
-    def _layers(self) -> dict[str, Tensor]:
-        """The layers so far: those of first surfaces, and those that the film makes."""
-        layers = {}
-        film = self.picture.film
-        for name, layer in self.seen.items():
-            seen = self.picture.layers[name]
-            values = seen.mean() * (self.unit if layer.length else 1.0) if layer.averaged else seen.first()
-            layers[name] = values.to(self.dtype)
-        for name in self.settings.film.aovs:
-            if name not in self.seen:
-                made: Any = LAYERS[name]  # a FilmLayer
-                counts = film.counts if self.twice is None else self.twice.counts(film)
-                layers[name] = made.of(film, counts).to(self.dtype)
-        return layers
+        return rendering_of(self)

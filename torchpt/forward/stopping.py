@@ -1,8 +1,8 @@
 """When a render ends, and how many samples it takes until it asks again.
 
-Where only ``render.spp`` ends it, passes double. Else they are blocks of 16 samples, after a start that doubles, and shorter
-where a block would take more time than is left, or is more than a quarter of the samples there are: every pass begins at a
-multiple of its own length, so that sequences stay balanced.
+Where only ``render.spp`` ends it, passes double if somebody looks at the picture in between. Else they are blocks of 16
+samples, after a start that doubles, and shorter where a block would take more time than is left, or is more than a quarter of
+the samples there are: every pass begins at a multiple of its own length, so that sequences stay balanced.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ class Stop:
         render: the settings.
         streams: that share the samples of a pixel.
         longest: seconds that a pass may take where only ``render.spp`` ends it; None: it does not matter.
+        watched: whether something looks at the picture between passes; else they are as long as they may be.
         reason: the rule that ended it; "" as long as it goes on.
         share: of the work that is done, 0..1, by the rule that is nearest to its end.
     """
@@ -35,6 +36,7 @@ class Stop:
     render: Render
     streams: int = 1
     longest: float | None = None
+    watched: bool = True
     reason: str = ""
     share: float = 0.0
     _pace: float | None = field(default=None, repr=False)  # seconds a sample of every pixel, in the last pass
@@ -69,7 +71,7 @@ class Stop:
             self.reason = self.reason or "spp"
             return 0
         if not self.open:
-            size = max(taken, self.streams)
+            size = max(taken, self.streams) if self.watched else LARGEST_PASS
             while self.longest is not None and self._pace is not None and size > 1 and self._pace * size > self.longest:
                 size //= 2
             return min(size, LARGEST_PASS, left)

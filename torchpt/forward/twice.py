@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -67,12 +68,17 @@ class Twice:
         first = self._first(film)
         return known_error(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
 
-    def look_again(self, film: Film) -> list[tuple[Plate, int, int]]:
-        """What is to be sampled for the picture to know its error better, once it is finished."""
+    def look_again(self, film: Film, agreed: Callable[[Tensor], Tensor] | None = None) -> list[tuple[Plate, int, int]]:
+        """What is to be sampled for the picture to know its error better, once it is finished.
+
+        ``agreed`` makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
+        """
         if not len(self.pilots):
             return []
         picture, first = self.picture(film).cpu(), self._first(film)
         suspects, doubtful = to_look_at(picture, self.pilots, first, self._second())
+        if agreed is not None:
+            suspects, doubtful = agreed(suspects), agreed(doubtful)
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
         streams = Streams(self.plate.streams.first + self.plate.streams.count, STREAMS)
         plate = Plate(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from torchpt.cameras import Camera
+from torchpt.film import Filter
 from torchpt.forward.kept import kept
 from torchpt.forward.schedule import streams_of
+from torchpt.forward.waves import say_once
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
 from torchpt.integrators.compiled import CompiledStages, Stages
 from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.loop.schedule import Loop
 from torchpt.integrators.stages import Plan
 from torchpt.integrators.wave import Wave
 from torchpt.records import World
@@ -30,7 +34,7 @@ if TYPE_CHECKING:
     from torchpt.integrators.first_surface import FirstSurface
     from torchpt.integrators.layer import SurfaceLayer
 
-__all__ = ["kernels_of", "loop_facts", "looped", "make_wave", "rebound", "surface_layers"]
+__all__ = ["kernels_of", "loop_facts", "loop_of", "looped", "make_wave", "rebound", "surface_layers"]
 
 #: From this many camera paths a BSDF model on ``compile: auto`` compiles: a cold start takes a minute each, and saves a
 #: quarter of the rest.
@@ -44,32 +48,64 @@ def make_wave(
     dtype: torch.dtype,
     tape: bool = False,
     attached: bool = False,
+    like: Wave | None = None,
 ) -> Wave:
-    """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``."""
+    """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``.
+
+    ``like``: a wave of the same scene, settings and parameters, but for those of the camera: what it reads is read again.
+    """
     film, spp = settings.film, settings.render.spp
     integrator = settings.integrator.counted_in(scene.space.unit)
-    uv = any(layer.uv for layer in surface_layers(settings).values())
-    world, geometry = scene.world(dtype, params, uv, settings.light_choice)
-    threads = None if settings.render.threads == "auto" else int(settings.render.threads)
-    moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in params or {})
-    accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
-    own = not params  # the world is the scene's own, and what is made of it may be kept
-    if not integrator.lit:
-        world = _dark(scene, world, own)
+    params = params or {}
+    shaping = {name: value for name, value in params.items() if not name.startswith("camera.")}
+    own = not shaping  # the world is the scene's own, and what is made of it may be kept
+    if like is None:
+        uv = any(layer.uv for layer in surface_layers(settings).values())
+        world, geometry = scene.world(dtype, shaping, uv, settings.light_choice)
+        threads = None if settings.render.threads == "auto" else int(settings.render.threads)
+        moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in shaping)
+        accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
+        if not integrator.lit:
+            world = _dark(scene, world, own)
+    else:
+        world, accel = like.stages.world, like.accel
     points = points_of(settings.sampler)
     plan = integrator.plan(points, dtype, tape, attached)
-    camera = scene.camera(film, scene.merged(params), dtype)
+    camera = _camera(scene, settings, params, dtype)
     return Wave(
         stages=_stages(scene, settings, plan, world, _pixel_of(world, camera), own),
         integrator=integrator,
         accel=accel,
         camera=camera,
-        filter=film.filter.kind(film.filter.values, scene.device),
+        filter=_filter(film.filter.kind, tuple(film.filter.values.items()), scene.device),
         sampler=Sampler(points, settings.render.seed, streams_of(settings), spp, film.width),
         crop=film.crop or (0, 0, film.width, film.height),
         centre=scene.space.shift,
-        first=_first(scene, integrator, world, own),
+        first=_first(scene, integrator, world, own) if like is None else like.first,
     )
+
+
+def _camera(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
+    """The camera on the film; the latest one where it was made of the same."""
+    merged, film = scene.merged(params), settings.film
+    if torch.is_grad_enabled():
+        return scene.camera(film, merged, dtype)
+    given = [value for name, value in merged.items() if name.startswith("camera.")]
+    if any(value.is_inference() for value in given):
+        return scene.camera(film, merged, dtype)
+    # By identity: what the ids are of is held beside them, so that they stay their own.
+    held = (scene.description.camera, *given)
+    made_of = ([id(value) for value in held], [value._version for value in given], film.width, film.height, dtype)
+    keeper = kept(scene)
+    if keeper.camera is None or keeper.camera[0][0] != made_of:
+        keeper.camera = (made_of, held), scene.camera(film, merged, dtype)
+    return keeper.camera[1]
+
+
+@lru_cache(maxsize=64)
+def _filter(kind: type[Filter], values: tuple[tuple[str, Any], ...], device: torch.device) -> Filter:
+    """A filter; renders of the same read the same tensors."""
+    return kind(dict(values), device)
 
 
 def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Wave:
@@ -166,7 +202,7 @@ def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kerne
     """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
     packets = wave.accel.name == "brute" and not wave.stages.world.geometry.counts[4]
     fused = packets and wave.stages.world.materials.opacity is None and wave.first is None
-    kernels = Kernels(wave, packets, fused, before)
+    kernels = Kernels(wave, packets, fused, before, fixed=not scene.own_models)
     own = [
         k
         for k, model in enumerate(wave.stages.world.materials.models)
@@ -195,3 +231,15 @@ def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
         "rows_a_path": kernels.state.count,
         **({"eager": eager} if eager else {}),
     }
+
+
+def loop_of(scene: Scene, wave: Wave, eager: list[str]) -> Loop:
+    """The compiled loop of a render, whose kernels are kept with the scene; materials without kernels join ``eager``."""
+    keeper = kept(scene)
+    kernels = keeper.kernels = kernels_of(scene, wave, keeper.kernels)
+    for number, reason in kernels.eager.items():
+        name = str(wave.stages.world.materials.models[number])
+        eager.append(f"{name}: {reason}")
+        say_once(f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}")
+    integrator = wave.integrator
+    return Loop(kernels, torch.get_num_threads(), integrator.clamp, integrator.strict, say_once)

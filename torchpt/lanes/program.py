@@ -5,13 +5,14 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpt.lanes.graph import Unsupported
-from torchpt.lanes.prologue import Guard, Source, Step, Table, replayed
+from torchpt.lanes.prologue import Guard, Name, Source, Step, Table, names_of, replayed
 
 __all__ = ["Program", "Tables", "bound", "holds", "laid_out", "signature"]
 
@@ -52,8 +53,17 @@ class Program:
     nodes: Mapping[str, int]
     sums: Sequence[Sequence[Any]] = ()
 
-    def leaves(self) -> set[str]:
+    def leaves(self) -> frozenset[str]:
         """Paths of the leaves that enter its tables."""
+        return self._leaves
+
+    @cached_property
+    def names(self) -> tuple[Name | None, ...]:
+        """Of its steps, see :func:`torchpt.lanes.prologue.names_of`."""
+        return names_of(self.steps)
+
+    @cached_property
+    def _leaves(self) -> frozenset[str]:
         paths: set[str] = set()
 
         def visit(value: Any) -> None:
@@ -67,7 +77,7 @@ class Program:
         for step in self.steps:
             visit((step.args, tuple(step.kwargs.values())))
         visit([table.source for table in self.tables])
-        return paths
+        return frozenset(paths)
 
 
 @dataclass(frozen=True)
@@ -109,6 +119,8 @@ def bound(
     held: Sequence[Tensor],
     leaves: Mapping[str, Tensor],
     known: dict[Any, Tensor] | None = None,
+    names: Sequence[Name | None] = (),
+    results: dict[Name, Tensor] | None = None,
 ) -> Tables:
     """The tables of a kernel for one scene.
 
@@ -118,9 +130,11 @@ def bound(
         held: its own tensors.
         leaves: the scene's tensors by path.
         known: leaves that were laid out before, by path and axis; filled.
+        names: of the steps.
+        results: what steps of other kernels came to, see :func:`torchpt.lanes.prologue.replayed`; filled.
     """
     known = {} if known is None else known
-    tensor = replayed(steps, held, leaves)
+    tensor = replayed(steps, held, leaves, names, results)
     words: list[int] = []
     keep: list[Tensor] = []
     for table in tables:

@@ -7,12 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["Guard", "Source", "Step", "Table", "pruned", "replayed"]
+__all__ = ["Guard", "Name", "Source", "Step", "Table", "names_of", "pruned", "replayed"]
+
+#: Bytes of a tensor up to which it is kept for other prologues.
+SMALL = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -97,8 +101,78 @@ def pruned(
     )
 
 
-def replayed(steps: Sequence[Step], held: Sequence[Tensor], leaves: Mapping[str, Tensor]) -> Any:
-    """Runs a prologue; returns ``tensor(source)``."""
+@dataclass(frozen=True)
+class Name:
+    """Of a step: the same in all prologues of the process for the same arithmetic on leaves of the same paths.
+
+    Attributes:
+        number: tells it from others.
+        leaves: paths of those that enter it.
+    """
+
+    number: int
+    leaves: frozenset[str]
+
+
+def names_of(steps: Sequence[Step]) -> tuple[Name | None, ...]:
+    """Names of steps; None where a tensor of the program's own has part in one, or what its arguments are cannot be told."""
+    names: list[Name | None] = []
+    leaves: set[str] = set()  # of the step that is looked at
+
+    def told(value: Any) -> Any:
+        if isinstance(value, Source):
+            if value.kind == "held":
+                raise TypeError("a tensor of the program's own")
+            if value.kind == "leaf":
+                leaves.add(str(value.name))
+                return "leaf", value.name
+            name = names[int(value.name)]
+            if name is None:
+                raise TypeError("a step that has no name")
+            leaves.update(name.leaves)
+            return "step", name.number, value.item
+        if isinstance(value, list | tuple):
+            return type(value), tuple(told(x) for x in value)
+        return type(value), repr(value) if isinstance(value, float) else value
+
+    for step in steps:
+        leaves.clear()
+        schema = getattr(step.function, "_schema", None)
+        try:
+            if schema is None or schema.is_mutable:
+                raise TypeError("what writes into its arguments")
+            key = step.function, told(step.args), tuple((k, told(value)) for k, value in step.kwargs.items())
+            names.append(Name(_numbers.setdefault(key, next(_count)), frozenset(leaves)))
+        except TypeError:  # of what cannot be hashed, too
+            names.append(None)
+    return tuple(names)
+
+
+#: Numbers of steps by what they do.
+_numbers: dict[Any, int] = {}
+_count = count()
+
+
+def _small(result: Any) -> bool:
+    return isinstance(result, Tensor) and result.untyped_storage().nbytes() <= SMALL
+
+
+def replayed(
+    steps: Sequence[Step],
+    held: Sequence[Tensor],
+    leaves: Mapping[str, Tensor],
+    names: Sequence[Name | None] = (),
+    known: dict[Name, Tensor] | None = None,
+) -> Any:
+    """Runs a prologue; returns ``tensor(source)``.
+
+    Args:
+        steps: the prologue.
+        held: the program's own tensors.
+        leaves: the scene's by path.
+        names: of the steps, see :func:`names_of`.
+        known: what steps came to in other prologues on the same leaves, by name; filled with what is small.
+    """
     results: list[Any] = []
 
     def tensor(source: Source) -> Tensor:
@@ -115,6 +189,12 @@ def replayed(steps: Sequence[Step], held: Sequence[Tensor], leaves: Mapping[str,
         return type(value)(filled(x) for x in value) if isinstance(value, list | tuple) else value
 
     with torch.no_grad():
-        for step in steps:
-            results.append(step.function(*filled(step.args), **{k: filled(v) for k, v in step.kwargs.items()}))
+        for number, step in enumerate(steps):
+            name = names[number] if names and known is not None else None
+            result = None if name is None or known is None else known.get(name)
+            if result is None:
+                result = step.function(*filled(step.args), **{k: filled(v) for k, v in step.kwargs.items()})
+                if name is not None and known is not None and _small(result):
+                    known[name] = result
+            results.append(result)
     return tensor

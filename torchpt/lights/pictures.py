@@ -1,4 +1,4 @@
-"""Pictures that lights shine by, read from files."""
+"""Pictures that lights shine by."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchpt.images import read_texels
+from torchpt.images import Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
 from torchpt.spec import Refused
 
-__all__ = ["radiance_of"]
+__all__ = ["radiance_in", "radiance_of"]
 
 
 def radiance_of(source: Path, key: str) -> NDArray[np.float32]:
@@ -26,7 +26,11 @@ def radiance_of(source: Path, key: str) -> NDArray[np.float32]:
         Refused: a negative value.
         AssetError: an image that is malformed.
     """
-    read = read_texels(source)
+    return radiance_in(read_texels(source), str(source), key)
+
+
+def radiance_in(read: Texels, source: str, key: str) -> NDArray[np.float32]:
+    """The same of a picture that was read; ``source``: what errors call it."""
     values = read.values[..., :3] if read.values.shape[2] >= 3 else read.values[..., :1].repeat(3, 2)
     if read.eight_bit:
         values = srgb_to_linear(torch.from_numpy(np.ascontiguousarray(values))).numpy()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
-__all__ = ["hits_like", "operator"]
+__all__ = ["hits_like", "operator", "outside_graphs"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -36,6 +36,19 @@ def operator(name: str, fake: Callable[..., R]) -> Callable[[Callable[P, R]], Ca
         return call
 
     return wrap
+
+
+def outside_graphs(function: Callable[P, R]) -> Callable[P, R]:
+    """A function that ``torch.compile`` calls as it is, between two graphs."""
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if torch.compiler.is_compiling():  # not before: this imports the compiler
+            outside: Any = torch.compiler.disable(function)
+            return outside(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return call
 
 
 def hits_like(t_max: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

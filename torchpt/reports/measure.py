@@ -24,8 +24,9 @@ from torchpt.rendering import Progress, Rendering, render_scene
 from torchpt.reports.grid import Variant
 from torchpt.reports.store import Run, Store, name_of
 from torchpt.reports.study import Study
+from torchpt.scene.devices import device_of
 from torchpt.scene.digest import digest
-from torchpt.scene.scene import Scene, device_of
+from torchpt.scene.scene import Scene
 from torchpt.settings import Settings
 
 __all__ = ["Curve", "Job", "Measured", "Stopped", "film_size", "measure", "prepare", "seed_of"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from torchpt.scene.scene import Scene, load
+from torchpt.scene.loading import load
+from torchpt.scene.scene import Scene
 
 __all__ = ["Scene", "load"]

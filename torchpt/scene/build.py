@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from torchpt.format.description import Description
 from torchpt.lights import order
 from torchpt.records import KINDS
+from torchpt.scene.coordinates import check_coordinates, declare_corners
 from torchpt.scene.materials import declare, resolved
 from torchpt.scene.parameters import Parameters
 from torchpt.scene.parts import Copy, Part, Source
@@ -42,8 +44,12 @@ class Built:
     copies: tuple[Copy, ...] = ()
 
 
-def build_parts(description: Description) -> Built:
+def build_parts(description: Description, traced: Collection[str] = ()) -> Built:
     """Resolve a description.
+
+    Args:
+        description: of the scene.
+        traced: dotted names of normals and texture coordinates that are to be parameters.
 
     Raises:
         SceneError: more than one environment, a shape that cannot be placed, or sizes too far apart for float32.
@@ -63,6 +69,8 @@ def build_parts(description: Description) -> Built:
     sources = sources_of(description, parameters)
     sources = sorted([*sources, *builder.sources], key=lambda source: order(source.kind))
     parameters.declare_all("camera", description.camera.kind, description.camera.values)
+    declare_corners(parts, traced, parameters)
+    check_coordinates(parts, parameters.stated, description.file)
     parts.sort(key=lambda part: KINDS.index(part.kind))
     centre, unit = centre_and_unit(parts, copies, sources, parameters, description.camera, description.file)
     warn_of_touching(parts, copies, description.file)

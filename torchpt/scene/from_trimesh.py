@@ -16,7 +16,8 @@ from torchpt.meshes import FileLight, MeshPart
 from torchpt.meshes.mesh_part import checked
 from torchpt.meshes.trimesh_material import Looks
 from torchpt.meshes.trimesh_parts import lights_of, parts_of, placed_in
-from torchpt.scene.scene import Scene, load
+from torchpt.scene.loading import load
+from torchpt.scene.scene import Scene
 from torchpt.scene.sources import labels_of
 
 __all__ = ["description_of", "from_trimesh"]

@@ -17,11 +17,13 @@ class Parameters(dict[str, np.ndarray]):
 
     Attributes:
         specs: what each of them is.
+        stated: texels that the scene states itself, in no file.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.specs: dict[str, Spec] = {}
+        self.stated: set[str] = set()
 
     def declare(self, name: str, value: Any, spec: Spec) -> None:
         """Add one; texels stay as they are, all else is kept in float64."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 import difflib
+import itertools
 import threading
-import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
@@ -19,64 +20,40 @@ from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
 from torchpt.cameras import Camera, PinholeMatrices
 from torchpt.cameras.opencv import extrinsics
-from torchpt.errors import RenderError, SceneError
-from torchpt.format.description import Description, Source, read_description, settings
+from torchpt.errors import SceneError
+from torchpt.format.description import Description, settings
 from torchpt.native.memory import Meter, mb
+from torchpt.native.modes import lasting
 from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
+from torchpt.scene.devices import device_of
 from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, middle_of
+from torchpt.scene.view import through
 from torchpt.settings import Film, Settings
 from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 
-__all__ = ["Scene", "device_of", "load"]
+__all__ = ["Scene", "numbered"]
 
 #: Of a scene, what copies of it have: all else is made of it on demand.
 _KEPT = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
 
-
-def load(
-    source: Source,
-    device: str | torch.device | None = None,
-    bsdfs: Mapping[str, Bsdf] | None = None,
-) -> Scene:
-    """Load a scene.
-
-    Args:
-        source: the name of a scene that ships, a path ending in ``.yaml``, an open file, YAML text (of more than one line),
-            or a dict of the same schema. Relative paths in it start at the file's folder, else at the current one.
-        device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
-            ``render.device``, which is ``auto`` where it does not say.
-        bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
-
-    Raises:
-        SceneError: the description is wrong; says where and what is accepted.
-        AssetError: a file that it names is missing or malformed.
-        RenderError: the device is not there.
-    """
-    start = time.perf_counter()
-    description = read_description(source, bsdfs)
-    chosen = device_of(settings(description).render.device if device is None else device)
-    scene = Scene(description, chosen, tuple((bsdfs or {}).values()))
-    scene.load_seconds = time.perf_counter() - start
-    return scene
+_numbers = itertools.count(1)
+_scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 
 
-def device_of(name: str | torch.device) -> torch.device:
-    """The device for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
-    if isinstance(name, torch.device):
-        return name
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = torch.device(name)
-    if device.type == "cuda" and (not torch.cuda.is_available() or (device.index or 0) >= torch.cuda.device_count()):
-        found = f"{torch.cuda.device_count()} CUDA devices" if torch.cuda.is_available() else "no CUDA device"
-        raise RenderError(f"render.device: {name} is not available; this machine has {found}")
-    return device
+def numbered(number: int) -> Scene | None:
+    """The scene of a number, where it is still there."""
+    return _scenes.get(number)
+
+
+def _leaf(value: Tensor) -> Tensor:
+    """A parameter as a copy apart from its tape has it: one made of others becomes a tensor of its own."""
+    return value if value.is_leaf else value.detach().requires_grad_()
 
 
 class Scene:
@@ -93,7 +70,13 @@ class Scene:
             ``torchpt.render(scene, params=...)``.
     """
 
-    def __init__(self, description: Description, device: torch.device, own_models: tuple[Bsdf, ...] = ()) -> None:
+    def __init__(
+        self,
+        description: Description,
+        device: torch.device,
+        own_models: tuple[Bsdf, ...] = (),
+        traced: Collection[str] = (),
+    ) -> None:
         settle()
         meter = Meter(device)
         meter.base()  # only now all modules are there
@@ -101,7 +84,7 @@ class Scene:
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
         with needing("the files and shapes of the scene"):
-            self._built: Built = build_parts(description)
+            self._built: Built = build_parts(description, traced)
         # Geometry far from the origin would lose its detail in float32 before it can be moved there.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {
@@ -123,6 +106,36 @@ class Scene:
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
         self._state: dict[str, tuple[Tensor, int]] = {}
+        self._origin: Scene | None = None
+        self._number()
+
+    def _number(self) -> None:
+        """Become another scene than any before."""
+        self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.textured`
+        #: Of all scenes of this process, by which compiled graphs name it.
+        self.number = next(_numbers)
+        _scenes[self.number] = self
+
+    @property
+    def origin(self) -> Scene:
+        """The scene that this is a view of (:meth:`seen_by`), else itself: what is made of either is made of that."""
+        return self if self._origin is None else self._origin
+
+    def seen_by(self, camera: Mapping[str, Any], film: Mapping[str, Any] | None = None) -> Scene:
+        """This scene through another camera. Tensors are shared, and so is all that is made of them: nothing is built again.
+
+        Args:
+            camera: its block, as in a scene file.
+            film: film settings in place of the scene's own, by whose size a ``K`` in pixels is read that does not say its own.
+
+        Raises:
+            SceneError: what is wrong with the camera.
+        """
+        view = object.__new__(type(self))
+        view.__dict__.update(self.__dict__ | through(self.description, self._built, self.params, camera, film or {}))
+        view._origin = self.origin
+        view._number()
+        return view
 
     def to(self, device: str | torch.device) -> Scene:
         """The scene on a device, which may be ``auto``: itself where it is there already, else a copy.
@@ -144,7 +157,7 @@ class Scene:
     def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
         """Another scene of copied tensors and models; what its description came to never changes, and is shared."""
         return self._copied(
-            self.device, {name: copy.deepcopy(value, memo) for name, value in self.params.items()}, memo
+            self.device, {name: copy.deepcopy(_leaf(value), memo) for name, value in self.params.items()}, memo
         )
 
     def _copied(self, device: torch.device, params: dict[str, Tensor], memo: dict[int, Any] | None) -> Scene:
@@ -160,7 +173,8 @@ class Scene:
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy in another process is made of: files are not read again."""
-        return {name: getattr(self, name) for name in _KEPT}
+        held = {name: getattr(self, name) for name in _KEPT}
+        return held | {"params": {name: _leaf(value) for name, value in self.params.items()}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         settle()
@@ -183,6 +197,10 @@ class Scene:
         triangles = sum(len(value) for name, value in self.params.items() if name.endswith(".vertices"))
         held = sum(value.numel() * value.element_size() for value in self.params.values())
         return f"{len(self._built.parts)} parts with {triangles} vertices, whose parameters alone take {mb(held)}"
+
+    def use(self, built: Built) -> None:
+        """Come to something else, of the same parameters by name, before anything was made of them."""
+        self._built = built
 
     @property
     def built(self) -> Built:
@@ -211,13 +229,16 @@ class Scene:
             shape = self.params[name].shape
             if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
                 found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
-                raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}")
+                texels = ", or texels (H, W, C)" if self.spec(name).texture else ""
+                raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}{texels}")
             self._check(name, value.detach())
         check_sources(self._built.sources, params or {}, self.merged(params))
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """All parameters, those of ``params`` (once checked) in place of the scene's."""
-        return {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
+        every = {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
+        # Tensors of torch.inference_mode have no place on a tape; their copies have.
+        return {name: value.clone() if value.is_inference() else value for name, value in every.items()}
 
     def spec(self, name: str) -> Spec:
         """What a parameter is."""
@@ -250,8 +271,8 @@ class Scene:
             self._refresh()
             key = dtype, uv, choice
             if key not in self._worlds:
-                with torch.no_grad():
-                    self._worlds[key] = self._assemble(self.params, dtype, uv, choice)
+                with lasting(), torch.no_grad():
+                    self._worlds[key] = self._assemble(self.merged(None), dtype, uv, choice)
             return self._worlds[key]
 
     def accel(self, kind: str, threads: int | None, geometry: Geometry | None = None) -> Accel:
@@ -285,6 +306,11 @@ class Scene:
         pose = params["camera.to_world"]
         pose = torch.cat((self._space.pose(pose), pose[3:].double())).to(dtype)
         return camera.kind.on(pose, (film.width, film.height), values)
+
+    def film_size(self, film: Mapping[str, Any] | None = None) -> tuple[int, int]:
+        """Width and height in pixels of the whole film, under film settings in place of the scene's own."""
+        wished = settings(self.description, {"film": film or {}}).film
+        return wished.width, wished.height
 
     def pinhole(
         self,
@@ -326,20 +352,26 @@ class Scene:
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""
-        state = {name: (value, value._version) for name, value in self.params.items()}
+        # Tensors of torch.inference_mode count no versions, and are taken to have changed.
+        state = {name: (value, -1 if value.is_inference() else value._version) for name, value in self.params.items()}
         # The tensors themselves are kept and compared: an id may be another tensor's by now.
         changed = [
             name
             for name, (value, version) in state.items()
-            if name not in self._state or value is not self._state[name][0] or version != self._state[name][1]
+            if name not in self._state
+            or value is not self._state[name][0]
+            or version != self._state[name][1]
+            or version < 0
         ]
-        if not changed and len(state) == len(self._state):
+        gone = any(name not in state and not name.startswith("camera.") for name in self._state)
+        if not changed and not gone:
             return
         for name in changed:
             if self.spec(name).place and name in self._state:
                 self._check(name, state[name][0].detach())
-        self._state = state
-        if changed and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it
+        self._state.clear()  # views of the scene have the same
+        self._state.update(state)
+        if not gone and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it
             return
         self._worlds.clear()
         self._accels.clear()

@@ -64,6 +64,8 @@ class ShapeBuilder:
     def __init__(self, description: Description, parameters: Parameters, opener: Opener) -> None:
         self.description, self.parameters, self.opener = description, parameters, opener
         self.sources: list[Source] = []
+        self._slots: dict[str, ResolvedMaterial] = {}
+        self._declared: set[int] = set()
 
     def parts(self, owner: Owner) -> list[Part]:
         """What a shape comes to; no instance."""
@@ -151,7 +153,9 @@ class ShapeBuilder:
         """The material that the scene gives a shape, by name or its own; the grey of one that has none."""
         known = self.description.materials
         if isinstance(given, str):
-            return resolved(known[given], f"materials.{given}", known, self.opener)
+            if given not in self._slots:
+                self._slots[given] = resolved(known[given], f"materials.{given}", known, self.opener)
+            return self._slots[given]
         return resolved(plain_material() if given is None else given, f"{stem}.material", known, self.opener)
 
     def _file_slot(self, own: FileMaterial, prefix: str, key: str, source: str) -> ResolvedMaterial:
@@ -169,7 +173,9 @@ class ShapeBuilder:
 
     def _part(self, owner: Owner, stem: str, slot: ResolvedMaterial, surface: Surface, pose: np.ndarray) -> Part:
         """A surface of a shape, without what only triangles have; its emission and its material's numbers are declared."""
-        declare(slot, self.parameters)
+        if slot is not self._slots.get(slot.name.removeprefix("materials.")) or id(slot) not in self._declared:
+            declare(slot, self.parameters)
+            self._declared.add(id(slot))
         emission, names = owner.shape["emission"], (f"{owner.key}.emission",)
         texture = slot.emission if emission is None and isinstance(slot.emission, Node) else None
         if emission is not None and names[0] not in self.parameters:

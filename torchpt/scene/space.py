@@ -51,9 +51,9 @@ class Space:
         return (p.double() - self.centre) / self.unit
 
     def pose(self, to_world: Tensor) -> Tensor:
-        """The map ``(3, 4)`` into these coordinates, from one ``(4, 4)`` into the scene's; in float64."""
+        """The map ``(..., 3, 4)`` into these coordinates, from one ``(..., 4, 4)`` into the scene's; in float64."""
         pose = to_world.double()
-        return torch.cat((pose[:3, :3], pose[:3, 3:4] - self.centre[:, None]), 1) / self.unit
+        return torch.cat((pose[..., :3, :3], pose[..., :3, 3:4] - self.centre[:, None]), -1) / self.unit
 
     def matrix(self) -> Tensor:
         """From these coordinates to the scene's, ``(4, 4)`` float64."""

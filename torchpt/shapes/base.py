@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchpt import spec
+from torchpt.math import tensor_transforms
 from torchpt.spec import Color, Flag, Other, Pose, Refused, Spec
 
 __all__ = ["BOTTOM", "TOP", "UPRIGHT", "Place", "Shape", "Size", "Surface", "Triangles", "placed"]
@@ -123,8 +126,11 @@ class Shape:
         """
 
     @classmethod
-    def own(cls, values: Mapping[str, Any]) -> Matrix | None:
-        """From the space of its surfaces to its own, ``(4, 4)``: its size and place before its transform; None: the same."""
+    def own(cls, values: Mapping[str, Any]) -> Any:
+        """From the space of its surfaces to its own, ``(4, 4)``: its size and place before its transform; None: the same.
+
+        A tensor of what are tensors among ``values``, a matrix of numbers.
+        """
         return None
 
     @classmethod
@@ -148,8 +154,12 @@ class Shape:
         return None
 
 
-def placed(origin: Any, size: tuple[float, float, float], turn: Matrix) -> Matrix:
-    """A scale, then a rotation ``(3, 3)``, then a move, as ``(4, 4)``."""
+def placed(origin: Sequence[Any], size: Sequence[Any], turn: Matrix) -> Any:
+    """A scale, then a rotation ``(3, 3)``, then a move, as ``(4, 4)``: a tensor where any of the six numbers is one."""
+    tensors = [number for number in (*origin, *size) if isinstance(number, Tensor)]
+    if tensors:
+        own = [torch.stack([torch.as_tensor(number).to(tensors[0]) for number in three]) for three in (origin, size)]
+        return tensor_transforms.placed(torch.from_numpy(turn).to(tensors[0]) * own[1], own[0])
     matrix = np.eye(4)
     matrix[:3, :3] = turn * size
     matrix[:3, 3] = origin

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -29,6 +30,7 @@ class Corners:
         faces: ``(P, 3)`` vertices at the corners; of meshes only.
         mirrored: whether a flat shape's two axes changed places.
         frame: ``(12, 1)`` float64 ``p0 e1 e2 e3`` of a quadric.
+        uvs: ``(V, 2)`` at the vertices, where they are a parameter of the scene; else the part has them.
     """
 
     p0: Tensor
@@ -38,6 +40,7 @@ class Corners:
     faces: Tensor | None = None
     mirrored: bool = False
     frame: Tensor | None = None
+    uvs: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -145,16 +148,22 @@ class Primitive:
     # -- when a scene is assembled
 
     @classmethod
-    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, vertices: Tensor | None) -> Corners:
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
         """Where the primitives of a part lie.
 
         Args:
             part: whose.
             pose: ``(3, 4)`` float64 into the lanes' coordinates.
             dtype: of the lanes.
-            vertices: ``(V, 3)`` in the part's own space, of meshes.
+            own: arrays of the part that are parameters of the scene: ``vertices (V, 3)`` in its own space, of meshes always;
+                ``normals (V, 3)`` and ``uvs (V, 2)`` where gradients of them are wanted.
         """
         raise NotImplementedError
+
+    @classmethod
+    def corners_of_many(cls, poses: Tensor, dtype: torch.dtype) -> list[Corners] | None:
+        """The corners of parts that are no more than a pose each, ``(N, 3, 4)``, at once; None: one by one."""
+        return None
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:

@@ -11,7 +11,7 @@ from torchpt.spec.base import REQUIRED, Moves, Spec
 from torchpt.spec.choices import Choice, Flag, Map, Other, Pair, Path, Whole
 from torchpt.spec.kinds import Block, Kinds, parameters_of
 from torchpt.spec.numbers import Angle, Color, Index, Scalar, Texels, spec_of
-from torchpt.spec.places import Direction, Point, Pose, Vertices
+from torchpt.spec.places import Corners, Direction, Point, Pose, Vertices
 from torchpt.spec.reading import Refused
 from torchpt.spec.valued import Valued
 
@@ -21,6 +21,7 @@ __all__ = [
     "Block",
     "Choice",
     "Color",
+    "Corners",
     "Direction",
     "Flag",
     "Index",

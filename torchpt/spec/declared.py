@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import create_model
 
 from torchpt.errors import NotBuiltError, SceneError
 from torchpt.spec import REQUIRED, Block, Map, Refused, Spec, not_built, parameters_of
+from torchpt.spec.memo import Memo
 from torchpt.spec.reading import within
 from torchpt.spec.validate import Check, Model, check_keys, construct, dotted, refuse_not_built, refused
 
@@ -87,6 +89,25 @@ def described(
         check_keys(raw, ("type", *planned[name]), key, words, file)
         raise NotBuiltError(dotted(key, "type"), name, ", ".join(table), file)
     kind = table[name]
+
+    def read() -> Described:
+        return _read(what, kind, name, raw, key, file, texture)
+
+    if not isinstance(kind, type):  # an instance of the caller's own, which may change
+        return read()
+    found = _known.get((what, kind, texture), raw, read)
+    return Described(kind, dict(found.values), found.given)
+
+
+#: Things by what was written of them.
+_known: Memo[Described] = Memo(4096)
+
+
+def _read(
+    what: str, kind: Any, name: str, raw: Mapping[str, Any], key: str, file: str | None, texture: ReadTexture | None
+) -> Described:
+    """A thing of a kind that is known."""
+    words = f"{what} type {name}"
     names = list(parameters_of(kind))
     later = {**not_built.KEYS.get(what, {}), **not_built.KEYS.get(name, {})}
     check_keys({k: v for k, v in raw.items() if k not in later}, ("type", *names), key, words, file)
@@ -188,6 +209,8 @@ def _reader(spec: Spec, texture: ReadTexture | None) -> Callable[[Any], Any]:
     def read(value: Any) -> Any:
         if isinstance(value, str) and isinstance(spec, Map):
             value = {"texture": value}
+        elif isinstance(value, np.ndarray) and value.ndim > 1:
+            value = {"type": "image", "data": value}
         return texture(value, spec) if isinstance(value, Mapping) else spec.read(value)
 
     return read

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -76,14 +76,23 @@ def parameters_of(kind: Any) -> dict[str, Spec]:
         kind: a class, or an instance where each declares parameters of its own.
     """
     own = kind if isinstance(kind, type) else type(kind)
-    found: dict[str, Spec] = {}
-    layers = [vars(base).get("parameters", {}) for base in reversed(own.__mro__)]
+    found = dict(_of_class(own))
     if kind is not own:
-        layers.append(vars(kind).get("parameters", {}) if hasattr(kind, "__dict__") else {})
-    for layer in layers:
-        if isinstance(layer, Mapping):
-            found |= {name: spec_of(value) for name, value in layer.items()}
+        found |= _specs_in(vars(kind) if hasattr(kind, "__dict__") else {})
     return found
+
+
+@lru_cache(maxsize=1024)
+def _of_class(own: type[Any]) -> dict[str, Spec]:
+    found: dict[str, Spec] = {}
+    for base in reversed(own.__mro__):
+        found |= _specs_in(vars(base))
+    return found
+
+
+def _specs_in(names: Mapping[str, Any]) -> dict[str, Spec]:
+    layer = names.get("parameters", {})
+    return {name: spec_of(value) for name, value in layer.items()} if isinstance(layer, Mapping) else {}
 
 
 @dataclass(frozen=True)

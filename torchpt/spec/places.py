@@ -13,7 +13,7 @@ from torchpt.spec.reading import Refused
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["Direction", "Point", "Pose", "Vertices"]
+__all__ = ["Corners", "Direction", "Point", "Pose", "Vertices"]
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,13 @@ class Vertices(_Vector):
     def read(self, value: Any) -> Any:
         """See :class:`Spec`."""
         return reading.rows(value, 3, "[x, y, z]")
+
+
+@dataclass(frozen=True)
+class Corners(Vertices):
+    """Normals ``(V, 3)`` or coordinates ``(V, 2)`` of a mesh: a tensor of the scene where its gradients are wanted."""
+
+    place: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)

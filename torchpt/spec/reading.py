@@ -102,7 +102,9 @@ def text(value: Any) -> str:
 
 
 def transform(value: Any) -> NDArray[np.float64]:
-    """A list of operations as one matrix ``(4, 4)``, see :func:`torchpt.math.transforms.compose`."""
+    """A list of operations, or a matrix, as one ``(4, 4)``, see :func:`torchpt.math.transforms.compose`."""
+    if isinstance(value, np.ndarray) or (isinstance(value, list) and value and isinstance(value[0], list | np.ndarray)):
+        return matrix(value)
     try:
         return transforms.compose(value)
     except SceneError as error:

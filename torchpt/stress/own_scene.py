@@ -15,7 +15,8 @@ from torchpt.errors import RenderError
 from torchpt.format.description import Description, overridden, read_description
 from torchpt.math.transforms import rotate
 from torchpt.rendering import render_scene
-from torchpt.scene.scene import Scene, device_of
+from torchpt.scene.devices import device_of
+from torchpt.scene.scene import Scene
 from torchpt.scene.space import extent_of
 from torchpt.settings import Settings
 from torchpt.stress.bench import Bench, apart

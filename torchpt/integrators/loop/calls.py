@@ -48,6 +48,12 @@ class Calls:
         self._salts: dict[int, Any] = {}
         self._uniforms = {"place": self.place.ctypes.data}
 
+    def serve(self, kernels: Kernels, halt: threading.Event) -> None:
+        """Go on with the kernels of another render of the same structure, whose memory looks the same."""
+        self.kernels, self._halt = kernels, halt
+        self._prepared.clear()
+        self._keep.clear()
+
     def clear(self) -> None:
         """Start to count anew."""
         self.counters[:] = 0

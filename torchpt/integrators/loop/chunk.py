@@ -75,6 +75,12 @@ class Worker:
         self._arenas = [Memory(kernels.state.count) for _ in range(2)]
         self._lists = [[Memory(1) for _ in range(kernels.models + 2)] for _ in range(2)]
 
+    def serve(self, kernels: Kernels, halt: threading.Event) -> None:
+        """Go on with another render of the same structure: fresh memory would cost time."""
+        self.kernels, self.wave = kernels, kernels.wave
+        self.calls.serve(kernels, halt)
+        self.search.kernels = kernels
+
     def trace(self, chunk: Chunk) -> Tally:
         """Fills ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
         self.start(chunk)

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchpt.integrators.loop import opacity, output, vertex
 from torchpt.integrators.loop import packets as packet_kernels
+from torchpt.integrators.loop.handed import Handed
 from torchpt.integrators.loop.layout import Layout
 from torchpt.integrators.loop.leaves import Leaves
 from torchpt.integrators.loop.programs import program_of
@@ -48,15 +48,19 @@ class Kernels(Layout):
         packets: see :class:`~torchpt.integrators.loop.layout.Layout`.
         fused: see there.
         before: kernels of another render, whose tables are taken over where they are made of the same tensors.
+        fixed: whether a world says the same of itself as long as it is the same one; models of the caller's own may not.
 
     Attributes:
         eager: models whose stage does what no kernel can, and what that is; they run as tensor operations.
         seconds: spent on making kernels.
+        handed: what renders of the same structure share.
         search: what the search by packets reads; None where the search structure is called.
         non_opaque: for each primitive whether a ray may pass it, as uint8, for the search structure.
     """
 
-    def __init__(self, wave: Wave, packets: bool, fused: bool, before: Kernels | None = None) -> None:
+    def __init__(
+        self, wave: Wave, packets: bool, fused: bool, before: Kernels | None = None, fixed: bool = False
+    ) -> None:
         super().__init__(wave, packets, fused)
         self._leaves = Leaves(
             {
@@ -67,12 +71,17 @@ class Kernels(Layout):
                 "centre": wave.centre,
                 "pixel": wave.stages.pixel,
                 "first": wave.first,
-            }
+            },
+            None if before is None else before._leaves,
         )
-        asked = (self.world, wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, self._leaves.tensors)
-        self._structure = (*map(signature, asked), packets, fused)
-        self._laid_out: dict[Any, Tensor] = {}
-        self._take_over(before if before is not None and before._structure == self._structure else None)
+        same = fixed and before is not None and before.world is self.world
+        self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
+        asked = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, self._leaves.tensors)
+        self._structure = (self._of_world, *map(signature, asked), packets, fused)
+        alike = before is not None and before._structure == self._structure
+        self.handed = before.handed if alike else Handed()  # pyright: ignore[reportOptionalMemberAccess]
+        self._laid_out = self.handed.tables(self._leaves)
+        self._results = self.handed.results(self._leaves)
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
         self.search = packet_kernels.search_words(wave) if packets else None
@@ -82,15 +91,6 @@ class Kernels(Layout):
             self.non_opaque = opacity.non_opaque(self.world, prims).to(torch.uint8).numpy()
         self.seconds = 0.0
         self.eager: dict[int, str] = {}
-
-    def _take_over(self, before: Kernels | None) -> None:
-        """Keep what another render of the same structure made of tensors that are unchanged."""
-        self._before, self._unchanged = before, set[str]()
-        if before is None:
-            return
-        self._unchanged = self._leaves.unchanged(before._leaves)
-        self._laid_out |= {key: table for key, table in before._laid_out.items() if key[0] in self._unchanged}
-        before._before = None
 
     def probe(self, numbers: Iterable[int]) -> dict[int, str]:
         """Which of the models' stages no kernel can be made of, and why."""
@@ -198,8 +198,13 @@ class Kernels(Layout):
             return build(trace, *arguments)
 
         program = program_of(key, self._structure, self._leaves, self, traced, listed)
-        old = None if self._before is None else self._before._made.get(key)
-        if old is not None and old.program is program and not program.held and program.leaves() <= self._unchanged:
+        old = self.handed.kernel(key, program, self._leaves)
+        if old is not None:
             return old
-        tables = bound(program.tables, program.steps, program.held, self._leaves.tensors, self._laid_out)
-        return Kernel(program, tables)
+        leaves = self._leaves.tensors
+        tables = bound(
+            program.tables, program.steps, program.held, leaves, self._laid_out, program.names, self._results
+        )
+        made = Kernel(program, tables)
+        self.handed.keep(key, made, self._laid_out, self._results, self._leaves)
+        return made

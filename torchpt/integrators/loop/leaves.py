@@ -8,7 +8,10 @@ from typing import Any
 
 from torch import Tensor
 
-__all__ = ["Leaves", "leaves_of"]
+__all__ = ["Leaves", "State", "leaves_of"]
+
+#: A tensor, and which of the contents that it has had.
+State = tuple[Tensor, object]
 
 
 def leaves_of(record: Any, path: str) -> Iterator[tuple[str, Tensor]]:
@@ -31,21 +34,29 @@ class Leaves:
 
     Args:
         records: by the name that the paths begin with.
+        before: those of another render: records that are the same ones are not walked through again.
 
     Attributes:
         tensors: by path.
         ids: path and tensor by the tensor's id.
+        states: by path, the tensor and which of its contents it has.
     """
 
-    def __init__(self, records: dict[str, Any]) -> None:
-        self.tensors = dict(leaf for name, record in records.items() for leaf in leaves_of(record, name))
+    def __init__(self, records: dict[str, Any], before: Leaves | None = None) -> None:
+        known = {} if before is None else before._walked
+        self._walked: dict[str, tuple[Any, list[tuple[str, Tensor]]]] = {}
+        for name, record in records.items():
+            same = name in known and known[name][0] is record and not isinstance(record, dict)
+            self._walked[name] = known[name] if same else (record, list(leaves_of(record, name)))
+        self.tensors = dict(leaf for _, leaves in self._walked.values() for leaf in leaves)
         self.ids = {id(tensor): (path, tensor) for path, tensor in self.tensors.items()}
         # A tensor is the same one only as long as nobody wrote into it; of inference tensors that cannot be known.
-        self._states = {
-            path: (id(tensor), object() if tensor.is_inference() else tensor._version)
+        self.states: dict[str, State] = {
+            path: (tensor, object() if tensor.is_inference() else tensor._version)
             for path, tensor in self.tensors.items()
         }
 
-    def unchanged(self, before: Leaves) -> set[str]:
-        """Paths of the tensors that are those of another render, with the same numbers; both have the same paths."""
-        return {path for path, state in self._states.items() if before._states[path] == state}
+    def has(self, path: str, state: State) -> bool:
+        """Whether a tensor is one that was read before, with the same numbers."""
+        tensor, version = self.states[path]
+        return tensor is state[0] and version == state[1]

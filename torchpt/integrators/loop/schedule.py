@@ -26,7 +26,7 @@ from torchpt.lanes.kernel import HEAD
 from torchpt.native.memory import let_go
 from torchpt.shortage import needing, ran_out
 
-__all__ = ["Loop", "Share"]
+__all__ = ["PATIENCE", "TASKS", "Block", "Loop", "Share"]
 
 #: Tasks of a pass for each thread, so that none waits long for the last one.
 TASKS = 6
@@ -80,6 +80,7 @@ class Loop:
 
     Attributes:
         lanes: most of a chunk.
+        idle: workers of renders of the same structure that are done, to be taken over; those of this one are put there.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Loop:
         self.kernels, self.threads, self.clamp, self.strict = kernels, threads, clamp, strict
         self.said = said
         self.lanes = LANES
+        self.idle: list[Worker] = []
         self._workers: list[Worker] = []
         self._halt = threading.Event()
 
@@ -107,16 +109,27 @@ class Loop:
         Returns:
             Whether all were taken.
         """
-        blocks = [
+        return self.take(self.blocks(spans, self.threads * TASKS), each)
+
+    def blocks(self, spans: Sequence[tuple[Plate, int, int]], tasks: int) -> list[Block]:
+        """Samples of plates cut into blocks of pixels: ``tasks`` for each plate, as far as they repay."""
+        return [
             (plate, start, size, first, count)
             for plate, first, count in spans
-            for start, size in self._blocks(plate, count)
+            for start, size in self._cut(plate, count, tasks)
         ]
+
+    def take(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
+        """Takes blocks; ``each`` and what is returned are those of :meth:`run`."""
         while blocks and not self._halt.is_set():
             blocks = self._round(blocks, each)
             if blocks:
                 blocks = self._smaller(blocks)
         return not self._halt.is_set()
+
+    def take_rest(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
+        """Takes blocks for which there was no memory, by fewer threads or lanes; else as :meth:`take`."""
+        return self.take(self._smaller(blocks), each)
 
     def _round(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> list[Block]:
         """Takes blocks on threads; returns what of them memory did not suffice for."""
@@ -163,7 +176,7 @@ class Loop:
                 except IndexError:
                     return
                 try:
-                    shares.put(self._task(*block))
+                    shares.put(self.task(*block))
                 except BaseException as error:
                     shares.put(error)
                     return
@@ -199,12 +212,13 @@ class Loop:
             for pixel in range(start, start + size, self.lanes)
         ]
 
-    def _blocks(self, plate: Plate, samples: int) -> Iterator[tuple[int, int]]:
+    def _cut(self, plate: Plate, samples: int, tasks: int) -> Iterator[tuple[int, int]]:
         """Consecutive pixels of each task."""
         pixels = plate.film.width * plate.film.height
-        size = -(-pixels // (self.threads * TASKS)) if self.threads > 1 else pixels
-        size = max(size, -(-FEWEST // samples), min(NARROW, -(-pixels // self.threads)))
-        size = min(-(-size // WIDTH) * WIDTH, self.lanes)
+        size = pixels
+        if tasks > 1 and self.threads > 1:
+            size = max(-(-pixels // tasks), -(-FEWEST // samples), min(NARROW, -(-pixels // self.threads)))
+        size = max(min(-(-size // WIDTH) * WIDTH, self.lanes), 1)
         for start in range(0, pixels, size):
             yield start, min(size, pixels - start)
 
@@ -213,7 +227,17 @@ class Loop:
         self._workers.clear()
         let_go()
 
-    def _task(self, plate: Plate, start: int, size: int, first: int, count: int) -> Share:
+    def dismiss(self) -> None:
+        """Leave this render's workers to the next one of its structure."""
+        self.idle += self._workers
+        self._workers = []
+
+    def halt(self) -> None:
+        """End the render: tasks stop at their next kernel."""
+        self._halt.set()
+
+    def task(self, plate: Plate, start: int, size: int, first: int, count: int) -> Share:
+        """Takes a block, in a thread of its own."""
         share = Share(Tally())
         sample = first
         try:
@@ -236,10 +260,15 @@ class Loop:
         return share
 
     def _worker(self) -> Worker:
-        try:
-            return self._workers.pop()
-        except IndexError:
-            return Worker(self.kernels, self._halt)
+        for workers in (self._workers, self.idle):
+            try:
+                worker = workers.pop()
+            except IndexError:
+                continue
+            if worker.kernels is not self.kernels:
+                worker.serve(self.kernels, self._halt)
+            return worker
+        return Worker(self.kernels, self._halt)
 
     def _chunk(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
         """A chunk into the films: all of it, or nothing where memory runs out."""

@@ -29,13 +29,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
+from torchpt.images.given import TEXELS, texels_of
 from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.math.angles import azimuth
 from torchpt.math.distributions import Cells, invert_linear
 from torchpt.math.threads import sum_all
 from torchpt.math.vectors import dot, luminance, safe_reciprocal, take
 from torchpt.records import Lights, LightSample
-from torchpt.spec import Moves, Path, Pose, Scalar, Spec, Texels
+from torchpt.spec import Moves, Other, Path, Pose, Refused, Scalar, Spec, Texels
 
 if TYPE_CHECKING:
     import numpy as np
@@ -290,7 +291,13 @@ class Envmap(Environment):
 
     name = "envmap"
     parameters: ClassVar = {
-        "path": Path(doc="the picture: `.exr`, `.hdr` or 8-bit; of several the first that is there"),
+        "path": Path(None, doc="the picture: `.exr`, `.hdr` or 8-bit; of several the first that is there"),
+        "data": Other(
+            None,
+            reader=texels_of,
+            words=TEXELS,
+            doc="in place of a file: an array, a tensor or rows of numbers, the first at the top; linear, but for uint8",
+        ),
         "scale": Scalar(1.0, doc="factor of its radiance"),
         "transform": Pose(
             None,
@@ -301,13 +308,23 @@ class Envmap(Environment):
     }
 
     @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Light`: of one source."""
+        if values["path"] is None and values["data"] is None:
+            raise Refused("a file path or data (one of them is required)", None, ("path",))
+        if values["path"] is not None and values["data"] is not None:
+            raise Refused("either path or data, not both", "texels", ("data",))
+
+    @classmethod
     def files(
         cls, values: Mapping[str, Any], find: Callable[[str], FilePath]
     ) -> dict[str, tuple[NDArray[np.float32], Spec]]:
         """See :class:`Light`."""
-        from torchpt.lights.pictures import radiance_of
+        from torchpt.lights.pictures import radiance_in, radiance_of
 
         spec = Texels(doc="radiance `(H, W, 3)`, before `scale`")
+        if values["data"] is not None:
+            return {"texels": (radiance_in(values["data"], "data", "data"), spec)}
         return {"texels": (radiance_of(find("path"), "path"), spec)}
 
     @classmethod

@@ -87,7 +87,9 @@ def primitives_of(
         faces = normal.split(sizes, 1)
         triples = [c.normals or (n, n, n) for c, n in zip(corners, faces, strict=True)]
         flips = [-1.0 if part.flip and c.normals is not None else 1.0 for part, c in zip(parts, corners, strict=True)]
-        n0, n1, n2 = (joined([t[k] * f for t, f in zip(triples, flips, strict=True)]) for k in range(3))
+        n0, n1, n2 = (
+            joined([t[k] if f == 1.0 else t[k] * f for t, f in zip(triples, flips, strict=True)]) for k in range(3)
+        )
         normals = (n0, n1, n2)
         # The outside is where the shading normals point, whatever way a file winds its faces.
         against = dot(normal, n0 + n1 + n2).detach() < 0

@@ -16,7 +16,7 @@ from torchpt.errors import SceneError
 from torchpt.records import Geometry, LaneGeometry, LaneMaterials, LaneTextures, World, tensors_of
 from torchpt.scene.assembly.charts import charts_of
 from torchpt.scene.assembly.copies import copies_of, copy_maps
-from torchpt.scene.assembly.corners import corners_of
+from torchpt.scene.assembly.corners import corners_of_all
 from torchpt.scene.assembly.emitters import lights_of
 from torchpt.scene.assembly.lane_material import lane_material
 from torchpt.scene.assembly.materials import Groups, groups_of, node_map_of, opacity_maps_of, opacity_of
@@ -55,7 +55,7 @@ def assemble(
         SceneError: parameters that put something further away than float32 can follow.
     """
     device = space.centre.device
-    corners = [corners_of(part, parameters, space, dtype) for part in parts]
+    corners = corners_of_all(parts, parameters, space, dtype)
     primitives = primitives_of(parts, corners, dtype, device)
     _check_reach(parts, primitives, space)
     owners: list[Part | Copy] = [*parts, *copies]

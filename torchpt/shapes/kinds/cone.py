@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -46,12 +45,12 @@ class Cone(Shape, Quadric):
             raise Refused("a finite number other than 0", values["height"], ("height",))
 
     @classmethod
-    def own(cls, values: Mapping[str, Any]) -> Matrix:
+    def own(cls, values: Mapping[str, Any]) -> Any:
         """See :class:`Shape`."""
         height, slope = values["height"], values["slope"]
         turn = UPRIGHT if height < 0 else UPRIGHT * [[1.0], [-1.0], [-1.0]]
-        base, length = np.add(values["apex"], (0.0, height, 0.0)), abs(height)
-        return placed(base, (slope * length, slope * length, length), turn)
+        (x, y, z), length = values["apex"], abs(height)
+        return placed((x, y + height, z), (slope * length, slope * length, length), turn)
 
     @classmethod
     def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:

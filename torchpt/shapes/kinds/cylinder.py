@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,11 +31,11 @@ class Cylinder(Shape, Quadric):
     }
 
     @classmethod
-    def own(cls, values: Mapping[str, Any]) -> Matrix:
+    def own(cls, values: Mapping[str, Any]) -> Any:
         """See :class:`Shape`."""
         radius, height = values["radius"], values["height"]
-        bottom = np.subtract(values["center"], (0.0, 0.5 * height, 0.0))
-        return placed(bottom, (radius, radius, height), UPRIGHT)
+        x, y, z = values["center"]
+        return placed((x, y - 0.5 * height, z), (radius, radius, height), UPRIGHT)
 
     @classmethod
     def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:

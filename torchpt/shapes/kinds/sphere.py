@@ -67,7 +67,7 @@ class Sphere(Shape):
     }
 
     @classmethod
-    def own(cls, values: Mapping[str, Any]) -> Matrix:
+    def own(cls, values: Mapping[str, Any]) -> Any:
         """See :class:`Shape`; its surface is the unit sphere."""
         radius = values["radius"]
         return placed(values["center"], (radius, radius, radius), np.eye(3))

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchpt.shapes.primitive import Corners, Triple
 
-__all__ = ["axes_of", "corner_moves", "unit_uvs"]
+__all__ = ["axes_of", "axes_of_all", "corner_moves", "unit_uvs"]
 
 
 def axes_of(pose: Tensor) -> tuple[Tensor, Tensor, Tensor, bool]:
@@ -15,10 +15,18 @@ def axes_of(pose: Tensor) -> tuple[Tensor, Tensor, Tensor, bool]:
 
     Then x and y are exchanged: the shape still faces where its own +z goes, as in Mitsuba.
     """
-    linear, move = pose.split((3, 1), 1)
-    x, y = linear[:, 0:1], linear[:, 1:2]
-    mirrored = bool(torch.linalg.det(linear.detach()) < 0)
-    return (move, y, x, True) if mirrored else (move, x, y, False)
+    move, x, y, mirrored = axes_of_all(pose[None])
+    return move, x, y, mirrored[0]
+
+
+def axes_of_all(poses: Tensor) -> tuple[Tensor, Tensor, Tensor, list[bool]]:
+    """The same of N poses ``(N, 3, 4)``, side by side: ``(3, N)`` each."""
+    x, y, move = poses[:, :, 0].T, poses[:, :, 1].T, poses[:, :, 3].T
+    mirrored = torch.linalg.det(poses[:, :, :3].detach()) < 0
+    flags: list[bool] = mirrored.tolist()
+    if any(flags):
+        x, y = torch.where(mirrored, y, x), torch.where(mirrored, x, y)
+    return move, x, y, flags
 
 
 def unit_uvs(corners: Corners) -> Triple:

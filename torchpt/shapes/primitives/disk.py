@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -27,7 +28,7 @@ class Disk(Primitive):
     charted = True
 
     @classmethod
-    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, vertices: Tensor | None) -> Corners:
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
         """See :class:`Primitive`."""
         move, x, y, mirrored = axes_of(pose)
         p1, p2 = move + x, move + y

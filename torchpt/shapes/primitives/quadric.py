@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -26,7 +27,7 @@ class Quadric(Primitive):
     charted = True
 
     @classmethod
-    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, vertices: Tensor | None) -> Corners:
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
         """See :class:`Primitive`."""
         linear, move = pose.split((3, 1), 1)
         x, y = linear[:, 0:1], linear[:, 1:2]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchpt.shapes.primitive import Corners, Primitive, Triple
-from torchpt.shapes.primitives._affine import axes_of, corner_moves, unit_uvs
+from torchpt.shapes.primitives._affine import axes_of_all, corner_moves, unit_uvs
 
 if TYPE_CHECKING:
     from torchpt.scene.parts import Part
@@ -22,12 +23,18 @@ class Rectangle(Primitive):
     name = "rectangle"
 
     @classmethod
-    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, vertices: Tensor | None) -> Corners:
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
         """See :class:`Primitive`: Mitsuba's unit shape [-1, 1]^2 from its lower corner."""
-        move, x, y, mirrored = axes_of(pose)
+        return cls.corners_of_many(pose[None], dtype)[0]
+
+    @classmethod
+    def corners_of_many(cls, poses: Tensor, dtype: torch.dtype) -> list[Corners]:
+        """See :class:`Primitive`."""
+        move, x, y, mirrored = axes_of_all(poses)
         x, y = 2.0 * x, 2.0 * y
         p0 = move - 0.5 * (x + y)
-        return Corners(p0.to(dtype), (p0 + x).to(dtype), (p0 + y).to(dtype), mirrored=mirrored)
+        places = (place.to(dtype).split(1, 1) for place in (p0, p0 + x, p0 + y))
+        return [Corners(*own, mirrored=flag) for *own, flag in zip(*places, mirrored, strict=True)]
 
     @classmethod
     def uvs(cls, part: Part, corners: Corners) -> Triple:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -29,7 +30,7 @@ class Sphere(Primitive):
     angles = True
 
     @classmethod
-    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, vertices: Tensor | None) -> Corners:
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
         """See :class:`Primitive`."""
         linear, move = pose.split((3, 1), 1)
         radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)

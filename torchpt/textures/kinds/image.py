@@ -1,4 +1,4 @@
-"""Images: files whose texels become one parameter ``(H, W, C)``. Every file is read once a scene."""
+"""Images: files, or numbers of the scene, whose texels become one parameter ``(H, W, C)``. Every file is read once a scene."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torchpt.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS
+from torchpt.images.given import TEXELS, texels_of
 from torchpt.spec import Choice, Color, Other, Path, Refused, Whole
 from torchpt.spec import Texels as TexelsSpec
 from torchpt.textures.atlas import WRAPS, ImageNode
@@ -33,9 +34,16 @@ class Image(Mapped):
     name = "image"
     parameters: ClassVar = {
         "path": Other(
+            None,
             reader=_source,
             words=Path().accepted,
             doc="PNG, JPEG, TGA, BMP, PPM, EXR or HDR; 8 or 16 bits, half or float",
+        ),
+        "data": Other(
+            None,
+            reader=texels_of,
+            words=TEXELS,
+            doc="in place of a file: an array, a tensor or rows of numbers, the first at the top; linear, but for uint8",
         ),
         "wrap": Choice("repeat", names=WRAPS, doc="how it goes on beyond its edges"),
         "filter": Choice(
@@ -60,7 +68,17 @@ class Image(Mapped):
     def label(cls, values: Mapping[str, Any]) -> str | None:
         """See :class:`Texture`."""
         path = values["path"]
-        return path.label if isinstance(path, EncodedImage) else path[0]
+        return path.label if isinstance(path, EncodedImage) else path[0] if path else None
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Texture`: of one source."""
+        if values["path"] is None and values["data"] is None:
+            raise Refused("a file path or data (one of them is required)", None, ("path",))
+        if values["path"] is not None and values["data"] is not None:
+            raise Refused("either path or data, not both", "texels", ("data",))
+        if values["data"] is not None and values["max_pixels"] is not None:
+            raise Refused("no max_pixels beside data: it is of files", values["max_pixels"], ("max_pixels",))
 
     @classmethod
     def suits(cls, values: Mapping[str, Any], coloured: bool) -> None:
@@ -100,6 +118,8 @@ class Image(Mapped):
 
 def _picture(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texels]:
     """An image's numbers as stored, and how errors name it."""
+    if values["data"] is not None:
+        return f"{opening.name}.data", values["data"]
     if isinstance(values["path"], EncodedImage):
         label, source = values["path"].label, values["path"]
     else:
@@ -125,6 +145,8 @@ def _declared(
     opening.check(texels, opening.key, label, scale)
     spec = TexelsSpec(low=None, slack=1e-6, moves=opening.slot.moves, doc="texels `(H, W, C)`, linear")
     opening.declare(name, texels, opening.ranged(spec, scale))
+    if label == f"{opening.name}.data":
+        opening.parameters.stated.add(name)
     return name
 
 

@@ -1,0 +1,55 @@
+"""Sweeps by a launcher of Hydra that runs jobs in processes of their own: `hydra/launcher=joblib` (extra `sweep`)."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchpt
+
+WORDS = ["scene=cornell_box", "film.width=24", "film.height=16", "render.threads=1", "render.pilots=true"]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(find_spec("joblib") is None, reason="hydra-joblib-launcher is not installed (extra `sweep`)"),
+]
+
+
+def sweep(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    launcher = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(folder / "tmp")}
+    (folder / "tmp").mkdir()
+    return subprocess.run(
+        [sys.executable, "-m", "torchpt", "render", "-m", *WORDS, *launcher, *words],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+def test_jobs_of_several_processes_write_what_jobs_of_one_do(tmp_path: Path) -> None:
+    done = sweep(tmp_path, "render.spp=1,2", "sampler=sobol,independent", "out=x.exr")
+    assert done.returncode == 0, done.stderr
+    assert {json.loads(line)["out"] for line in done.stdout.splitlines()} == {f"x_{k}.exr" for k in range(4)}
+    scene = torchpt.load("cornell_box", device="cpu")
+    film = {"width": 24, "height": 16}
+    for number, (spp, sampler) in enumerate((spp, name) for spp in (1, 2) for name in ("sobol", "independent")):
+        image = torchpt.render(scene, spp=spp, sampler=sampler, film=film, pilots=True, threads=1)
+        assert torch.equal(torchpt.read_image(tmp_path / f"x_{number}.exr"), image)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tmp", *(f"x_{k}.exr" for k in range(4))]
+    assert list((tmp_path / "tmp").glob("torchpt-sweep-*")) == []
+
+
+def test_a_job_that_is_wrong_leaves_the_others_pictures(tmp_path: Path) -> None:
+    done = sweep(tmp_path, "render.spp=1,-3", "out=y.exr")
+    assert done.returncode == 2
+    assert [line for line in done.stderr.splitlines() if line.startswith("torchpt: render.spp: expected")]
+    assert "Traceback" not in done.stderr and (tmp_path / "y_0.exr").exists()

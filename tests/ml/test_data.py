@@ -1,0 +1,188 @@
+"""Data sets of rendered pictures: an item is a function of its index, whoever renders it."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import pytest
+import torch
+from scene_makers import dim, flat, room
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+import torchpt
+from torchpt.data import RenderDataset, RenderStream
+from torchpt.errors import SceneError
+
+Items = dict[int, dict[str, Tensor]]
+
+
+def data(**changes: Any) -> RenderDataset:
+    return RenderDataset(room, 4, **{"spp": 4, "layers": ["depth", "normal"], "seed": 7, **changes})
+
+
+def by_index(batches: Any) -> Items:
+    return {int(i): {k: v[n] for k, v in batch.items()} for batch in batches for n, i in enumerate(batch["index"])}
+
+
+def same(found: Items, expected: Items) -> bool:
+    return found.keys() == expected.keys() and all(
+        torch.equal(found[i][name], value) for i, item in expected.items() for name, value in item.items()
+    )
+
+
+def test_an_item_is_the_render_of_its_index():
+    item = data()[2]
+    scene = torchpt.load(room(2), "cpu")
+    expected = torchpt.render(scene, spp=4, seed=9, film={"aovs": ["depth", "normal"]}, full=True)
+    camera = scene.pinhole()
+    assert torch.equal(item["image"], expected.image) and torch.equal(item["depth"], expected["depth"])
+    assert (
+        item["image"].shape == (8, 10, 3) and item["normal"].shape == (8, 10, 3) and item["depth"].shape == (8, 10, 1)
+    )
+    assert torch.equal(item["K"], camera.K) and torch.equal(item["R"], camera.R) and torch.equal(item["t"], camera.t)
+    assert torch.equal(item["to_world"], scene.params["camera.to_world"]) and int(item["index"]) == 2
+    assert not any(value.requires_grad for value in item.values())
+
+
+def test_items_differ_and_come_again():
+    items = data(cameras=[torch.eye(4) + 0.0])
+    assert len(items) == 4
+    first, other = data()[0], data()[1]
+    assert not torch.equal(first["image"], other["image"])
+    assert torch.equal(data()[0]["image"], first["image"]) and torch.equal(data()[-3]["image"], other["image"])
+    with pytest.raises(IndexError, match="index 4 of a data set of 4 items"):
+        data()[4]
+
+
+def test_cameras_of_each_scene():
+    scene = torchpt.load(room(0), "cpu")
+    near, far = scene.params["camera.to_world"].clone(), scene.params["camera.to_world"].clone()
+    far[2, 3] += 1
+    calls: list[int] = []
+
+    def make(index: int) -> dict[str, Any]:
+        calls.append(index)
+        return room(index)
+
+    items = RenderDataset(
+        make, 2, cameras=[near, {"camera.to_world": far, "camera.fov": 30.0}], spp=1, layers=["depth"]
+    )
+    found = [items[i] for i in range(len(items))]
+    assert len(found) == 4 and calls == [0, 1]  # a scene is made once for its cameras
+    assert torch.equal(found[0]["to_world"], near) and torch.equal(found[3]["to_world"], far)
+    assert float(found[1]["depth"][4, 5, 0] - found[0]["depth"][4, 5, 0]) == pytest.approx(1, abs=0.05)
+    assert float(found[1]["K"][0, 0]) > float(found[0]["K"][0, 0])
+
+
+def test_settings_of_a_scene_and_of_the_data_set():
+    scene = torchpt.load(room(1), "cpu")
+    params = {"shapes.lamp.emission": torch.ones(3)}
+    expected = torchpt.render(scene, params=params, spp=2, seed=1, film={"width": 5})
+    assert torch.equal(RenderDataset(dim, 2, spp=16, film={"width": 5})[1]["image"], expected)
+
+
+def test_a_camera_without_a_matrix_has_its_pose():
+    item = RenderDataset(flat, 1, spp=1)[0]
+    assert item["to_world"].shape == (4, 4) and "K" not in item
+
+
+def test_scenes_may_be_made_by_the_caller_and_items_are_without_gradients():
+    scene = torchpt.load(room(0), "cpu")
+    scene.params["materials.wall.reflectance"].requires_grad_()
+    item = RenderDataset(lambda _: scene, 1, spp=1)[0]
+    assert not item["image"].requires_grad and item["image"].shape == (8, 10, 3)
+
+
+@pytest.mark.parametrize(
+    ("wish", "key"),
+    [({"seed": -1}, "seed"), ({"full": True}, "full"), ({"params": {}}, "params"), ({"scenes": -1}, "scenes")],
+)
+def test_arguments_that_are_not_accepted(wish, key):
+    with pytest.raises(SceneError, match=f"^{key}: expected"):
+        RenderDataset(room, **{"scenes": 2, **wish})
+
+
+def test_an_unknown_layer_is_named():
+    with pytest.raises(SceneError, match="film.aovs"):
+        data(layers=["smell"])[0]
+
+
+# -- workers
+
+
+@pytest.fixture(scope="module")
+def expected() -> Items:
+    """By this process, with threads: what workers are forked from has rendered."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        items = data()
+        return {i: items[i] for i in range(4)}
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_the_same_bits_without_workers(expected):
+    assert same(by_index(DataLoader(data(), batch_size=2)), expected)
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_the_same_bits_in_workers(expected, method):
+    loader = DataLoader(data(), batch_size=2, num_workers=2, multiprocessing_context=method, timeout=300)
+    assert same(by_index(loader), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")  # torch's, where there are fewer cores
+@pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("wish", [{"compile": "off"}, {"threads": 2}, {"accel": "torch"}], ids=str)
+def test_the_same_bits_in_any_number_of_workers(method, workers, wish):
+    items = data(**wish)
+    loader = DataLoader(items, num_workers=workers, multiprocessing_context=method, timeout=300)
+    assert same(by_index(loader), {i: items[i] for i in range(4)})
+
+
+def test_a_stream_in_workers_has_each_index_once(expected):
+    stream = RenderStream(room, 4, spp=4, layers=["depth", "normal"], seed=7)
+    loader = DataLoader(stream, batch_size=1, num_workers=2, multiprocessing_context="fork", timeout=300)
+    assert same(by_index(loader), expected)
+    assert same(by_index(DataLoader(stream, batch_size=4)), expected)
+
+
+def test_a_stream_has_no_end_and_goes_on():
+    indices = RenderStream(room).indices()
+    assert [next(indices) for _ in range(5)] == [0, 1, 2, 3, 4]
+    later = iter(RenderStream(room, start=3, spp=1, seed=5))
+    first = next(later)
+    assert int(first["index"]) == 3 and int(next(later)["index"]) == 4
+    assert torch.equal(first["image"], RenderDataset(room, 4, spp=1, seed=5)[3]["image"])
+
+
+@pytest.mark.parametrize("start", [0, 1, 5])
+def test_ranks_share_a_stream(start):
+    shares = [list(RenderStream(room, 12, start=start, shard=(rank, 3)).indices()) for rank in range(3)]
+    assert sorted(index for share in shares for index in share) == list(range(start, 12))
+    assert all(index % 3 == rank for rank, share in enumerate(shares) for index in share)
+
+
+def test_ranks_of_torch_distributed(tmp_path, monkeypatch):
+    stream = RenderStream(room, 6, spp=1)
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+    assert list(stream.indices()) == [1, 3, 5]
+    sent = pickle.dumps(stream)  # as to a spawned worker
+    monkeypatch.undo()
+    assert list(pickle.loads(sent).indices()) == [1, 3, 5]
+    assert list(RenderStream(room, 6, shard=(1, 2)).indices()) == [1, 3, 5]
+
+
+def test_a_used_data_set_is_sent_without_its_scene():
+    items = data()
+    size = len(pickle.dumps(items))
+    assert items[0]["image"].shape == (8, 10, 3)
+    assert len(pickle.dumps(items)) == size and copy.copy(items)._items is items._items

@@ -1,0 +1,50 @@
+"""docs/ml.md: its Python runs, and its tables name what there is."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchpt
+
+PAGE = Path(__file__).parents[2] / "docs" / "ml.md"
+BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def test_the_lessons_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    blocks = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
+    assert len(blocks) == 3
+    for block in blocks:
+        exec(compile(block, str(PAGE), "exec"), names)
+    found = torch.tensor([float(x) for x in re.findall(r"\d\.\d+", capsys.readouterr().out)])
+    right = torchpt.load("cornell_box", "cpu").params["materials.red.reflectance"]
+    torch.testing.assert_close(found, right, rtol=0, atol=0.02)
+    batch = names["batch"]
+    assert isinstance(batch, dict) and batch["image"].shape == (2, 16, 16, 3) and batch["K"].shape == (2, 3, 3)
+
+
+def table(heading: str) -> dict[str, list[str]]:
+    """Rows of the first table below a heading, by what stands in their first cell."""
+    text = PAGE.read_text(encoding="utf-8").split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
+    rows = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("| `")]
+    return {row[0].strip().strip("`"): row for row in rows}
+
+
+def test_every_argument_of_render_has_a_row_with_its_default():
+    rows, signature = table("Arguments of `render`"), inspect.signature(torchpt.render)
+    assert set(rows) == set(signature.parameters)
+    for name, parameter in signature.parameters.items():
+        if parameter.default is not inspect.Parameter.empty:
+            default = str(parameter.default)
+            assert f"`{default}`" in rows[name][-1], name
+
+
+@pytest.mark.parametrize("loss", torchpt.losses.__all__)
+def test_every_loss_has_a_row(loss):
+    assert any(row.startswith(f"{loss}(") for row in table("Losses"))

@@ -1,0 +1,39 @@
+"""Scenes by index, as functions of a module: spawned workers must be able to import them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+FILM = {"width": 10, "height": 8, "filter": "box"}
+
+
+def room(index: int) -> dict[str, Any]:
+    """A wall whose colour depends on the index, a ball before it, a lamp."""
+    colour = torch.rand(3, generator=torch.Generator().manual_seed(index)).tolist()
+    return {
+        "camera": {"type": "perspective", "origin": [0, 0, 4], "target": [0, 0, 0], "fov": 40},
+        "film": FILM,
+        "integrator": {"type": "path", "max_depth": 3},
+        "materials": {"wall": {"type": "diffuse", "reflectance": colour}},
+        "shapes": {
+            "back": {"type": "rectangle", "material": "wall", "transform": [{"scale": 2}]},
+            "ball": {"type": "sphere", "center": [0, 0, 1], "radius": 0.5},
+            "lamp": {
+                "type": "rectangle",
+                "emission": 5,
+                "transform": [{"rotate": {"axis": [1, 0, 0], "angle": 90}}, {"translate": [0, 2, 1]}],
+            },
+        },
+    }
+
+
+def dim(index: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The same with settings of its own."""
+    return room(index), {"spp": 2, "params": {"shapes.lamp.emission": [1.0, 1.0, 1.0]}}
+
+
+def flat(index: int) -> dict[str, Any]:
+    """The same by an orthographic camera, which has no matrix K."""
+    return {**room(index), "camera": {"type": "orthographic", "origin": [0, 0, 4], "target": [0, 0, 0], "width": 3}}

@@ -1,0 +1,420 @@
+"""Batches: each picture is the one that ``render`` makes alone, nothing is made twice, and errors say where they belong."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import torchpt
+from torchpt import accel
+from torchpt.errors import RenderError, SceneError
+from torchpt.integrators.loop import kernels as loop_kernels
+from torchpt.integrators.loop import programs
+from torchpt.scene import scene as scenes_room
+
+SIZE = {"width": 24, "height": 16, "filter": "box"}
+
+
+def room(x: float = 0.0, colour: float = 0.5, ball: bool = True, **more):
+    shapes = {
+        "floor": {"type": "rectangle", "transform": [{"scale": 3}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}]},
+        "wall": {"type": "rectangle", "material": "grey", "transform": [{"scale": 3}, {"translate": [0, 0, -2]}]},
+        "lamp": {
+            "type": "rectangle",
+            "transform": [{"rotate": {"axis": [1, 0, 0], "angle": 90}}, {"translate": [0, 2.5, 0]}],
+            "emission": [5, 5, 5],
+        },
+    }
+    if ball:
+        shapes["ball"] = {"type": "sphere", "center": [x, 0.5, 0], "radius": 0.5, "material": "grey"}
+    return torchpt.load(
+        {
+            "camera": {"type": "perspective", "origin": [0, 1, 4], "target": [0, 0.7, 0], "fov": 50},
+            "film": SIZE,
+            "integrator": {"max_depth": 4},
+            "render": {"spp": 3, "threads": 1, "device": "cpu"},
+            "materials": {"grey": {"type": "diffuse", "reflectance": [colour, 0.5, 0.4]}},
+            "shapes": shapes,
+            **more,
+        }
+    )
+
+
+def tetrahedron(height: float = 1.0):
+    """A scene of another kind: triangles, a mirror, two light sources."""
+    return torchpt.load(
+        {
+            "camera": {
+                "type": "thinlens",
+                "origin": [0, 1, 3],
+                "target": [0, 0.3, 0],
+                "aperture_radius": 0.05,
+                "focus_distance": 3,
+            },
+            "film": SIZE,
+            "render": {"spp": 3, "threads": 1, "device": "cpu"},
+            "shapes": {
+                "tip": {
+                    "type": "mesh",
+                    "vertices": [[-1, 0, 1], [1, 0, 1], [0, 0, -1], [0, height, 0]],
+                    "faces": [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
+                    "material": {"type": "conductor", "material": "Au"},
+                }
+            },
+            "lights": {
+                "sky": {"type": "constant", "radiance": [0.3, 0.4, 0.5]},
+                "sun": {"type": "directional", "direction": [0, -1, -0.5], "irradiance": [1, 1, 1]},
+            },
+        }
+    )
+
+
+def poses(scene, count):
+    found = scene.params["camera.to_world"].repeat(count, 1, 1)
+    found[:, 0, 3] += 0.1 * torch.arange(count)
+    return found
+
+
+BLOCKS = [
+    {"type": "perspective", "origin": [1, 1, 4], "target": [0, 0.5, 0], "fov": 40},
+    {"type": "orthographic", "origin": [0, 2, 3], "target": [0, 0.5, 0], "width": 4},
+    {"K": [[30, 0, 12], [0, 30, 8], [0, 0, 1]], "R": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "t": [0, 1, 4]},
+]
+
+
+# -- the same bits
+
+
+@pytest.mark.parametrize("threads", (1, 2, 3))
+def test_scenes_of_different_kinds(threads):
+    scenes = [room(0.2), tetrahedron(), room(-0.3, 0.8), room(ball=False), tetrahedron(0.5)]
+    batch = torchpt.render_batch(scenes, threads=threads, seed=5)
+    assert batch.shape == (5, 1, 16, 24, 3)
+    for scene, picture in zip(scenes, batch, strict=True):
+        assert torch.equal(picture[0], torchpt.render(scene, seed=5))
+
+
+def test_cameras_as_blocks():
+    scenes = [room(0.2), tetrahedron()]
+    batch = torchpt.render_batch(scenes, BLOCKS)
+    assert batch.shape == (2, 3, 16, 24, 3)
+    for s, scene in enumerate(scenes):
+        for c, block in enumerate(BLOCKS):
+            assert torch.equal(batch[s, c], torchpt.render(scene.seen_by(block)))
+    written = room(0.2, camera=BLOCKS[2])
+    assert torch.equal(batch[0, 2], torchpt.render(written))
+
+
+def test_cameras_as_poses():
+    scenes = [room(0.2), tetrahedron()]
+    given = poses(scenes[0], 3)
+    batch = torchpt.render_batch(scenes, given)
+    for s, scene in enumerate(scenes):
+        for c, pose in enumerate(given):
+            assert torch.equal(batch[s, c], torchpt.render(scene, params={"camera.to_world": pose}))
+    assert torch.equal(torchpt.render_batch(scenes, list(given)), batch)
+
+
+def test_a_film_of_the_call_is_that_of_matrices_in_pixels():
+    film = {"width": 12, "height": 8}
+    alone = torchpt.render(room(camera=BLOCKS[2], film=SIZE | film))
+    assert torch.equal(torchpt.render_batch(room(), BLOCKS[2:], film=film)[0, 0], alone)
+
+
+def test_parameters_of_each_scene():
+    scene = room()
+    rgb = torch.tensor([[0.2, 0.3, 0.4], [0.8, 0.1, 0.1]])
+    batch = torchpt.render_batch(scene, params={"materials.grey.reflectance": rgb})
+    as_list = [{"materials.grey.reflectance": row} for row in rgb]
+    assert batch.shape == (2, 1, 16, 24, 3)
+    assert torch.equal(torchpt.render_batch(scene, params=as_list), batch)
+    for own, picture in zip(as_list, batch, strict=True):
+        assert torch.equal(picture[0], torchpt.render(scene, params=own))
+    scenes = [scene, room(0.4)]
+    both = torchpt.render_batch(scenes, poses(scene, 2), as_list)
+    pose = poses(scene, 2)[1]
+    alone = torchpt.render(scenes[1], params={**as_list[1], "camera.to_world": pose})
+    assert torch.equal(both[1, 1], alone)
+
+
+def test_meshes_that_move():
+    scene = tetrahedron()
+    tips = scene.params["shapes.tip.vertices"].repeat(3, 1, 1)
+    tips[:, 3, 1] = torch.tensor([0.4, 0.8, 1.2])
+    batch = torchpt.render_batch(scene, params={"shapes.tip.vertices": tips})
+    for height, picture in zip((0.4, 0.8, 1.2), batch, strict=True):
+        assert torch.equal(picture[0], torchpt.render(tetrahedron(height)))
+
+
+def test_seeds():
+    scenes, given = [room(), tetrahedron()], poses(room(), 2)
+    each = torchpt.render_batch(scenes, given, seed=[3, 4])
+    grid = torchpt.render_batch(scenes, given, seed=[[3, 7], [4, 4]])
+    assert (
+        torch.equal(each[0, 0], grid[0, 0])
+        and torch.equal(each[1], grid[1])
+        and not torch.equal(each[0, 1], grid[0, 1])
+    )
+    assert torch.equal(grid[0, 1], torchpt.render(scenes[0], seed=7, params={"camera.to_world": given[1]}))
+
+
+def test_scenes_from_an_iterator():
+    told = []
+    batch = torchpt.render_batch((room(0.1 * k) for k in range(3)), on_progress=lambda *done: told.append(done))
+    assert torch.equal(batch[2, 0], torchpt.render(room(0.1 * 2)))
+    assert told == [(1, None), (2, None), (3, None)]
+
+
+@pytest.mark.parametrize(
+    "wishes",
+    (
+        {"compile": "off"},
+        {"max_memory": "2GB"},
+        {"target_error": 0.5},
+        {"sampler": {"type": "sobol", "adaptive": True}, "spp": 24},
+        {"pilots": True, "spp": 4},
+        {"integrator": {"type": "path", "max_depth": 3, "clamp": 0.4}},
+        {"dtype": torch.float64},
+        {"spp": 70},
+        {"integrator": "aov", "film": {"aovs": ["normal"]}},
+    ),
+    ids=str,
+)
+def test_every_way_to_render(wishes):
+    scenes = [room(0.2), room(0.3)]
+    batch = torchpt.render_batch(scenes, **wishes)
+    for scene, picture in zip(scenes, batch, strict=True):
+        assert torch.equal(picture[0], torchpt.render(scene, **wishes))
+
+
+def test_layers():
+    scenes, film = [room(0.2), tetrahedron()], {"aovs": ["depth", "albedo", "variance"]}
+    batch = torchpt.render_batch(scenes, poses(scenes[0], 2), film=film, full=True)
+    assert {name: tuple(value.shape) for name, value in batch.layers.items()} == {
+        "depth": (2, 2, 16, 24, 1),
+        "albedo": (2, 2, 16, 24, 3),
+        "variance": (2, 2, 16, 24, 3),
+    }
+    alone = torchpt.render(scenes[1], film=film, full=True, params={"camera.to_world": poses(scenes[0], 2)[1]})
+    assert torch.equal(batch.image[1, 1], alone.image) and batch[1, 1].rays == alone.rays
+    for name, layer in batch.layers.items():
+        assert torch.equal(layer[1, 1], alone.layers[name])
+    assert batch.denoised is None and batch[0, 1].paths == 16 * 24 * 3
+    assert repr(batch) == "Renderings(2 x 2 x 16 x 24 x 3; layers: depth, albedo, variance)"
+
+
+# -- gradients
+
+
+def test_gradients_are_those_of_single_renders():
+    scenes = [room(0.2), room(0.4)]
+    rgb = torch.tensor([[0.2, 0.3, 0.4], [0.8, 0.1, 0.1]], requires_grad=True)
+    batch = torchpt.render_batch(scenes, params={"materials.grey.reflectance": rgb}, seed=[1, 2])
+    weights = torch.rand(batch.shape, generator=torch.Generator().manual_seed(0))
+    (found,) = torch.autograd.grad((batch * weights).sum(), rgb)
+    for s, scene in enumerate(scenes):
+        own = rgb[s].detach().clone().requires_grad_()
+        alone = torchpt.render(scene, params={"materials.grey.reflectance": own}, seed=1 + s)
+        assert torch.equal(batch[s, 0], alone)
+        (expected,) = torch.autograd.grad((alone * weights[s, 0]).sum(), own)
+        assert torch.equal(found[s], expected) and bool(expected.any())
+
+
+def test_gradients_of_poses():
+    scene = room(0.2)
+    given = poses(scene, 2).requires_grad_()
+    batch = torchpt.render_batch(scene, given, edges=True)
+    (found,) = torch.autograd.grad(batch[0, 1].sum(), given)
+    own = given[1].detach().clone().requires_grad_()
+    (expected,) = torch.autograd.grad(torchpt.render(scene, params={"camera.to_world": own}).sum(), own)
+    assert torch.equal(found[1], expected) and bool(expected.any()) and not bool(found[0].any())
+
+
+def test_parameters_of_scenes_that_require_gradients():
+    scenes = [room(0.2), room(0.4)]
+    for scene in scenes:
+        scene.params["materials.grey.reflectance"].requires_grad_()
+    batch = torchpt.render_batch(scenes)
+    batch[1].sum().backward()
+    unused, used = (scene.params["materials.grey.reflectance"].grad for scene in scenes)
+    assert used is not None and bool(used.any())
+    assert unused is None or not bool(unused.any())
+    with torch.no_grad():
+        assert not torchpt.render_batch(scenes).requires_grad
+
+
+# -- what is made
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """How often worlds, search structures, tables of kernels and programs are made."""
+    made = {"worlds": 0, "trees": 0, "tables": [], "programs": 0}
+
+    def counting(room, name, key):
+        plain = getattr(room, name)
+
+        def call(*args, **given):
+            made[key] += 1
+            return plain(*args, **given)
+
+        monkeypatch.setattr(room, name, call)
+
+    counting(scenes_room, "assemble", "worlds")
+    counting(accel, "build", "trees")
+    counting(programs, "_traced", "programs")
+    plain = loop_kernels.Kernels._make
+
+    def make(self, key, *rest):
+        known = self.handed._kernels.get(key)
+        kernel = plain(self, key, *rest)
+        if known is None or kernel is not known[0]:
+            made["tables"].append(key[0])
+        return kernel
+
+    monkeypatch.setattr(loop_kernels.Kernels, "_make", make)
+    return made
+
+
+@pytest.mark.parametrize("params", (False, True), ids=("own", "given"))
+def test_cameras_build_nothing(counted, params):
+    scene = tetrahedron()
+    given = {"shapes.tip.vertices": scene.params["shapes.tip.vertices"][None] * 1.5} if params else None
+
+    def made(cameras):
+        counted.update(worlds=0, trees=0, tables=[], programs=0)
+        torchpt.render_batch(scene, poses(scene, cameras), given)
+        return dict(counted)
+
+    first, one, five = made(1), made(1), made(5)
+    assert first["worlds"] and first["trees"] and len(set(first["tables"])) > 2
+    assert (five["worlds"], five["trees"], five["programs"]) == (int(params), int(params), 0)
+    # Of a camera's own there is only what its rays are made of.
+    assert sorted(five["tables"]) == sorted([*one["tables"], *["generate"] * 4])
+    assert params or one["tables"] == ["generate"]
+
+
+def test_blocks_of_cameras_build_nothing(counted):
+    scene = room()
+    torchpt.render(scene)
+    counted.update(worlds=0, trees=0, tables=[], programs=0)
+    fovs = [{**BLOCKS[0], "fov": 40 + k} for k in range(4)]
+    torchpt.render_batch(scene, fovs)
+    assert counted["worlds"] == counted["trees"] == counted["programs"] == 0
+    assert set(counted["tables"]) <= {"generate"}
+
+
+def test_views_follow_their_scene():
+    scene = room()
+    view = scene.seen_by(BLOCKS[0])
+    before = torchpt.render(view)
+    scene.params["materials.grey.reflectance"].fill_(0.9)
+    after = torchpt.render(view)
+    assert not torch.equal(before, after)
+    assert torch.equal(after, torchpt.render(scene.seen_by(BLOCKS[0])))
+    scene.params["shapes.ball.to_world"][0, 3] += 0.2
+    assert torch.equal(torchpt.render(view), torchpt.render(scene.seen_by(BLOCKS[0])))
+    assert torch.equal(torchpt.render(scene), torchpt.render(scene))
+
+
+# -- errors
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    (
+        ({"cameras": []}, "cameras: "),
+        ({"cameras": BLOCKS[0]}, "cameras: "),
+        ({"cameras": [BLOCKS[0], 3]}, r"cameras\[1\]: "),
+        ({"cameras": [BLOCKS[0], {**BLOCKS[0], "fov": -1}]}, r"^cameras\[1\]\.fov: "),
+        ({"cameras": torch.eye(4)}, r"cameras: .*\(C, 4, 4\)"),
+        ({"cameras": torch.eye(3)[None]}, r"^cameras\[0\]: .*shape \(4, 4\)"),
+        ({"cameras": torch.eye(4)[None], "params": {"camera.to_world": torch.eye(4)[None].repeat(2, 1, 1)}}, "poses"),
+        (
+            {"params": {"materials.grey.reflectance": torch.ones(3, 3)}},
+            "^params: expected as many as there are scenes, 2",
+        ),
+        ({"params": [{}]}, "^params: expected as many"),
+        ({"params": [{}, {"materials.gray.reflectance": torch.ones(3)}]}, r"^scenes\[1\]\.params\.materials\.gray"),
+        ({"params": {"a": torch.ones(2), "b": torch.ones(3)}}, "^params.b: .*first dimension of 2"),
+        ({"params": {"a": 1.0}}, "^params.a: "),
+        ({"params": 3}, "^params: "),
+        ({"seed": [1, 2, 3]}, "^seed: "),
+        ({"seed": [[1], [1, 2]]}, "^seed: "),
+        ({"seed": [1, -2]}, r"render\.seed: "),
+        ({"spp": 0}, r"render\.spp: "),
+        ({"checkpoint": "a.ckpt"}, "^render.checkpoint: "),
+        ({"max_memory": "1kB"}, "^render.max_memory: .*pictures alone"),
+        ({"film": {"aovs": ["depth"]}}, r"film\.aovs: .*full=True"),
+    ),
+    ids=str,
+)
+def test_what_is_refused(arguments, message):
+    with pytest.raises(SceneError, match=message):
+        torchpt.render_batch([room(), room(0.1)], **arguments)
+
+
+def test_no_scenes_and_films_of_other_sizes():
+    with pytest.raises(SceneError, match="^scenes: expected one scene at least"):
+        torchpt.render_batch([])
+    with pytest.raises(SceneError, match=r"^scenes\[1\]\.film\.width: expected a picture of 24 x 16"):
+        torchpt.render_batch([room(), room(film={"width": 8, "height": 8})])
+
+
+@pytest.mark.parametrize("threads", (1, 2))
+def test_an_error_names_its_scene(threads):
+    bad = room()
+    bad.params["shapes.lamp.emission"].fill_(float("nan"))
+    scenes = [room(), room(0.1), bad, room(0.2)]
+    wish = {"integrator": {"type": "path", "strict": True}, "threads": threads}
+    with pytest.raises(RenderError, match=r"^scenes\[2\]: integrator\.strict: sample"):
+        torchpt.render_batch(scenes, **wish)
+    moved = room()
+    moved.params["shapes.ball.to_world"][0, 3] = float("inf")
+    with pytest.raises(SceneError, match=r"^scenes\[1\]\.params\.shapes\.ball: expected places"):
+        torchpt.render_batch([room(), moved], threads=threads)
+
+
+def test_what_watches_may_raise():
+    class Stop(Exception):
+        pass
+
+    def stop(done: int, total: int | None) -> None:
+        if done == 2:
+            raise Stop
+
+    with pytest.raises(Stop):
+        torchpt.render_batch([room(0.1 * k) for k in range(4)], on_progress=stop, threads=2)
+
+
+def test_memory_that_runs_out_in_a_thread(monkeypatch):
+    scenes = [room(0.2), room(0.3)]
+    expected = torchpt.render_batch(scenes)
+    plain, failed = loop_kernels.Kernels.generate, []
+
+    def once(self, chosen):
+        if not failed:
+            failed.append(True)
+            raise MemoryError
+        return plain(self, chosen)
+
+    monkeypatch.setattr(loop_kernels.Kernels, "generate", once)
+    assert torch.equal(torchpt.render_batch(scenes, threads=2), expected) and failed
+
+
+def test_cameras_of_tensors_and_views_of_their_own():
+    """A view's camera may be of tensors with gradients; what compiled graphs and texels after loading keep is each view's."""
+    scene = room()
+    fov = torch.tensor(40.0, requires_grad=True)
+    camera = {"origin": [0, 0.2, 3], "target": [0, 0, 0]}
+    view = scene.seen_by({**camera, "fov": fov})
+    assert view.number != scene.number and view.textured is not scene.textured
+    torchpt.render(view, spp=4).sum().backward()
+    alone = scene.seen_by({**camera, "fov": 40.0})
+    leaf = alone.params["camera.fov"].clone().requires_grad_()
+    torchpt.render(alone, params={"camera.fov": leaf}, spp=4).sum().backward()
+    assert fov.grad is not None and leaf.grad is not None and torch.equal(fov.grad, leaf.grad)
+    found = torch.func.grad(lambda x: torchpt.render(view, params={"camera.fov": x}, spp=4).sum())(torch.tensor(40.0))
+    assert torch.equal(found, leaf.grad)
+    with pytest.raises(SceneError, match="transforms go through render"):
+        torch.func.grad(lambda x: torchpt.render_batch(scene, params=[{"camera.fov": x}], spp=1).sum())(fov.detach())

@@ -1,0 +1,296 @@
+"""torch's own tools around ``render``: ``torch.func``, ``autograd.functional``, checkpoints, several backward passes, modes."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+import torchpt
+from torchpt.errors import SceneError, TorchptError
+
+WALL = "materials.wall.reflectance"
+WISHES: dict[str, Any] = {"spp": 4, "seed": 3, "threads": 1, "compile": "off"}
+ROOM: dict[str, Any] = {
+    "camera": {"type": "perspective", "origin": [0, 0, 4], "target": [0, 0, 0], "fov": 40},
+    "film": {"width": 6, "height": 5, "filter": "box"},
+    "integrator": {"type": "path", "max_depth": 3},
+    "materials": {"wall": {"type": "diffuse", "reflectance": [0.6, 0.4, 0.2]}},
+    "shapes": {"back": {"type": "rectangle", "material": "wall", "transform": [{"scale": 2}]}},
+    "lights": {"sun": {"type": "point", "position": [1, 1, 2], "intensity": 5}},
+}
+
+
+@pytest.fixture(scope="module")
+def scene() -> torchpt.Scene:
+    return torchpt.load(ROOM, "cpu")
+
+
+@pytest.fixture
+def colour(scene) -> Tensor:
+    return scene.params[WALL].clone()
+
+
+@pytest.fixture
+def picture(scene) -> Callable[[Tensor], Tensor]:
+    return lambda colour: torchpt.render(scene, params={WALL: colour}, **WISHES)
+
+
+@pytest.fixture
+def loss(picture) -> Callable[[Tensor], Tensor]:
+    return lambda colour: (picture(colour) ** 2).mean()
+
+
+def gradient(loss: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    """By ``backward``, which all else is held against."""
+    leaf = at.clone().requires_grad_()
+    loss(leaf).backward()
+    assert leaf.grad is not None and float(leaf.grad.abs().max()) > 0
+    return leaf.grad
+
+
+# -- torch.func
+
+
+def test_func_grad_and_vjp(picture, loss, colour):
+    expected = gradient(loss, colour)
+    assert torch.equal(torch.func.grad(loss)(colour), expected)
+    value, back = torch.func.vjp(loss, colour)[:2]
+    assert torch.equal(back(torch.ones(()))[0], expected) and torch.equal(value, loss(colour))
+    back = torch.func.vjp(picture, colour)[1]
+    torch.testing.assert_close(back(2 * picture(colour) / 90)[0], expected)
+
+
+def test_func_grad_of_a_pose_and_of_constants_beside_it(scene, colour):
+    def loss(pose: Tensor, colour: Tensor) -> Tensor:
+        return torchpt.render(scene, params={WALL: colour, "camera.to_world": pose}, **WISHES).mean()
+
+    pose = scene.params["camera.to_world"]
+    assert torch.equal(torch.func.grad(loss)(pose, colour), gradient(lambda pose: loss(pose, colour), pose))
+
+
+def test_a_refused_parameter_is_refused_under_a_transform_too(loss, colour):
+    for transform in (torch.func.grad, lambda loss: torch.func.vmap(loss)):
+        with pytest.raises(SceneError, match=f"params.{WALL}: expected"):
+            transform(loss)(torch.stack([colour - 5, colour - 5]) if transform is not torch.func.grad else colour - 5)
+
+
+def test_vmap_renders_one_picture_after_the_other(picture, loss, colour):
+    colours = torch.stack([colour, colour / 2])
+    assert torch.equal(torch.func.vmap(picture)(colours), torch.stack([picture(c) for c in colours]))
+    grads = torch.stack([gradient(loss, c) for c in colours])
+    assert torch.equal(torch.func.vmap(torch.func.grad(loss))(colours), grads)
+    torch.testing.assert_close(torch.func.grad(lambda c: torch.func.vmap(loss)(c).sum())(colours), grads)
+    assert torch.equal(torch.func.vmap(picture, in_dims=1)(colours.T.contiguous())[1], picture(colour / 2))
+
+
+def test_a_full_rendering_of_a_batch_is_refused(scene, colour):
+    with pytest.raises(SceneError, match=r"full: expected False under torch\.func\.vmap"):
+        torch.func.vmap(lambda c: torchpt.render(scene, params={WALL: c}, full=True, **WISHES).image)(colour[None])
+
+
+def test_jacobians_by_batches_of_cotangents(picture, colour):
+    def mean(colour: Tensor) -> Tensor:
+        return picture(colour).mean((0, 1))
+
+    expected = torch.stack(
+        [torch.autograd.grad(mean(leaf := colour.clone().requires_grad_())[k], leaf)[0] for k in range(3)]
+    )
+    assert torch.equal(torch.func.jacrev(mean)(colour), expected)
+    assert torch.equal(torch.autograd.functional.jacobian(mean, colour), expected)
+    # torch's older kind of batches, which no function of a caller's own ever sees as such
+    with pytest.raises(TorchptError, match=r"^render takes batches of cotangents by torch\.func\.jacrev alone"):
+        torch.autograd.functional.jacobian(mean, colour, vectorize=True)
+
+
+def test_functional_vjp(loss, colour):
+    found: Any = torch.autograd.functional.vjp(loss, colour)[1]
+    assert torch.equal(found, gradient(loss, colour))
+
+
+FORWARD_MODE = {
+    "jvp": lambda loss, c: torch.func.jvp(loss, (c,), (c,)),
+    "jacfwd": lambda loss, c: torch.func.jacfwd(loss)(c),
+    "hessian": lambda loss, c: torch.func.hessian(loss)(c),
+}
+TWICE = {
+    "create_graph": lambda loss, c: torch.autograd.grad(gradient_on_tape(loss, c), c),
+    "grad of grad": lambda loss, c: torch.func.grad(lambda c: torch.func.grad(loss)(c).sum())(c),
+    "hvp": lambda loss, c: torch.autograd.functional.hvp(loss, c, c),
+    "vhp": lambda loss, c: torch.autograd.functional.vhp(loss, c, c),
+    "functional.jvp": lambda loss, c: torch.autograd.functional.jvp(loss, c, c),
+    "functional.hessian": lambda loss, c: torch.autograd.functional.hessian(loss, c),
+}
+
+
+def gradient_on_tape(loss: Callable[[Tensor], Tensor], leaf: Tensor) -> Tensor:
+    leaf.requires_grad_()
+    return torch.autograd.grad(loss(leaf), leaf, create_graph=True)[0].sum()
+
+
+own = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's, where it first meets forward mode
+
+
+@own
+@pytest.mark.parametrize("way", FORWARD_MODE)
+def test_forward_mode_says_what_does_instead(loss, colour, way):
+    with pytest.raises(TorchptError, match=r"^render has no forward-mode derivatives .*: take torch\.func\.vjp"):
+        FORWARD_MODE[way](loss, colour)
+
+
+@own
+def test_dual_numbers_say_so_too(loss, colour):
+    with torch.autograd.forward_ad.dual_level(), pytest.raises(TorchptError, match="forward-mode"):
+        loss(torch.autograd.forward_ad.make_dual(colour, colour))
+
+
+@pytest.mark.parametrize("way", TWICE)
+def test_second_derivatives_say_what_does_instead(loss, colour, way):
+    with pytest.raises(TorchptError, match="^render has no second derivatives: take the difference of two gradients"):
+        TWICE[way](loss, colour)
+
+
+def test_create_graph_alone_gives_the_gradient(loss, colour):
+    leaf = colour.clone().requires_grad_()
+    (found,) = torch.autograd.grad(loss(leaf), leaf, create_graph=True)
+    assert torch.equal(found.detach(), gradient(loss, colour))
+
+
+# -- graphs of several renders, and several backward passes
+
+
+def test_two_renders_of_one_parameter_add_up(loss, colour):
+    twice = gradient(lambda c: loss(c) + loss(c), colour)
+    torch.testing.assert_close(twice, 2 * gradient(loss, colour), rtol=1e-6, atol=0)
+
+
+def test_a_graph_that_is_kept_gives_the_same_gradient_again(loss, colour):
+    leaf = colour.clone().requires_grad_()
+    value = loss(leaf)
+    value.backward(retain_graph=True)
+    assert leaf.grad is not None
+    first = leaf.grad.clone()
+    value.backward()
+    assert torch.equal(leaf.grad, 2 * first)
+    with pytest.raises(RuntimeError, match="second time"):
+        value.backward()
+
+
+def test_a_parameter_changed_before_the_backward_pass_is_noticed(picture, colour):
+    leaf = colour.clone().requires_grad_()
+    value = picture(leaf).mean()
+    with torch.no_grad():
+        leaf.mul_(0.5)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        value.backward()
+
+
+@pytest.mark.parametrize("reentrant", [False, True])
+def test_checkpointing(loss, colour, reentrant):
+    found = gradient(lambda c: checkpoint(loss, c, use_reentrant=reentrant), colour)  # pyright: ignore
+    assert torch.equal(found, gradient(loss, colour))
+
+
+def test_layers_under_func_grad(scene):
+    def depth(pose: Tensor) -> Tensor:
+        wish = {**WISHES, "film": {**ROOM["film"], "aovs": ["depth"]}}
+        return torchpt.render(scene, params={"camera.to_world": pose}, full=True, **wish)["depth"].mean()
+
+    pose = scene.params["camera.to_world"]
+    leaf = pose.clone().requires_grad_()
+    depth(leaf).backward()
+    assert torch.equal(torch.func.grad(depth)(pose), leaf.grad) and float(leaf.grad[2, 3]) == pytest.approx(1, rel=0.1)
+
+
+# -- modes
+
+
+@pytest.mark.parametrize("mode", ["off", "auto"])
+def test_autocast_changes_no_bit(scene, colour, mode):
+    wishes = {**WISHES, "compile": mode}
+
+    def loss(colour: Tensor) -> Tensor:
+        return torchpt.render(scene, params={WALL: colour, "camera.to_world": pose}, **wishes).square().mean()
+
+    pose = scene.params["camera.to_world"].clone().requires_grad_()
+    plain, expected = torchpt.render(scene, **wishes), gradient(loss, colour)
+    of_pose, pose.grad = pose.grad, None
+    fresh = copy.deepcopy(scene)  # what is kept of a scene is made in the mode too
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(torchpt.render(fresh, **wishes), plain)
+        assert torch.equal(gradient(loss, colour), expected)
+    assert pose.grad is not None and of_pose is not None and torch.equal(pose.grad, of_pose)
+
+
+def test_a_half_precision_parameter_gets_a_half_precision_gradient(loss, colour):
+    half = colour.bfloat16()
+    found = gradient(loss, half)
+    assert found.dtype == torch.bfloat16
+    torch.testing.assert_close(found.float(), gradient(loss, half.float()), rtol=0.01, atol=0)
+
+
+def test_no_grad(loss, colour):
+    leaf = colour.clone().requires_grad_()
+    with torch.no_grad():
+        assert not loss(leaf).requires_grad
+    assert loss(leaf).requires_grad
+
+
+def test_a_scene_is_the_same_outside_of_inference_mode(picture, loss, colour, scene):
+    fresh = copy.deepcopy(scene)
+    expected, plain = gradient(loss, colour), torchpt.render(scene, **WISHES)
+    with torch.inference_mode():
+        assert torch.equal(torchpt.render(fresh, **WISHES), plain)
+        assert torch.equal(torchpt.render(fresh, params={WALL: colour * 1.0}, **WISHES), plain)
+        fresh.params[WALL].mul_(0.5)
+        darker = torchpt.render(fresh, **WISHES)
+        assert not torch.equal(darker, plain)
+        fresh.params[WALL].mul_(2.0)
+        loaded = torchpt.load(ROOM, "cpu")
+    for found in (fresh, loaded):
+        assert torch.equal(torchpt.render(found, **WISHES), plain)
+        leaf = colour.clone().requires_grad_()
+        (torchpt.render(found, params={WALL: leaf}, **WISHES) ** 2).mean().backward()
+        assert leaf.grad is not None and torch.equal(leaf.grad, expected)
+
+
+def test_tensors_of_inference_mode_may_stand_in_a_scene(colour, loss):
+    with torch.inference_mode():
+        found = copy.deepcopy(torchpt.load(ROOM, "cpu"))  # its parameters are copied in that mode
+        bright = colour * 1.5
+    assert all(value.is_inference() for value in found.params.values())
+    leaf = colour.clone().requires_grad_()
+    (torchpt.render(found, params={WALL: leaf}, **WISHES) ** 2).mean().backward()
+    assert leaf.grad is not None and torch.equal(leaf.grad, gradient(loss, colour))
+    with torch.inference_mode():
+        before = torchpt.render(found, **WISHES)
+        found.params[WALL].copy_(bright)  # counts no version
+        torch.testing.assert_close(torchpt.render(found, **WISHES), 1.5 * before)
+
+
+def test_texels_in_a_colours_place_under_transforms() -> None:
+    """The scene with a texture in that place is made outside of any transform, and serves afterwards."""
+    described = {
+        "camera": {"origin": [0, 1, 4], "target": [0, 0, 0]},
+        "film": {"width": 6, "height": 6},
+        "materials": {"paint": {"type": "diffuse"}},
+        "shapes": {"wall": {"type": "rectangle", "material": "paint"}},
+        "lights": {"sky": {"type": "constant"}},
+    }
+    scene = torchpt.load(described, "cpu")
+
+    def picture(texels: torch.Tensor) -> torch.Tensor:
+        return torchpt.render(scene, params={"materials.paint.reflectance": texels}, spp=4)
+
+    texels = torch.rand(2, 4, 4, 3, generator=torch.Generator().manual_seed(1))
+    found = torch.func.grad(lambda x: picture(x).sum())(texels[0])
+    leaf = texels[0].clone().requires_grad_()
+    picture(leaf).sum().backward()
+    assert leaf.grad is not None and torch.equal(found, leaf.grad) and float(found.norm()) > 0
+    both = torch.func.vmap(picture)(texels)
+    assert torch.equal(both, torch.stack([picture(one) for one in texels]))

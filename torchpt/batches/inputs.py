@@ -1,0 +1,128 @@
+"""What a batch is given, read and checked: cameras, parameters, seeds; and how errors name the scene that they are about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.errors import AssetError, NotBuiltError, RenderError, SceneError
+
+__all__ = ["Cameras", "Seeds", "cameras_of", "named", "params_of", "seeds_of"]
+
+#: Blocks of scene files, poses ``(4, 4)``, or a tensor of poses ``(C, 4, 4)``.
+Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
+#: One for all, one for each scene, or one for each scene and camera.
+Seeds = int | Sequence[int] | Sequence[Sequence[int]] | None
+
+
+def cameras_of(cameras: Cameras) -> Sequence[Mapping[str, Any] | Tensor | None]:
+    """The cameras of a batch one by one; None stands for each scene's own.
+
+    Raises:
+        SceneError: something else.
+    """
+    if cameras is None:
+        return [None]
+    expected = "a sequence of camera blocks or poses (4, 4), or a tensor (C, 4, 4)"
+    if isinstance(cameras, Tensor | np.ndarray):
+        cameras = torch.as_tensor(cameras)
+        if cameras.dim() != 3 or not len(cameras):
+            raise SceneError("cameras", tuple(cameras.shape), expected)
+        return list(cameras.unbind())
+    if not isinstance(cameras, Sequence) or isinstance(cameras, str) or not cameras:
+        raise SceneError("cameras", cameras, expected)
+    found: list[Mapping[str, Any] | Tensor] = []
+    for c, camera in enumerate(cameras):
+        if not isinstance(camera, Mapping | Tensor | np.ndarray):
+            raise SceneError(f"cameras[{c}]", camera, expected)
+        found.append(camera if isinstance(camera, Mapping) else torch.as_tensor(camera))
+    return found
+
+
+def params_of(params: Any) -> Sequence[Mapping[str, Tensor]] | None:
+    """The parameters of each scene of a batch; None where there are none.
+
+    Raises:
+        SceneError: tensors without a leading dimension, or of different ones; neither a mapping nor a sequence of mappings.
+    """
+    if params is None:
+        return None
+    if isinstance(params, Mapping):
+        size: int | None = None
+        for name, value in params.items():
+            if not isinstance(value, Tensor) or value.dim() < 1 or not len(value):
+                found = tuple(value.shape) if isinstance(value, Tensor) else value
+                raise SceneError(f"params.{name}", found, "a tensor whose first dimension is the number of scenes")
+            size = size or len(value)
+            if len(value) != size:
+                raise SceneError(
+                    f"params.{name}", tuple(value.shape), f"a first dimension of {size}, as the first parameter's"
+                )
+        parts = {name: value.unbind() for name, value in params.items()}
+        return [{name: part[s] for name, part in parts.items()} for s in range(size)] if size else None
+    if isinstance(params, Sequence) and not isinstance(params, str) and params:
+        for s, own in enumerate(params):
+            if not isinstance(own, Mapping):
+                raise SceneError(f"params[{s}]", own, "a mapping from names to tensors")
+        return params
+    raise SceneError("params", params, "a mapping to tensors with a leading dimension, or a sequence of mappings")
+
+
+def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, int], Any]:
+    """The seed of scene ``s`` and camera ``c`` (None: the scene's own).
+
+    Args:
+        seed: as it was given.
+        scenes: how many there are; None: that is not known.
+        cameras: how many there are.
+
+    Raises:
+        SceneError: too few or too many.
+    """
+    if seed is None or isinstance(seed, int):
+        return lambda s, c: seed
+    whole = seed.tolist() if isinstance(seed, Tensor | np.ndarray) else seed
+    expected = f"a whole number, a sequence of {scenes or 'as many as there are scenes'}, or of sequences of {cameras}"
+    if not isinstance(whole, Sequence) or isinstance(whole, str) or (scenes is not None and len(whole) != scenes):
+        raise SceneError("seed", whole, expected)
+    for row in whole:
+        if isinstance(row, Sequence) and (isinstance(row, str) or len(row) != cameras):
+            raise SceneError("seed", whole, expected)
+
+    def of(s: int, c: int) -> Any:
+        if s >= len(whole):
+            raise SceneError("seed", len(whole), "as many as there are scenes")
+        row = whole[s]
+        return row[c] if isinstance(row, Sequence) else row
+
+    return of
+
+
+@contextmanager
+def named(scene: str, camera: int | None) -> Iterator[None]:
+    """Errors within say which scene of a batch they are about, and those of a camera's block which camera.
+
+    Args:
+        scene: such as ``scenes[3]``; "" where there is but one.
+        camera: its number; None where scenes have their own.
+    """
+    try:
+        yield
+    except SceneError as error:
+        key = error.key
+        if camera is not None and key.startswith(("camera", "params.camera.to_world")):
+            key = f"cameras[{camera}]{key.removeprefix('params.camera.to_world').removeprefix('camera')}"
+        elif scene and not key.startswith(("scenes[", "params[", "cameras[", "seed")):
+            key = f"{scene}.{key}"
+        made = NotBuiltError if isinstance(error, NotBuiltError) else SceneError
+        raise made(key, error.value, error.expected, error.file) from None
+    except AssetError as error:
+        raise AssetError(error.file, f"{error.problem} ({scene})" if scene else error.problem) from None
+    except RenderError as error:
+        known = not scene or str(error).startswith(scene)
+        raise RenderError(str(error) if known else f"{scene}: {error}") from None

@@ -1,0 +1,256 @@
+"""Cameras as other libraries have them: blocks of a scene made of theirs, and theirs made of a scene's camera.
+
+All agree on a pinhole of ``fx fy cx cy`` in pixels; they differ in axes, in which way the pose goes, and in where pixels are
+counted from.
+
+====================  =======================================  ==================  ==========================
+whose                 axes of the camera                       pose                the first pixel's middle
+====================  =======================================  ==================  ==========================
+torchpt, Mitsuba      x left, y up, looks along +z             camera to world     (0.5, 0.5)
+OpenCV's, COLMAP      x right, y down, looks along +z          world to camera     (0.5, 0.5) in COLMAP
+cv2, kornia           x right, y down, looks along +z          world to camera     (0, 0)
+OpenGL, glTF,         x right, y up, looks along -z            camera to world     (0.5, 0.5)
+Blender, NeRF
+PyTorch3D             x left, y up, looks along +z             world to camera,    (0.5, 0.5) on its screen
+                                                               rows times ``R``
+====================  =======================================  ==================  ==========================
+
+Tensors go in and come out: gradients flow through both ways. Numbers, lists and arrays are taken as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchpt.errors import SceneError
+from torchpt.math.tensor_transforms import placed
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
+
+    from torchpt.scene.scene import Scene
+
+__all__ = [
+    "OpenGLCamera", "from_kornia", "from_opencv", "from_opengl", "from_pytorch3d", "to_kornia", "to_opencv", "to_opengl",
+    "to_pytorch3d",
+]  # fmt: skip
+
+#: A scene's ``camera`` block.
+Block = dict[str, Any]
+#: Width and height of a picture in pixels.
+Size = tuple[int, int]
+
+
+class OpenGLCamera(NamedTuple):
+    """A camera with OpenGL's axes: those of glTF, Blender and NeRF."""
+
+    matrix: Tensor  # (4, 4) camera to world; x right, y up, looks along -z
+    K: Tensor  # (3, 3) in pixels from the picture's corner
+    fov: Tensor  # (2,) degrees along x and y, of a film whose middle it looks at
+    size: Size
+
+
+def from_opencv(K: Any, R: Any, t: Any, size: Size, first_pixel: float = 0.5) -> Block:
+    """A camera of OpenCV's matrices: a point ``X`` of the world lies at ``R X + t`` (+x right, +y down, +z ahead).
+
+    Args:
+        K: ``(3, 3)`` in pixels, without skew.
+        R: ``(3, 3)`` rotation.
+        t: ``(3,)``.
+        size: width and height in pixels of the picture that ``K`` belongs to.
+        first_pixel: where ``K`` has the middle of the first pixel, along x and y: 0.5 as COLMAP, 0 as ``cv2``.
+    """
+    inner = _moved(_tensor(K, "K", (3, 3)), 0.5 - first_pixel)
+    pose = {"R": _tensor(R, "R", (3, 3)), "t": _tensor(t, "t", (3,))}
+    return {"type": "perspective", "K": inner, **pose, "size": [int(size[0]), int(size[1])]}
+
+
+def to_opencv(
+    scene: Scene,
+    params: Mapping[str, Tensor] | None = None,
+    film: Mapping[str, Any] | None = None,
+    dtype: torch.dtype = torch.float32,
+    first_pixel: float = 0.5,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``K (3, 3)``, ``R (3, 3)`` and ``t (3,)`` of a scene's camera.
+
+    Args:
+        scene: whose.
+        params: tensors in place of the scene's; gradients flow to those of the camera, and to the scene's own.
+        film: film settings in place of the scene's own, such as ``width`` and ``height``.
+        dtype: of the matrices.
+        first_pixel: where ``K`` is to have the middle of the first pixel.
+
+    Raises:
+        SceneError: a camera that is no pinhole's.
+    """
+    inner, turn, move = scene.pinhole(params, film, torch.float64)
+    return _moved(inner, first_pixel - 0.5).to(dtype), turn.to(dtype), move.to(dtype)
+
+
+def from_opengl(
+    matrix: Any,
+    fov: Any = None,
+    fov_axis: str = "x",
+    *,
+    K: Any = None,
+    size: Size | None = None,
+    first_pixel: float = 0.5,
+) -> Block:
+    """A camera of OpenGL's axes: of glTF, Blender and NeRF.
+
+    Args:
+        matrix: ``(4, 4)`` or ``(3, 4)`` camera to world; x right, y up, looks along -z. A scale is ignored, as in glTF.
+        fov: full angle in *degrees* (glTF's ``yfov`` and NeRF's ``camera_angle_x`` are radians).
+        fov_axis: what it spans: ``y`` for glTF's, ``x`` for NeRF's, ``larger`` for Blender's.
+        K: ``(3, 3)`` in place of ``fov``, in pixels of a picture of ``size``.
+        size: width and height in pixels of that picture.
+        first_pixel: where ``K`` has the middle of the first pixel.
+
+    Raises:
+        SceneError: neither a ``fov`` nor ``K``, or both; a ``K`` without ``size``.
+    """
+    if (fov is None) == (K is None):
+        raise SceneError("fov", fov, "an angle in degrees, or K and size, one of the two")
+    if K is not None and size is None:
+        raise SceneError("size", size, "[width, height] of the picture that K belongs to")
+    pose = _pose(matrix)
+    block: Block = {
+        "type": "perspective",
+        "to_world": placed(pose[:, :3] * pose.new_tensor([-1.0, 1.0, -1.0]), pose[:, 3]),
+    }
+    if K is None:
+        return {**block, "fov": fov, "fov_axis": fov_axis}
+    assert size is not None
+    inner = _moved(_tensor(K, "K", (3, 3)), 0.5 - first_pixel)
+    return {**block, "K": inner, "size": [int(size[0]), int(size[1])]}
+
+
+def to_opengl(
+    scene: Scene,
+    params: Mapping[str, Tensor] | None = None,
+    film: Mapping[str, Any] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> OpenGLCamera:
+    """A scene's camera with OpenGL's axes. Arguments and errors as :func:`to_opencv`."""
+    inner, turn, move = scene.pinhole(params, film, torch.float64)
+    width, height = scene.film_size(film)
+    matrix = placed(turn.T * turn.new_tensor([1.0, -1.0, -1.0]), -(turn.T @ move))
+    halves = inner.new_tensor([width, height]) * 0.5
+    fov = torch.atan2(halves, torch.stack((inner[0, 0], inner[1, 1]))) * (360.0 / math.pi)
+    return OpenGLCamera(matrix.to(dtype), inner.to(dtype), fov.to(dtype), (width, height))
+
+
+def from_kornia(camera: PinholeCamera, index: int = 0) -> Block:
+    """One of the cameras of kornia's ``PinholeCamera``, in whose pixels the first one's middle is (0, 0).
+
+    Args:
+        camera: the batch of cameras.
+        index: which of them.
+    """
+    outer = camera.extrinsics[index]
+    size = int(camera.width[index]), int(camera.height[index])
+    return from_opencv(camera.intrinsics[index, :3, :3], outer[:3, :3], outer[:3, 3], size, 0.0)
+
+
+def to_kornia(
+    scene: Scene,
+    params: Mapping[str, Tensor] | None = None,
+    film: Mapping[str, Any] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> PinholeCamera:
+    """A scene's camera as kornia's ``PinholeCamera``, a batch of one. Arguments and errors as :func:`to_opencv`.
+
+    ``project`` gives pixels as kornia counts them: a point that is seen in the middle of ``image[row, column]`` lies at
+    ``(column, row)``.
+    """
+    from kornia.geometry.camera import PinholeCamera
+
+    inner, turn, move = to_opencv(scene, params, film, torch.float64, 0.0)
+    whole = placed(inner, torch.zeros_like(move))
+    size = [torch.tensor([side], device=turn.device) for side in scene.film_size(film)]
+    return PinholeCamera(whole[None].to(dtype), placed(turn, move)[None].to(dtype), size[1], size[0])
+
+
+def from_pytorch3d(
+    R: Any, T: Any, focal_length: Any, principal_point: Any = (0.0, 0.0), *, image_size: Any, in_ndc: bool = True
+) -> Block:
+    """A camera of the numbers that PyTorch3D's ``PerspectiveCameras`` has: one camera, or a batch of one.
+
+    Args:
+        R: ``(3, 3)``: a point is a row, and lies at ``X R + T`` in the camera's space.
+        T: ``(3,)``.
+        focal_length: ``()`` or ``(2,)``.
+        principal_point: ``(2,)``.
+        image_size: height and width in pixels, in this order.
+        in_ndc: whether the two before are in PyTorch3D's normalized coordinates, whose smaller side is 2 long; else in pixels.
+    """
+    # Ours is the same camera space, and R's columns are its axes in the world.
+    turn, move = _tensor(R, "R", (3, 3)), _tensor(T, "T", (3,))
+    tall, wide = (int(side) for side in _tensor(image_size, "image_size", (2,)).tolist())
+    focal, point = _tensor(focal_length, "focal_length", None), _tensor(principal_point, "principal_point", (2,))
+    focal = focal.reshape(-1).expand(2)
+    if in_ndc:
+        half = min(wide, tall) * 0.5
+        focal, point = focal * half, point.new_tensor([wide, tall]) * 0.5 - point * half
+    zero = torch.zeros_like(focal[0])
+    inner = (focal[0], zero, point[0], zero, focal[1], point[1], zero, zero, torch.ones_like(zero))
+    pose = placed(turn, -(turn @ move))
+    return {"type": "perspective", "to_world": pose, "K": torch.stack(inner).reshape(3, 3), "size": [wide, tall]}
+
+
+def to_pytorch3d(
+    scene: Scene,
+    params: Mapping[str, Tensor] | None = None,
+    film: Mapping[str, Any] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> dict[str, Any]:
+    """What PyTorch3D's ``PerspectiveCameras(**numbers)`` takes, a batch of one. Arguments and errors as :func:`to_opencv`."""
+    inner, turn, move = scene.pinhole(params, film, torch.float64)
+    wide, tall = scene.film_size(film)
+    half, flip = min(wide, tall) * 0.5, turn.new_tensor([-1.0, -1.0, 1.0])
+    numbers = {
+        "R": turn.T * flip,
+        "T": move * flip,
+        "focal_length": inner.diagonal()[:2] / half,
+        "principal_point": (inner.new_tensor([wide, tall]) * 0.5 - inner[:2, 2]) / half,
+    }
+    found: dict[str, Any] = {key: value[None].to(dtype) for key, value in numbers.items()}
+    return {**found, "image_size": torch.tensor([[tall, wide]], device=turn.device), "in_ndc": True}
+
+
+def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
+    """Numbers in float64, of a shape or a batch of one."""
+    try:
+        found = torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise SceneError(key, value, "numbers") from None
+    if shape is not None and found.shape == (1, *shape):
+        found = found[0]
+    if shape is not None and found.shape != shape:
+        raise SceneError(key, f"shape {tuple(found.shape)}", f"numbers of shape {shape}")
+    return found
+
+
+def _pose(matrix: Any) -> Tensor:
+    """``(3, 4)`` of a ``(4, 4)`` or ``(3, 4)``, its axes of length 1."""
+    try:
+        found = torch.as_tensor(matrix, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise SceneError("matrix", matrix, "a matrix (4, 4) or (3, 4)") from None
+    if found.shape not in ((4, 4), (3, 4)):
+        raise SceneError("matrix", f"shape {tuple(found.shape)}", "a matrix (4, 4) or (3, 4)")
+    axes = found[:3, :3]
+    return torch.cat((axes / torch.linalg.vector_norm(axes, dim=0), found[:3, 3:]), 1)
+
+
+def _moved(matrix: Tensor, offset: float) -> Tensor:
+    """``K`` with its principal point moved by the same number of pixels along both axes."""
+    if offset == 0.0:
+        return matrix
+    return matrix + matrix.new_tensor([[0.0, 0.0, offset], [0.0, 0.0, offset], [0.0, 0.0, 0.0]])

@@ -1,0 +1,204 @@
+"""Rendered pictures as data sets of ``torch.utils.data``: ``RenderDataset`` by index, ``RenderStream`` without end.
+
+An item is a function of its index alone: the same bits in any number of workers, forked or spawned, on any rank. For it,
+what is handed over as ``make`` must be such a function too: draw its random numbers from
+``torch.Generator().manual_seed(index)``. Spawned workers pickle the data set, so that ``make`` must be a function of a
+module, no ``lambda``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, IterableDataset, get_worker_info
+
+from torchpt.errors import SceneError
+from torchpt.rendering import render
+from torchpt.scene import Scene, load
+
+__all__ = ["Made", "RenderDataset", "RenderStream"]
+
+#: A scene or a mapping of the scene format; with arguments of ``torchpt.render`` for it, where there are some.
+Made = Scene | Mapping[str, Any] | tuple[Scene | Mapping[str, Any], Mapping[str, Any]]
+
+
+class _Items:
+    """How an index becomes an item."""
+
+    def __init__(
+        self,
+        make: Callable[[int], Made],
+        cameras: Sequence[Any],
+        spp: int | None,
+        layers: Sequence[str],
+        seed: int,
+        device: str | torch.device,
+        wishes: Mapping[str, Any],
+    ) -> None:
+        for key in ("full", "params", "spp", "seed"):
+            if key in wishes:
+                raise SceneError(key, wishes[key], "an argument of the data set, of `make` or none")
+        if type(seed) is not int or seed < 0:
+            raise SceneError("seed", seed, "a whole number >= 0")
+        self.make, self.layers, self.seed, self.device, self.wishes = make, tuple(layers), seed, device, dict(wishes)
+        self.spp = spp
+        self.cameras = [c if isinstance(c, Mapping) else {"camera.to_world": torch.as_tensor(c)} for c in cameras]
+        self.latest: tuple[int, Scene, dict[str, Any]] | None = None
+
+    def item(self, index: int) -> dict[str, Tensor]:
+        """See :class:`RenderDataset`."""
+        number, view = divmod(index, max(len(self.cameras), 1))
+        scene, own = self._scene(number)
+        wishes: dict[str, Any] = {**self.wishes, **own}
+        film = {**(self.wishes.get("film") or {}), **(own.get("film") or {})}
+        params = {**(self.cameras[view] if self.cameras else {}), **(wishes.pop("params", None) or {})}
+        params = {name: torch.as_tensor(value, dtype=torch.float32) for name, value in params.items()}
+        if get_worker_info() is not None:
+            wishes.setdefault("threads", 1)  # workers share the cores
+        wishes = {"spp": self.spp, "seed": self.seed + index, **wishes, "film": {**film, "aovs": list(self.layers)}}
+        with torch.no_grad():
+            found = render(scene, params=params, full=True, **wishes)
+            world = scene.merged(params)["camera.to_world"]
+            item = {"image": found.image, **{name: found.layers[name] for name in self.layers}, "to_world": world}
+            if "camera.fov" in scene.params:
+                matrices = scene.pinhole(params, film)
+                item |= {"K": matrices.K, "R": matrices.R, "t": matrices.t}
+        return {**{name: value.detach() for name, value in item.items()}, "index": torch.tensor(index)}
+
+    def _scene(self, number: int) -> tuple[Scene, dict[str, Any]]:
+        """A scene and its own wishes; the latest one is kept, for its next camera."""
+        if self.latest is None or self.latest[0] != number:
+            made = self.make(number)
+            source, own = made if isinstance(made, tuple) else (made, {})
+            scene = source if isinstance(source, Scene) else load(dict(source), self.device)
+            self.latest = number, scene, dict(own)
+        return self.latest[1], dict(self.latest[2])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "latest": None}  # workers make their own
+
+
+class RenderDataset(Dataset):
+    """A data set of rendered pictures, by index.
+
+    Item ``i`` is a dict of tensors: ``image (H, W, 3)`` linear RGB; each of ``layers`` by name, ``(H, W, C)``; the camera as
+    ``to_world (4, 4)`` and, of a perspective or thin lens one, as OpenCV's ``K (3, 3)`` in pixels, ``R (3, 3)`` and ``t (3,)``
+    (docs/cameras.md); ``index ()`` int64. ``torch.utils.data.DataLoader`` puts them into batches as they are, where all are of
+    one size.
+
+    Its seed is ``seed + i``. In workers a render takes one thread, else as many as the scene wishes, unless ``threads``
+    says otherwise.
+
+    Args:
+        make: from a scene's index to the scene: a :class:`torchpt.Scene`, a mapping of the scene format, or a pair of one of
+            these and arguments of ``torchpt.render`` (``params`` among them), which win over those of the data set.
+        scenes: how many there are.
+        cameras: poses ``(4, 4)`` from camera to world, or mappings of ``camera.*`` parameters, for each scene: item
+            ``i`` is scene ``i // len(cameras)`` seen by camera ``i % len(cameras)``. Without any, each scene has its own.
+        spp: samples a pixel; None: the scene's own wish.
+        layers: names of layers (``film.aovs``).
+        seed: of item 0; any integer from 0.
+        device: where mappings are loaded.
+        wishes: further arguments of ``torchpt.render``.
+
+    Raises:
+        SceneError: arguments that are not accepted; on access, what ``load`` and ``render`` raise.
+        IndexError: on access, an index that there is not.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int], Made],
+        scenes: int,
+        *,
+        cameras: Sequence[Any] = (),
+        spp: int | None = None,
+        layers: Sequence[str] = (),
+        seed: int = 0,
+        device: str | torch.device = "cpu",
+        **wishes: Any,
+    ) -> None:
+        if type(scenes) is not int or scenes < 0:
+            raise SceneError("scenes", scenes, "a whole number >= 0")
+        self._items, self.scenes = _Items(make, cameras, spp, layers, seed, device, wishes), scenes
+
+    def __len__(self) -> int:
+        return self.scenes * max(len(self._items.cameras), 1)
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        index = int(index)
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index {index} of a data set of {len(self)} items")
+        return self._items.item(index % len(self))
+
+
+class RenderStream(IterableDataset):
+    """The items of a :class:`RenderDataset` one after the other, without end by default.
+
+    Ranks and workers share them: rank ``r`` of ``R`` has the indices ``i`` with ``i % R == r``, and its worker ``w`` of ``W``
+    every ``W``-th of these. So no picture is rendered twice, and one that is rendered on another rank has the same bits.
+
+    Args:
+        make: see :class:`RenderDataset`.
+        scenes: how many there are; None: no end.
+        start: the first index, to go on where a run ended.
+        shard: ``(rank, world)``; by default those of ``torch.distributed``, where it is set up in the process that makes the
+            workers, else ``(0, 1)``.
+        cameras: see :class:`RenderDataset`; so are all others.
+        spp: see there.
+        layers: see there.
+        seed: see there.
+        device: see there.
+        wishes: see there.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[int], Made],
+        scenes: int | None = None,
+        *,
+        start: int = 0,
+        shard: tuple[int, int] | None = None,
+        cameras: Sequence[Any] = (),
+        spp: int | None = None,
+        layers: Sequence[str] = (),
+        seed: int = 0,
+        device: str | torch.device = "cpu",
+        **wishes: Any,
+    ) -> None:
+        if scenes is not None and (type(scenes) is not int or scenes < 0):
+            raise SceneError("scenes", scenes, "a whole number >= 0, or None for no end")
+        if type(start) is not int or start < 0:
+            raise SceneError("start", start, "a whole number >= 0")
+        if shard is not None and not 0 <= shard[0] < shard[1]:
+            raise SceneError("shard", shard, "(rank, world) with 0 <= rank < world")
+        self._items, self.scenes = _Items(make, cameras, spp, layers, seed, device, wishes), scenes
+        self.start, self.shard = start, shard
+        self.seen: tuple[int, int] | None = None  # of the process that made this worker
+
+    def indices(self) -> Iterator[int]:
+        """Those that this process renders, in order."""
+        rank, world = self.shard or self.seen or _ranks()
+        worker = get_worker_info()
+        mine, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        index = self.start + (rank - self.start) % world + world * mine
+        end = None if self.scenes is None else self.scenes * max(len(self._items.cameras), 1)
+        while end is None or index < end:
+            yield index
+            index += world * workers
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        return (self._items.item(index) for index in self.indices())
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "seen": self.seen or _ranks()}  # spawned workers know nothing of ranks
+
+
+def _ranks() -> tuple[int, int]:
+    """Rank and number of ranks; ``(0, 1)`` where there are none."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        return torch.distributed.get_rank(), torch.distributed.get_world_size()
+    return 0, 1

@@ -1,0 +1,105 @@
+"""Several renders at once: their samples are one work list, and what is next is made ready while threads trace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import torch
+
+from torchpt.forward.result import Rendering
+from torchpt.forward.run import Run
+from torchpt.integrators.loop.together import Job, Together
+from torchpt.lanes.graph import Unsupported
+
+__all__ = ["Entry", "render_many"]
+
+#: Renders that are made ready before there is a thread for them, for each thread.
+AHEAD = 2
+
+
+@dataclass
+class Entry:
+    """A render of several.
+
+    Attributes:
+        make: makes it ready; called when it is soon to begin.
+        done: told of the rendering.
+        failed: told of an error instead, which it may raise as another one.
+        run: once it is ready.
+    """
+
+    make: Callable[[], Run]
+    done: Callable[[Rendering], None]
+    failed: Callable[[BaseException], None]
+    run: Run = field(init=False)
+
+
+def render_many(entries: Iterable[Entry], tasks: int) -> None:
+    """Render them, each to the very bits that it has alone.
+
+    The renders that the compiled loop takes, and which nothing but their number of samples ends, share threads and a work list.
+    Others are rendered one after another: by tensor operations (on CUDA above all), to a time or an error, in bounded memory.
+
+    Args:
+        entries: what is to be rendered; taken one by one.
+        tasks: into how many parts the work of a render is cut, as far as that repays.
+
+    Raises:
+        Exception: what an entry's ``failed`` raises; the others are given up then.
+    """
+    crew = Together[Entry](torch.get_num_threads())
+    try:
+        for entry in entries:
+            with torch.no_grad(), _blamed(entry):
+                entry.run = entry.make()
+                spans = entry.run.at_once()
+                if spans is None:
+                    _drain(crew, 0)
+                    entry.done(entry.run.go(None))
+                    del entry.run
+                    continue
+                loop = entry.run.loop
+                assert loop is not None
+                crew.add(Job(entry, loop, loop.blocks(spans, tasks)))
+            _drain(crew, AHEAD * crew.threads * tasks)
+        _drain(crew, 0)
+    finally:
+        crew.close()
+
+
+class _blamed:
+    """Errors within are told to an entry."""
+
+    def __init__(self, entry: Entry) -> None:
+        self.entry = entry
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, Exception):
+            self.entry.failed(error)
+
+
+def _drain(crew: Together[Entry], most: int) -> None:
+    """Take in what threads have done, until no more than ``most`` blocks are pending."""
+    while True:
+        found = crew.next(wait=crew.pending > most)
+        if found is None:
+            if crew.pending <= most:
+                return
+            continue
+        job, share = found
+        entry = job.owner
+        with torch.no_grad(), _blamed(entry):
+            if isinstance(share, Unsupported):
+                entry.run.unsupported = share
+                job.loop.halt()
+            elif isinstance(share, BaseException):
+                raise share
+            else:
+                entry.run.took(share)
+            if job.left == 0:
+                entry.done(entry.run.completed(job.rest))
+                del entry.run

@@ -1,0 +1,119 @@
+"""What a render comes to: the picture so far, its layers, and what is known of both."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchpt.film import KnownError
+from torchpt.forward.causes import causes_of
+from torchpt.forward.result import Rendering
+from torchpt.images.denoiser import GUIDES
+from torchpt.integrators import LAYERS
+from torchpt.native.memory import Meter, let_go, mb
+from torchpt.shortage import needing, ran_out
+
+if TYPE_CHECKING:
+    from torchpt.forward.run import Run
+
+__all__ = ["final", "rendering_of"]
+
+
+def final(run: Run) -> Rendering:
+    """The picture at the end, and why samples of it are not finite.
+
+    Where memory does not suffice, what else is held is given back first.
+    """
+    try:
+        return _told(run)
+    except Exception as error:
+        if not ran_out(error):
+            raise
+    if run.loop is not None:
+        run.loop.release()
+    let_go()
+    size = mb(run.need.picture)
+    with needing(lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}"):
+        return _told(run)
+
+
+def _told(run: Run) -> Rendering:
+    rendering = rendering_of(run)
+    rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(run.scene, run.wave, run.lost)
+    return rendering
+
+
+def rendering_of(run: Run) -> Rendering:
+    """The picture so far; where ranks share a render, what their films hold was joined before."""
+    radiant, film = run.integrator.light, run.picture.film
+    layers = _layers(run)
+    known = None
+    if radiant:
+        values = film.mean() if run.twice is None else run.twice.picture(film)
+        image, known = values.to(run.dtype), _known(run, values)
+    else:
+        shown = layers[next(iter(run.seen))]
+        blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
+        image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else torch.cat((shown, blank), -1)
+    clamped = None
+    if radiant and run.integrator.clamp is not None:
+        before, after = run.light.tolist()
+        clamped = 1.0 - after / before if before > 0 else 0.0
+    counts = (film if radiant else next(iter(run.picture.layers.values()))).counts
+    compile_seconds = 0.0 if run.loop is None else run.loop.kernels.seconds
+    names = run.settings.film.aovs or run.integrator.layers
+    meter = Meter(run.device)
+    return Rendering(
+        image=image,
+        layers={name: layers[name] for name in names},
+        guides={name: layers[name] for name in GUIDES} if run.settings.film.denoise else {},
+        spp=int(counts.sum()) // len(counts),
+        seconds=time.perf_counter() - run.start,
+        load_seconds=run.load_seconds,
+        build_seconds=run.build_seconds,
+        compile_seconds=compile_seconds,
+        render_seconds=run.seconds_of_sampling(),
+        paths=run.done,
+        rays=run.tally.rays,
+        nonfinite_samples=run.lost.count,
+        truncated_paths=run.tally.truncated,
+        clamped=clamped,
+        relmse=None if known is None else known.relmse,
+        relmse_interval=None if known is None else known.interval,
+        heavy_tailed=known is not None and known.heavy_tailed,
+        stopped_by=run.stop.reason,
+        complete=bool(run.stop.reason) and not run.ended,
+        peak_memory=max(meter.peak() - meter.base(), 0),
+        lanes=run.waves.lanes if run.waves is not None and run.waves.halved else None,
+        eager=tuple(run.eager),
+        scene=run.name,
+        settings=run.settings,
+    )
+
+
+def _known(run: Run, picture: Tensor) -> KnownError | None:
+    """The picture's own error."""
+    film = run.picture.film
+    if run.twice is not None:
+        return run.twice.known(film, picture)
+    relmse = film.relmse()
+    return None if relmse is None else KnownError(relmse, None, False)
+
+
+def _layers(run: Run) -> dict[str, Tensor]:
+    """The layers so far: those of first surfaces, and those that the film makes."""
+    layers = {}
+    film = run.picture.film
+    for name, layer in run.seen.items():
+        seen = run.picture.layers[name]
+        values = seen.mean() * (run.unit if layer.length else 1.0) if layer.averaged else seen.first()
+        layers[name] = values.to(run.dtype)
+    for name in run.settings.film.aovs:
+        if name not in run.seen:
+            made: Any = LAYERS[name]  # a FilmLayer
+            counts = film.counts if run.twice is None else run.twice.counts(film)
+            layers[name] = made.of(film, counts).to(run.dtype)
+    return layers

@@ -1,0 +1,145 @@
+"""A scene with chosen parameters as ``nn.Parameter``: ``forward`` renders it."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchpt.errors import SceneError
+from torchpt.nn.ranges import range_of
+from torchpt.rendering import render
+from torchpt.scene import Scene
+
+__all__ = ["Renderer"]
+
+
+class Renderer(nn.Module):
+    """A scene that is rendered, and optimized, as any other module.
+
+    The chosen parameters are ``nn.Parameter`` objects without bounds, which :mod:`torchpt.nn.ranges` keeps in range: whatever
+    an optimizer does to them, the scene can be rendered. ``values()`` gives what they stand for.
+
+    Each ``forward`` in training mode draws other samples: with the same ones in every step an optimizer fits their noise. The
+    seed is ``seed + steps``, where the buffer ``steps`` counts calls in training mode; with ``torch.distributed`` set up,
+    ``seed + steps * world + rank``, so that ranks render different samples of one picture. In ``eval()`` mode it is
+    ``seed``, always. A seed that is handed to ``forward`` wins, and counts nothing.
+
+    Scenes are shared, not copied, and never changed: ``scene.params`` keeps what it had (:meth:`write` changes it). Weights of
+    BSDF models of your own are theirs: hand them to the optimizer beside ``parameters()``.
+
+    Args:
+        scene: from ``torchpt.load``.
+        names: dotted names of ``scene.params``, and patterns of them such as ``materials.*.reflectance``.
+        seed: any integer from 0.
+        rigid: whether poses are turned and moved alone (six numbers each); False: their 16 numbers are parameters, as they are.
+        wishes: further arguments of ``torchpt.render`` for each call.
+
+    Raises:
+        SceneError: a name or pattern without a parameter, or a render's argument that has a place of its own here.
+    """
+
+    steps: Tensor
+
+    def __init__(
+        self, scene: Scene, names: str | Sequence[str] = (), *, seed: int = 0, rigid: bool = True, **wishes: Any
+    ) -> None:
+        super().__init__()
+        for key in ("params", "seed"):
+            if key in wishes:
+                raise SceneError(key, wishes[key], "an argument of Renderer.forward")
+        if type(seed) is not int or seed < 0:
+            raise SceneError("seed", seed, "a whole number >= 0")
+        self.scene, self.seed, self.wishes = scene, seed, wishes
+        self.names = _chosen(scene, (names,) if isinstance(names, str) else names)
+        with torch.no_grad():
+            starts = [scene.params[name].detach() for name in self.names]
+            ranges = [range_of(scene.spec(n), start, rigid) for n, start in zip(self.names, starts, strict=True)]
+            free = {
+                _key(name): nn.Parameter(found.inverse(start).clone())
+                for name, found, start in zip(self.names, ranges, starts, strict=True)
+            }
+        self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
+        self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
+
+    def forward(self, params: Mapping[str, Tensor] | None = None, *, seed: int | None = None, **wishes: Any) -> Any:
+        """Render.
+
+        Args:
+            params: further parameters in place of the scene's, by dotted name, such as those of the camera; of a name that is a
+                parameter of this module, in place of that.
+            seed: in place of the counted one.
+            wishes: arguments of ``torchpt.render``, in place of those given at first.
+
+        Returns:
+            The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
+        """
+        if seed is None:
+            seed = self._next_seed()
+        return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, **{**self.wishes, **wishes})
+
+    def values(self) -> dict[str, Tensor]:
+        """What the parameters stand for, by dotted name, as ``torchpt.render(params=...)`` takes them; gradients flow."""
+        return {name: found(self.free[_key(name)]) for name, found in zip(self.names, self.ranges, strict=True)}
+
+    @torch.no_grad()
+    def assign(self, values: Mapping[str, Tensor]) -> None:
+        """Let parameters stand for other values, by dotted name.
+
+        Raises:
+            SceneError: a name that is not chosen, or a value that the scene does not accept.
+        """
+        for name, value in values.items():
+            if name not in self.names:
+                raise SceneError(f"params.{name}", name, f"one of {', '.join(self.names)}")
+            self.scene.check({name: value})
+            found = self.ranges[self.names.index(name)]
+            self.free[_key(name)].copy_(found.inverse(value.to(self.free[_key(name)])))  # pyright: ignore[reportCallIssue]
+
+    @torch.no_grad()
+    def write(self) -> None:
+        """Put the values into ``scene.params``."""
+        for name, value in self.values().items():
+            self.scene.params[name] = value.detach().clone()
+
+    def _next_seed(self) -> int:
+        if not self.training:
+            return self.seed
+        rank, world = 0, 1
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            rank, world = torch.distributed.get_rank(), torch.distributed.get_world_size()
+        seed = self.seed + int(self.steps) * world + rank
+        self.steps += 1
+        return seed
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Renderer:
+        super()._apply(fn, recurse)
+        self.scene = self.scene.to(self.steps.device)
+        return self
+
+    def extra_repr(self) -> str:
+        """The scene and the names, for ``print``."""
+        return f"{self.scene.name or 'scene'}: {', '.join(self.names) or 'no parameters'}; seed {self.seed}"
+
+
+def _key(name: str) -> str:
+    """How ``torch`` may call a parameter: without dots."""
+    return name.replace(".", "/")
+
+
+def _chosen(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
+    """The parameters that names and patterns stand for, in the scene's order."""
+    found: set[str] = set()
+    for name in names:
+        matches = [each for each in scene.params if each == name or fnmatchcase(each, name)]
+        if not matches:
+            close = difflib.get_close_matches(name, scene.params, 3) or list(scene.params)[:8]
+            raise SceneError(
+                "names", name, f"a parameter of this scene or a pattern of some, such as {', '.join(close)}"
+            )
+        found.update(matches)
+    return tuple(name for name in scene.params if name in found)

@@ -1,0 +1,304 @@
+"""From the arguments of ``render`` to a rendering: what is asked for is checked, completed and made, on a tape or without."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypedDict, Unpack
+
+import torch
+from torch import Tensor
+
+from torchpt import adjoint as adjoints
+from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape, without_gradient
+from torchpt.errors import EdgeWarning, SceneError
+from torchpt.format.description import settings as complete
+from torchpt.forward import Rendering, limited_threads, render_scene
+from torchpt.graphs import known
+from torchpt.images.denoiser import check_denoiser, denoise
+from torchpt.integrators import KINDS as INTEGRATORS
+from torchpt.ranks import Group, together
+from torchpt.scene import Scene
+from torchpt.scene.textured import with_texels
+from torchpt.settings import Settings
+from torchpt.taped import in_batch, wants_gradients
+
+__all__ = ["Common", "Order", "Wishes", "ordered", "rendered"]
+
+
+class Common(TypedDict, total=False):
+    """Arguments of :func:`render` that are the same for all pictures of a batch, for type checkers."""
+
+    spp: int | None
+    integrator: str | Mapping[str, Any] | None
+    sampler: str | Mapping[str, Any] | None
+    film: Mapping[str, Any] | None
+    time_limit: float | None
+    target_error: float | None
+    pilots: bool | str | None
+    checkpoint: str | None
+    resume: bool | None
+    accel: str | None
+    compile: str | bool | None
+    threads: int | str | None
+    max_memory: int | str | None
+    device: str | torch.device | None
+    dtype: torch.dtype
+    adjoint: str | None
+    seed_grad: int | None
+    spp_grad: int | None
+    edges: bool
+    edge_spp: int | None
+    ranks: Group | None
+
+
+class Wishes(Common, total=False):
+    """The other arguments of :func:`render`, for type checkers."""
+
+    seed: int | None
+    params: Mapping[str, Tensor] | None
+
+
+@dataclass(frozen=True)
+class Order:
+    """A picture that was asked for: checked, complete, and not begun.
+
+    Attributes:
+        scene: what is rendered.
+        settings: how.
+        params: tensors in place of the scene's.
+        backward: the backward pass's own seed, its samples a pixel and its samples of edges a pixel (0: none); None: as the
+            forward pass.
+        dtype: of the lanes.
+        adjoint: how gradients are taken.
+        ranks: that share the work.
+    """
+
+    scene: Scene
+    settings: Settings
+    params: Mapping[str, Tensor]
+    backward: Mapping[str, int | None]
+    dtype: torch.dtype
+    adjoint: str
+    ranks: Group | None = None
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """Names of the parameters that are differentiated."""
+        return tuple(name for name, value in self.params.items() if wants_gradients(value))
+
+    @property
+    def taped(self) -> bool:
+        """Whether the picture is to carry gradients."""
+        return torch.is_grad_enabled() and bool(self.wanted or self.scene.weights())
+
+
+#: Of the arguments of ``render``, those that the block ``render`` of a scene file has too.
+_OF_RENDER = (
+    "spp", "seed", "accel", "compile", "threads", "max_memory", "time_limit", "target_error", "pilots", "checkpoint", "resume",
+)  # fmt: skip
+
+
+def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
+    """What the arguments of ``render`` ask for.
+
+    Raises:
+        SceneError: one that is not accepted.
+        RenderError: a denoiser that is not there.
+    """
+    dtype, adjoint, film = wishes.get("dtype", torch.float32), wishes.get("adjoint"), wishes.get("film")
+    backward = {"seed": wishes.get("seed_grad"), "spp": wishes.get("spp_grad"), "edges": wishes.get("edge_spp")}
+    numbers = {"seed_grad": (backward["seed"], 0), "spp_grad": (backward["spp"], 1), "edge_spp": (backward["edges"], 1)}
+    _check(scene, wishes.get("device"), dtype, adjoint, numbers)
+    if not wishes.get("edges", True):
+        backward["edges"] = 0
+    given = {name: wishes.get(name) for name in _OF_RENDER}
+    blocks = {"film": film, "integrator": wishes.get("integrator"), "sampler": wishes.get("sampler"), "render": given}
+    settings = complete(scene.description, blocks)
+    if not full:
+        settings = _of_one_picture(settings, film)
+    elif settings.film.denoise:
+        check_denoiser()
+    params = _given(scene, wishes.get("params"), full)
+    scene = with_texels(scene, params)
+    return Order(scene, settings, params, backward, dtype, adjoint or adjoints.KINDS[0], wishes.get("ranks"))
+
+
+def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
+    """Parameters in place of the scene's, those of its own that want gradients among them.
+
+    Raises:
+        SceneError: an unknown name, or no tensor. All else is checked where they are plain tensors (:mod:`torchpt.taped`).
+    """
+    given = dict(params or {})
+    if any(name not in scene.params or not isinstance(value, Tensor) for name, value in given.items()):
+        scene.check(given)
+    if full and any(in_batch(value) for value in given.values()):
+        raise SceneError("full", True, "False under torch.func.vmap, where a render gives pictures alone")
+    if not torch.is_grad_enabled():
+        return given
+    return {name: value for name, value in scene.params.items() if value.requires_grad} | given
+
+
+def rendered(order: Order, made: list[Rendering] | None = None) -> Rendering:
+    """The rendering that was asked for, on a tape where one is wanted, and denoised where that is.
+
+    ``made``: a list of the rendering alone, without gradients, where it is there already; it is taken out.
+
+    Raises:
+        SceneError: a parameter that is not accepted.
+    """
+    scene, settings = order.scene, order.settings
+
+    def render(params: Mapping[str, Tensor]) -> Rendering:
+        if made:
+            return made.pop()
+        scene.check(params)
+        return known(lambda: render_scene(scene, settings, params=params, dtype=order.dtype, ranks=order.ranks))
+
+    if order.taped:
+        seed = settings.render.seed ^ 0x5DEECE66D if order.backward["seed"] is None else order.backward["seed"]
+        rendering = _differentiable(replace(order, backward={**order.backward, "seed": seed}), render)
+    elif order.params:
+        rendering = _constant(order.params, render)
+    else:
+        rendering = render({})
+    if settings.film.denoise:
+        with limited_threads(settings.render.threads):
+            rendering.denoised = denoise(rendering.image.detach(), **rendering.guides)
+    return rendering
+
+
+def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
+    """Settings of a render that returns a tensor; a scene file's wishes for layers and to denoise are for files.
+
+    Raises:
+        SceneError: such a wish of the caller's own.
+    """
+    if (film or {}).get("aovs") and settings.integrator.light:  # else the picture is a layer
+        raise SceneError("film.aovs", settings.film.aovs, "none, or full=True: a tensor is one picture, without layers")
+    if (film or {}).get("denoise") and settings.film.denoise:
+        expected = "false, or full=True: a tensor is one picture; hand it to torchpt.denoise with its layers"
+        raise SceneError("film.denoise", True, expected)
+    return replace(settings, film=settings.film.but(denoise=False))
+
+
+def _check(
+    scene: Scene,
+    device: str | torch.device | None,
+    dtype: torch.dtype,
+    adjoint: str | None,
+    numbers: Mapping[str, tuple[int | None, int]],
+) -> None:
+    """Refuse arguments of :func:`render` that are no settings; ``numbers`` are whole, with the least of each."""
+    if device not in (None, "auto") and not _same(device, scene.device):
+        raise SceneError("device", str(device), f"the scene's own device {scene.device}; load the scene on the other")
+    if dtype not in (torch.float32, torch.float64):
+        raise SceneError("dtype", dtype, "torch.float32 or torch.float64")
+    if adjoint not in (None, *adjoints.KINDS):
+        raise SceneError("adjoint", adjoint, " or ".join(adjoints.KINDS))
+    for key, (value, low) in numbers.items():
+        if value is not None and (type(value) is not int or value < low):
+            raise SceneError(key, value, f"a whole number >= {low}")
+
+
+def _same(wish: str | torch.device, own: torch.device) -> bool:
+    """Whether a wish for a device names the one that a scene is on."""
+    try:
+        device = torch.device(wish)
+    except RuntimeError:
+        return False
+    return device.type == own.type and device.index in (None, own.index or 0)
+
+
+def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rendering]) -> Rendering:
+    """A rendering whose picture is on a tape from the parameters that are wanted; ``render`` makes it without."""
+    scene, settings, params, backward = order.scene, order.settings, order.params, order.backward
+    wanted, dtype, ranks = order.wanted, order.dtype, order.ranks
+    if not settings.integrator.light:
+        radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
+        raise SceneError("integrator.type", settings.integrator.name, f"one of {radiant} where gradients are wanted")
+    if settings.render.checkpoint is not None:
+        raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
+    attached = adjoints.attached(scene, wanted)
+    if concerns(scene, wanted):
+        _warn_of_edges(scene, settings, backward["edges"] == 0)
+    for name in without_gradient(scene, wanted):
+        said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"
+        warnings.warn(said, EdgeWarning, stacklevel=5)
+    names = (*wanted, *(name for name in params if name not in wanted))
+    made: list[Rendering] = []
+    taken: list[int] = []
+
+    def given_by(*tensors: Tensor) -> dict[str, Tensor]:
+        return dict(zip(names, tensors, strict=True))
+
+    def forward(*tensors: Tensor) -> Tensor:
+        made.append(render(given_by(*tensors)))
+        return made[-1].image
+
+    def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
+        with together(ranks, "the loss", lambda: cotangent.detach().cpu().contiguous().numpy().tobytes()):
+            return gradients(cotangent, *tensors)
+
+    def gradients(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
+        given, of_edges = given_by(*tensors), edges_taken()
+        # One pass that is a derivative of the very estimator takes its own samples again.
+        own = again().render
+        exact = own.seed == settings.render.seed and own.spp == taken[0]
+        held = not exact and adjoints.suits(scene, settings, wanted)
+        found = adjoints.gradients(
+            scene, again(), given, wanted, dtype, attached, order.adjoint, cotangent, held, ranks
+        )
+        if of_edges and concerns(scene, wanted):
+            _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
+            moved = add_gradients(
+                scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held, ranks
+            )
+            found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
+        return [*found[: len(wanted)], *(None for _ in names[len(wanted) :]), *found[len(wanted) :]]
+
+    def again(spp: int | None = None) -> Settings:
+        spp = spp or backward["spp"] or taken[0]
+        return replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
+
+    def edges_taken() -> int:
+        return 0 if backward["edges"] == 0 else backward["edges"] or backward["spp"] or taken[0]
+
+    def asked() -> Asked:
+        return Asked(scene, again(), wanted, dtype, edges_taken())
+
+    tensors = tuple(params[name] for name in names)
+    image = adjoints.on_tape(forward, backward_pass, tensors, scene.weights())
+    rendering = made[-1]
+    made.clear()  # the tape keeps the closures, which are not to keep pictures
+    taken.append(max(rendering.spp, 1))
+    layers = followed(settings)
+    if layers:
+        values = {name: rendering.layers[name] for name in layers}
+        rendering.layers |= on_tape(values, tensors, asked, given_by)
+    return replace(rendering, image=image)
+
+
+def _constant(params: Mapping[str, Tensor], render: Callable[[Mapping[str, Tensor]], Rendering]) -> Rendering:
+    """A rendering without gradients, of parameters that may still be those of a transform of ``torch.func``."""
+    made: list[Rendering] = []
+
+    def forward(*tensors: Tensor) -> Tensor:
+        made.append(render(dict(zip(params, tensors, strict=True))))
+        return made[-1].image
+
+    image = adjoints.on_tape(forward, lambda *_: (), tuple(params.values()), ())
+    return replace(made[-1], image=image)
+
+
+def _warn_of_edges(scene: Scene, settings: Settings, every: bool) -> None:
+    """Say which visibility edges (``every`` one, or those of this scene that are not done) a gradient leaves out."""
+    edges = "all visibility edges (silhouettes and shadow edges that move)"
+    if not every:
+        missing = left_out(scene, settings)
+        if not missing:
+            return
+        edges = f"some edges: {'; '.join(missing)}"
+    warnings.warn(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning, stacklevel=6)

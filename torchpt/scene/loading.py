@@ -1,0 +1,52 @@
+"""From what a user has to a :class:`Scene`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+import torch
+
+from torchpt.bsdfs import Bsdf
+from torchpt.format.description import Source, read_description, settings
+from torchpt.format.tensors import Tensors
+from torchpt.native.modes import lasting
+from torchpt.native.operators import outside_graphs
+from torchpt.scene.devices import device_of
+from torchpt.scene.scene import Scene
+from torchpt.scene.traced import corners_in, traced, widened
+
+__all__ = ["load"]
+
+
+@outside_graphs
+def load(
+    source: Source,
+    device: str | torch.device | None = None,
+    bsdfs: Mapping[str, Bsdf] | None = None,
+) -> Scene:
+    """Load a scene.
+
+    Args:
+        source: the name of a scene that ships, a path ending in ``.yaml``, an open file, YAML text (of more than one line),
+            or a dict of the same schema. Relative paths in it start at the file's folder, else at the current one. In a dict
+            numbers, colours, poses, texels and vertices may be arrays, and tensors on any device: those that require
+            gradients get them from every picture (docs/scenes.md, *Tensors in dicts*).
+        device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
+            ``render.device``, which is ``auto`` where it does not say.
+        bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
+
+    Raises:
+        SceneError: the description is wrong; says where and what is accepted.
+        AssetError: a file that it names is missing or malformed.
+        RenderError: the device is not there.
+    """
+    start = time.perf_counter()
+    tensors = Tensors()
+    description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
+    chosen = device_of(settings(description).render.device if device is None else device)
+    with lasting():
+        scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
+    scene.params |= traced(tensors, scene.description, scene.built, scene.params)
+    scene.load_seconds = time.perf_counter() - start
+    return scene

@@ -1,0 +1,121 @@
+"""Texels where a scene has a number or a colour: the scene with a texture in that place, made once and kept beside it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.bsdfs.resolved import ResolvedMaterial
+from torchpt.errors import NotBuiltError, SceneError
+from torchpt.format.textures import texture_of
+from torchpt.scene.build import Built
+from torchpt.scene.coordinates import check_coordinates
+from torchpt.scene.parameters import Parameters
+from torchpt.scene.scene import Scene
+from torchpt.scene.texels import Opener
+from torchpt.spec import Refused
+from torchpt.taped import in_transform, outside_transforms
+from torchpt.textures import Node
+
+__all__ = ["with_texels"]
+
+
+#: Scenes with texels that are kept beside one, the latest.
+KEPT = 4
+
+
+def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
+    """The scene itself, or where texels are given for numbers and colours of its materials one that reads them there.
+
+    The second one shares the tensors, meshes and pictures of the first; its search structures are its own.
+
+    Args:
+        scene: as it was loaded.
+        params: tensors in place of its own.
+
+    Raises:
+        SceneError: texels where the scene's materials cannot read any, that are out of range, or on a mesh without uvs.
+        NotBuiltError: texels for what a material tabulates.
+    """
+    given = {**scene.params, **(params or {})}
+    with outside_transforms():
+        return _reading_texels(scene, given)
+
+
+def _reading_texels(scene: Scene, given: Mapping[str, Tensor]) -> Scene:
+    loaded = scene.built.parameters
+    texels = {
+        name: _plain(value, loaded[name])
+        for name, value in given.items()
+        if name in loaded and _is_texels(value, loaded[name].ndim)
+    }
+    if not texels:
+        return scene
+    # By size, so that threads that render with different ones at a time do not share a scene.
+    key = tuple(sorted((name, tuple(value.shape)) for name, value in texels.items()))
+    made = scene.textured.get(key)
+    if made is None:
+        made = copy.copy(scene)
+        made.use(_built(scene, texels))
+        for oldest in list(scene.textured)[: max(0, len(scene.textured) + 1 - KEPT)]:
+            scene.textured.pop(oldest, None)
+        scene.textured[key] = made
+    for name in made.params:
+        made.params[name] = texels.get(name, scene.params[name])
+    return made
+
+
+def _is_texels(value: object, dimensions: int) -> bool:
+    return dimensions < 2 and isinstance(value, Tensor) and value.dim() == 3 and value.is_floating_point()
+
+
+def _plain(value: Tensor, loaded: np.ndarray) -> Tensor:
+    """Texels apart from their tape; where transforms of ``torch.func`` hide them, others of their shape stand for them."""
+    if in_transform(value):
+        return torch.full(value.shape, float(loaded.mean()), dtype=value.dtype, device=value.device)
+    return value.detach()
+
+
+def _built(scene: Scene, texels: Mapping[str, Tensor]) -> Built:
+    """What the scene came to, with nodes in place of numbers."""
+    before, file = scene.built, scene.description.file
+    parameters = Parameters()
+    parameters |= before.parameters
+    parameters.specs |= before.parameters.specs
+    parameters.stated |= before.parameters.stated | texels.keys()
+    opener = Opener({}, scene.description.resolve, parameters, file)
+    materials = {m.name: m for owner in (*before.parts, *before.copies) for m in owner.material.all()}
+    nodes: dict[str, dict[str, Node]] = {}
+    for name, value in texels.items():
+        stem, _, slot = name.rpartition(".")
+        material, spec = materials.get(stem), before.parameters.specs[name]
+        if material is None or slot not in material.values or not spec.texture:
+            expected = f"a floating tensor of shape {before.parameters[name].shape}, not texels"
+            raise SceneError(f"params.{name}", f"shape {tuple(value.shape)}", expected)
+        if slot in material.model.tabulated:
+            expected = f"a number, as {material.model.name} tabulates what depends on it"
+            raise NotBuiltError(f"params.{name}", "a texture", expected)
+        if slot == "weight" and any(inner.model.sheer or inner.opacity != 1.0 for inner in material.inner):
+            raise NotBuiltError(f"params.{name}", "a texture", "a number where light passes one of the two by chance")
+        del parameters[name], parameters.specs[name]
+        array = value.to("cpu", torch.float32).numpy()
+        try:
+            texture = texture_of({"type": "image", "data": array}, spec)
+        except Refused as error:
+            raise SceneError(f"params.{name}", error.value, error.expected) from None
+        nodes.setdefault(stem, {})[slot] = opener(texture, name)
+    parts = tuple(replace(part, material=_reading(part.material, nodes)) for part in before.parts)
+    copies = tuple(replace(copied, material=_reading(copied.material, nodes)) for copied in before.copies)
+    check_coordinates([*parts], texels, file)
+    return replace(before, parts=parts, copies=copies, parameters=parameters)
+
+
+def _reading(material: ResolvedMaterial, nodes: Mapping[str, Mapping[str, Node]]) -> ResolvedMaterial:
+    """A material that reads nodes, by its name and their slots; so do those that it blends."""
+    inner = tuple(_reading(one, nodes) for one in material.inner)
+    return replace(material, values={**material.values, **nodes.get(material.name, {})}, inner=inner)

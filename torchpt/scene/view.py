@@ -1,0 +1,62 @@
+"""A scene through another camera: all but that is shared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.format.cameras import read_camera
+from torchpt.format.description import Description
+from torchpt.format.tensors import Tensors
+from torchpt.format.yaml_file import plain
+from torchpt.scene.build import Built
+from torchpt.scene.parameters import Parameters
+from torchpt.scene.traced import traced, widened
+
+__all__ = ["through"]
+
+
+def through(
+    description: Description,
+    built: Built,
+    params: Mapping[str, Tensor],
+    camera: Mapping[str, Any],
+    film: Mapping[str, Any],
+) -> dict[str, Any]:
+    """What of a scene another camera changes, by attribute: its description, what that came to, its parameters.
+
+    Args:
+        description: of the scene.
+        built: what it came to.
+        params: its tensors.
+        camera: the block of the other camera, as written.
+        film: film settings in place of the scene's own.
+
+    Raises:
+        SceneError: what is wrong with the camera.
+    """
+    size = description.film | {name: value for name, value in film.items() if value is not None}
+    tensors = Tensors()
+    chosen = read_camera(tensors.taken_from(plain({"camera": camera}))["camera"], size, None)
+    description = widened(replace(description, camera=chosen), tensors)
+    chosen, parameters = description.camera, Parameters()
+    for name, value in built.parameters.items():
+        if not name.startswith("camera."):
+            parameters.declare(name, value, built.parameters.specs[name])
+    parameters.declare_all("camera", chosen.kind, chosen.values)
+    device = next(iter(params.values())).device
+    far = bool(built.centre.any())
+    own = {
+        name: torch.tensor(
+            value, device=device, dtype=torch.float64 if far and parameters.specs[name].place else torch.float32
+        )
+        for name, value in parameters.items()
+        if name.startswith("camera.")
+    }
+    built = replace(built, parameters=parameters)
+    every = {name: value for name, value in params.items() if not name.startswith("camera.")} | own
+    return {"description": description, "_built": built, "params": every | traced(tensors, description, built, every)}
