@@ -19,9 +19,14 @@ def test_the_lessons_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     blocks = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
-    assert len(blocks) == 3
+    assert len(blocks) == 6
     for block in blocks:
         exec(compile(block, str(PAGE), "exec"), names)
+    for name in ("fov", "paint"):
+        leaf = names[name]
+        assert isinstance(leaf, torch.Tensor) and leaf.grad is not None and float(leaf.grad.norm()) > 0
+    written = torchpt.cameras.read_transforms("transforms.json")
+    assert len(written) == 3 and all(torchpt.read_image(str(path)).shape == (16, 16, 3) for path, _, _ in written)
     found = torch.tensor([float(x) for x in re.findall(r"\d\.\d+", capsys.readouterr().out)])
     right = torchpt.load("cornell_box", "cpu").params["materials.red.reflectance"]
     torch.testing.assert_close(found, right, rtol=0, atol=0.02)

@@ -69,6 +69,27 @@ def test_the_bits_of_one_process(box: torchpt.Scene, broken: torchpt.Scene, size
         assert [name for name in cases if not same(found[name], alone[name])] == []
 
 
+def test_a_batch(box: torchpt.Scene, tmp_path: Path) -> None:
+    """Pictures of a batch have the bits of one process too, and gradients those of all ranks."""
+    poses = box.params["camera.to_world"].repeat(2, 1, 1)
+    poses[1, 0, 3] += 0.1
+
+    def work(group: Any) -> tuple[Any, Any]:
+        leaf = torch.tensor([[0.5, 0.1, 0.1]], requires_grad=True)
+        wishes: dict[str, Any] = {"film": FILM, "threads": 1, "spp": 3, "ranks": group, "edges": False}
+        images = torchpt.render_batch(box, poses, {"materials.red.reflectance": leaf}, **wishes)
+        images.square().mean().backward()
+        assert leaf.grad is not None
+        return images.detach().numpy().copy(), leaf.grad.numpy().copy()
+
+    images, gradient = work(None)
+    found = in_ranks(2, work, tmp_path)
+    for one in found:
+        assert not isinstance(one, Exception), one
+        assert np.array_equal(one[0], images)
+        assert np.array_equal(one[1], found[0][1]) and np.allclose(one[1], gradient, rtol=1e-5)
+
+
 def test_a_checkpoint_of_three_goes_on_in_one_and_back(box: torchpt.Scene, tmp_path: Path) -> None:
     whole = facts(box, {"spp": 12, "pilots": True})
     file = {"checkpoint": str(tmp_path / "a.npz"), "pilots": True, "spp": 12}

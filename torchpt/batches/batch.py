@@ -86,7 +86,7 @@ def render_batch(
     Picture ``[s, c]`` is to the bit ``torchpt.render(scenes[s].seen_by(cameras[c]), params=..., seed=...)``. Threads share one
     list of work over all pictures, and what is next is made ready while they trace. Worlds, search structures and kernels are
     made once for all cameras of a scene. On CUDA, and where pictures are rendered by tensor operations, to a time or an error,
-    or in bounded memory, they are rendered one after another.
+    in bounded memory, or by several ``ranks`` (which share each picture's pixels), they are rendered one after another.
 
     Args:
         scenes: from :func:`torchpt.load`: a sequence, or an iterator that loads them (while others are rendered), of any kinds,
@@ -215,7 +215,7 @@ def _entries(
         def make() -> Run:
             like = next((wave for scene, wave in latest if scene == picture.scene), None)
             plain = {name: value.detach() for name, value in order.params.items()}
-            run = Run(order.scene, order.settings, plain, order.dtype, like=like)
+            run = Run(order.scene, order.settings, plain, order.dtype, order.ranks, like)
             latest[:] = [(picture.scene, run.wave)]
             return run
 
