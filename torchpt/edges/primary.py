@@ -20,17 +20,16 @@ from torchpt.edges.draws import Choice, Numbers
 from torchpt.edges.film import Worth, film_places, slopes
 from torchpt.edges.seen import Pieces
 from torchpt.edges.shared import share_of
+from torchpt.edges.steps import steps_at
 from torchpt.edges.traced import Traced
 from torchpt.math.vectors import take
 
-__all__ = ["Along", "Primary", "step_of"]
+__all__ = ["Along", "Primary"]
 
 #: A place counts as hidden where a ray beside it ends before this share of the way.
 _BEFORE = 1.0 - 2.0**-10
 #: The same where the ray meets the edge's own surface.
 _OWN = 1.0 - 2.0**-6
-#: How far beside a curve rays are traced, in units of the film's longer side at a slope of 1.
-_STEP = 2.0**-16
 
 #: Values ``(C, N)`` that rays ``o, d (3, N)`` bring, by keys.
 Look = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -57,14 +56,6 @@ class Along:
         # What is infinitely far moves along with the camera.
         at = torch.where(torch.isfinite(origin), origin, bodies.camera.origin()) + away
         return total - (film_places(bodies.camera, at) * weight).sum()
-
-
-def step_of(bodies: Bodies) -> float:
-    """How far beside a curve of the film rays are traced, in pixels: a few hundred roundings of a ray's direction."""
-    width = float(max(bodies.camera.resolution))
-    spread = float(bodies.camera.pixel()[4]) * width  # of the film at distance 1
-    narrow = max(1.0, 1.0 / spread) if float(bodies.camera.pixel()[3]) else 1.0
-    return _STEP * width * narrow
 
 
 @dataclass(frozen=True)
@@ -105,8 +96,10 @@ class Primary:
         index = ((length > 0) & (value != 0).any(0)).nonzero().squeeze(1)
         s, p, normal, length = (take(x, index) for x in (s, p, normal, length))
         unit = normal / length
-        o, d = self._beside(s, unit)
-        share = self._share(held.taken(index), take(pieces.curves.mate, index), p, s, o, d)
+        mate = take(pieces.curves.mate, index)
+        step = steps_at(self.bodies, (take(held.prim, index), mate), s)
+        o, d = self._beside(s, unit, step)
+        share = self._share(held.taken(index), mate, p, s, step, o, d)
         seen = (share > 0).nonzero().squeeze(1)
         both = torch.cat((seen, seen + len(index)))
         o, d, index = take(o, both), take(d, both), take(index, seen)
@@ -124,14 +117,13 @@ class Primary:
             beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, normal.repeat(1, 2) * each
         return Along(held.taken(index), normal * (worthy / chance), beside)
 
-    def _beside(self, s: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
+    def _beside(self, s: Tensor, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
-        step = step_of(self.bodies)
         places = torch.cat((s - unit * step, s + unit * step), 1)
         o, d = self.bodies.camera.rays(places[0], places[1], None)
         return o.expand_as(d), d
 
-    def _share(self, held: Held, mate: Tensor, p: Tensor, s: Tensor, o: Tensor, d: Tensor) -> Tensor:
+    def _share(self, held: Held, mate: Tensor, p: Tensor, s: Tensor, step: Tensor, o: Tensor, d: Tensor) -> Tensor:
         """How much of each edge counts ``(N,)``: nothing where it is hidden, a part where others lie on it."""
         n = p.shape[1]
         t, prim = self.traced.nearest(o, d)
@@ -143,7 +135,7 @@ class Primary:
         if self.traced.wave.stages.world.materials.opacity is not None:
             seen = torch.ones_like(seen)  # what hides may let pass
         near = (t - reach).abs() < reach * 2.0**-8
-        return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step_of(self.bodies)), 0.0)
+        return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step), 0.0)
 
 
 def primary_of(bodies: Bodies, pieces: Pieces, traced: Traced, numbers: Numbers) -> Primary:

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from torchpt.edges.bodies import Bodies, Held
-from torchpt.edges.film import film_places
+from torchpt.edges.steps import distance_to, is_flat, outline_of
 
 __all__ = ["share_of"]
 
 
-def share_of(bodies: Bodies, held: Held, mate: Tensor, s: Tensor, prim: Tensor, near: Tensor, step: float) -> Tensor:
+def share_of(bodies: Bodies, held: Held, mate: Tensor, s: Tensor, prim: Tensor, near: Tensor, step: Tensor) -> Tensor:
     """Parts ``(N,)`` with which places of edges count.
 
     Args:
@@ -25,32 +25,15 @@ def share_of(bodies: Bodies, held: Held, mate: Tensor, s: Tensor, prim: Tensor, 
         s: on the film ``(2, N)``.
         prim: what is seen on both sides ``(2, N)``.
         near: whether at the edge's own distance ``(2, N)``.
-        step: how far beside the edges that is, in pixels.
+        step: how far beside the edges that is ``(N,)``, in pixels.
     """
     own = prim == held.prim
     other = torch.where(own[0], prim[1], prim[0])
     both = near.all(0) & own.any(0) & ~own.all(0)
     flat = both & (other >= 0) & (mate < 0)
-    triangles, rectangles = bodies.counts[0], sum(bodies.counts[:2])
-    base, copied = other, torch.zeros_like(flat)
-    if bodies.copies is not None:
-        copied = other >= sum(bodies.counts)
-    four = (base >= triangles) & (base < rectangles)
-    flat = flat & ((base < rectangles) | copied)
+    flat = flat & is_flat(bodies, other)
     safe = torch.where(flat, other, 0)
     if not bool(flat.any()):
         return torch.ones_like(s[0])
-    p0, x, y, _ = bodies.place(safe)
-    corners = [p0, p0 + x, torch.where(four, p0 + x + y, p0 + y), torch.where(four, p0 + y, p0)]
-    places = [film_places(bodies.camera, corner) for corner in corners]
-    away = torch.stack([_distance(s, a, b) for a, b in zip(places, [*places[1:], places[0]], strict=True)]).amin(0)
+    away = torch.stack([distance_to(s, a, b) for a, b in outline_of(bodies, safe)]).amin(0)
     return torch.where(flat & (away < 0.5 * step), 0.5, 1.0)
-
-
-def _distance(s: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """From places ``(2, N)`` to segments ``a b``."""
-    along = b - a
-    square = (along * along).sum(0)
-    share = (((s - a) * along).sum(0) / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
-    away = s - a - along * share
-    return (away * away).sum(0).sqrt()
