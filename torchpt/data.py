@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from torchpt.errors import SceneError
+from torchpt.orders import check_names
 from torchpt.rendering import render
 from torchpt.scene import Scene, load
 
@@ -30,6 +31,7 @@ class _Items:
 
     def __init__(
         self,
+        call: str,
         make: Callable[[int], Made],
         cameras: Sequence[Any],
         spp: int | None,
@@ -38,6 +40,9 @@ class _Items:
         device: str | torch.device,
         wishes: Mapping[str, Any],
     ) -> None:
+        if not callable(make):
+            raise SceneError("make", make, "a function from a scene's index to the scene")
+        check_names(call, wishes, ("cameras", "layers"))
         for key in ("full", "params", "spp", "seed"):
             if key in wishes:
                 raise SceneError(key, wishes[key], "an argument of the data set, of `make` or none")
@@ -46,6 +51,12 @@ class _Items:
         self.make, self.layers, self.seed, self.device, self.wishes = make, tuple(layers), seed, device, dict(wishes)
         self.spp = spp
         self.cameras = [c if isinstance(c, Mapping) else {"camera.to_world": torch.as_tensor(c)} for c in cameras]
+        for c, camera in enumerate(cameras):
+            if isinstance(camera, Mapping) and not all(str(name).startswith("camera.") for name in camera):
+                expected = (
+                    "names of scene.params such as camera.fov; a whole camera block is for render_batch or seen_by"
+                )
+                raise SceneError(f"cameras[{c}]", list(camera), expected)
         self.latest: tuple[int, Scene, dict[str, Any]] | None = None
 
     def item(self, index: int) -> dict[str, Tensor]:
@@ -72,7 +83,13 @@ class _Items:
         """A scene and its own wishes; the latest one is kept, for its next camera."""
         if self.latest is None or self.latest[0] != number:
             made = self.make(number)
-            source, own = made if isinstance(made, tuple) else (made, {})
+            source, own = made if isinstance(made, tuple) and len(made) == 2 else (made, {})
+            if not isinstance(source, Scene | Mapping) or not isinstance(own, Mapping):
+                expected = (
+                    "a scene from torchpt.load, a mapping of the scene format, or (one of them, arguments of render)"
+                )
+                raise SceneError(f"make({number})", made, expected)
+            check_names("render", own)
             scene = source if isinstance(source, Scene) else load(dict(source), self.device)
             self.latest = number, scene, dict(own)
         return self.latest[1], dict(self.latest[2])
@@ -106,6 +123,7 @@ class RenderDataset(Dataset):
 
     Raises:
         SceneError: arguments that are not accepted; on access, what ``load`` and ``render`` raise.
+        TypeError: an argument that ``render`` does not know.
         IndexError: on access, an index that there is not.
     """
 
@@ -123,7 +141,7 @@ class RenderDataset(Dataset):
     ) -> None:
         if type(scenes) is not int or scenes < 0:
             raise SceneError("scenes", scenes, "a whole number >= 0")
-        self._items, self.scenes = _Items(make, cameras, spp, layers, seed, device, wishes), scenes
+        self._items, self.scenes = _Items("RenderDataset", make, cameras, spp, layers, seed, device, wishes), scenes
 
     def __len__(self) -> int:
         return self.scenes * max(len(self._items.cameras), 1)
@@ -175,7 +193,8 @@ class RenderStream(IterableDataset):
             raise SceneError("start", start, "a whole number >= 0")
         if shard is not None and not 0 <= shard[0] < shard[1]:
             raise SceneError("shard", shard, "(rank, world) with 0 <= rank < world")
-        self._items, self.scenes = _Items(make, cameras, spp, layers, seed, device, wishes), scenes
+        self._items = _Items("RenderStream", make, cameras, spp, layers, seed, device, wishes)
+        self.scenes = scenes
         self.start, self.shard = start, shard
         self.seen: tuple[int, int] | None = None  # of the process that made this worker
 

@@ -18,7 +18,10 @@ __all__ = [
 
 def _shown(value: object, limit: int = 80) -> str:
     try:
+        shape = getattr(value, "shape", ())
         text = repr(value)
+        if len(shape) > 1:  # cut off, rows of numbers would not even say how many there are
+            text = f"an array of shape {tuple(shape)}: {text}"
     except Exception:  # whole numbers of more than 4300 digits, and objects that cannot be shown
         text = f"a value of type {type(value).__name__} that cannot be shown"
     return _one_line(text, limit)

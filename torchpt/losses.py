@@ -17,7 +17,11 @@ _FLOOR = 1e-2
 
 
 def _same(*pictures: Tensor) -> None:
-    """Refuse pictures that torch would stretch over each other."""
+    """Refuse pictures that torch would stretch over each other, and what is no picture."""
+    for picture in pictures:
+        if not isinstance(picture, Tensor):
+            hint = "; hand over its .image" if hasattr(picture, "image") else ""
+            raise TypeError(f"expected a picture as a tensor, got {type(picture).__name__}{hint}")
     shapes = {tuple(picture.shape) for picture in pictures}
     if len(shapes) > 1:
         raise ValueError(f"pictures differ in shape: {', '.join(map(str, sorted(shapes)))}")
@@ -28,6 +32,7 @@ def l2(image: Tensor, target: Tensor) -> Tensor:
 
     Raises:
         ValueError: pictures of two shapes (so do all of these).
+        TypeError: no tensor, such as a whole :class:`torchpt.Rendering` (so do all of these).
     """
     _same(image, target)
     return (image - target).square().mean()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, TypedDict, Unpack
@@ -21,11 +22,12 @@ from torchpt.images.denoiser import check_denoiser, denoise
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.ranks import Group, together
 from torchpt.scene import Scene
+from torchpt.scene.entry import as_scene
 from torchpt.scene.textured import with_texels
 from torchpt.settings import Settings
 from torchpt.taped import in_batch, wants_gradients
 
-__all__ = ["Common", "Order", "Wishes", "ordered", "rendered"]
+__all__ = ["Common", "Order", "Wishes", "check_names", "ordered", "rendered"]
 
 
 class Common(TypedDict, total=False):
@@ -101,6 +103,25 @@ _OF_RENDER = (
 )  # fmt: skip
 
 
+def check_names(call: str, wishes: Collection[str], own: Collection[str] = ()) -> None:
+    """Refuse arguments that ``render`` does not know, in Python's own words.
+
+    Args:
+        call: who takes them, such as ``render_batch``.
+        wishes: names that were given to be handed on.
+        own: names that ``call`` takes itself, which may be meant.
+
+    Raises:
+        TypeError: an unknown one.
+    """
+    known = {*Wishes.__annotations__, "full"}
+    for name in wishes:
+        if name not in known:
+            close = difflib.get_close_matches(name, sorted(known.union(own)), 1)
+            hint = f". Did you mean '{close[0]}'?" if close else ""
+            raise TypeError(f"{call}() got an unexpected keyword argument '{name}'{hint}")
+
+
 def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
     """What the arguments of ``render`` ask for.
 
@@ -108,6 +129,7 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
         SceneError: one that is not accepted.
         RenderError: a denoiser that is not there.
     """
+    _check_types(as_scene(scene), full, wishes)
     dtype, adjoint, film = wishes.get("dtype", torch.float32), wishes.get("adjoint"), wishes.get("film")
     backward = {"seed": wishes.get("seed_grad"), "spp": wishes.get("spp_grad"), "edges": wishes.get("edge_spp")}
     numbers = {"seed_grad": (backward["seed"], 0), "spp_grad": (backward["spp"], 1), "edge_spp": (backward["edges"], 1)}
@@ -204,6 +226,23 @@ def _check(
     for key, (value, low) in numbers.items():
         if value is not None and (type(value) is not int or value < low):
             raise SceneError(key, value, f"a whole number >= {low}")
+
+
+def _check_types(scene: Scene, full: Any, wishes: Mapping[str, Any]) -> None:
+    """Refuse arguments of :func:`render` that are of another kind than they must be."""
+    for key, value in (("full", full), ("edges", wishes.get("edges", True))):
+        if type(value) is not bool:
+            raise SceneError(key, value, "True or False")
+    ranks, params = wishes.get("ranks"), wishes.get("params")
+    if ranks is not None and not isinstance(ranks, Group):
+        raise SceneError("ranks", ranks, "a torchpt.ranks.Group")
+    if params is not None and not isinstance(params, Mapping):
+        raise SceneError("params", params, "a mapping from names of scene.params to tensors")
+    for name, value in (params or {}).items():
+        if not isinstance(name, str):
+            raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
+        if isinstance(value, Tensor) and value.is_meta:
+            raise SceneError(f"params.{name}", "a tensor on the device meta", "a tensor that holds numbers")
 
 
 def _same(wish: str | torch.device, own: torch.device) -> bool:

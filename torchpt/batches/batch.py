@@ -10,14 +10,15 @@ from typing import Any, Literal, Unpack, overload
 import torch
 from torch import Tensor
 
-from torchpt.batches.inputs import Cameras, Seeds, cameras_of, named, params_of, seeds_of
+from torchpt.batches.inputs import Cameras, Seeds, cameras_of, named, params_of, scenes_of, seeds_of
 from torchpt.errors import SceneError
 from torchpt.forward import Entry, Rendering, Run, limited_threads, render_many
 from torchpt.integrators.loop.schedule import TASKS
 from torchpt.integrators.wave import Wave
 from torchpt.native.memory import mb
-from torchpt.orders import Common, Order, ordered, rendered
+from torchpt.orders import Common, Order, check_names, ordered, rendered
 from torchpt.scene import Scene
+from torchpt.scene.entry import as_scene
 from torchpt.taped import in_transform
 
 __all__ = ["Renderings", "render_batch"]
@@ -41,6 +42,8 @@ class Renderings:
 
     def __getitem__(self, which: tuple[int, int]) -> Rendering:
         """The picture of scene ``s`` by camera ``c``."""
+        if not isinstance(which, tuple) or len(which) != 2:
+            raise TypeError(f"expected renderings[s, c], a scene's number and a camera's, got renderings[{which!r}]")
         s, c = which
         return self.rows[s][c]
 
@@ -105,11 +108,14 @@ def render_batch(
     Raises:
         SceneError: what is not accepted, by a key that begins with the scene's or camera's place, such as ``scenes[3].``.
         RenderError: as :func:`torchpt.render`.
+        TypeError: an argument that ``render`` does not know.
     """
+    check_names("render_batch", wishes, ("cameras", "on_progress"))
+    scenes = scenes_of(scenes)
     checkpoint = wishes.get("checkpoint")
     if checkpoint is not None:
         raise SceneError("render.checkpoint", checkpoint, "null for a batch")
-    sets = params_of(params)
+    sets = params_of(params, scenes)
     views = cameras_of(cameras)
     size = len(sets or [None]) if isinstance(scenes, Scene) else len(scenes) if isinstance(scenes, Sequence) else None
     seeds = seeds_of(seed, size, len(views))
@@ -159,7 +165,8 @@ def _pictures(
 ) -> Iterator[_Picture]:
     """What is asked for, picture by picture, those of a scene together; ``several``: scenes are one under other parameters."""
     size: tuple[int, int] | None = None
-    for s, scene in enumerate(scenes):
+    for s, each in enumerate(scenes):
+        scene = as_scene(each, f"scenes[{s}]")
         if sets is not None and s >= len(sets):
             raise SceneError("params", len(sets), "as many as there are scenes")
         for c, camera in enumerate(cameras):

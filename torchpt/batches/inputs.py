@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -11,13 +11,34 @@ import torch
 from torch import Tensor
 
 from torchpt.errors import AssetError, NotBuiltError, RenderError, SceneError
+from torchpt.scene import Scene
+from torchpt.scene.entry import as_scene
 
-__all__ = ["Cameras", "Seeds", "cameras_of", "named", "params_of", "seeds_of"]
+__all__ = ["Cameras", "Seeds", "cameras_of", "named", "params_of", "scenes_of", "seeds_of"]
 
 #: Blocks of scene files, poses ``(4, 4)``, or a tensor of poses ``(C, 4, 4)``.
 Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
 #: One for all, one for each scene, or one for each scene and camera.
 Seeds = int | Sequence[int] | Sequence[Sequence[int]] | None
+
+#: Keys of a camera's block, one of which at least says where it stands.
+_PLACES = frozenset({"origin", "target", "to_world", "R", "t"})
+
+
+def scenes_of(scenes: Any) -> Scene | Iterable[Scene]:
+    """The scenes of a batch, as they are given; what an iterator gives is not looked at yet.
+
+    Raises:
+        SceneError: something else.
+    """
+    if isinstance(scenes, Scene):
+        return scenes
+    if isinstance(scenes, str | bytes | Mapping | Tensor) or not isinstance(scenes, Iterable):
+        raise SceneError("scenes", scenes, "a scene from torchpt.load, or a sequence or an iterator of such scenes")
+    if isinstance(scenes, Sequence):
+        for s, scene in enumerate(scenes):
+            as_scene(scene, f"scenes[{s}]")
+    return scenes
 
 
 def cameras_of(cameras: Cameras) -> Sequence[Mapping[str, Any] | Tensor | None]:
@@ -40,11 +61,16 @@ def cameras_of(cameras: Cameras) -> Sequence[Mapping[str, Any] | Tensor | None]:
     for c, camera in enumerate(cameras):
         if not isinstance(camera, Mapping | Tensor | np.ndarray):
             raise SceneError(f"cameras[{c}]", camera, expected)
+        if isinstance(camera, Mapping) and not _PLACES & camera.keys():
+            whole = (
+                "a whole camera block, with origin and target, to_world, or R and t; hand single numbers over as params"
+            )
+            raise SceneError(f"cameras[{c}]", dict(camera), f"{whole}, such as camera.fov")
         found.append(camera if isinstance(camera, Mapping) else torch.as_tensor(camera))
     return found
 
 
-def params_of(params: Any) -> Sequence[Mapping[str, Tensor]] | None:
+def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[str, Tensor]] | None:
     """The parameters of each scene of a batch; None where there are none.
 
     Raises:
@@ -58,11 +84,18 @@ def params_of(params: Any) -> Sequence[Mapping[str, Tensor]] | None:
             if not isinstance(value, Tensor) or value.dim() < 1 or not len(value):
                 found = tuple(value.shape) if isinstance(value, Tensor) else value
                 raise SceneError(f"params.{name}", found, "a tensor whose first dimension is the number of scenes")
+            own = scenes.params.get(name) if isinstance(scenes, Scene) else None
+            if own is not None and value.dim() <= own.dim():
+                expected = f"a first dimension that is the number of scenes, before those of {tuple(own.shape)}"
+                raise SceneError(f"params.{name}", tuple(value.shape), expected)
             size = size or len(value)
             if len(value) != size:
                 raise SceneError(
                     f"params.{name}", tuple(value.shape), f"a first dimension of {size}, as the first parameter's"
                 )
+        if size and isinstance(scenes, Sequence) and size != len(scenes):
+            expected = f"as many as there are scenes, {len(scenes)}, along the first dimension of each tensor"
+            raise SceneError("params", size, expected)
         parts = {name: value.unbind() for name, value in params.items()}
         return [{name: part[s] for name, part in parts.items()} for s in range(size)] if size else None
     if isinstance(params, Sequence) and not isinstance(params, str) and params:

@@ -152,7 +152,12 @@ def from_kornia(camera: PinholeCamera, index: int = 0) -> Block:
     Args:
         camera: the batch of cameras.
         index: which of them.
+
+    Raises:
+        SceneError: no such camera.
     """
+    if not all(hasattr(camera, name) for name in ("extrinsics", "intrinsics", "width", "height")):
+        raise SceneError("camera", camera, "kornia's PinholeCamera")
     outer = camera.extrinsics[index]
     size = int(camera.width[index]), int(camera.height[index])
     return from_opencv(camera.intrinsics[index, :3, :3], outer[:3, :3], outer[:3, 3], size, 0.0)

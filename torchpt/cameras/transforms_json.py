@@ -90,11 +90,13 @@ def write_transforms(path: str | os.PathLike[str], frames: Iterable[Frame]) -> N
             ``fov`` along x or y.
 
     Raises:
-        SceneError: a frame without a size, or a camera in another form.
+        SceneError: no frames, a frame without a size, or a camera in another form.
         OutputError: it cannot be written.
     """
     rows = [_row(frame, f"frames.{number}") for number, frame in enumerate(frames)]
-    shared = {key: value for key, value in (rows[0] if rows else {}).items() if key in _NUMBERS}
+    if not rows:
+        raise SceneError("frames", [], "one frame at least")
+    shared = {key: value for key, value in rows[0].items() if key in _NUMBERS}
     shared = {key: value for key, value in shared.items() if all(row.get(key) == value for row in rows)}
     kept = [{key: value for key, value in row.items() if key not in shared} for row in rows]
     text = json.dumps({"camera_model": "OPENCV", **shared, "frames": kept}, indent=1, allow_nan=False)
@@ -151,6 +153,8 @@ def _numbers(value: Any) -> Tensor:
 
 def _row(frame: Frame, key: str) -> dict[str, Any]:
     """A frame as the file has it."""
+    if not isinstance(frame, Frame):
+        raise SceneError(key, frame, "a Frame, of frame_of(scene, image) or read_transforms")
     camera, size = frame.camera, frame.size
     if size is None:
         raise SceneError(f"{key}.size", None, "width and height of the picture in pixels")

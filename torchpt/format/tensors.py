@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpt.errors import SceneError
+from torchpt.taped import in_transform
 
 __all__ = ["Key", "Tensors"]
 
@@ -78,6 +79,9 @@ class Tensors:
 
 def _numbers(tensor: Tensor, key: Key) -> np.ndarray:
     """A tensor's values, apart from it: what is done to the tensor later does not change them."""
+    if in_transform(tensor):
+        expected = "plain numbers: hand tensors under torch.func to render(params=...)"
+        raise SceneError(".".join(map(str, key)), "a tensor under a transform of torch.func", expected)
     try:
         values = tensor.detach()
         if values.dtype in (torch.float16, torch.bfloat16):

@@ -13,7 +13,7 @@ from torchpt.spec import Refused
 __all__ = ["TEXELS", "texels_of"]
 
 #: What is accepted.
-TEXELS = "texels (H, W, C) or (H, W), C from 1 to 4: finite numbers, or 8 bits a value (uint8)"
+TEXELS = "texels (H, W, C), channels last, or (H, W), C from 1 to 4: finite numbers, or 8 bits a value (uint8)"
 
 
 def texels_of(value: Any) -> Texels:

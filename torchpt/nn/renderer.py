@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -12,8 +12,11 @@ from torch import Tensor, nn
 
 from torchpt.errors import SceneError
 from torchpt.nn.ranges import range_of
+from torchpt.orders import check_names
 from torchpt.rendering import render
 from torchpt.scene import Scene
+from torchpt.scene.devices import device_of
+from torchpt.scene.entry import as_scene
 
 __all__ = ["Renderer"]
 
@@ -34,28 +37,36 @@ class Renderer(nn.Module):
 
     Args:
         scene: from ``torchpt.load``.
-        names: dotted names of ``scene.params``, and patterns of them such as ``materials.*.reflectance``.
+        names: dotted names of ``scene.params``, and patterns of them such as ``materials.*.reflectance``; None: no parameters.
         seed: any integer from 0.
         rigid: whether poses are turned and moved alone (six numbers each); False: their 16 numbers are parameters, as they are.
         wishes: further arguments of ``torchpt.render`` for each call.
 
     Raises:
-        SceneError: a name or pattern without a parameter, or a render's argument that has a place of its own here.
+        SceneError: no scene, a name or pattern without a parameter, a render's argument that has a place of its own here.
+        TypeError: an argument that ``render`` does not know.
     """
 
     steps: Tensor
 
     def __init__(
-        self, scene: Scene, names: str | Sequence[str] = (), *, seed: int = 0, rigid: bool = True, **wishes: Any
+        self,
+        scene: Scene,
+        names: str | Sequence[str] | None = None,
+        *,
+        seed: int = 0,
+        rigid: bool = True,
+        **wishes: Any,
     ) -> None:
         super().__init__()
+        check_names("Renderer", wishes, ("names", "rigid"))
         for key in ("params", "seed"):
             if key in wishes:
                 raise SceneError(key, wishes[key], "an argument of Renderer.forward")
         if type(seed) is not int or seed < 0:
             raise SceneError("seed", seed, "a whole number >= 0")
-        self.scene, self.seed, self.wishes = scene, seed, wishes
-        self.names = _chosen(scene, (names,) if isinstance(names, str) else names)
+        self.scene, self.seed, self.wishes = as_scene(scene), seed, wishes
+        self.names = () if names is None else _chosen(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
             ranges = [
@@ -121,6 +132,7 @@ class Renderer(nn.Module):
         return seed
 
     def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> Renderer:
+        device_of(fn(self.steps).device)  # one that is not there is refused before anything has moved
         super()._apply(fn, recurse)
         self.scene = self.scene.to(self.steps.device)
         return self
@@ -137,8 +149,15 @@ def _key(name: str) -> str:
 
 def _chosen(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     """The parameters that names and patterns stand for, in the scene's order."""
+    if not isinstance(names, Iterable) or isinstance(names, Mapping):
+        raise SceneError("names", names, "a name of scene.params, or a sequence of names and patterns")
+    names = tuple(names)
+    if not names:
+        raise SceneError("names", [], "one name at least, or None for a module without parameters")
     found: set[str] = set()
     for name in names:
+        if not isinstance(name, str):
+            raise SceneError("names", name, "a name of scene.params or a pattern of some, as text")
         matches = [each for each in scene.params if each == name or fnmatchcase(each, name)]
         if not matches:
             close = difflib.get_close_matches(name, scene.params, 3) or list(scene.params)[:8]

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import torch
 
-from torchpt.errors import RenderError
+from torchpt.errors import RenderError, SceneError
 
 __all__ = ["device_of"]
 
 
 def device_of(name: str | torch.device) -> torch.device:
-    """The device for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
-    if isinstance(name, torch.device):
-        return name
+    """The device for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
+
+    Raises:
+        SceneError: none of these.
+        RenderError: the device is not there.
+    """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = torch.device(name)
+    try:
+        device = torch.device(name)
+    except (RuntimeError, TypeError):
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise SceneError("render.device", str(name), "auto, cpu, cuda or cuda:N")
     if device.type == "cuda" and (not torch.cuda.is_available() or (device.index or 0) >= torch.cuda.device_count()):
         found = f"{torch.cuda.device_count()} CUDA devices" if torch.cuda.is_available() else "no CUDA device"
         raise RenderError(f"render.device: {name} is not available; this machine has {found}")
