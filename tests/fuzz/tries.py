@@ -95,7 +95,7 @@ def load_and_render(source: Any, seed: int = 0) -> str:
         "aovs": ["albedo", "normal", "depth"] if seed % 5 == 0 else None,
     }
     render = {
-        "spp": 1, "max_memory": "64MB", "threads": 1, "compile": compiled, "checkpoint": None, "resume": None, "preview": None,
+        "spp": 1, "max_memory": "1GB", "threads": 1, "compile": compiled, "checkpoint": None, "resume": None, "preview": None,
         "device": "cpu", "accel": "numba", "time_limit": None,
     }  # fmt: skip
     description, settings = overridden(scene.description, {"film": film, "render": render})
