@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import warnings
 from collections.abc import Callable, Collection, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, TypedDict, Unpack
 
@@ -144,6 +145,7 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
         check_denoiser()
     params = _given(scene, wishes.get("params"), full)
     scene = with_texels(scene, params)
+    scene.check_own()
     return Order(scene, settings, params, backward, dtype, adjoint or adjoints.KINDS[0], wishes.get("ranks"))
 
 
@@ -160,7 +162,7 @@ def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dic
         raise SceneError("full", True, "False under torch.func.vmap, where a render gives pictures alone")
     if not torch.is_grad_enabled():
         return given
-    return {name: value for name, value in scene.params.items() if value.requires_grad} | given
+    return {name: value for name, value in scene.params.items() if getattr(value, "requires_grad", False)} | given
 
 
 def rendered(order: Order, made: list[Rendering] | None = None) -> Rendering:
@@ -176,7 +178,8 @@ def rendered(order: Order, made: list[Rendering] | None = None) -> Rendering:
     def render(params: Mapping[str, Tensor]) -> Rendering:
         if made:
             return made.pop()
-        scene.check(params)
+        with nullcontext() if order.ranks is None else order.ranks.together():
+            scene.check(params)
         return known(lambda: render_scene(scene, settings, params=params, dtype=order.dtype, ranks=order.ranks))
 
     if order.taped:

@@ -172,7 +172,7 @@ def test_a_signal_keeps_the_picture_so_far(
 def test_a_signal_before_there_is_a_picture(
     folder: Path, renderer: Renderer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from torchpt.scene import scene as loading
+    from torchpt.scene import devices as loading
 
     monkeypatch.setattr(loading, "device_of", lambda name: os.kill(os.getpid(), signal.SIGTERM))
     assert main(["render", "scene=s.yaml"]) == 143

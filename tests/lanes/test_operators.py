@@ -302,6 +302,13 @@ CASES = [
         ],
     ),
     Case(
+        "logical_and_",
+        [
+            lambda x: (x.f > 0).logical_and_(x.g < 1),
+            lambda x: torch.where((x.f > 0).logical_and_(x.g < 1), x.f, x.g),
+        ],
+    ),
+    Case(
         "__and__ __or__ __xor__",
         [
             lambda x: aten.__and__(x.i, x.j),

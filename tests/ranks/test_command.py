@@ -66,7 +66,7 @@ def test_what_is_not_set_is_named(tmp_path: Path) -> None:
     assert started.lines() == ["torchpt: WORLD_SIZE is 2, but there is no MASTER_ADDR: start it by torchrun"]
 
 
-@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize("rank", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_signal_to_one_ends_all_with_the_picture_so_far(rank: int, tmp_path: Path) -> None:
     started = command(2, [*WORDS, "render.spp=1000000", "out=a.exr", "render.checkpoint=a.npz"], tmp_path, 0.1)
     _wait_for(tmp_path / "a.npz", started)

@@ -41,6 +41,7 @@ def broken() -> torchpt.Scene:
     """Some of its samples are not finite."""
     scene = torchpt.load("cornell_box", device="cpu")
     scene.params["materials.red.reflectance"].fill_(torch.nan)
+    scene.check_own = lambda: None  # which refuses that  # type: ignore[method-assign]
     return scene
 
 
@@ -205,7 +206,7 @@ def test_a_lost_rank_ends_the_others(box: torchpt.Scene, tmp_path: Path) -> None
 def test_a_rank_that_says_nothing_is_given_up(box: torchpt.Scene, tmp_path: Path) -> None:
     def work(group: Any) -> None:
         if group.rank == 1:
-            time.sleep(2.5)
+            time.sleep(5.0)
             return
         torchpt.render(box, spp=1, film=FILM, ranks=group)
 

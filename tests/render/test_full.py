@@ -55,8 +55,8 @@ def halved(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
         seen.append(tuple(guides))
         return 0.5 * image
 
-    monkeypatch.setattr(torchpt.rendering, "check_denoiser", lambda: None)
-    monkeypatch.setattr(torchpt.rendering, "denoise", half)
+    monkeypatch.setattr(torchpt.orders, "check_denoiser", lambda: None)
+    monkeypatch.setattr(torchpt.orders, "denoise", half)
     return seen
 
 

@@ -214,6 +214,7 @@ def test_chunks_of_a_few_lanes(scene_of, lanes, mode):
     assert same(shot(scene, {}, mode, film, lanes=lanes), shot(scene, {}, mode, film))
 
 
+@pytest.mark.slow
 def test_waves_that_threads_divide(scene_of):
     """Tensor operations: torch leaves up to 32,768 numbers to one thread. Here is one pass of 33,282 lanes."""
     scene, film = scene_of("every kind of primitive"), film_of(129)

@@ -92,7 +92,7 @@ def same(a: Any, b: Any) -> bool:
     )
 
 
-@pytest.mark.parametrize("step", [211, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [997, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_failure_at_any_operation_of_a_piece_changes_no_bit(box, step):
     """Each operation of a render fails once, the copies into the films included."""
     with in_pieces(lambda k: False, MemoryError) as counted:
@@ -177,7 +177,7 @@ def backward_failing(
         return gradient(scene, adjoint), counted[0]
 
 
-@pytest.mark.parametrize("adjoint", ["autograd", "replay"])
+@pytest.mark.parametrize("adjoint", ["autograd", pytest.param("replay", marks=pytest.mark.slow)])
 def test_a_failure_anywhere_in_the_backward_pass_changes_rounding_at_most(box, adjoint, monkeypatch):
     whole, count = backward_failing(box, adjoint, lambda k: False, monkeypatch)
     assert count > 300 and float(whole.abs().min()) > 0

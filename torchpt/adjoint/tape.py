@@ -70,18 +70,23 @@ def chunk_by_chunk(assembly: Assembly, settings: Settings, sums: Sums, part: Par
     Raises:
         RenderError: not even the tape of a single lane fits in memory.
     """
-    leaves = [*assembly.leaves, *assembly.held]
 
     def add(span: Span) -> None:
-        found = assembly.sums()
-        with torch.enable_grad(), gathered_by(found):
-            values, asked = part(span)
-        if values.requires_grad:  # else nothing in these pixels depends on the parameters
-            with one_thread():  # several round sums over lanes otherwise
-                found.add_each(torch.autograd.grad(values, leaves, asked.to(values.dtype), allow_unused=True))
-        sums.join(found)
+        sums.join(piece(assembly, part, span))
 
     assembly.through(Waves(_budget(settings, assembly), "the tape of a single lane"), add, count, samples)
+
+
+def piece(assembly: Assembly, part: Part, span: Span) -> Sums:
+    """The sums of a chunk."""
+    found = assembly.sums()
+    with torch.enable_grad(), gathered_by(found):
+        values, asked = part(span)
+    if values.requires_grad:  # else nothing in these pixels depends on the parameters
+        leaves = [*assembly.leaves, *assembly.held]
+        with one_thread():  # several round sums over lanes otherwise
+            found.add_each(torch.autograd.grad(values, leaves, asked.to(values.dtype), allow_unused=True))
+    return found
 
 
 def _budget(settings: Settings, assembly: Assembly) -> Budget:

@@ -6,7 +6,7 @@ kind           of                                      parameter
 ``Bounded``    two ends: albedos, roughnesses, angles  ``low + (high - low) ((1 + 2 e) sigmoid(x) - e)``, held at the ends
 ``Above``      one end: radiances, radii, indices      ``low + s (softplus(x) - e)``, held at the end; ``s`` as below
 ``Free``       none: points, directions, vertices      ``x``
-``Rigid``      poses                                   ``exp(w)`` times the pose at first, moved to ``t``; ``x = (w, t)``
+``Rigid``      poses                                   ``exp(w)`` times the pose at first, at ``l t``; ``x = (w, t)``
 =============  ======================================  =============================================================
 
 A plain sigmoid reaches neither 0 nor 1, and has no slope near them: an albedo of 0 would be minus infinity, and stay there.
@@ -127,23 +127,25 @@ class Above(Range):
 class Rigid(Range):
     """A pose: turned about the axes of the world around its own origin, and moved; its scales and shears stay.
 
-    ``x`` is ``(6,)``: the rotation from the pose at first as axis times angle in radians, and the place of its origin.
+    ``x`` is ``(6,)``: the rotation from the pose at first as axis times angle in radians, and the place of its origin in
+    ``length``, so that a step of either is as large as the other's to what is seen.
     """
 
     frame: Tensor
 
-    def __init__(self, start: Tensor) -> None:
+    def __init__(self, start: Tensor, length: float = 1.0) -> None:
         super().__init__()
+        self.length = length
         self.register_buffer("frame", start.detach()[:3, :3].clone())
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Range`."""
-        a, b, c = x[:3].unbind()
+        a, b, c = x[:3].double().unbind()  # angles of many turns have no digits left in float32
         zero = torch.zeros_like(a)
         across = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3)  # of the cross product
-        turned = torch.linalg.matrix_exp(across) @ self.frame
+        turned = (torch.linalg.matrix_exp(across) @ self.frame.double()).to(x.dtype)
         last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=x.dtype, device=x.device)
-        return torch.cat((torch.cat((turned, x[3:, None]), 1), last))
+        return torch.cat((torch.cat((turned, self.length * x[3:, None]), 1), last))
 
     def inverse(self, value: Tensor) -> Tensor:
         """See :class:`Range`.
@@ -156,13 +158,16 @@ class Rigid(Range):
         turn = value[:3, :3].double() @ torch.linalg.inv(self.frame.double())
         if not torch.allclose(turn @ turn.T, torch.eye(3).to(turn), atol=1e-4) or torch.linalg.det(turn) < 0:
             raise ValueError("expected the pose at first, turned and moved")
-        return torch.cat((rotation_matrix_to_axis_angle(turn[None])[0].to(value), value[:3, 3]))
+        return torch.cat((rotation_matrix_to_axis_angle(turn[None])[0].to(value), value[:3, 3] / self.length))
 
 
-def range_of(spec: Spec, start: Tensor, rigid: bool = True) -> Range:
-    """The range of a parameter that is ``start`` at first; ``rigid``: whether poses are turned and moved alone."""
+def range_of(spec: Spec, start: Tensor, rigid: bool = True, length: float = 1.0) -> Range:
+    """The range of a parameter that is ``start`` at first.
+
+    ``rigid``: whether poses are turned and moved alone; ``length``: how large the scene is.
+    """
     if isinstance(spec, Pose):
-        return Rigid(start) if rigid or spec.angles else Free()
+        return Rigid(start, length) if rigid or spec.angles else Free()
     low, high = getattr(spec, "low", None), getattr(spec, "high", None)
     above, below = getattr(spec, "above", None), getattr(spec, "below", None)
     # Of an end that belongs to the range and one that does not, the tighter one counts.

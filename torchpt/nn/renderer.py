@@ -24,13 +24,13 @@ __all__ = ["Renderer"]
 class Renderer(nn.Module):
     """A scene that is rendered, and optimized, as any other module.
 
-    The chosen parameters are ``nn.Parameter`` objects without bounds, which :mod:`torchpt.nn.ranges` keeps in range: whatever
-    an optimizer does to them, the scene can be rendered. ``values()`` gives what they stand for.
+    The chosen parameters are ``nn.Parameter`` objects without bounds, which :mod:`torchpt.nn.ranges` keeps in range: as long as
+    they are finite, the scene can be rendered (places too far away are refused). ``values()`` gives what they stand for.
 
     Each ``forward`` in training mode draws other samples: with the same ones in every step an optimizer fits their noise. The
     seed is ``seed + steps``, where the buffer ``steps`` counts calls in training mode; with ``torch.distributed`` set up,
-    ``seed + steps * world + rank``, so that ranks render different samples of one picture. In ``eval()`` mode it is
-    ``seed``, always. A seed that is handed to ``forward`` wins, and counts nothing.
+    ``seed + steps * world + rank``, so that ranks render different samples of one picture (but with ``ranks=``, where they
+    share it). In ``eval()`` mode it is ``seed``, always. A seed that is handed to ``forward`` wins, and counts nothing.
 
     Scenes are shared, not copied, and never changed: ``scene.params`` keeps what it had (:meth:`write` changes it). Weights of
     BSDF models of your own are theirs: hand them to the optimizer beside ``parameters()``.
@@ -69,7 +69,9 @@ class Renderer(nn.Module):
         self.names = () if names is None else _chosen(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
-            ranges = [range_of(scene.spec(n), start, rigid) for n, start in zip(self.names, starts, strict=True)]
+            ranges = [
+                range_of(scene.spec(n), start, rigid, scene.length) for n, start in zip(self.names, starts, strict=True)
+            ]
             free = {
                 _key(name): nn.Parameter(found.inverse(start).clone())
                 for name, found, start in zip(self.names, ranges, starts, strict=True)
@@ -89,13 +91,15 @@ class Renderer(nn.Module):
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
         """
+        wishes = {**self.wishes, **wishes}
         if seed is None:
-            seed = self._next_seed()
-        return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, **{**self.wishes, **wishes})
+            seed = self._next_seed(wishes.get("ranks") is not None)
+        return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, **wishes)
 
     def values(self) -> dict[str, Tensor]:
         """What the parameters stand for, by dotted name, as ``torchpt.render(params=...)`` takes them; gradients flow."""
-        return {name: found(self.free[_key(name)]) for name, found in zip(self.names, self.ranges, strict=True)}
+        with torch.autocast(self.steps.device.type, enabled=False):  # a pose of half precision is another one
+            return {name: found(self.free[_key(name)]) for name, found in zip(self.names, self.ranges, strict=True)}
 
     @torch.no_grad()
     def assign(self, values: Mapping[str, Tensor]) -> None:
@@ -117,11 +121,11 @@ class Renderer(nn.Module):
         for name, value in self.values().items():
             self.scene.params[name] = value.detach().clone()
 
-    def _next_seed(self) -> int:
+    def _next_seed(self, together: bool) -> int:
         if not self.training:
             return self.seed
         rank, world = 0, 1
-        if torch.distributed.is_available() and torch.distributed.is_initialized():
+        if not together and torch.distributed.is_available() and torch.distributed.is_initialized():
             rank, world = torch.distributed.get_rank(), torch.distributed.get_world_size()
         seed = self.seed + int(self.steps) * world + rank
         self.steps += 1

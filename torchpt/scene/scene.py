@@ -5,11 +5,12 @@ from __future__ import annotations
 import copy
 import difflib
 import itertools
+import math
 import threading
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
-from weakref import WeakValueDictionary
+from weakref import WeakValueDictionary, ref
 
 import numpy as np
 import torch
@@ -31,11 +32,13 @@ from torchpt.scene.build import Built, build_parts
 from torchpt.scene.devices import device_of
 from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
-from torchpt.scene.space import FARTHEST, Space, middle_of
+from torchpt.scene.space import FARTHEST, Space, extent_of, middle_of
+from torchpt.scene.vetting import vet
 from torchpt.scene.view import through
 from torchpt.settings import Film, Settings
 from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
+from torchpt.taped import outside_transforms
 
 __all__ = ["Scene", "numbered"]
 
@@ -97,6 +100,7 @@ class Scene:
         #: The most that was held above import while the scene was read; 0 where it is not known.
         self.peak = after - meter.base() if after > before else 0
         self._begin()
+        self._vetted = {name: (ref(value), 0) for name, value in self.params.items()}  # a file's numbers were read
 
     def _begin(self) -> None:
         """Nothing is made of the parameters yet."""
@@ -112,6 +116,7 @@ class Scene:
     def _number(self) -> None:
         """Become another scene than any before."""
         self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.textured`
+        self._vetted: dict[str, tuple[ref[Tensor], int]] = {}  # which tensors were checked, at which version
         #: Of all scenes of this process, by which compiled graphs name it.
         self.number = next(_numbers)
         _scenes[self.number] = self
@@ -216,6 +221,11 @@ class Scene:
         """The middle of the box around all that can be hit, ``(3,)`` float64; the origin where nothing can."""
         return middle_of(self._built.parts, self._built.copies)
 
+    @property
+    def length(self) -> float:
+        """About how large the scene is, as a power of two: the side of the box around all that can be hit."""
+        return 2.0 ** round(math.log2(max(extent_of(self._built.parts, self._built.copies), 2.0**-100)))
+
     def check(self, params: Mapping[str, Tensor] | None) -> None:
         """Refuse parameters that this scene cannot be rendered with.
 
@@ -231,8 +241,17 @@ class Scene:
                 found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
                 texels = ", or texels (H, W, C)" if self.spec(name).texture else ""
                 raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}{texels}")
-            self._check(name, value.detach())
+            self.check_number(name, value.detach())
         check_sources(self._built.sources, params or {}, self.merged(params))
+
+    def check_own(self) -> None:
+        """Refuse what was put into :attr:`params`, or changed there in place, as :meth:`check` does; once for each change.
+
+        Raises:
+            SceneError: likewise, and names that are gone or new.
+        """
+        with outside_transforms():
+            vet(self, self._vetted)
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """All parameters, those of ``params`` (once checked) in place of the scene's."""
@@ -244,7 +263,7 @@ class Scene:
         """What a parameter is."""
         return self._built.parameters.specs[name]
 
-    def _check(self, name: str, value: Tensor) -> None:
+    def check_number(self, name: str, value: Tensor) -> None:
         """Refuse numbers that no scene file could hold."""
         spec = self.spec(name)
         try:
@@ -368,7 +387,7 @@ class Scene:
             return
         for name in changed:
             if self.spec(name).place and name in self._state:
-                self._check(name, state[name][0].detach())
+                self.check_number(name, state[name][0].detach())
         self._state.clear()  # views of the scene have the same
         self._state.update(state)
         if not gone and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it

@@ -133,5 +133,7 @@ class Pose(Spec):
             raise Refused("numbers finite in float32", "a value that is not finite in float32")
         if not is_usable(matrix):
             raise Refused(f"a matrix that can be inverted, {WITHIN}", matrix.tolist())
+        if abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-4:
+            raise Refused("a transform whose last row is 0 0 0 1", matrix[3].tolist())
         if self.angles and similarity_scale(matrix, 1e-4) is None:
             raise Refused(self.expected, matrix.tolist())
