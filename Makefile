@@ -29,11 +29,14 @@ render: $(VENV)/run.stamp
 	@$(PY) -m torchpt render "scene=$(SCENE)" "out=$(OUT)" $(ARGS)
 	@echo "The picture is $(abspath .)/$(OUT)"
 
+# Tests of ranks fork the process that they run in, so that it must not have worked for other tests before.
 test: $(VENV)/dev.stamp
-	$(PY) -m pytest -m "not slow and not gpu" -n 2 --dist loadfile $(ARGS)
+	$(PY) -m pytest -m "not slow and not gpu" tests/ranks
+	$(PY) -m pytest -m "not slow and not gpu" -n 2 --dist loadfile --ignore=tests/ranks $(ARGS)
 
 test-all: $(VENV)/bench.stamp
-	$(PY) -m pytest $(ARGS)
+	$(PY) -m pytest tests/ranks
+	$(PY) -m pytest --ignore=tests/ranks $(ARGS)
 
 stress: $(VENV)/dev.stamp
 	$(PY) -m torchpt stress "accel=[numba,torch,brute]" "compile=[on,off]" out=stress $(ARGS)
