@@ -11,8 +11,8 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ from torchpt.commands.compare import HELP as HELP_COMPARE
 from torchpt.commands.compare import compare
 from torchpt.commands.converge import HELP as HELP_CONVERGE
 from torchpt.commands.converge import converge
+from torchpt.commands.hydra_process import hydra_process
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.orbit import HELP as HELP_ORBIT
 from torchpt.commands.plain_words import compose_plainly
@@ -297,7 +298,7 @@ def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
     with sweep_folder() if arguments.multirun else nullcontext() as folder:
         if folder is not None:
             words.append(f"hydra.sweep.dir={_quoted(folder)}")
-        with _hydra_environment(words):
+        with hydra_process(words):
             try:
                 hydra.main(version_base="1.3", config_path=str(_configs()), config_name="config")(task)()
             except SystemExit as end:
@@ -333,22 +334,6 @@ def _check_grammar(words: list[str]) -> None:
 
 def _quoted(text: str) -> str:
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
-
-
-@contextmanager
-def _hydra_environment(words: list[str]) -> Iterator[None]:
-    """Hydra reads ``sys.argv``, and hands its errors over (rather than print them) only under HYDRA_FULL_ERROR."""
-    argv, before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv = ["torchpt", *words]
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        yield
-    finally:
-        sys.argv = argv
-        if before is None:
-            del os.environ["HYDRA_FULL_ERROR"]
-        else:
-            os.environ["HYDRA_FULL_ERROR"] = before
 
 
 def _came_from_job(error: BaseException) -> bool:
