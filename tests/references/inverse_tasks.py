@@ -33,7 +33,6 @@ class Task:
         params: from the scene and the numbers to parameters of ``torchpt.render``.
         rate: Adam's first step; it falls to a hundredth along a cosine.
         steps: how many.
-        edges: whether edges of visibility tell the way.
         spp: samples a pixel of each picture and each gradient.
         depth: of the paths.
         bar: how many times smaller the error is to become.
@@ -48,7 +47,6 @@ class Task:
     params: Callable[[Scene, Tensor], dict[str, Tensor]]
     rate: float
     steps: int = 150
-    edges: bool = False
     spp: int = 16
     depth: int = 3
     bar: float = 10.0
@@ -194,18 +192,18 @@ TASKS: dict[str, Task] = {
     ),
     "free_light": Task(known.FREE, **shifted("shapes.lamp.to_world", (0, 1, 2), (-1.2, 0.6, -1), 0.06, depth=2)),
     "hidden_light": Task(
-        UNDER_PLATE, **shifted("shapes.lamp.to_world", (0, 2), (0.9, -0.6), 0.05, depth=2, edges=True),
+        UNDER_PLATE, **shifted("shapes.lamp.to_world", (0, 2), (0.9, -0.6), 0.05, depth=2),
     ),
     "camera": Task(
         EVEN_ROOM, lambda scene: torch.tensor([0.15, -0.12, 0.2, 0.04, 0.05, -0.06]), lambda scene: torch.zeros(6),
-        _twisted, 0.03, steps=400, edges=True,
+        _twisted, 0.03, steps=400,
     ),
     "black_ball": Task(
         BLACK_BALL, lambda scene: torch.tensor([0.45, -0.35, 0.4]), lambda scene: torch.zeros(3), _ball, 0.03,
-        depth=2, edges=True,
+        depth=2,
     ),
     "lit_ball": Task(
-        ON_PICTURE, **shifted("shapes.ball.to_world", (0, 1, 2), (0.5, 0.25, 0.4), 0.03, edges=True),
+        ON_PICTURE, **shifted("shapes.ball.to_world", (0, 1, 2), (0.5, 0.25, 0.4), 0.03),
         files={"paint.exr": known.painted},
     ),
 }  # fmt: skip

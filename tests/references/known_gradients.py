@@ -41,7 +41,6 @@ class Pair:
         parameter: its name in ``scene.params``.
         direction: of the parameter's shape, as ``{index: value}`` or as a function of the parameter.
         step: of the finer difference; the other one is twice as wide.
-        edges: whether edges of visibility move.
         spp: samples a pixel of one gradient.
         depth: of the paths.
         files: pictures ``(H, W, 3)`` by file name.
@@ -52,7 +51,6 @@ class Pair:
     parameter: str
     direction: Mapping[tuple[int, ...], float] | Callable[[Tensor], Tensor]
     step: float
-    edges: bool
     spp: int = 64
     depth: int = 2
     files: Mapping[str, Callable[[], Tensor]] = field(default_factory=dict)
@@ -272,14 +270,13 @@ FREE = {**DARK, "shapes": {"floor": FLOOR, "lamp": {**OVERHEAD, "transform": [{"
 
 PAIRS: dict[str, Pair] = {
     # Nothing becomes visible or hidden.
-    "albedo_room": Pair(ROOM, "materials.red.reflectance", {(0,): 1.0, (1,): 0.5}, 0.05, False, depth=4),
-    "emission_room": Pair(ROOM, "shapes.lamp.emission", {(0,): 1.0, (2,): -0.4}, 0.5, False, depth=4),
+    "albedo_room": Pair(ROOM, "materials.red.reflectance", {(0,): 1.0, (1,): 0.5}, 0.05, depth=4),
+    "emission_room": Pair(ROOM, "shapes.lamp.emission", {(0,): 1.0, (2,): -0.4}, 0.5, depth=4),
     "texels": Pair(
         with_shapes(TABLE, floor=PAINTED, ball=BALL),
         "shapes.floor.material.reflectance",
         noise,
         0.05,
-        False,
         depth=3,
         files={"paint.exr": painted},
     ),
@@ -288,40 +285,35 @@ PAIRS: dict[str, Pair] = {
         "shapes.floor.material.alpha",
         {(): 1.0},
         0.01,
-        False,
     ),
-    "metal_eta": Pair(
-        UNDER_SKY, "shapes.ball.material.eta", {(0,): 1.0, (1,): 0.5}, 0.05, False, files={"sky.exr": sky}
-    ),
+    "metal_eta": Pair(UNDER_SKY, "shapes.ball.material.eta", {(0,): 1.0, (1,): 0.5}, 0.05, files={"sky.exr": sky}),
     "principled_roughness": Pair(
         with_shapes(TABLE, floor={**FLOOR, "material": PRINCIPLED}),
         "shapes.floor.material.roughness",
         {(): 1.0},
         0.02,
-        False,
     ),
     "principled_metallic": Pair(
         with_shapes(TABLE, floor={**FLOOR, "material": PRINCIPLED}),
         "shapes.floor.material.metallic",
         {(): 1.0},
         0.05,
-        False,
     ),
-    "glass_index": Pair(GLASS, "materials.glass.int_ior", {(): 1.0}, 0.01, False, depth=4, spp=256),
-    "sky_texels": Pair(UNDER_SKY, "lights.sky.texels", noise, 0.05, False, depth=3, files={"sky.exr": sky}),
-    "sky_scale": Pair(UNDER_SKY, "lights.sky.scale", {(): 1.0}, 0.1, False, depth=3, files={"sky.exr": sky}),
-    "sky_turned": Pair(UNDER_SKY, "lights.sky.to_world", turn, 0.01, False, files={"sky.exr": sky}, turns=True),
-    "free_lamp": Pair(FREE, "shapes.lamp.to_world", X, 0.05, False),
-    "floor_tilt": Pair(FREE, "shapes.floor.vertices", {(2, 1): 1.0, (3, 1): 0.6}, 0.05, False),
+    "glass_index": Pair(GLASS, "materials.glass.int_ior", {(): 1.0}, 0.01, depth=4, spp=256),
+    "sky_texels": Pair(UNDER_SKY, "lights.sky.texels", noise, 0.05, depth=3, files={"sky.exr": sky}),
+    "sky_scale": Pair(UNDER_SKY, "lights.sky.scale", {(): 1.0}, 0.1, depth=3, files={"sky.exr": sky}),
+    "sky_turned": Pair(UNDER_SKY, "lights.sky.to_world", turn, 0.01, files={"sky.exr": sky}, turns=True),
+    "free_lamp": Pair(FREE, "shapes.lamp.to_world", X, 0.05),
+    "floor_tilt": Pair(FREE, "shapes.floor.vertices", {(2, 1): 1.0, (3, 1): 0.6}, 0.05),
     "smooth_vertex_up": Pair(
-        with_shapes(FREE, bent={**fan(), "material": ORANGE}), "shapes.bent.vertices", {(0, 1): 1.0}, 0.02, True
+        with_shapes(FREE, bent={**fan(), "material": ORANGE}), "shapes.bent.vertices", {(0, 1): 1.0}, 0.02
     ),
     # The camera moves.
-    "camera_x_room": Pair(ROOM, "camera.to_world", X, 0.006, True, depth=4),
-    "camera_z_room": Pair(ROOM, "camera.to_world", Z, 0.006, True, depth=4),
-    "camera_turn_room": Pair(ROOM, "camera.to_world", about_own_y, 0.003, True, depth=4, turns=True),
-    "fov_room": Pair(ROOM, "camera.fov", {(): 1.0}, 0.1, True, depth=4),
-    "camera_x_ball": Pair(with_shapes(TABLE, ball=BALL), "camera.to_world", X, 0.01, True),
+    "camera_x_room": Pair(ROOM, "camera.to_world", X, 0.006, depth=4),
+    "camera_z_room": Pair(ROOM, "camera.to_world", Z, 0.006, depth=4),
+    "camera_turn_room": Pair(ROOM, "camera.to_world", about_own_y, 0.003, depth=4, turns=True),
+    "fov_room": Pair(ROOM, "camera.fov", {(): 1.0}, 0.1, depth=4),
+    "camera_x_ball": Pair(with_shapes(TABLE, ball=BALL), "camera.to_world", X, 0.01),
     "camera_x_sky": Pair(
         {
             **ALONE,
@@ -331,16 +323,15 @@ PAIRS: dict[str, Pair] = {
         "camera.to_world",
         X,
         0.01,
-        True,
     ),
     # Shapes move.
-    "lamp_pose_room": Pair(ROOM, "shapes.lamp.to_world", X, 0.006, True),
-    "lamp_pose_room_indirect": Pair(ROOM, "shapes.lamp.to_world", X, 0.006, True, depth=4),
-    "block_pose_room_indirect": Pair(ROOM, "shapes.block.to_world", Y, 0.01, True, depth=4),
-    "ball_pose": Pair(with_shapes(TABLE, ball=BALL), "shapes.ball.to_world", Z, 0.02, True),
-    "ball_pose_indirect": Pair(with_shapes(TABLE, ball=BALL), "shapes.ball.to_world", Z, 0.02, True, depth=3),
-    "ball_pose_bulb": Pair({**with_shapes(DARK, ball=BALL), "lights": BULB}, "shapes.ball.to_world", Y, 0.02, True),
-    "silhouette_vertex": Pair(with_shapes(TABLE, screen=SCREEN), "shapes.screen.vertices", {(1, 0): 1.0}, 0.02, True),
+    "lamp_pose_room": Pair(ROOM, "shapes.lamp.to_world", X, 0.006),
+    "lamp_pose_room_indirect": Pair(ROOM, "shapes.lamp.to_world", X, 0.006, depth=4),
+    "block_pose_room_indirect": Pair(ROOM, "shapes.block.to_world", Y, 0.01, depth=4),
+    "ball_pose": Pair(with_shapes(TABLE, ball=BALL), "shapes.ball.to_world", Z, 0.02),
+    "ball_pose_indirect": Pair(with_shapes(TABLE, ball=BALL), "shapes.ball.to_world", Z, 0.02, depth=3),
+    "ball_pose_bulb": Pair({**with_shapes(DARK, ball=BALL), "lights": BULB}, "shapes.ball.to_world", Y, 0.02),
+    "silhouette_vertex": Pair(with_shapes(TABLE, screen=SCREEN), "shapes.screen.vertices", {(1, 0): 1.0}, 0.02),
     "sphere_radius_sky": Pair(
         {
             **ALONE,
@@ -350,14 +341,12 @@ PAIRS: dict[str, Pair] = {
         "shapes.ball.to_world",
         grown,
         0.01,
-        True,
     ),
     "ball_under_sky": Pair(
         {**with_shapes(DARK, ball=BALL), "lights": SKY},
         "shapes.ball.to_world",
         X,
         0.02,
-        True,
         files={"sky.exr": sky},
     ),
     "cylinder_pose": Pair(
@@ -365,48 +354,37 @@ PAIRS: dict[str, Pair] = {
         "shapes.it.to_world",
         Y,
         0.02,
-        True,
     ),
     "cone_pose": Pair(
         with_shapes(TABLE, it={"type": "cone", "apex": [0, 1.1, 0], "height": -1, "slope": 0.5, **STANDING}),
         "shapes.it.to_world",
         Z,
         0.02,
-        True,
     ),
     "disk_pose": Pair(
         with_shapes(TABLE, it={"type": "disk", "material": BLUE, "transform": TILTED}),
         "shapes.it.to_world",
         Z,
         0.02,
-        True,
     ),
     "rectangle_pose": Pair(
         with_shapes(TABLE, it={"type": "rectangle", "material": BLUE, "transform": TILTED}),
         "shapes.it.to_world",
         Z,
         0.02,
-        True,
     ),
-    "cube_pose": Pair(with_shapes(TABLE, it=BOX), "shapes.it.to_world", Y, 0.02, True),
+    "cube_pose": Pair(with_shapes(TABLE, it=BOX), "shapes.it.to_world", Y, 0.02),
     "instance_pose": Pair(
         with_shapes(TABLE, block=SMALL_BOX, copy=COPY),
         "shapes.copy.to_world",
         Z,
         0.02,
-        True,
     ),
-    "smooth_normals": Pair(
-        with_shapes(TABLE, bent=fan()), "shapes.bent.vertices", {(1, 0): 1.0, (2, 2): 0.5}, 0.02, True
-    ),
+    "smooth_normals": Pair(with_shapes(TABLE, bent=fan()), "shapes.bent.vertices", {(1, 0): 1.0, (2, 2): 0.5}, 0.02),
     # Lights move whose shadows have hard edges.
     "spot_position": Pair(
-        {**with_shapes(DARK, screen=SCREEN), "lights": SPOT}, "lights.spot.position", {(0,): 1.0}, 0.03, True
+        {**with_shapes(DARK, screen=SCREEN), "lights": SPOT}, "lights.spot.position", {(0,): 1.0}, 0.03
     ),
-    "point_position": Pair(
-        {**with_shapes(DARK, ball=BALL), "lights": BULB}, "lights.bulb.position", {(0,): 1.0}, 0.03, True
-    ),
-    "sun_direction": Pair(
-        {**with_shapes(DARK, box=BOX), "lights": SUN}, "lights.sun.direction", {(0,): 1.0}, 0.02, True
-    ),
+    "point_position": Pair({**with_shapes(DARK, ball=BALL), "lights": BULB}, "lights.bulb.position", {(0,): 1.0}, 0.03),
+    "sun_direction": Pair({**with_shapes(DARK, box=BOX), "lights": SUN}, "lights.sun.direction", {(0,): 1.0}, 0.02),
 }

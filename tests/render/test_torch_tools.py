@@ -259,6 +259,23 @@ def test_a_scene_is_the_same_outside_of_inference_mode(picture, loss, colour, sc
         assert leaf.grad is not None and torch.equal(leaf.grad, expected)
 
 
+def test_a_view_made_in_inference_mode_serves_outside_of_it(scene, loss, colour):
+    camera = {"origin": [0.2, 1, 3], "target": [0, 1, 0]}
+    with torch.inference_mode():
+        view = scene.seen_by(camera)
+    assert not any(value.is_inference() for value in view.params.values())
+    pose = view.params["camera.to_world"].clone().requires_grad_()
+    torchpt.render(view, params={"camera.to_world": pose}, **WISHES).mean().backward()
+    assert pose.grad is not None and bool(pose.grad.any())
+
+
+def test_batches_do_not_heed_autocast(scene):
+    views = [{"origin": [x, 1, 3], "target": [0, 1, 0]} for x in (0.0, 0.2)]
+    plain = torchpt.render_batch([scene, scene], views, **WISHES)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(torchpt.render_batch([scene, scene], views, **WISHES), plain)
+
+
 def test_tensors_of_inference_mode_may_stand_in_a_scene(colour, loss):
     with torch.inference_mode():
         found = copy.deepcopy(torchpt.load(ROOM, "cpu"))  # its parameters are copied in that mode

@@ -235,7 +235,7 @@ def _entries(
             with named(picture.name, None):
                 raise error
 
-        return Entry(make, done, failed)
+        return Entry(order.scene.device, make, done, failed)
 
     return map(entry, pictures)
 

@@ -11,6 +11,7 @@ from torchpt.forward.result import Rendering
 from torchpt.forward.run import Run
 from torchpt.integrators.loop.together import Job, Together
 from torchpt.lanes.graph import Unsupported
+from torchpt.native.modes import undisturbed
 
 __all__ = ["Entry", "render_many"]
 
@@ -23,12 +24,14 @@ class Entry:
     """A render of several.
 
     Attributes:
+        device: where it is rendered.
         make: makes it ready; called when it is soon to begin.
         done: told of the rendering.
         failed: told of an error instead, which it may raise as another one.
         run: once it is ready.
     """
 
+    device: torch.device
     make: Callable[[], Run]
     done: Callable[[Rendering], None]
     failed: Callable[[BaseException], None]
@@ -51,7 +54,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
     crew = Together[Entry](torch.get_num_threads())
     try:
         for entry in entries:
-            with torch.no_grad(), _blamed(entry):
+            with undisturbed(entry.device), _blamed(entry):
                 entry.run = entry.make()
                 spans = entry.run.at_once()
                 if spans is None:
@@ -92,7 +95,7 @@ def _drain(crew: Together[Entry], most: int) -> None:
             continue
         job, share = found
         entry = job.owner
-        with torch.no_grad(), _blamed(entry):
+        with undisturbed(entry.device), _blamed(entry):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
                 job.loop.halt()

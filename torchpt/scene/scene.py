@@ -137,7 +137,9 @@ class Scene:
             SceneError: what is wrong with the camera.
         """
         view = object.__new__(type(self))
-        view.__dict__.update(self.__dict__ | through(self.description, self._built, self.params, camera, film or {}))
+        with lasting():
+            own = through(self.description, self._built, self.params, camera, film or {})
+        view.__dict__.update(self.__dict__ | own)
         view._origin = self.origin
         view._number()
         return view
