@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from torchpt.images.decode import MAX_PIXELS
 from torchpt.images.texels import Texels
 from torchpt.spec import Refused
 
-__all__ = ["TEXELS", "texels_of"]
+__all__ = ["TEXELS", "check_source", "texels_of"]
 
 #: What is accepted.
 TEXELS = "texels (H, W, C), channels last, or (H, W), C from 1 to 4: finite numbers, or 8 bits a value (uint8)"
@@ -41,3 +42,15 @@ def texels_of(value: Any) -> Texels:
     if array.dtype in (np.uint8, np.uint16):
         values /= np.float32(np.iinfo(array.dtype).max)
     return Texels(values, array.dtype == np.uint8)
+
+
+def check_source(values: Mapping[str, Any]) -> None:
+    """A picture comes from the file ``path`` or from the numbers ``data``.
+
+    Raises:
+        Refused: it comes from neither, or from both.
+    """
+    if values["path"] is None and values["data"] is None:
+        raise Refused("a file path or data (one of them is required)", None, ("path",))
+    if values["path"] is not None and values["data"] is not None:
+        raise Refused("either path or data, not both", "texels", ("data",))

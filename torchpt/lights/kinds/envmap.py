@@ -29,14 +29,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from torchpt.images.given import TEXELS, texels_of
+from torchpt.images.given import TEXELS, check_source, texels_of
 from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.math.angles import azimuth
 from torchpt.math.distributions import Cells, invert_linear
 from torchpt.math.threads import sum_all
 from torchpt.math.vectors import dot, luminance, safe_reciprocal, take
 from torchpt.records import Lights, LightSample
-from torchpt.spec import Moves, Other, Path, Pose, Refused, Scalar, Spec, Texels
+from torchpt.spec import Moves, Other, Path, Pose, Scalar, Spec, Texels
 
 if TYPE_CHECKING:
     import numpy as np
@@ -310,10 +310,7 @@ class Envmap(Environment):
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
         """See :class:`Light`: of one source."""
-        if values["path"] is None and values["data"] is None:
-            raise Refused("a file path or data (one of them is required)", None, ("path",))
-        if values["path"] is not None and values["data"] is not None:
-            raise Refused("either path or data, not both", "texels", ("data",))
+        check_source(values)
 
     @classmethod
     def files(

@@ -12,7 +12,7 @@ from torchpt.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS
-from torchpt.images.given import TEXELS, texels_of
+from torchpt.images.given import TEXELS, check_source, texels_of
 from torchpt.spec import Choice, Color, Other, Path, Refused, Whole
 from torchpt.spec import Texels as TexelsSpec
 from torchpt.textures.atlas import WRAPS, ImageNode
@@ -73,10 +73,7 @@ class Image(Mapped):
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
         """See :class:`Texture`: of one source."""
-        if values["path"] is None and values["data"] is None:
-            raise Refused("a file path or data (one of them is required)", None, ("path",))
-        if values["path"] is not None and values["data"] is not None:
-            raise Refused("either path or data, not both", "texels", ("data",))
+        check_source(values)
         if values["data"] is not None and values["max_pixels"] is not None:
             raise Refused("no max_pixels beside data: it is of files", values["max_pixels"], ("max_pixels",))
 
