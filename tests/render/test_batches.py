@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 
@@ -386,6 +388,24 @@ def test_what_watches_may_raise():
 
     with pytest.raises(Stop):
         torchpt.render_batch([room(0.1 * k) for k in range(4)], on_progress=stop, threads=2)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_torch_has_the_threads_that_it_had(fails):
+    """While others trace, what is next is made ready by a single thread of torch."""
+    before, seen = torch.get_num_threads(), []
+
+    def scenes():
+        for k in range(6):
+            seen.append(torch.get_num_threads())
+            if fails and k == 4:
+                raise ZeroDivisionError
+            yield room(0.1 * k)
+
+    with pytest.raises(ZeroDivisionError) if fails else nullcontext():
+        torchpt.render_batch(scenes(), threads=2, spp=64)
+    assert torch.get_num_threads() == before
+    assert seen[0] == 2 and 1 in seen[1:]
 
 
 def test_memory_that_runs_out_in_a_thread(monkeypatch):

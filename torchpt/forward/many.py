@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 
 import torch
@@ -11,6 +12,7 @@ from torchpt.forward.result import Rendering
 from torchpt.forward.run import Run
 from torchpt.integrators.loop.together import Job, Together
 from torchpt.lanes.graph import Unsupported
+from torchpt.math.threads import one_thread
 from torchpt.native.modes import undisturbed
 
 __all__ = ["Entry", "render_many"]
@@ -52,23 +54,37 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
         Exception: what an entry's ``failed`` raises; the others are given up then.
     """
     crew = Together[Entry](torch.get_num_threads())
+    waiting = iter(entries)
     try:
-        for entry in entries:
+        while True:
+            with _beside(crew):
+                entry = next(waiting, None)
+            if entry is None:
+                break
             with undisturbed(entry.device), _blamed(entry):
-                entry.run = entry.make()
-                spans = entry.run.at_once()
+                with _beside(crew):
+                    entry.run = entry.make()
+                    spans, loop = entry.run.at_once(), entry.run.loop
+                if loop is not None:
+                    loop.threads = crew.threads
                 if spans is None:
                     _drain(crew, 0)
                     entry.done(entry.run.go(None))
                     del entry.run
                     continue
-                loop = entry.run.loop
                 assert loop is not None
                 crew.add(Job(entry, loop, loop.blocks(spans, tasks)))
             _drain(crew, AHEAD * crew.threads * tasks)
         _drain(crew, 0)
     finally:
         crew.close()
+
+
+@contextmanager
+def _beside(crew: Together[Entry]) -> Iterator[None]:
+    """While all cores trace, tensor operations of this thread are its own: a team would wait for a core, and spin meanwhile."""
+    with one_thread() if crew.pending else nullcontext():
+        yield
 
 
 class _blamed:
@@ -95,7 +111,7 @@ def _drain(crew: Together[Entry], most: int) -> None:
             continue
         job, share = found
         entry = job.owner
-        with undisturbed(entry.device), _blamed(entry):
+        with undisturbed(entry.device), _blamed(entry), _beside(crew):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
                 job.loop.halt()
