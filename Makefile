@@ -36,7 +36,7 @@ test: $(VENV)/dev.stamp
 
 test-all: $(VENV)/bench.stamp
 	$(PY) -m pytest tests/ranks
-	$(PY) -m pytest --ignore=tests/ranks $(ARGS)
+	$(PY) -m pytest -n 2 --dist loadfile --ignore=tests/ranks $(ARGS)
 
 stress: $(VENV)/dev.stamp
 	$(PY) -m torchpt stress "accel=[numba,torch,brute]" "compile=[on,off]" out=stress $(ARGS)
