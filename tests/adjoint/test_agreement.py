@@ -73,6 +73,15 @@ def test_other_lights(kind):
     agree(room(COLOUR["plate"], lights={"other": light}), f"lights.other.{key}")
 
 
+@pytest.mark.parametrize("name", ["materials.plate.int_ior", "lights.sky.texels"])
+def test_tables_by_kernels(name, capfd):
+    """Whose entries are made of what is differentiated, or are it: their derivatives are kernels' too."""
+    texels = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(1)) + 0.1
+    sky = {"type": "envmap", "data": texels.tolist()}
+    agree(room(PLATES["roughplastic"][0], lights={"sky": sky}), name)
+    assert "differentiated by tensor operations" not in capfd.readouterr().err
+
+
 def test_emission_of_one_lamp():
     agree(room(COLOUR["plate"]), "shapes.lamp.emission")
 

@@ -309,6 +309,13 @@ CASES = [
         ],
     ),
     Case(
+        "masked_fill_",
+        [
+            lambda x: (x.f * 2.0).masked_fill_(x.g < 1, 0.5),
+            lambda x: (x.f * 2.0).masked_fill_(x.g < 1, 0.5) + x.g,
+        ],
+    ),
+    Case(
         "__and__ __or__ __xor__",
         [
             lambda x: aten.__and__(x.i, x.j),

@@ -218,22 +218,23 @@ class Table:
     """Functions on [0, 1], one a material, each by ``K`` values at equal distances; linear between them.
 
     Attributes:
-        values: ``(M, K)``.
+        values: ``(M K,)``, one function after the other: flat as it is looked up in, so that its derivatives go to this tensor.
+        count: K.
         row: ``(N,)`` which of them a lane reads; None before lanes are known.
     """
 
     values: Tensor
+    count: int
     row: Tensor | None = None
 
     def at(self, x: Tensor) -> Tensor:
         """Values ``(N,)`` at ``x (N,)``, clamped to [0, 1]."""
-        last = self.values.shape[1] - 1
+        last = self.count - 1
         place = x.clamp(0.0, 1.0) * last
         below = place.detach().to(torch.int64).clamp_max(last - 1)
-        start = below if self.row is None else self.row * (last + 1) + below
-        flat = self.values.reshape(-1)
-        low = take(flat, start)
-        return low + (take(flat, start + 1) - low) * (place - below)
+        start = below if self.row is None else self.row * self.count + below
+        low = take(self.values, start)
+        return low + (take(self.values, start + 1) - low) * (place - below)
 
 
 def gather(rows: Parameters, row: Tensor) -> Parameters:
@@ -262,7 +263,8 @@ def stacked(prepared: Sequence[Parameters], factors: Sequence[str] = Bsdf.factor
         elif isinstance(like, dict):
             out[name] = stacked([value or {} for value in column], factors)
         elif isinstance(like, Table):
-            out[name] = Table(torch.cat([torch.zeros_like(like.values) if t is None else t.values for t in column]))
+            values = torch.cat([torch.zeros_like(like.values) if t is None else t.values for t in column])
+            out[name] = Table(values, like.count)
         else:
             nothing = torch.ones_like(like) if name in factors else torch.zeros_like(like)
             out[name] = torch.cat([nothing if t is None else t for t in column], -1)

@@ -111,7 +111,8 @@ def energy_table(parameters: Parameters, etas: Sequence[Tensor | None]) -> Table
         nodes = 64 if isotropic and eta is not None else 32
         index = None if eta is None else eta.double()
         blocks.append(microfacet.energy(wo, au, None if isotropic else av, index, nodes, nodes))
-    return Table(torch.cat(blocks).clamp_max(1.0).to(u.dtype)[None])
+    values = torch.cat(blocks).clamp_max(1.0).to(u.dtype)
+    return Table(values, len(values))
 
 
 def energy_at(table: Table, parameters: Parameters, wo: Tensor, block: Tensor | None = None) -> Tensor:

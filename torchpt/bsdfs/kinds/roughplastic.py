@@ -62,7 +62,7 @@ class RoughPlastic(Rough, Coat):
         through = microfacet.coat_transmittance(cosines, alpha, index)
         inner = microfacet.coat_reflectance(cosines, alpha, 1.0 / index)
         diffuse = 2.0 * (inner * cosines).mean()[None].to(eta.dtype)
-        return {"transmittance": Table(through.to(eta.dtype)[None]), "inner": diffuse}
+        return {"transmittance": Table(through.to(eta.dtype), _ENTRIES), "inner": diffuse}
 
     def prepare(self, values: Parameters) -> Parameters:
         """See :class:`Bsdf`."""

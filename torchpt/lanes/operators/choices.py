@@ -13,7 +13,7 @@ from torchpt.lanes.graph import DTYPES, FLOATS
 from torchpt.lanes.operators.nodes import apply, type_of
 from torchpt.lanes.tracing import Tracer, handles
 
-__all__: list[str] = []
+__all__ = ["masked_fill"]
 
 
 @handles("bitwise_not", "logical_not")
@@ -60,7 +60,8 @@ def _where(tracer: Tracer, out: Tensor, condition: Tensor, a: Any, b: Any) -> No
 
 
 @handles("masked_fill")
-def _masked_fill(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any) -> None:
+def masked_fill(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any) -> None:
+    """Another number where a mask holds."""
     _where(tracer, out, mask, value, a)
 
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchpt.lanes.graph import DTYPES, Graph, Unsupported
 from torchpt.lanes.operators.arithmetic import binary
+from torchpt.lanes.operators.choices import masked_fill
 from torchpt.lanes.operators.nodes import apply, cast_all
 from torchpt.lanes.tracing import Tracer, handles
 
@@ -50,6 +51,14 @@ def _slice_backward(
 def _logical_and_(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
     """In place: what the derivative of a clamp makes of a comparison that nobody else reads."""
     binary("and")(tracer, out, a, b)
+    if out is not a:
+        tracer.alias(a, out)
+
+
+@handles("masked_fill_")
+def _masked_fill_(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any) -> None:
+    """In place: what the derivative of a maximum makes of a number that nobody else reads."""
+    masked_fill(tracer, out, a, mask, value)
     if out is not a:
         tracer.alias(a, out)
 

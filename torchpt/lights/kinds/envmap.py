@@ -199,16 +199,11 @@ def _corners(map: EnvironmentMap, row: Tensor, column: Tensor) -> _Corners:
     width = map.size[1]
     right = torch.where(column == width - 1, 0, column + 1)
     first = row * width
-    planes = torch.arange(3, device=row.device)[:, None] * (map.size[0] * width)
-
-    def colour(texel: Tensor) -> Tensor:
-        return take(map.texels.reshape(-1), (planes + texel).reshape(-1)).view(3, -1)
-
     return (
-        colour(first + column),
-        colour(first + right),
-        colour(first + width + column),
-        colour(first + width + right),
+        take(map.texels, first + column),
+        take(map.texels, first + right),
+        take(map.texels, first + width + column),
+        take(map.texels, first + width + right),
     )
 
 
