@@ -8,7 +8,7 @@ module, no ``lambda``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -43,20 +43,17 @@ class _Items:
         if not callable(make):
             raise SceneError("make", make, "a function from a scene's index to the scene")
         check_names(call, wishes, ("cameras", "layers"))
-        for key in ("full", "params", "spp", "seed"):
+        for key in ("params", "spp", "seed"):
             if key in wishes:
                 raise SceneError(key, wishes[key], "an argument of the data set, of `make` or none")
+        _check_wishes(wishes)
         if type(seed) is not int or seed < 0:
             raise SceneError("seed", seed, "a whole number >= 0")
+        if isinstance(layers, str) or not isinstance(layers, Iterable):
+            raise SceneError("layers", layers, "a sequence of names of layers")
         self.make, self.layers, self.seed, self.device, self.wishes = make, tuple(layers), seed, device, dict(wishes)
         self.spp = spp
-        self.cameras = [c if isinstance(c, Mapping) else {"camera.to_world": torch.as_tensor(c)} for c in cameras]
-        for c, camera in enumerate(cameras):
-            if isinstance(camera, Mapping) and not all(str(name).startswith("camera.") for name in camera):
-                expected = (
-                    "names of scene.params such as camera.fov; a whole camera block is for render_batch or seen_by"
-                )
-                raise SceneError(f"cameras[{c}]", list(camera), expected)
+        self.cameras = _cameras(cameras)
         self.latest: tuple[int, Scene, dict[str, Any]] | None = None
 
     def item(self, index: int) -> dict[str, Tensor]:
@@ -64,18 +61,25 @@ class _Items:
         number, view = divmod(index, max(len(self.cameras), 1))
         scene, own = self._scene(number)
         wishes: dict[str, Any] = {**self.wishes, **own}
-        film = {**(self.wishes.get("film") or {}), **(own.get("film") or {})}
+        film = {
+            **(self.wishes.get("film") or {}),
+            **(own.get("film") or {}),
+            "aovs": list(self.layers),
+            "denoise": False,
+        }
         params = {**(self.cameras[view] if self.cameras else {}), **(wishes.pop("params", None) or {})}
-        params = {name: torch.as_tensor(value, dtype=torch.float32) for name, value in params.items()}
+        own_types = {name: value.dtype for name, value in scene.params.items()}
+        params = {n: _tensor(f"params.{n}", value, own_types.get(n, torch.float32)) for n, value in params.items()}
         if get_worker_info() is not None:
             wishes.setdefault("threads", 1)  # workers share the cores
-        wishes = {"spp": self.spp, "seed": self.seed + index, **wishes, "film": {**film, "aovs": list(self.layers)}}
+        wishes = {"spp": self.spp, "seed": self.seed + index, **wishes, "film": film}
         with torch.no_grad():
             found = render(scene, params=params, full=True, **wishes)
-            world = scene.merged(params)["camera.to_world"]
+            exact = own_types["camera.to_world"]  # float64 far from the origin
+            world = scene.merged(params)["camera.to_world"].to(exact)
             item = {"image": found.image, **{name: found.layers[name] for name in self.layers}, "to_world": world}
             if "camera.fov" in scene.params:
-                matrices = scene.pinhole(params, film)
+                matrices = scene.pinhole(params, film, exact)
                 item |= {"K": matrices.K, "R": matrices.R, "t": matrices.t}
         return {**{name: value.detach() for name, value in item.items()}, "index": torch.tensor(index)}
 
@@ -90,6 +94,7 @@ class _Items:
                 )
                 raise SceneError(f"make({number})", made, expected)
             check_names("render", own)
+            _check_wishes(own, f"make({number}).")
             scene = source if isinstance(source, Scene) else load(dict(source), self.device)
             self.latest = number, scene, dict(own)
         return self.latest[1], dict(self.latest[2])
@@ -214,6 +219,51 @@ class RenderStream(IterableDataset):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "seen": self.seen or _ranks()}  # spawned workers know nothing of ranks
+
+
+def _check_wishes(wishes: Mapping[str, Any], where: str = "") -> None:
+    """Refuse arguments of ``render`` that would change nothing here; ``where``: what their keys begin with."""
+    film, params = wishes.get("film"), wishes.get("params")
+    if "full" in wishes:
+        raise SceneError(f"{where}full", wishes["full"], "none: an item holds the picture and its layers")
+    if film is not None and not isinstance(film, Mapping):
+        raise SceneError(f"{where}film", film, "a mapping of film settings such as width")
+    if params is not None and not isinstance(params, Mapping):
+        raise SceneError(f"{where}params", params, "a mapping from names of scene.params to tensors")
+    film = film or {}
+    if film.get("aovs") not in (None, (), []):
+        raise SceneError(f"{where}film.aovs", film["aovs"], "none: use layers, an argument of the data set")
+    if film.get("denoise") not in (None, False):
+        expected = "false: an item holds no denoised picture; hand its image to torchpt.denoise with its layers"
+        raise SceneError(f"{where}film.denoise", film["denoise"], expected)
+
+
+def _cameras(cameras: Any) -> list[Mapping[str, Any]]:
+    """Each camera as parameters of a scene."""
+    if isinstance(cameras, str | Mapping) or not isinstance(cameras, Iterable):
+        raise SceneError("cameras", cameras, "a sequence of poses (4, 4) or of mappings of camera.* parameters")
+    found: list[Mapping[str, Any]] = []
+    for c, camera in enumerate(cameras):
+        if not isinstance(camera, Mapping):
+            shape = tuple(_tensor(f"cameras[{c}]", camera, torch.float64).shape)
+            if shape != (4, 4):
+                raise SceneError(f"cameras[{c}]", f"shape {shape}", "a pose (4, 4) or a mapping of camera.* parameters")
+            camera = {"camera.to_world": camera}
+        elif not all(str(name).startswith("camera.") for name in camera):
+            expected = "names of scene.params such as camera.fov; a whole camera block is for render_batch or seen_by"
+            raise SceneError(f"cameras[{c}]", list(camera), expected)
+        found.append(camera)
+    return found
+
+
+def _tensor(key: str, value: Any, dtype: torch.dtype) -> Tensor:
+    """A floating tensor as it is, and other numbers as one of ``dtype``."""
+    if isinstance(value, Tensor) and value.is_floating_point():
+        return value
+    try:
+        return torch.as_tensor(value, dtype=dtype)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise SceneError(key, value, "numbers, or a floating tensor") from None
 
 
 def _ranks() -> tuple[int, int]:

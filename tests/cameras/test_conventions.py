@@ -1,5 +1,8 @@
 """Cameras as other libraries have them: one picture from all of them, round trips, gradients, and where a point is seen."""
 
+# pyright: reportArgumentType=false
+# Wrong arguments are among what is handed over here.
+
 from __future__ import annotations
 
 import json
@@ -205,7 +208,86 @@ def test_a_file_of_nerf_is_read(tmp_path: Any) -> None:
         cameras.write_transforms(tmp_path / "none" / "out.json", [cameras.Frame("a.png", blocks[0], SIZE)])
 
 
+def _one_frame(path: Any, **numbers: Any) -> cameras.Frame:
+    path.write_text(json.dumps({**numbers, "frames": [{"file_path": "a.png", "transform_matrix": POSE}]}))
+    return cameras.read_transforms(path)[0]
+
+
+def test_angles_of_a_picture_whose_size_is_known_are_lengths_in_pixels(tmp_path: Any) -> None:
+    """Each along its own axis, and nothing beside them is lost."""
+    path = tmp_path / "transforms.json"
+    wide, tall = (0.5 * side / math.tan(0.5 * angle) for side, angle in ((24, 0.8), (16, 0.6)))
+    lengths: dict[str, Any] = {"w": 24, "h": 16, "cx": 10.0, "cy": 9.5}
+    angles = {"camera_angle_x": 0.8, "camera_angle_y": 0.6}
+    for numbers, fx, fy in (
+        (angles, wide, tall),
+        ({"camera_angle_x": 0.8}, wide, wide),
+        ({"camera_angle_y": 0.6}, tall, tall),
+        ({"fl_x": 30, **angles}, 30.0, tall),
+        ({"fl_x": 30, "camera_angle_x": 0.8}, 30.0, 30.0),
+        ({"fl_y": 30, "fl_x": 20, **angles}, 20.0, 30.0),
+    ):
+        frame = _one_frame(path, **lengths, **numbers)
+        expected = torch.tensor([[fx, 0, 10], [0, fy, 9.5], [0, 0, 1]], dtype=torch.float64)
+        assert torch.allclose(frame.camera["K"], expected) and frame.size == SIZE
+        assert torch.allclose(loaded(frame.camera).pinhole().K.double(), expected, rtol=1e-5)
+
+
+#: Beside ``to_world``: what a block may say of its lens.
+LENSES: list[dict[str, Any]] = [
+    {"fov": 44.0, "principal_point_offset_x": 0.06, "principal_point_offset_y": -0.04, "pixel_aspect": 1.1},
+    {"fov": torch.tensor(44.0), "fov_axis": "diagonal", "pixel_aspect": torch.tensor(0.8)},
+    {"fov": 30.0, "fov_axis": "larger"},
+    {"fov": 30.0, "fov_axis": "y", "type": "perspective"},
+    {"K": np.array([[20.0, 0, 11], [0, 21.0, 9], [0, 0, 1]])},
+    {"K": [[20.0, 0, 11], [0, 21.0, 9], [0, 0, 1]], "size": [30, 30]},
+]
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: ", ".join(lens))
+def test_all_of_a_lens_is_written(lens: dict[str, Any], tmp_path: Any, scene: torchpt.Scene) -> None:
+    block = {"to_world": scene.params["camera.to_world"], **lens}
+    path = tmp_path / "transforms.json"
+    cameras.write_transforms(path, [cameras.Frame("a.png", block, SIZE)])
+    (frame,) = cameras.read_transforms(path)
+    for ours, theirs in zip(loaded(frame.camera).pinhole(), loaded(block).pinhole(), strict=True):
+        assert torch.allclose(ours, theirs, rtol=1e-5, atol=1e-4)
+
+
 POSE = np.eye(4).tolist()
+UNWRITTEN: dict[str, tuple[cameras.Frame, str]] = {
+    key: (cameras.Frame("a.png", {"to_world": POSE, **block}, size), said)
+    for key, block, size, said in (
+        ("no angle", {"fov": 0}, SIZE, "camera.fov: expected"),
+        ("a word", {"fov": "x"}, SIZE, "camera.fov: expected"),
+        ("a NaN", {"fov": math.nan}, SIZE, "camera.fov: expected"),
+        ("a pose of NaN", {"fov": 40, "to_world": torch.full((4, 4), math.nan)}, SIZE, "camera.to_world"),
+        ("a K without a length", {"K": np.diag([0.0, 1.0, 1.0])}, SIZE, "camera.K.* expected"),
+        (
+            "a lens",
+            {"fov": 40, "type": "thinlens", "aperture_radius": 0.1},
+            SIZE,
+            "camera.type: expected .*perspective",
+        ),
+        ("an unknown key", {"fov": 40, "aperture_radius": 0.1}, SIZE, "camera.aperture_radius: expected a known key"),
+        ("both", {"fov": 40, "K": np.eye(3)}, SIZE, "camera: expected to_world or R and t, and K or fov"),
+        ("another size", {"fov": 40}, (24,), "size: expected width and height"),
+        ("no size", {"fov": 40}, (0, 5), "size: expected width and height"),
+    )
+} | {
+    "no block": (cameras.Frame("a.png", 3, SIZE), "camera: expected the block"),
+    "no name": (cameras.Frame(3, {}, SIZE), "image: expected the picture's file"),
+}
+
+
+@pytest.mark.parametrize("case", UNWRITTEN)
+def test_what_is_not_written_is_one_line(case: str, tmp_path: Any) -> None:
+    frame, said = UNWRITTEN[case]
+    with pytest.raises(SceneError, match=f"^frames.0.{said}") as error:
+        cameras.write_transforms(tmp_path / "out.json", [frame])
+    assert "\n" not in str(error.value) and not list(tmp_path.iterdir())
+
+
 BAD = {
     "{": "is no JSON",
     '{"frames": 3}': "no list of frames",
@@ -216,6 +298,35 @@ BAD = {
         {"camera_angle_x": 0.5, "frames": [{"transform_matrix": [[1, 2]]}]}
     ): "transform_matrix: expected a matrix",
     json.dumps({"camera_angle_x": "wide", "frames": [{"transform_matrix": POSE}]}): "camera_angle_x: expected a finite",
+    json.dumps(
+        {"camera_angle_x": 10**400, "frames": [{"transform_matrix": POSE}]}
+    ): "camera_angle_x: expected a finite",
+    json.dumps(
+        {"camera_angle_x": 0, "frames": [{"transform_matrix": POSE}]}
+    ): "camera_angle_x: expected an angle above 0",
+    json.dumps(
+        {"camera_angle_y": 3.2, "frames": [{"transform_matrix": POSE}]}
+    ): "camera_angle_y: expected an angle above 0",
+    json.dumps(
+        {"camera_angle_x": 0.5, "cx": 3, "frames": [{"transform_matrix": POSE}]}
+    ): "w and h are missing.* cx belongs",
+    json.dumps(
+        {"fl_x": -3, "w": 5, "h": 5, "frames": [{"transform_matrix": POSE}]}
+    ): "frames.0.fl_x: expected a number > 0",
+    json.dumps(
+        {"fl_x": 3, "w": -5, "h": 5, "frames": [{"transform_matrix": POSE}]}
+    ): "frames.0.w: expected a whole number",
+    json.dumps(
+        {"fl_x": 3, "w": 5, "h": 5.5, "frames": [{"transform_matrix": POSE}]}
+    ): "frames.0.h: expected a whole number",
+    json.dumps({"fl_x": 3, "w": 5, "h": 1e300, "frames": [{"transform_matrix": POSE}]}): "frames.0.h: expected a",
+    json.dumps(
+        {"camera_angle_x": 0.5, "frames": [{"transform_matrix": [[math.nan] * 4] * 3}]}
+    ): "_matrix: expected finite",
+    json.dumps({"camera_angle_x": 0.5, "frames": [{"transform_matrix": [[0] * 4] * 3}]}): "_matrix: expected finite",
+    json.dumps(
+        {"camera_angle_x": 0.5, "frames": [{"transform_matrix": [[10**400] * 4] * 3}]}
+    ): "transform_matrix: expected a matrix",
     json.dumps({"camera_angle_x": 0.5, "k1": 0.1, "frames": [{"transform_matrix": POSE}]}): "undistort",
     json.dumps({"camera_angle_x": 0.5, "camera_model": "OPENCV_FISHEYE", "frames": [{}]}): "OPENCV_FISHEYE",
 }
@@ -232,6 +343,12 @@ def test_what_is_wrong_with_a_file_is_one_line(text: str, tmp_path: Any) -> None
         cameras.read_transforms(tmp_path / "none.json")
 
 
+def _two_of_kornia() -> Any:
+    one = cameras.to_kornia(loaded(AIMED))
+    parts = (one.intrinsics, one.extrinsics, one.height, one.width)
+    return type(one)(*(torch.cat((part, part)) for part in parts))
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -240,6 +357,18 @@ def test_what_is_wrong_with_a_file_is_one_line(text: str, tmp_path: Any) -> None
         (lambda: cameras.from_opengl(POSE, K=np.eye(3)), "size: expected"),
         (lambda: cameras.from_opengl("a matrix", 40.0), "matrix: expected a matrix"),
         (lambda: cameras.from_opencv(np.eye(3), np.eye(4), np.zeros(3), SIZE), r"R: expected numbers of shape \(3, 3\)"),
+        (lambda: cameras.from_opencv(np.eye(3), np.eye(3), np.zeros(3), None), "size: expected .width, height. in pixels"),
+        (lambda: cameras.from_opencv(np.eye(3), np.eye(3), np.zeros(3), (24,)), "size: expected .width, height. in pixels"),
+        (lambda: cameras.from_opencv(np.eye(3), np.eye(3), np.zeros(3), "24"), "size: expected .width, height. in pixels"),
+        (lambda: cameras.from_opengl(POSE, K=np.eye(3), size=(-2, 3)), "size: expected .width, height. in pixels"),
+        (lambda: cameras.from_opengl([[10**400] * 4] * 3, 40.0), "matrix: expected a matrix"),
+        (lambda: cameras.from_kornia(_two_of_kornia(), 5), "index: expected a whole number below 2, .* got 5"),
+        (lambda: cameras.from_kornia(_two_of_kornia(), -3), "index: expected a whole number below 2, .* got -3"),
+        (lambda: cameras.from_kornia(_two_of_kornia(), "x"), "index: expected a whole number below 2, .* got 'x'"),
+        (lambda: cameras.from_pytorch3d(np.eye(3), np.zeros(3), [1.0, 2.0, 3.0], image_size=(4, 4)),
+         "focal_length: expected one number, or two"),
+        (lambda: cameras.from_pytorch3d(np.eye(3), np.zeros(3), [], image_size=(4, 4)), "focal_length: expected one number"),
+        (lambda: cameras.from_pytorch3d(np.eye(3), np.zeros(3), 1.0, image_size=(0, 4)), "image_size: expected .height, width"),
         (lambda: cameras.to_kornia(loaded({"type": "orthographic", "origin": [0, 0, 3], "target": [0, 0, 0]})),
          "camera.type: expected a camera with an angle"),
     ],

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from scene_makers import dim, flat, room
+from scene_makers import FILM, dim, flat, room
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -21,6 +21,20 @@ Items = dict[int, dict[str, Tensor]]
 
 def data(**changes: Any) -> RenderDataset:
     return RenderDataset(room, 4, **{"spp": 4, "layers": ["depth", "normal"], "seed": 7, **changes})
+
+
+def far_away() -> torchpt.Scene:
+    """A ball 4,000 km from the origin."""
+    place = [4e6, 0, 0]
+    return torchpt.load(
+        {
+            "camera": {"type": "perspective", "origin": [4e6, 0, 4], "target": place, "fov": 40},
+            "film": FILM,
+            "shapes": {"ball": {"type": "sphere", "center": place}},
+            "lights": {"sky": {"type": "constant", "radiance": 1.0}},
+        },
+        "cpu",
+    )
 
 
 def by_index(batches: Any) -> Items:
@@ -108,6 +122,38 @@ def test_arguments_that_are_not_accepted(wish, key):
 def test_an_unknown_layer_is_named():
     with pytest.raises(SceneError, match="film.aovs"):
         data(layers=["smell"])[0]
+
+
+@pytest.mark.parametrize("kind", ["tensor", "list", "array", "made"])
+def test_poses_far_from_the_origin_keep_their_digits(kind):
+    scene = far_away()
+    pose = scene.params["camera.to_world"].clone()
+    assert pose.dtype == torch.float64
+    pose[0, 3] += 0.2
+    given = {"tensor": pose, "list": pose.tolist(), "array": pose.numpy(), "made": pose.tolist()}[kind]
+    if kind == "made":
+        item = RenderDataset(lambda _: (scene, {"params": {"camera.to_world": given}}), 1, spp=1)[0]
+    else:
+        item = RenderDataset(lambda _: scene, 1, cameras=[given], spp=1)[0]
+    assert torch.equal(item["to_world"], pose)
+    assert torch.allclose(-(item["R"].T @ item["t"]), pose[:3, 3], rtol=0, atol=1e-6)
+    assert torch.equal(item["image"], torchpt.render(scene, params={"camera.to_world": pose}, spp=1, seed=0))
+
+
+def test_items_of_a_scene_are_of_one_type_whatever_its_poses_are():
+    poses = [torch.eye(4, dtype=torch.float64), torch.eye(4), torch.eye(4).tolist()]
+    items = RenderDataset(room, 1, cameras=poses, spp=1)
+    first, *others = (items[i] for i in range(3))
+    for other in others:
+        assert all(other[name].dtype == first[name].dtype for name in first)
+    assert first["to_world"].dtype == torch.float32
+
+
+def test_wishes_of_a_scene_for_files_are_left_out(monkeypatch):
+    monkeypatch.setattr("torchpt.orders.denoise", lambda *_, **__: pytest.fail("nobody sees it"))
+    scene = torchpt.load({**room(0), "film": {**FILM, "denoise": True, "aovs": ["normal"]}}, "cpu")
+    item = RenderDataset(lambda _: scene, 1, spp=1, layers=["depth"])[0]
+    assert "depth" in item and "normal" not in item
 
 
 # -- workers

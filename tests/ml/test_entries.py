@@ -51,6 +51,14 @@ def loaded(**camera: Any) -> torchpt.Scene:
     return torchpt.load(block(**camera), "cpu")
 
 
+def items(scene: Any, **changes: Any) -> RenderDataset:
+    return RenderDataset(lambda _: scene, 1, **{"spp": 1, **changes})
+
+
+def made(scene: Any, **own: Any) -> Any:
+    return RenderDataset(lambda _: (scene, own), 1, spp=1)[0]
+
+
 def under(transform: Callable[..., Any], work: Callable[..., Any]) -> Any:
     return transform(work)(torch.tensor([30.0]) if transform is torch.func.vmap else torch.tensor(30.0))
 
@@ -103,6 +111,30 @@ REFUSED: dict[str, tuple[Callable[[torchpt.Scene], Any], str]] = {
         lambda s: RenderDataset(lambda i: s, 1, cameras=[{"fov": 30}]),
         r"cameras\[0\]: expected names of scene.params such as camera.fov; a whole camera block is for render_batch",
     ),
+    "cameras of a data set none": (lambda s: items(s, cameras=None), "cameras: expected a sequence of poses"),
+    "cameras of a data set a word": (lambda s: items(s, cameras="x"), "cameras: expected a sequence of poses"),
+    "a word for a pose": (lambda s: items(s, cameras=["x"]), r"cameras\[0\]: expected numbers"),
+    "one pose for many": (lambda s: items(s, cameras=torch.eye(4)), r"cameras\[0\]: expected a pose \(4, 4\)"),
+    "a word for a parameter": (
+        lambda s: items(s, cameras=[{"camera.fov": "wide"}])[0],
+        "params.camera.fov: expected numbers",
+    ),
+    "layers a word": (lambda s: items(s, layers="depth"), "layers: expected a sequence"),
+    "layers none": (lambda s: items(s, layers=None), "layers: expected a sequence"),
+    "film a word": (lambda s: items(s, film="x"), "film: expected a mapping of film settings"),
+    "layers in the film": (lambda s: items(s, film={"aovs": ["depth"]}), "film.aovs: expected none: use layers"),
+    "denoised items": (lambda s: items(s, film={"denoise": True}), "film.denoise: expected false"),
+    "a stream of them": (
+        lambda s: RenderStream(lambda i: s, film={"aovs": ["depth"]}),
+        "film.aovs: expected none: use layers",
+    ),
+    "made layers": (lambda s: made(s, film={"aovs": ["depth"]}), r"make\(0\).film.aovs: expected none: use layers"),
+    "made denoised": (lambda s: made(s, film={"denoise": True}), r"make\(0\).film.denoise: expected false"),
+    "made film a word": (lambda s: made(s, film="x"), r"make\(0\).film: expected a mapping"),
+    "made full": (lambda s: made(s, full=True), r"make\(0\).full: expected none"),
+    "made params a list": (lambda s: made(s, params=[1]), r"make\(0\).params: expected a mapping from names"),
+    "made params a word": (lambda s: made(s, params={PAINT: "red"}), f"params.{PAINT}: expected numbers"),
+    "made params unknown": (lambda s: made(s, params={"pain": 1.0}), "params.pain: expected a parameter of this scene"),
     # batches
     "a number for a batch": (lambda s: batch(s, [{"fov": 30}]), r"cameras\[0\]: expected a whole camera block.*params"),
     "a name for a batch": (lambda s: batch(s, [{"camera.fov": 3.0}]), r"cameras\[0\]: expected a whole camera block"),

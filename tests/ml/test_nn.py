@@ -162,6 +162,43 @@ def test_values_are_assigned_and_written(scene):
         renderer.assign({LAMP: colour})
 
 
+BEAM, CUTOFF, PLACE, AIM = (f"lights.s.{name}" for name in ("beam_width", "cutoff_angle", "position", "target"))
+
+
+def lit_by_a_spot() -> Renderer:
+    """By a cone of 20 degrees whose beam is 15 wide."""
+    spot = {"type": "spot", "position": [0, 0, 3], "target": [0, 0, 0], "cutoff_angle": 20.0}
+    return Renderer(torchpt.load({**room(1), "lights": {"s": spot}}, "cpu"), "lights.s.*", **WISHES)
+
+
+@pytest.mark.parametrize("names", [(BEAM, CUTOFF), (CUTOFF, BEAM)])
+def test_values_that_go_together_are_assigned_together(names):
+    renderer = lit_by_a_spot()
+    renderer.assign({name: torch.tensor({BEAM: 30.0, CUTOFF: 40.0}[name]) for name in names})
+    found = {name: value.detach() for name, value in renderer.values().items()}
+    assert float(found[BEAM]) == pytest.approx(30, rel=1e-5) and float(found[CUTOFF]) == pytest.approx(40, rel=1e-5)
+    renderer.assign({BEAM: torch.tensor(35.0)})  # right with the module's own cutoff, wrong with the scene's
+    with pytest.raises(SceneError, match="beam_width: expected an angle of at most cutoff_angle"):
+        renderer.assign({CUTOFF: torch.tensor(30.0)})
+
+
+@pytest.mark.parametrize("last", [{BEAM: torch.tensor(45.0)}, {PLACE: torch.zeros(3)}, {WALL: torch.ones(3)}])
+def test_what_is_refused_changes_nothing(last):
+    renderer = lit_by_a_spot()
+    before = copy.deepcopy(renderer.state_dict())
+    with pytest.raises(SceneError):
+        renderer.assign({CUTOFF: torch.tensor(40.0), **last})
+    assert all(torch.equal(value, before[name]) for name, value in renderer.state_dict().items())
+
+
+def test_a_pose_that_is_not_reached_is_refused_before_anything_changes(renderer):
+    before = copy.deepcopy(renderer.state_dict())
+    larger = torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0]))
+    with pytest.raises(SceneError, match="params.camera.to_world: expected the pose at first, turned and moved"):
+        renderer.assign({WALL: torch.ones(3), "camera.to_world": larger})
+    assert all(torch.equal(value, before[name]) for name, value in renderer.state_dict().items())
+
+
 @pytest.mark.parametrize(
     ("arguments", "wishes", "key"),
     [

@@ -21,6 +21,7 @@ Tensors go in and come out: gradients flow through both ways. Numbers, lists and
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -64,10 +65,13 @@ def from_opencv(K: Any, R: Any, t: Any, size: Size, first_pixel: float = 0.5) ->
         t: ``(3,)``.
         size: width and height in pixels of the picture that ``K`` belongs to.
         first_pixel: where ``K`` has the middle of the first pixel, along x and y: 0.5 as COLMAP, 0 as ``cv2``.
+
+    Raises:
+        SceneError: numbers of another shape, or no size.
     """
-    inner = _moved(_tensor(K, "K", (3, 3)), 0.5 - first_pixel)
+    inner, wide_and_tall = _moved(_tensor(K, "K", (3, 3)), 0.5 - first_pixel), _size(size)
     pose = {"R": _tensor(R, "R", (3, 3)), "t": _tensor(t, "t", (3,))}
-    return {"type": "perspective", "K": inner, **pose, "size": [int(size[0]), int(size[1])]}
+    return {"type": "perspective", "K": inner, **pose, "size": wide_and_tall}
 
 
 def to_opencv(
@@ -126,9 +130,7 @@ def from_opengl(
     }
     if K is None:
         return {**block, "fov": fov, "fov_axis": fov_axis}
-    assert size is not None
-    inner = _moved(_tensor(K, "K", (3, 3)), 0.5 - first_pixel)
-    return {**block, "K": inner, "size": [int(size[0]), int(size[1])]}
+    return {**block, "K": _moved(_tensor(K, "K", (3, 3)), 0.5 - first_pixel), "size": _size(size)}
 
 
 def to_opengl(
@@ -158,6 +160,11 @@ def from_kornia(camera: PinholeCamera, index: int = 0) -> Block:
     """
     if not all(hasattr(camera, name) for name in ("extrinsics", "intrinsics", "width", "height")):
         raise SceneError("camera", camera, "kornia's PinholeCamera")
+    count = len(camera.extrinsics)
+    try:
+        index = range(count)[operator.index(index)]
+    except (IndexError, TypeError):
+        raise SceneError("index", index, f"a whole number below {count}, the number of cameras") from None
     outer = camera.extrinsics[index]
     size = int(camera.width[index]), int(camera.height[index])
     return from_opencv(camera.intrinsics[index, :3, :3], outer[:3, :3], outer[:3, 3], size, 0.0)
@@ -194,11 +201,16 @@ def from_pytorch3d(
         principal_point: ``(2,)``.
         image_size: height and width in pixels, in this order.
         in_ndc: whether the two before are in PyTorch3D's normalized coordinates, whose smaller side is 2 long; else in pixels.
+
+    Raises:
+        SceneError: numbers of another shape.
     """
     # Ours is the same camera space, and R's columns are its axes in the world.
     turn, move = _tensor(R, "R", (3, 3)), _tensor(T, "T", (3,))
-    tall, wide = (int(side) for side in _tensor(image_size, "image_size", (2,)).tolist())
+    tall, wide = _size(_tensor(image_size, "image_size", (2,)), "image_size", "[height, width]")
     focal, point = _tensor(focal_length, "focal_length", None), _tensor(principal_point, "principal_point", (2,))
+    if focal.numel() not in (1, 2):
+        raise SceneError("focal_length", f"shape {tuple(focal.shape)}", "one number, or two")
     focal = focal.reshape(-1).expand(2)
     if in_ndc:
         half = min(wide, tall) * 0.5
@@ -233,7 +245,7 @@ def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
     """Numbers in float64, of a shape or a batch of one."""
     try:
         found = torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise SceneError(key, value, "numbers") from None
     if shape is not None and found.shape == (1, *shape):
         found = found[0]
@@ -242,11 +254,24 @@ def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
     return found
 
 
+def _size(size: Any, key: str = "size", sides: str = "[width, height]") -> list[int]:
+    """Two sides of a picture in pixels."""
+    expected = f"{sides} in pixels, whole numbers >= 1"
+    try:
+        found = [] if isinstance(size, str) else [int(side) for side in size]
+        whole = len(found) == 2 and all(side >= 1 and side == given for side, given in zip(found, size, strict=True))
+    except (TypeError, ValueError, OverflowError):
+        whole, found = False, []
+    if not whole:
+        raise SceneError(key, size, expected)
+    return found
+
+
 def _pose(matrix: Any) -> Tensor:
     """``(3, 4)`` of a ``(4, 4)`` or ``(3, 4)``, its axes of length 1."""
     try:
         found = torch.as_tensor(matrix, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise SceneError("matrix", matrix, "a matrix (4, 4) or (3, 4)") from None
     if found.shape not in ((4, 4), (3, 4)):
         raise SceneError("matrix", f"shape {tuple(found.shape)}", "a matrix (4, 4) or (3, 4)")

@@ -1,8 +1,9 @@
 """``transforms.json``: the cameras of a set of pictures, as NeRF, instant-ngp and nerfstudio keep them.
 
 ``transform_matrix`` is camera to world with OpenGL's axes (x right, y up, looks along -z). ``fl_x fl_y cx cy`` are pixels from
-the picture's corner, ``w h`` its size; ``camera_angle_x`` is the full angle along x in radians. A frame may have all of them
-itself, else those at the top of the file count.
+the picture's corner, ``w h`` its size; ``camera_angle_x`` is the full angle along x in radians, and counts where there is no
+``fl_x``. A frame may have all of them itself, else those at the top of the file count. Without ``w`` and ``h`` there are angles
+alone, and the one along x counts: pixels are squares.
 """
 
 from __future__ import annotations
@@ -10,17 +11,20 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.cameras import opencv
 from torchpt.cameras.conventions import from_opengl, to_opengl
-from torchpt.cameras.traced import opencv_pose
 from torchpt.errors import AssetError, OutputError, SceneError
 from torchpt.files import read_regular
+from torchpt.spec import Refused, reading
+from torchpt.spec.declared import described
 
 if TYPE_CHECKING:
     from torchpt.scene.scene import Scene
@@ -32,6 +36,18 @@ _NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angl
 #: What bends rays, or turns the picture otherwise: none of it is built, so it must be 0.
 _BENT = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+_FOCAL = "a number > 0", lambda x: x > 0.0
+_SIDE = "a whole number in 1..16777216", lambda x: 1.0 <= x <= 2.0**24 and x.is_integer()
+_ANGLE = "an angle above 0 and below pi", lambda x: 1e-30 < x < math.pi
+#: What is accepted of numbers that have ends.
+_ENDS: dict[str, tuple[str, Callable[[float], bool]]] = {
+    "fl_x": _FOCAL,
+    "fl_y": _FOCAL,
+    "w": _SIDE,
+    "h": _SIDE,
+    "camera_angle_x": _ANGLE,
+    "camera_angle_y": _ANGLE,
+}
 
 
 class Frame(NamedTuple):
@@ -87,10 +103,10 @@ def write_transforms(path: str | os.PathLike[str], frames: Iterable[Frame]) -> N
     Args:
         path: of the file.
         frames: of :func:`frame_of` or :func:`read_transforms`; others need ``to_world`` or ``R`` and ``t``, and ``K`` or
-            ``fov`` along x or y.
+            ``fov`` with what may stand beside it.
 
     Raises:
-        SceneError: no frames, a frame without a size, or a camera in another form.
+        SceneError: no frames, a frame without a size, a camera in another form, or one that no scene could have.
         OutputError: it cannot be written.
     """
     rows = [_row(frame, f"frames.{number}") for number, frame in enumerate(frames)]
@@ -109,76 +125,82 @@ def write_transforms(path: str | os.PathLike[str], frames: Iterable[Frame]) -> N
         raise OutputError(path, f"cannot be written ({error.strerror})") from None
 
 
-def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
-    def number(name: str) -> float | None:
-        value = row.get(name)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise AssetError(path, f"{key}.{name}: expected a finite number, got {value!r}")
-        return float(value)
+def _number(path: Any, key: str, row: Mapping[str, Any], name: str) -> float | None:
+    """A number of a frame, where it has it."""
+    value = row.get(name)
+    if value is None:
+        return None
+    expected, fits = _ENDS.get(name, ("a finite number", lambda _: True))
+    try:
+        found = reading.number(value)
+    except Refused:
+        raise AssetError(path, f"{key}.{name}: expected a finite number, got {value!r}") from None
+    if not fits(found):
+        raise AssetError(path, f"{key}.{name}: expected {expected}, got {value!r}")
+    return found
 
+
+def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
+    """A frame of the file, of its own keys and those at the top."""
     model = row.get("camera_model", _MODELS[0])
     if model not in _MODELS or row.get("is_fisheye"):
         raise AssetError(path, f"{key}: a camera of model {model!r} is not built; one of {', '.join(_MODELS)}")
-    if any(number(name) for name in _BENT):
+    if any(_number(path, key, row, name) for name in _BENT):
         raise AssetError(
             path, f"{key}: a lens that bends rays ({', '.join(_BENT)}) is not built; undistort the pictures"
         )
     image, matrix = row.get("file_path", ""), row.get("transform_matrix")
     if not isinstance(image, str):
         raise AssetError(path, f"{key}.file_path: expected text, got {image!r}")
-    known = {name: number(name) for name in _NUMBERS}
-    wide, tall, fx, fy = (known[name] for name in ("w", "h", "fl_x", "fl_y"))
-    size = (int(wide), int(tall)) if wide and tall else None
+    known = {name: found for name in _NUMBERS if (found := _number(path, key, row, name)) is not None}
+    size = (int(known["w"]), int(known["h"])) if {"w", "h"} <= known.keys() else None
+    pixels = [name for name in ("fl_x", "fl_y", "cx", "cy") if name in known]
+    if size is None and pixels:
+        raise AssetError(path, f"{key}: w and h are missing, the size of the picture that {pixels[0]} belongs to")
+    axis = "x" if "camera_angle_x" in known else "y"
+    angle = known.get(f"camera_angle_{axis}")
+    if angle is None and not {"fl_x", "fl_y"} & known.keys():
+        raise AssetError(path, f"{key}: no fl_x and no camera_angle_x")
+    lens: dict[str, Any] = {"K": _inner(known, size)} if size else {"fov": math.degrees(angle or 0), "fov_axis": axis}
     try:
-        if fx or fy:
-            if size is None:
-                raise AssetError(path, f"{key}: w and h are missing, the size of the picture that fl_x belongs to")
-            cx, cy = (0.5 * side if x is None else x for x, side in zip((known["cx"], known["cy"]), size, strict=True))
-            inner = [[fx or fy, 0.0, cx], [0.0, fy or fx, cy], [0.0, 0.0, 1.0]]
-            return Frame(image, from_opengl(matrix, K=inner, size=size), size)
-        axis = "x" if known["camera_angle_x"] is not None else "y"
-        angle = known[f"camera_angle_{axis}"]
-        if angle is None:
-            raise AssetError(path, f"{key}: no fl_x and no camera_angle_x")
-        return Frame(image, from_opengl(matrix, math.degrees(angle), axis), size)
+        camera = from_opengl(matrix, **lens, size=size)
     except SceneError as error:
         raise AssetError(path, f"{key}.transform_matrix: expected {error.expected}") from None
+    if not camera["to_world"].isfinite().all():
+        raise AssetError(path, f"{key}.transform_matrix: expected finite numbers, and axes of a length")
+    return Frame(image, camera, size)
 
 
-def _numbers(value: Any) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64).detach().cpu()
+def _inner(known: Mapping[str, float], size: tuple[int, int]) -> list[list[float]]:
+    """``K``: along each axis what is said of it, in pixels, as an angle, or along the other axis."""
+    focal: list[float | None] = []
+    for axis, side in zip("xy", size, strict=True):
+        angle = known.get(f"camera_angle_{axis}")
+        focal.append(known.get(f"fl_{axis}") or (None if angle is None else 0.5 * side / math.tan(0.5 * angle)))
+    fx, fy = focal[0] or focal[1], focal[1] or focal[0]
+    assert fx is not None and fy is not None
+    return [[fx, 0.0, known.get("cx", 0.5 * size[0])], [0.0, fy, known.get("cy", 0.5 * size[1])], [0.0, 0.0, 1.0]]
+
+
+def _plain(value: Any) -> Any:
+    """Tensors and arrays as numbers and lists of them."""
+    if isinstance(value, Tensor | np.ndarray):
+        return value.tolist()
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _row(frame: Frame, key: str) -> dict[str, Any]:
     """A frame as the file has it."""
     if not isinstance(frame, Frame):
         raise SceneError(key, frame, "a Frame, of frame_of(scene, image) or read_transforms")
-    camera, size = frame.camera, frame.size
-    if size is None:
-        raise SceneError(f"{key}.size", None, "width and height of the picture in pixels")
-    placed = "to_world" in camera or {"R", "t"} <= camera.keys()
-    if not placed or (camera.get("K") is None) == (camera.get("fov") is None):
-        raise SceneError(
-            f"{key}.camera",
-            sorted(camera),
-            "to_world or R and t, and K or fov: as frame_of and read_transforms give them",
-        )
-    given = [_numbers(camera[name]) for name in ("to_world", "R", "t") if name in camera]
-    pose = given[0] if len(given) == 1 else opencv_pose(*given)
-    wide, tall = size
-    if camera.get("K") is not None:
-        inner = _numbers(camera["K"])
-        scale = wide / camera.get("size", size)[0]
-        (fx, fy), (cx, cy) = (inner.diagonal()[:2] * scale).tolist(), (inner[:2, 2] * scale).tolist()
-    else:
-        axis = camera.get("fov_axis", "x")
-        if axis not in ("x", "y"):
-            raise SceneError(f"{key}.camera.fov_axis", axis, "x or y")
-        half = math.radians(float(_numbers(camera["fov"]))) * 0.5
-        fx = fy = 0.5 * (wide if axis == "x" else tall) / math.tan(half)
-        cx, cy = 0.5 * wide, 0.5 * tall
+    if not isinstance(frame.image, str):
+        raise SceneError(f"{key}.image", frame.image, "the picture's file as text")
+    try:
+        wide, tall = size = opencv.size(frame.size)
+    except Refused:
+        raise SceneError(f"{key}.size", frame.size, "width and height of the picture in pixels") from None
+    inner, pose = _seen(frame.camera, size, f"{key}.camera")
+    (fx, fy), (cx, cy) = inner.diagonal()[:2].tolist(), inner[:2, 2].tolist()
     matrix = pose * pose.new_tensor([-1.0, 1.0, -1.0, 1.0]) + 0.0  # no -0.0
     return {
         "file_path": frame.image,
@@ -192,3 +214,25 @@ def _row(frame: Frame, key: str) -> dict[str, Any]:
         "camera_angle_x": 2.0 * math.atan2(0.5 * wide, fx),
         "camera_angle_y": 2.0 * math.atan2(0.5 * tall, fy),
     }
+
+
+def _seen(block: Any, size: tuple[int, int], key: str) -> tuple[Tensor, Tensor]:
+    """``K (3, 3)`` on a film of ``size`` and camera to world ``(4, 4)`` of a block, read as a scene reads it."""
+    from torchpt.cameras.kinds.perspective import Perspective
+
+    if not isinstance(block, Mapping):
+        raise SceneError(key, block, "the block of a camera")
+    block = {name: _plain(value) for name, value in block.items() if value is not None}
+    placed = "to_world" in block or {"R", "t"} <= block.keys()
+    if not placed or ("K" in block) == ("fov" in block):
+        expected = "to_world or R and t, and K or fov: as frame_of and read_transforms give them"
+        raise SceneError(key, sorted(map(str, block)), expected)
+    if "K" in block:
+        block = {"size": list(size), **block}
+    values = described("camera", {Perspective.name: Perspective}, block, key, None, Perspective.name).values
+    numbers = {
+        name: torch.tensor(value, dtype=torch.float64) if isinstance(value, float) else value
+        for name, value in values.items()
+    }
+    camera = Perspective.on(torch.tensor(values["to_world"], dtype=torch.float64), size, numbers)
+    return camera.intrinsics(), camera.to_world

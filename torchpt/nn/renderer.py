@@ -25,7 +25,9 @@ class Renderer(nn.Module):
     """A scene that is rendered, and optimized, as any other module.
 
     The chosen parameters are ``nn.Parameter`` objects without bounds, which :mod:`torchpt.nn.ranges` keeps in range: as long as
-    they are finite, the scene can be rendered (places too far away are refused). ``values()`` gives what they stand for.
+    they are finite, the scene can be rendered, but for places too far away and for what must go together: a spot whose
+    ``beam_width`` is larger than its ``cutoff_angle``, or whose ``position`` is its ``target``, is refused by the render.
+    ``values()`` gives what they stand for.
 
     Each ``forward`` in training mode draws other samples: with the same ones in every step an optimizer fits their noise. The
     seed is ``seed + steps``, where the buffer ``steps`` counts calls in training mode; with ``torch.distributed`` set up,
@@ -103,17 +105,24 @@ class Renderer(nn.Module):
 
     @torch.no_grad()
     def assign(self, values: Mapping[str, Tensor]) -> None:
-        """Let parameters stand for other values, by dotted name.
+        """Let parameters stand for other values, by dotted name: all of them, or none where one is refused.
 
         Raises:
-            SceneError: a name that is not chosen, or a value that the scene does not accept.
+            SceneError: a name that is not chosen, or values that the scene does not accept, with those that stay.
         """
-        for name, value in values.items():
+        for name in values:
             if name not in self.names:
                 raise SceneError(f"params.{name}", name, f"one of {', '.join(self.names)}")
-            self.scene.check({name: value})
-            found = self.ranges[self.names.index(name)]
-            self.free[_key(name)].copy_(found.inverse(value.to(self.free[_key(name)])))  # pyright: ignore[reportCallIssue]
+        self.scene.check({**self.values(), **values})
+        found: dict[str, Tensor] = {}
+        for name, value in values.items():
+            try:
+                found[name] = self.ranges[self.names.index(name)].inverse(value.to(self.free[_key(name)]))  # pyright: ignore[reportCallIssue]
+            except ValueError:
+                expected = "the pose at first, turned and moved (rigid=False takes any)"
+                raise SceneError(f"params.{name}", value.tolist(), expected) from None
+        for name, value in found.items():
+            self.free[_key(name)].copy_(value)
 
     @torch.no_grad()
     def write(self) -> None:
