@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import chain, repeat
 from typing import Any, Literal, Unpack, overload
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -111,6 +112,8 @@ def render_batch(
         TypeError: an argument that ``render`` does not know.
     """
     check_names("render_batch", wishes, ("cameras", "on_progress"))
+    if on_progress is not None and not callable(on_progress):
+        raise SceneError("on_progress", on_progress, "a function")
     scenes = scenes_of(scenes)
     checkpoint = wishes.get("checkpoint")
     if checkpoint is not None:
@@ -125,14 +128,14 @@ def render_batch(
     if first is None:
         raise SceneError("scenes", 0, "one scene at least")
     total = None if size is None else size * len(views)
-    found: dict[tuple[int, int], tuple[Order, Rendering]] = {}
+    found: dict[tuple[int, int], tuple[Order | None, Rendering]] = {}
     with limited_threads(first.order.settings.render.threads):
         tasks = 1 if total is None else -(-TASKS * torch.get_num_threads() // total)
         _check_memory(first.order, total)
         render_many(_entries(chain([first], pictures), found, on_progress, total), tasks)
     count = 1 + max(s for s, _ in found)
     for key, given in (("params", sets), ("seed", seed)):
-        if isinstance(given, Sequence | Tensor) and len(given) != count:
+        if isinstance(given, Sequence | Tensor | np.ndarray) and len(given) != count:
             raise SceneError(key, len(given), f"as many as there are scenes, {count}")
     # Gradients last: what is on a tape is made of pictures that are there.
     rows = tuple(tuple(_taped(found.pop((s, c))) for c in range(len(views))) for s in range(count))
@@ -148,10 +151,10 @@ def _stacked(rows: list[list[Tensor]]) -> Tensor:
     return torch.stack([torch.stack(row) for row in rows])
 
 
-def _taped(found: tuple[Order, Rendering]) -> Rendering:
-    """A rendering on the tape that its parameters are on."""
+def _taped(found: tuple[Order | None, Rendering]) -> Rendering:
+    """A rendering on the tape that its parameters are on; without an order there is none."""
     order, rendering = found
-    return rendered(order, [rendering])
+    return rendering if order is None else rendered(order, [rendering])
 
 
 def _pictures(
@@ -164,7 +167,7 @@ def _pictures(
     wishes: Common,
 ) -> Iterator[_Picture]:
     """What is asked for, picture by picture, those of a scene together; ``several``: scenes are one under other parameters."""
-    size: tuple[int, int] | None = None
+    like: dict[str, Any] = {}
     for s, each in enumerate(scenes):
         scene = as_scene(each, f"scenes[{s}]")
         if sets is not None and s >= len(sets):
@@ -174,12 +177,12 @@ def _pictures(
             with named(name, c if camera is not None else None):
                 order = _ordered(scene, camera, {} if sets is None else sets[s], seeds(s, c), full, wishes)
                 film = order.settings.film
-                _, _, width, height = film.crop or (0, 0, film.width, film.height)
-                size = size or (width, height)
-                if (width, height) != size:
-                    raise SceneError(
-                        "film.width", [width, height], f"a picture of {size[0]} x {size[1]} as the first one's"
-                    )
+                _, _, *size = film.crop or (0, 0, film.width, film.height)
+                asked = {"width": size} | ({"aovs": list(film.aovs), "denoise": film.denoise} if full else {})
+                like = like or asked
+                for key, value in asked.items():
+                    if value != like[key]:
+                        raise SceneError(f"film.{key}", value, f"{like[key]}, as of the first picture")
             yield _Picture(s, c, name, order)
 
 
@@ -209,7 +212,7 @@ def _ordered(
 
 def _entries(
     pictures: Iterable[_Picture],
-    found: dict[tuple[int, int], tuple[Order, Rendering]],
+    found: dict[tuple[int, int], tuple[Order | None, Rendering]],
     on_progress: Callable[[int, int | None], None] | None,
     total: int | None,
 ) -> Iterator[Entry]:
@@ -218,6 +221,7 @@ def _entries(
 
     def entry(picture: _Picture) -> Entry:
         order, place = picture.order, (picture.scene, picture.camera)
+        taped = order.taped  # before gradients are off
 
         def make() -> Run:
             like = next((wave for scene, wave in latest if scene == picture.scene), None)
@@ -227,7 +231,8 @@ def _entries(
             return run
 
         def done(rendering: Rendering) -> None:
-            found[place] = order, rendering
+            # An order holds its scene, of which there may be many.
+            found[place] = (order, rendering) if taped else (None, rendered(order, [rendering]))
             if on_progress is not None:
                 on_progress(len(found), total)
 

@@ -102,6 +102,8 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[
         for s, own in enumerate(params):
             if not isinstance(own, Mapping):
                 raise SceneError(f"params[{s}]", own, "a mapping from names to tensors")
+        if isinstance(scenes, Sequence) and len(params) != len(scenes):
+            raise SceneError("params", len(params), f"as many as there are scenes, {len(scenes)}")
         return params
     raise SceneError("params", params, "a mapping to tensors with a leading dimension, or a sequence of mappings")
 

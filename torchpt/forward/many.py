@@ -17,7 +17,7 @@ from torchpt.native.modes import undisturbed
 
 __all__ = ["Entry", "render_many"]
 
-#: Renders that are made ready before there is a thread for them, for each thread.
+#: Renders a thread that are made ready in advance.
 AHEAD = 2
 
 
@@ -61,18 +61,19 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 entry = next(waiting, None)
             if entry is None:
                 break
-            with undisturbed(entry.device), _blamed(entry):
-                with _beside(crew):
-                    entry.run = entry.make()
-                    spans, loop = entry.run.at_once(), entry.run.loop
-                if loop is not None:
-                    loop.threads = crew.threads
-                if spans is None:
-                    _drain(crew, 0)
+            with undisturbed(entry.device), _blamed(entry), _beside(crew):
+                entry.run = entry.make()
+                spans = entry.run.at_once()
+            if spans is None:
+                _drain(crew, 0)
+                with undisturbed(entry.device), _blamed(entry):
                     entry.done(entry.run.go(None))
-                    del entry.run
-                    continue
+                del entry.run
+                continue
+            with _blamed(entry):
+                loop = entry.run.loop
                 assert loop is not None
+                loop.threads = crew.threads
                 crew.add(Job(entry, loop, loop.blocks(spans, tasks)))
             _drain(crew, AHEAD * crew.threads * tasks)
         _drain(crew, 0)
@@ -87,18 +88,14 @@ def _beside(crew: Together[Entry]) -> Iterator[None]:
         yield
 
 
-class _blamed:
+@contextmanager
+def _blamed(entry: Entry) -> Iterator[None]:
     """Errors within are told to an entry."""
-
-    def __init__(self, entry: Entry) -> None:
-        self.entry = entry
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, Exception):
-            self.entry.failed(error)
+    try:
+        yield
+    except Exception as error:
+        entry.failed(error)
+        raise
 
 
 def _drain(crew: Together[Entry], most: int) -> None:

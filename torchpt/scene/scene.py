@@ -138,7 +138,7 @@ class Scene:
         """
         view = object.__new__(type(self))
         with lasting():
-            own = through(self.description, self._built, self.params, camera, film or {})
+            own = through(self.description, self._built, self.params, camera, {} if film is None else film)
         view.__dict__.update(self.__dict__ | own)
         view._origin = self.origin
         view._number()

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.errors import SceneError
 from torchpt.format.cameras import read_camera
 from torchpt.format.description import Description
 from torchpt.format.tensors import Tensors
@@ -37,8 +38,10 @@ def through(
         film: film settings in place of the scene's own.
 
     Raises:
-        SceneError: what is wrong with the camera.
+        SceneError: what is wrong with the camera, or with the film.
     """
+    if not isinstance(film, Mapping):
+        raise SceneError("film", film, "a mapping")
     size = description.film | {name: value for name, value in film.items() if value is not None}
     tensors = Tensors()
     chosen = read_camera(tensors.taken_from(plain({"camera": camera}))["camera"], size, None)

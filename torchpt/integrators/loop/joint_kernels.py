@@ -54,7 +54,7 @@ class JointKernels(Kernels):
         for path, tape in zip(paths, tapes, strict=True):
             if path is not None:
                 self._leaves.ids[id(tape)] = path, tape
-        self._structure = (*self._structure, self.joint_plan.attached, tuple(paths))
+        self.structure = (*self.structure, self.joint_plan.attached, tuple(paths))
         self.slots = Rows(joint.SLOTS)
         self.back_eager: dict[tuple[Any, ...], str] = {}
 

@@ -53,6 +53,7 @@ class Kernels(Layout):
     Attributes:
         eager: models whose stage does what no kernel can, and what that is; they run as tensor operations.
         seconds: spent on making kernels.
+        structure: what renders have in common that can share kernels, and threads their memory.
         handed: what renders of the same structure share.
         search: what the search by packets reads; None where the search structure is called.
         non_opaque: for each primitive whether a ray may pass it, as uint8, for the search structure.
@@ -77,8 +78,8 @@ class Kernels(Layout):
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
         asked = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, self._leaves.tensors)
-        self._structure = (self._of_world, *map(signature, asked), packets, fused)
-        alike = before is not None and before._structure == self._structure
+        self.structure = (self._of_world, *map(signature, asked), packets, fused)
+        alike = before is not None and before.structure == self.structure
         self.handed = before.handed if alike else Handed()  # pyright: ignore[reportOptionalMemberAccess]
         self._laid_out = self.handed.tables(self._leaves)
         self._results = self.handed.results(self._leaves)
@@ -197,7 +198,7 @@ class Kernels(Layout):
         def traced(trace: Any) -> Sinks:
             return build(trace, *arguments)
 
-        program = program_of(key, self._structure, self._leaves, self, traced, listed)
+        program = program_of(key, self.structure, self._leaves, self, traced, listed)
         old = self.handed.kernel(key, program, self._leaves)
         if old is not None:
             return old

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Generic, TypeVar
 
 from torchpt.errors import RenderError
 from torchpt.integrators.loop.chunk import Worker
-from torchpt.integrators.loop.handed import Handed
 from torchpt.integrators.loop.schedule import PATIENCE, Block, Loop, Share
 
 __all__ = ["Job", "Together"]
 
 T = TypeVar("T")
+
+#: Latest structures of renders whose idle workers are kept.
+STRUCTURES = 4
 
 
 @dataclass(eq=False)
@@ -25,7 +28,7 @@ class Job(Generic[T]):
         owner: of whom it is.
         loop: of the render.
         blocks: what it takes.
-        left: blocks that are not taken yet.
+        left: blocks of which nothing has come in yet.
         rest: what memory did not suffice for.
     """
 
@@ -48,7 +51,7 @@ class Together(Generic[T]):
 
     def __init__(self, threads: int) -> None:
         self.threads, self.pending = threads, 0
-        self._idle: dict[Handed, list[Worker]] = {}
+        self._idle: list[tuple[Hashable, list[Worker]]] = []  # with the structure of the renders that they may serve
         self._todo = SimpleQueue[tuple[Job[T], Block] | None]()
         self._done = SimpleQueue[tuple[Job[T], Share | BaseException]]()
         self._crew: list[threading.Thread] = []
@@ -60,9 +63,9 @@ class Together(Generic[T]):
         Raises:
             RenderError: there is no memory for a single thread.
         """
-        job.loop.idle = self._idle.setdefault(job.loop.kernels.handed, [])
         job.left = len(job.blocks)
         self._jobs.add(job)
+        job.loop.idle = self._idle_of(job.loop.kernels.structure)
         for block in job.blocks:
             self.pending += 1
             self._todo.put((job, block))
@@ -92,6 +95,13 @@ class Together(Generic[T]):
             self._todo.put(None)
         for thread in self._crew:
             thread.join()
+
+    def _idle_of(self, structure: Hashable) -> list[Worker]:
+        """The workers that renders of a structure take over and leave."""
+        known = next((one for one in self._idle if one[0] == structure), None)
+        found = (structure, []) if known is None else known
+        self._idle = [found, *(one for one in self._idle if one is not found)][:STRUCTURES]
+        return found[1]
 
     def _start(self) -> None:
         thread = threading.Thread(target=self._work, name=f"torchpt_{len(self._crew)}")
