@@ -2,12 +2,14 @@
 
 A graph holds tensors, numbers and text. So a scene is named by its number, wishes are written as text, and parameters are the
 operators' tensors; the seed is a number of its own, so that another one needs no other graph. What a graph cannot hold is
-rendered outside of it, which breaks it: ``full=True`` (a :class:`torchpt.Rendering`), scenes with models of the caller's own.
+rendered outside of it, which breaks it: ``full=True`` (a :class:`torchpt.Rendering`), scenes with models of the caller's own,
+arguments that are no plain values.
 """
 
 from __future__ import annotations
 
 import ast
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
@@ -65,7 +67,7 @@ def _in_graph(
     **wishes: Any,
 ) -> Any:
     """The render as an operator of the graph that is being traced, or outside of it. It is torch that reads this function."""
-    if full or len(scene.own_models) > 0:
+    if full or len(scene.own_models) > 0 or not _fits(seed, dtype, wishes):
         outside: Any = torch.compiler.disable(render)
         return outside(scene, params=params, full=full, seed=seed, dtype=dtype, **wishes)
     given = dict(params) if params is not None else {}
@@ -76,6 +78,24 @@ def _in_graph(
     wanted = [name for name in given if given[name].requires_grad]
     text = _text([wishes, list(given), wanted, dtype is torch.float64])
     return torch.ops.torchpt.render(scene.number, text, -1 if seed is None else seed, list(given.values()))[0]
+
+
+def _fits(seed: Any, dtype: Any, wishes: Mapping[str, Any]) -> bool:
+    """Whether arguments can be written down in a graph; others, what is not accepted among them, are seen to outside of it."""
+    known = dtype is torch.float32 or dtype is torch.float64
+    number = isinstance(seed, int) and not isinstance(seed, bool)
+    return known and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(wishes)
+
+
+def _plain(value: Any) -> bool:
+    """Whether a nest of values is one of numbers, words and None."""
+    if isinstance(value, Mapping):
+        return all([isinstance(key, str) and _plain(value[key]) for key in value])
+    if isinstance(value, list | tuple):
+        return all([_plain(item) for item in value])
+    if isinstance(value, float):
+        return -math.inf < value < math.inf
+    return value is None or isinstance(value, bool | int | str)
 
 
 def _text(value: Any) -> str:

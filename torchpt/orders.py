@@ -6,7 +6,7 @@ import difflib
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypedDict, Unpack
 
 import torch
@@ -14,12 +14,14 @@ from torch import Tensor
 
 from torchpt import adjoint as adjoints
 from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape, without_gradient
-from torchpt.errors import EdgeWarning, SceneError
+from torchpt.errors import EdgeWarning, RenderError, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Rendering, limited_threads, render_scene
 from torchpt.graphs import known
 from torchpt.images.denoiser import check_denoiser, denoise
 from torchpt.integrators import KINDS as INTEGRATORS
+from torchpt.integrators import LAYERS
+from torchpt.integrators.layer import SurfaceLayer
 from torchpt.ranks import Group, together
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
@@ -63,6 +65,10 @@ class Wishes(Common, total=False):
     params: Mapping[str, Tensor] | None
 
 
+#: A tensor, and its version (None: of an inference tensor, whose changes torch does not count).
+State = tuple[Tensor, int | None]
+
+
 @dataclass(frozen=True)
 class Order:
     """A picture that was asked for: checked, complete, and not begun.
@@ -76,6 +82,7 @@ class Order:
         dtype: of the lanes.
         adjoint: how gradients are taken.
         ranks: that share the work.
+        states: where gradients are wanted, the scene's own tensors as they were, with torch's count of their changes.
     """
 
     scene: Scene
@@ -85,6 +92,7 @@ class Order:
     dtype: torch.dtype
     adjoint: str
     ranks: Group | None = None
+    states: Mapping[str, State] = field(default_factory=dict)
 
     @property
     def wanted(self) -> tuple[str, ...]:
@@ -146,7 +154,29 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
     params = _given(scene, wishes.get("params"), full)
     scene = with_texels(scene, params)
     scene.check_own()
-    return Order(scene, settings, params, backward, dtype, adjoint or adjoints.KINDS[0], wishes.get("ranks"))
+    order = Order(scene, settings, params, backward, dtype, adjoint or adjoints.KINDS[0], wishes.get("ranks"))
+    return replace(order, states=_states(scene, params)) if order.taped else order
+
+
+def _states(scene: Scene, params: Mapping[str, Tensor]) -> dict[str, State]:
+    """Of the scene's own tensors, but for those that ``params`` stand for, which they are and how often they were changed."""
+    own = {name: value for name, value in scene.params.items() if name not in params}
+    return {name: (value, None if value.is_inference() else value._version) for name, value in own.items()}
+
+
+def _check_states(order: Order) -> None:
+    """Refuse a backward pass of another scene than that of the picture.
+
+    Raises:
+        RenderError: one of the scene's own parameters is another one by now.
+    """
+    for name, (value, version) in order.states.items():
+        now = order.scene.params[name]
+        if now is not value or (version is not None and now._version != version):
+            hint = "hand it over by params, whose values a picture keeps, or take gradients first"
+            raise RenderError(
+                f"scene.params[{name!r}] was changed after the picture whose gradient is asked for: {hint}"
+            )
 
 
 def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
@@ -206,7 +236,10 @@ def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Setti
     if (film or {}).get("denoise") and settings.film.denoise:
         expected = "false, or full=True: a tensor is one picture; hand it to torchpt.denoise with its layers"
         raise SceneError("film.denoise", True, expected)
-    return replace(settings, film=settings.film.but(denoise=False))
+    aovs = settings.film.aovs
+    if settings.integrator.light:  # variance stays: it decides how samples are drawn
+        aovs = tuple(name for name in aovs if not issubclass(LAYERS[name], SurfaceLayer))
+    return replace(settings, film=settings.film.but(denoise=False, aovs=aovs))
 
 
 def _check(
@@ -281,6 +314,7 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         return made[-1].image
 
     def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
+        _check_states(order)
         with together(ranks, "the loss", lambda: cotangent.detach().cpu().contiguous().numpy().tobytes()):
             return gradients(cotangent, *tensors)
 
@@ -309,6 +343,7 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         return 0 if backward["edges"] == 0 else backward["edges"] or backward["spp"] or taken[0]
 
     def asked() -> Asked:
+        _check_states(order)
         return Asked(scene, again(), wanted, dtype, edges_taken())
 
     tensors = tuple(params[name] for name in names)

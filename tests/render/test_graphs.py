@@ -15,6 +15,7 @@ from torch._dynamo.exc import Unsupported
 from torch._dynamo.testing import CompileCounter
 
 import torchpt
+from torchpt.errors import SceneError
 
 WALL = "materials.wall.reflectance"
 WISHES: dict[str, Any] = {
@@ -75,6 +76,34 @@ def test_the_picture_has_the_bits_of_an_eager_one(scene):
     assert torch.equal(compiled(scene, colour), picture(scene, colour))
     with torch.no_grad(), torch.autocast("cpu"):
         assert torch.equal(compiled(scene, colour), picture(scene, colour))
+
+
+def test_a_file_that_asks_for_layers_has_gradients(scene):
+    own = torchpt.load({**ROOM, "film": {"width": 6, "height": 5, "aovs": ["depth", "variance"]}}, "cpu")
+
+    def loss(colour):
+        return torchpt.render(own, params={WALL: colour}, spp=4, threads=1, compile="off").square().mean()
+
+    found = []
+    for step in (loss, torch.compile(loss, backend="aot_eager")):
+        leaf = torch.full((3,), 0.4, requires_grad=True)
+        step(leaf).backward()
+        found.append(leaf.grad)
+    torch.testing.assert_close(*found, rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [{"dtype": torch.float16}, {"seed": -5}, {"seed": 1 << 63}, {"seed": True}, {"time_limit": float("inf")}],
+    ids=str,
+)
+def test_what_is_refused_is_refused_in_graphs(scene, wish):
+    def step(colour):
+        return torchpt.render(scene, params={WALL: colour}, **{**WISHES, **wish}).mean()
+
+    for run in (step, torch.compile(step, backend="aot_eager")):
+        with pytest.raises(SceneError):
+            run(torch.full((3,), 0.4))
 
 
 def test_another_seed_or_colour_compiles_nothing_anew(scene):

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 import torchpt
-from torchpt.errors import SceneError, TorchptError
+from torchpt.errors import RenderError, SceneError, TorchptError
 
 WALL = "materials.wall.reflectance"
 WISHES: dict[str, Any] = {"spp": 4, "seed": 3, "threads": 1, "compile": "off"}
@@ -232,6 +232,19 @@ def test_a_half_precision_parameter_gets_a_half_precision_gradient(loss, colour)
     found = gradient(loss, half)
     assert found.dtype == torch.bfloat16
     torch.testing.assert_close(found.float(), gradient(loss, half.float()), rtol=0.01, atol=0)
+
+
+@pytest.mark.parametrize(
+    "change", [lambda s: s.params[WALL].mul_(0.5), lambda s: s.params.update({WALL: s.params[WALL] * 0.5})]
+)
+@pytest.mark.parametrize("adjoint", ["replay", "autograd"])
+def test_a_scene_that_changed_before_its_gradient(change, adjoint, scene):
+    fresh = copy.deepcopy(scene)
+    pose = fresh.params["camera.to_world"].clone().requires_grad_()
+    picture = torchpt.render(fresh, params={"camera.to_world": pose}, adjoint=adjoint, **WISHES)
+    change(fresh)
+    with pytest.raises(RenderError, match=r"scene.params\[.*\] was changed after the picture"):
+        picture.mean().backward()
 
 
 def test_no_grad(loss, colour):
