@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import signal
 import time
@@ -168,6 +169,12 @@ def test_what_differs_is_refused_everywhere(box: torchpt.Scene, tmp_path: Path) 
             torchpt.render(box, spp=1, seed=group.rank, film=FILM, ranks=group)
         torchpt.render(box, spp=1, film=FILM, ranks=group)  # the group is of use as before
 
+    def scenes(group: Any) -> None:
+        own = copy.copy(box)
+        own.params["materials.red.reflectance"] = torch.full((3,), 0.2 + 0.1 * group.rank)
+        with pytest.raises(RenderError, match="what is rendered must be the same"):
+            torchpt.render(own, spp=1, film=FILM, ranks=group)
+
     def losses(group: Any) -> None:
         red = scene.params["materials.red.reflectance"].clone().requires_grad_()
         image = torchpt.render(scene, spp=1, film=FILM, params={"materials.red.reflectance": red}, ranks=group)
@@ -176,6 +183,7 @@ def test_what_differs_is_refused_everywhere(box: torchpt.Scene, tmp_path: Path) 
 
     scene = box
     assert in_ranks(2, pictures, tmp_path) == [None, None]
+    assert in_ranks(2, scenes, tmp_path) == [None, None]
     assert in_ranks(2, losses, tmp_path) == [None, None]
 
 

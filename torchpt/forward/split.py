@@ -6,6 +6,7 @@ holds, sample by sample, so a film has the bits that it has in one process, whoe
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -146,6 +147,12 @@ class Split:
         return every
 
 
+def _digest(value: Tensor) -> str:
+    """Of a tensor's numbers."""
+    numbers = value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
+    return hashlib.blake2b(numbers.tobytes(), digest_size=16).hexdigest()
+
+
 def _films(plate: Plate) -> list[Film]:
     return [plate.film, *plate.layers.values()]
 
@@ -156,6 +163,7 @@ def stamp(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None,
     for group, keys in FREE.items():
         told[group] = {key: value for key, value in told[group].items() if key not in keys or key in DECIDED}
     told["render"].pop("device")
-    given = {name: value.detach().cpu().contiguous().numpy().tobytes() for name, value in (params or {}).items()}
+    tensors = {**scene.params, **(params or {})}
+    given = {name: _digest(tensors[name]) for name in sorted(tensors)}
     blocks = [repr(getattr(scene.description, name)) for name in BLOCKS]
     return repr((__version__, told, blocks, given, str(dtype))).encode()
