@@ -1,4 +1,4 @@
-"""Trees for the CPU's search: binned SAH over boxes, eight children a node, then blocks of cache lines."""
+"""Trees for the CPU's search: binary over boxes, then of eight children a node, then blocks of cache lines."""
 
 from __future__ import annotations
 

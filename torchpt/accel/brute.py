@@ -40,7 +40,7 @@ class Brute(Accel):
 
     Args:
         geometry: the primitives, on the CPU.
-        threads: CPU threads; ``None`` is torch's number.
+        threads: CPU threads; ``None`` is torch's number, as it is when rays are searched.
 
     Raises:
         SceneError: the geometry is not on the CPU, or float32 rows are too coarse for it.
@@ -63,15 +63,19 @@ class Brute(Accel):
         self.quadrics = inverses(geometry).T.contiguous()
         self.counts = list(geometry.counts)
         self.extent = size
-        self.threads = thread_count(threads)
+        self.threads = threads
         self.arrays = _arrays(self.table, self.spheres, self.quadrics, self.counts, self.extent)
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, self.threads)
+        return _intersect(
+            o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, thread_count(self.threads)
+        )
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, self.threads)
+        return _occluded(
+            o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, thread_count(self.threads)
+        )
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""

@@ -44,7 +44,7 @@ def _bin(box, i, axis, low, scale):
 
 @jit()
 def _best_split(box, start, stop, low, scale, bins, counts, suffix):
-    """Cheapest plane by the surface area heuristic (Wald 2007): axis, first bin of the upper side, cost (or -1)."""
+    """Cheapest plane by the surface area heuristic (Wald 2007): axis (-1: none), first bin of the upper side."""
     counts[:] = 0
     for k in range(3 * _BINS):
         _clear(bins, k)
@@ -73,7 +73,7 @@ def _best_split(box, start, stop, low, scale, bins, counts, suffix):
                 cost = np.float64(half_area(bins, 3 * _BINS)) * n + suffix[k]
                 if cost < best:
                     best, best_axis, best_cut = cost, axis, k
-    return best_axis, best_cut, best
+    return best_axis, best_cut
 
 
 @jit()
@@ -93,10 +93,13 @@ def _partition(box, ids, start, stop, axis, cut, low, scale):
 
 @jit()
 def _sorted(box, ids, start, stop, axis):
-    """Sorts a few primitives by their centres along an axis; equal ones stay in their order."""
+    """Sorts a few primitives by their centres along an axis, and equal ones by their ids."""
     for i in range(start + 1, stop):
         j = i
-        while j > start and box[j, axis] + box[j, 3 + axis] < box[j - 1, axis] + box[j - 1, 3 + axis]:
+        while j > start:
+            own, other = box[j, axis] + box[j, 3 + axis], box[j - 1, axis] + box[j - 1, 3 + axis]
+            if not (own < other or (own == other and ids[j] < ids[j - 1])):
+                break
             for c in range(6):
                 box[j, c], box[j - 1, c] = box[j - 1, c], box[j, c]
             ids[j], ids[j - 1] = ids[j - 1], ids[j]
@@ -172,7 +175,7 @@ def build_binary(box, ids, nodes, spans, common):
                     scale[c] = np.float32(_BINS) / size if size > _ZERO else _ZERO
                     if not scale[c] < _INF:
                         scale[c] = _ZERO
-                axis, cut, _ = _best_split(box, start, stop, low, scale, bins, counts, suffix)
+                axis, cut = _best_split(box, start, stop, low, scale, bins, counts, suffix)
                 middle = (start + stop) // 2
                 if axis >= 0:
                     middle = _partition(box, ids, start, stop, axis, cut, low[axis], scale[axis])

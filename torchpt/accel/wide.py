@@ -31,14 +31,14 @@ class Wide(Accel):
 
     Args:
         geometry: the primitives, on the CPU.
-        threads: CPU threads; ``None`` is torch's number.
+        threads: CPU threads; ``None`` is torch's number, as it is when rays are searched.
     """
 
     name, refits = "numba", True
 
     def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
         start = time.perf_counter()
-        self.threads = thread_count(threads)
+        self.threads = threads
         tree, planes, others = mesh_tree(geometry)
         self.counts, self.depth, self.sah_cost = geometry.counts, tree.depth, tree.cost
         self.nodes, self.leaves = tree.nodes, tree.leaves
@@ -63,15 +63,15 @@ class Wide(Accel):
         if topology is None:
             return None
         tree = copy.copy(self)
-        tree.threads, tree.topology = thread_count(threads), topology
+        tree.threads, tree.topology = threads, topology
         tree._take(memory, others, start)
         return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(o, d, t_max, self.tensors, self.threads)
+        return _intersect(o, d, t_max, self.tensors, thread_count(self.threads))
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(o, d, t_max, self.tensors, self.threads)
+        return _occluded(o, d, t_max, self.tensors, thread_count(self.threads))
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
@@ -88,7 +88,7 @@ class Wide(Accel):
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`.
 
-        The cost is that of the binary tree before it was widened, times what the wide one's has grown by since.
+        The cost is what it was when the tree was built, times what it has grown by since.
         """
         return {
             "name": self.name,

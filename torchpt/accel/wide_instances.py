@@ -18,6 +18,7 @@ from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.topology import Topology
 from torchpt.accel.wide import Wide
 from torchpt.native.jit import compiled, launch
+from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
 __all__ = ["WideInstanced"]
@@ -30,7 +31,7 @@ class WideInstanced(Accel):
 
     Args:
         geometry: with copies, on the CPU.
-        threads: CPU threads; ``None`` is torch's number.
+        threads: CPU threads; ``None`` is torch's number, as it is when rays are searched.
     """
 
     name, refits = "numba", True
@@ -88,14 +89,14 @@ class WideInstanced(Accel):
         hits = self.base._intersect(o, d, t_max)
         rays = (x.contiguous().numpy() for x in (o, d, t_max))
         args = (*rays, *self.arrays, *(x.numpy() for x in hits))
-        launch(kernels.nearest, kernels.nearest_parallel, t_max.shape[0], self.threads, _GRAIN, args)
+        launch(kernels.nearest, kernels.nearest_parallel, t_max.shape[0], thread_count(self.threads), _GRAIN, args)
         return hits
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
         out = self.base._occluded(o, d, t_max).int()
         rays = (x.contiguous().numpy() for x in (o, d, t_max))
         args = (*rays, *self.arrays, out.numpy())
-        launch(kernels.blocked, kernels.blocked_parallel, t_max.shape[0], self.threads, _GRAIN, args)
+        launch(kernels.blocked, kernels.blocked_parallel, t_max.shape[0], thread_count(self.threads), _GRAIN, args)
         return out != 0
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
