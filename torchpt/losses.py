@@ -22,6 +22,10 @@ def _same(*pictures: Tensor) -> None:
         if not isinstance(picture, Tensor):
             hint = "; hand over its .image" if hasattr(picture, "image") else ""
             raise TypeError(f"expected a picture as a tensor, got {type(picture).__name__}{hint}")
+        if not picture.is_floating_point():
+            raise TypeError(
+                f"expected a picture of floating numbers, linear as renders are, got one of {picture.dtype}"
+            )
     shapes = {tuple(picture.shape) for picture in pictures}
     if len(shapes) > 1:
         raise ValueError(f"pictures differ in shape: {', '.join(map(str, sorted(shapes)))}")
@@ -32,7 +36,7 @@ def l2(image: Tensor, target: Tensor) -> Tensor:
 
     Raises:
         ValueError: pictures of two shapes (so do all of these).
-        TypeError: no tensor, such as a whole :class:`torchpt.Rendering` (so do all of these).
+        TypeError: no tensor, such as a whole :class:`torchpt.Rendering`, or one of whole numbers (so do all of these).
     """
     _same(image, target)
     return (image - target).square().mean()

@@ -237,3 +237,18 @@ def test_huge_headers_are_refused_before_memory_is_asked_for(tmp_path: Path, mon
     monkeypatch.setattr(read_module, "MAX_PIXELS", 34)
     with pytest.raises(AssetError, match="7 x 5 pixels"):
         read_image(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(
+    ("given", "got"),
+    [
+        (np.zeros((2, 2, 3), np.float32), "ndarray"),
+        (torch.zeros(2, 2, 3, dtype=torch.uint8), "numbers of torch.uint8"),
+        (None, "NoneType"),
+    ],
+    ids=["an array", "8 bits", "None"],
+)
+def test_what_is_no_linear_picture_is_refused(tmp_path, given, got):
+    with pytest.raises(ValueError, match=f"expected a tensor of linear floats .* got {got}"):
+        write_image(tmp_path / "x.png", given)
+    assert not any(tmp_path.iterdir())

@@ -51,6 +51,15 @@ def test_two_equal_renders_are_the_plain_losses():
     assert float(losses.l1(a, b)) == pytest.approx(float((a - b).abs().mean()))
 
 
+def test_pictures_of_whole_numbers_are_refused():
+    """Their differences would wrap around."""
+    photo = torch.full((4, 4, 3), 200, dtype=torch.uint8)
+    for loss in (losses.l1, losses.l2, losses.relmse, losses.smape):
+        for pair in ((photo, photo), (torch.zeros(4, 4, 3), photo)):
+            with pytest.raises(TypeError, match=r"floating numbers, .* got one of torch.uint8"):
+                loss(*pair)
+
+
 def test_pictures_of_two_shapes_are_refused():
     for loss in (losses.l1, losses.l2, losses.relmse, losses.smape):
         with pytest.raises(ValueError, match="differ in shape"):

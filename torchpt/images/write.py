@@ -145,6 +145,10 @@ def reason_of(problem: Exception, destination: Path) -> str:
 
 
 def _pixels(name: str, image: Tensor) -> np.ndarray:
+    if not isinstance(image, Tensor) or not image.is_floating_point():
+        hint = "; hand over its .image" if hasattr(image, "image") else ""
+        got = f"numbers of {image.dtype}" if isinstance(image, Tensor) else type(image).__name__
+        raise ValueError(f"{name}: expected a tensor of linear floats (H, W, C), got {got}{hint}")
     pixels = image.detach().to("cpu", torch.float32)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
