@@ -41,7 +41,8 @@ class Renderer(nn.Module):
         scene: from ``torchpt.load``.
         names: dotted names of ``scene.params``, and patterns of them such as ``materials.*.reflectance``; None: no parameters.
         seed: any integer from 0.
-        rigid: whether poses are turned and moved alone (six numbers each); False: their 16 numbers are parameters, as they are.
+        rigid: whether poses are turned and moved alone (six numbers each); False: their 16 numbers are parameters, as they are,
+            where poses need not keep angles, as those of balls must.
         wishes: further arguments of ``torchpt.render`` for each call.
 
     Raises:
@@ -62,6 +63,8 @@ class Renderer(nn.Module):
     ) -> None:
         super().__init__()
         check_names("Renderer", wishes, ("names", "rigid"))
+        if type(rigid) is not bool:
+            raise SceneError("rigid", rigid, "True or False")
         for key in ("params", "seed"):
             if key in wishes:
                 raise SceneError(key, wishes[key], "an argument of Renderer.forward")
