@@ -177,7 +177,7 @@ def with_feature(name: str | None) -> dict[str, Any]:
 def kernels(described: Mapping[str, Any]) -> tuple[Kernels, torchpt.Scene]:
     """A scene's kernels, all that a render of it asks for made."""
     scene = torchpt.load(described, "cpu")
-    torchpt.render(scene, spp=8, compile="on")
+    torchpt.render(scene, spp=8, compile="on", full=True)  # with the layers that its file asks for
     made = kept(scene).kernels
     assert made is not None
     return made, scene

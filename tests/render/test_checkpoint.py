@@ -237,8 +237,7 @@ def killed(folder: Path, kills: int, spp: int) -> tuple[int, int]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = after = 0
     while done < kills:
-        there = (folder / "a.ckpt").exists()
-        more = ["render.resume=true"] if there else []
+        more = ["render.resume=true"] if (folder / "a.ckpt").exists() else []
         work = subprocess.Popen([sys.executable, "-c", COMMAND, *words, *more], cwd=folder, env=environment,
                                 stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
         while done and not (folder / "a.ckpt").exists() and work.poll() is None:
@@ -250,7 +249,7 @@ def killed(folder: Path, kills: int, spp: int) -> tuple[int, int]:
             work.send_signal(signal.SIGKILL)
             work.communicate()
             done += 1
-            after += there
+            after += (folder / "a.ckpt").exists()  # this one's own, perhaps
     else:
         subprocess.run([sys.executable, "-c", COMMAND, *words, "render.resume=true"], cwd=folder, env=environment, check=True,
                        capture_output=True)  # fmt: skip
