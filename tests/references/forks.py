@@ -17,6 +17,10 @@ from torchpt.cli import run
 from torchpt.forward import checkpoint
 from torchpt.forward import run as running
 
+# torch asks DNS for the name of the other side of each connection, to show it in messages: no test waits for such answers.
+os.environ.setdefault("RES_OPTIONS", "attempts:0")
+os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")  # nor sees that there are none
+
 #: Seconds after which a child is killed.
 PATIENCE = 100.0
 _context = multiprocessing.get_context("fork")
