@@ -79,7 +79,8 @@ class _Items:
             world = scene.merged(params)["camera.to_world"].to(exact)
             item = {"image": found.image, **{name: found.layers[name] for name in self.layers}, "to_world": world}
             if "camera.fov" in scene.params:
-                matrices = scene.pinhole(params, film, exact)
+                seen = {name: value for name, value in params.items() if name.startswith("camera.")}
+                matrices = scene.pinhole(seen, film, exact)
                 item |= {"K": matrices.K, "R": matrices.R, "t": matrices.t}
         return {**{name: value.detach() for name, value in item.items()}, "index": torch.tensor(index)}
 

@@ -23,6 +23,7 @@ from torchpt.errors import RenderError
 from torchpt.format.description import settings
 from torchpt.forward import Rendering
 from torchpt.scene import Scene
+from torchpt.scene.editions import AFTER, check_unchanged
 from torchpt.scene.scene import numbered
 
 __all__ = ["known", "opaque"]
@@ -67,7 +68,7 @@ def _in_graph(
     **wishes: Any,
 ) -> Any:
     """The render as an operator of the graph that is being traced, or outside of it. It is torch that reads this function."""
-    if full or len(scene.own_models) > 0 or not _fits(seed, dtype, wishes):
+    if full or len(scene.own_models) > 0 or not _fits(params, seed, dtype, wishes):
         outside: Any = torch.compiler.disable(render)
         return outside(scene, params=params, full=full, seed=seed, dtype=dtype, **wishes)
     given = dict(params) if params is not None else {}
@@ -80,10 +81,14 @@ def _in_graph(
     return torch.ops.torchpt.render(scene.number, text, -1 if seed is None else seed, list(given.values()))[0]
 
 
-def _fits(seed: Any, dtype: Any, wishes: Mapping[str, Any]) -> bool:
+def _fits(params: Any, seed: Any, dtype: Any, wishes: Mapping[str, Any]) -> bool:
     """Whether arguments can be written down in a graph; others, what is not accepted among them, are seen to outside of it."""
     known = dtype is torch.float32 or dtype is torch.float64
     number = isinstance(seed, int) and not isinstance(seed, bool)
+    if params is not None and not (
+        isinstance(params, Mapping) and all([isinstance(value, Tensor) for value in params.values()])
+    ):
+        return False
     return known and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(wishes)
 
 
@@ -132,6 +137,10 @@ class _Order(NamedTuple):
         wishes |= {"dtype": torch.float64 if double else torch.float32, "seed": None if seed < 0 else int(seed)}
         return cls(scene, wishes, names, wanted)
 
+    def editions(self) -> dict[str, int]:
+        """Of the scene's own parameters, but for those that are handed over."""
+        return {name: edition for name, edition in self.scene.editions().items() if name not in self.names}
+
     def like(self) -> Tensor:
         """A picture of the right size, unfilled."""
         blocks = {name: self.wishes.get(name) for name in ("film", "integrator", "sampler")}
@@ -173,16 +182,21 @@ def _register(render: Callable[..., Any]) -> None:
             with torch.no_grad():
                 return render(order.scene, params=given, **order.wishes).contiguous()
 
-        return _apart(work, made, order.scene.device), torch.tensor(made[0].spp)
+        editions = order.editions().values()
+        return _apart(work, made, order.scene.device), torch.tensor([made[0].spp, *editions])
 
     def like_picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        return _Order.read(number, text, 0).like(), torch.empty((), dtype=torch.int64)
+        order = _Order.read(number, text, 0)
+        return order.like(), torch.empty(1 + len(order.editions()), dtype=torch.int64)
 
     def gradients(
-        number: int, text: str, seed: int, tensors: Sequence[Tensor], spp: Tensor, cotangent: Tensor
+        number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor
     ) -> list[Tensor]:
         order = _Order.read(number, text, seed)
-        made = [Rendering(order.like(), spp=int(spp))]
+        spp, *editions = facts.tolist()
+        now = order.editions()
+        check_unchanged(dict(zip(now, editions, strict=True)), now, AFTER)
+        made = [Rendering(order.like(), spp=spp)]
 
         def work() -> list[Tensor]:
             given = {name: value.detach() for name, value in zip(order.names, tensors, strict=True)}
@@ -195,7 +209,7 @@ def _register(render: Callable[..., Any]) -> None:
         return _apart(work, made, order.scene.device)
 
     def like_gradients(
-        number: int, text: str, seed: int, tensors: Sequence[Tensor], spp: Tensor, cotangent: Tensor
+        number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor
     ) -> list[Tensor]:
         return [torch.empty_like(value, memory_format=torch.contiguous_format) for value in tensors]
 
@@ -205,8 +219,8 @@ def _register(render: Callable[..., Any]) -> None:
         ctx.save_for_backward(output[1], *tensors)
 
     def go_back(ctx: Any, cotangent: Tensor, _: Any) -> tuple[Any, ...]:
-        spp, *tensors = ctx.saved_tensors
-        return None, None, None, back(*ctx.named, tensors, spp, cotangent)
+        facts, *tensors = ctx.saved_tensors
+        return None, None, None, back(*ctx.named, tensors, facts, cotangent)
 
     forth = torch.library.custom_op("torchpt::render", picture, mutates_args=())
     forth.register_fake(like_picture)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpt import adjoint as adjoints
 from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape, without_gradient
-from torchpt.errors import EdgeWarning, RenderError, SceneError
+from torchpt.errors import EdgeWarning, SceneError
 from torchpt.format.description import settings as complete
 from torchpt.forward import Rendering, limited_threads, render_scene
 from torchpt.graphs import known
@@ -24,8 +24,9 @@ from torchpt.integrators import LAYERS
 from torchpt.integrators.layer import SurfaceLayer
 from torchpt.ranks import Group, together
 from torchpt.scene import Scene
+from torchpt.scene.editions import AFTER, check_unchanged
 from torchpt.scene.entry import as_scene
-from torchpt.scene.textured import with_texels
+from torchpt.scene.textured import renew, with_texels
 from torchpt.settings import Settings
 from torchpt.taped import in_batch, wants_gradients
 
@@ -65,16 +66,13 @@ class Wishes(Common, total=False):
     params: Mapping[str, Tensor] | None
 
 
-#: A tensor, and its version (None: of an inference tensor, whose changes torch does not count).
-State = tuple[Tensor, int | None]
-
-
 @dataclass(frozen=True)
 class Order:
     """A picture that was asked for: checked, complete, and not begun.
 
     Attributes:
-        scene: what is rendered.
+        given: the scene as the caller has it.
+        scene: what is rendered: the same, or one that reads texels where that has numbers.
         settings: how.
         params: tensors in place of the scene's.
         backward: the backward pass's own seed, its samples a pixel and its samples of edges a pixel (0: none); None: as the
@@ -82,9 +80,10 @@ class Order:
         dtype: of the lanes.
         adjoint: how gradients are taken.
         ranks: that share the work.
-        states: where gradients are wanted, the scene's own tensors as they were, with torch's count of their changes.
+        editions: of the scene's own parameters, but for those that ``params`` stand for, as they were.
     """
 
+    given: Scene
     scene: Scene
     settings: Settings
     params: Mapping[str, Tensor]
@@ -92,7 +91,7 @@ class Order:
     dtype: torch.dtype
     adjoint: str
     ranks: Group | None = None
-    states: Mapping[str, State] = field(default_factory=dict)
+    editions: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def wanted(self) -> tuple[str, ...]:
@@ -103,6 +102,20 @@ class Order:
     def taped(self) -> bool:
         """Whether the picture is to carry gradients."""
         return torch.is_grad_enabled() and bool(self.wanted or self.scene.weights())
+
+    def noted(self) -> Order:
+        """The same, with what :meth:`check_unchanged` compares."""
+        now = self.given.editions()
+        return replace(self, editions={name: edition for name, edition in now.items() if name not in self.params})
+
+    def check_unchanged(self, since: str) -> None:
+        """Refuse to go on with another scene than it was when it was noted; ``since`` is for the error.
+
+        Raises:
+            RenderError: one of the scene's own parameters was replaced, or changed in place.
+        """
+        check_unchanged(self.editions, self.given.editions(), since)
+        renew(self.scene, self.given, self.params)
 
 
 #: Of the arguments of ``render``, those that the block ``render`` of a scene file has too.
@@ -152,31 +165,10 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
     elif settings.film.denoise:
         check_denoiser()
     params = _given(scene, wishes.get("params"), full)
-    scene = with_texels(scene, params)
-    scene.check_own()
-    order = Order(scene, settings, params, backward, dtype, adjoint or adjoints.KINDS[0], wishes.get("ranks"))
-    return replace(order, states=_states(scene, params)) if order.taped else order
-
-
-def _states(scene: Scene, params: Mapping[str, Tensor]) -> dict[str, State]:
-    """Of the scene's own tensors, but for those that ``params`` stand for, which they are and how often they were changed."""
-    own = {name: value for name, value in scene.params.items() if name not in params}
-    return {name: (value, None if value.is_inference() else value._version) for name, value in own.items()}
-
-
-def _check_states(order: Order) -> None:
-    """Refuse a backward pass of another scene than that of the picture.
-
-    Raises:
-        RenderError: one of the scene's own parameters is another one by now.
-    """
-    for name, (value, version) in order.states.items():
-        now = order.scene.params[name]
-        if now is not value or (version is not None and now._version != version):
-            hint = "hand it over by params, whose values a picture keeps, or take gradients first"
-            raise RenderError(
-                f"scene.params[{name!r}] was changed after the picture whose gradient is asked for: {hint}"
-            )
+    textured = with_texels(scene, params)
+    textured.check_own()
+    order = Order(scene, textured, settings, params, backward, dtype, adjoint or adjoints.KINDS[0], wishes.get("ranks"))
+    return order.noted() if order.taped else order
 
 
 def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
@@ -314,7 +306,7 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         return made[-1].image
 
     def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
-        _check_states(order)
+        order.check_unchanged(AFTER)
         with together(ranks, "the loss", lambda: cotangent.detach().cpu().contiguous().numpy().tobytes()):
             return gradients(cotangent, *tensors)
 
@@ -343,7 +335,7 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         return 0 if backward["edges"] == 0 else backward["edges"] or backward["spp"] or taken[0]
 
     def asked() -> Asked:
-        _check_states(order)
+        order.check_unchanged(AFTER)
         return Asked(scene, again(), wanted, dtype, edges_taken())
 
     tensors = tuple(params[name] for name in names)

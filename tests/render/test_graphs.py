@@ -15,7 +15,7 @@ from torch._dynamo.exc import Unsupported
 from torch._dynamo.testing import CompileCounter
 
 import torchpt
-from torchpt.errors import SceneError
+from torchpt.errors import RenderError, SceneError
 
 WALL = "materials.wall.reflectance"
 WISHES: dict[str, Any] = {
@@ -193,3 +193,23 @@ def test_a_graph_does_not_keep_its_scene(scene):
 def test_load_in_compiled_code(scene):
     compiled = torch.compile(lambda: torchpt.render(torchpt.load(ROOM, "cpu"), **WISHES) * 2, backend="aot_eager")
     torch.testing.assert_close(compiled(), torchpt.render(scene, **WISHES) * 2)
+
+
+def test_a_scene_that_changed_before_its_gradient(scene: torchpt.Scene) -> None:
+    own = copy.deepcopy(scene)
+    compiled = torch.compile(picture, backend="aot_eager", fullgraph=True)
+    colour = torch.tensor([0.5, 0.4, 0.3], requires_grad=True)
+    image = compiled(own, colour)
+    own.params[WALL].mul_(0.5)  # for which the picture has another
+    image.sum().backward()
+    image = compiled(own, colour)
+    own.params["lights.sun.intensity"].mul_(10)
+    with pytest.raises(RenderError, match=r"'lights.sun.intensity'\] was changed after the picture"):
+        image.sum().backward()
+    compiled(own, colour).sum().backward()
+
+
+def test_what_is_no_tensor_is_refused_as_by_eager_code(scene: torchpt.Scene) -> None:
+    compiled = torch.compile(picture, backend="aot_eager")
+    with pytest.raises(SceneError, match=f"{WALL}: expected a floating tensor"):
+        compiled(scene, [1.0, 1.0, 1.0])  # type: ignore[arg-type]

@@ -88,7 +88,7 @@ class Wide(Accel):
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`.
 
-        The cost is what it was when the tree was built, times what it has grown by since.
+        The cost is what it was when the tree was built, times what the areas of its boxes have grown by since.
         """
         return {
             "name": self.name,

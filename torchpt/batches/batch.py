@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
 from typing import Any, Literal, Unpack, overload
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -17,8 +18,10 @@ from torchpt.forward import Entry, Rendering, Run, limited_threads, render_many
 from torchpt.integrators.loop.schedule import TASKS
 from torchpt.integrators.wave import Wave
 from torchpt.native.memory import mb
+from torchpt.native.modes import lasting
 from torchpt.orders import Common, Order, check_names, ordered, rendered
 from torchpt.scene import Scene
+from torchpt.scene.editions import check_unchanged
 from torchpt.scene.entry import as_scene
 from torchpt.taped import in_transform
 
@@ -148,7 +151,8 @@ def render_batch(
 
 
 def _stacked(rows: list[list[Tensor]]) -> Tensor:
-    return torch.stack([torch.stack(row) for row in rows])
+    with lasting():
+        return torch.stack([torch.stack(row) for row in rows])
 
 
 def _taped(found: tuple[Order | None, Rendering]) -> Rendering:
@@ -168,8 +172,13 @@ def _pictures(
 ) -> Iterator[_Picture]:
     """What is asked for, picture by picture, those of a scene together; ``several``: scenes are one under other parameters."""
     like: dict[str, Any] = {}
+    editions: WeakKeyDictionary[Scene, dict[str, int]] = WeakKeyDictionary()
     for s, each in enumerate(scenes):
         scene = as_scene(each, f"scenes[{s}]")
+        if not several:  # whether its pictures are rendered by now, nobody can tell
+            with named(f"scenes[{s}]", None):
+                now = scene.editions()
+                check_unchanged(editions.setdefault(scene, now), now, "while the batch has it")
         if sets is not None and s >= len(sets):
             raise SceneError("params", len(sets), "as many as there are scenes")
         for c, camera in enumerate(cameras):
@@ -207,7 +216,7 @@ def _ordered(
             "params", "tensors under a transform of torch.func", "plain ones: transforms go through render"
         )
     order.scene.check(order.params)
-    return order
+    return order.noted()
 
 
 def _entries(
@@ -223,14 +232,15 @@ def _entries(
         order, place = picture.order, (picture.scene, picture.camera)
         taped = order.taped  # before gradients are off
 
-        def make() -> Run:
+        def make(threads: int) -> Run:
             like = next((wave for scene, wave in latest if scene == picture.scene), None)
             plain = {name: value.detach() for name, value in order.params.items()}
-            run = Run(order.scene, order.settings, plain, order.dtype, order.ranks, like)
+            run = Run(order.scene, order.settings, plain, order.dtype, order.ranks, like, threads)
             latest[:] = [(picture.scene, run.wave)]
             return run
 
         def done(rendering: Rendering) -> None:
+            order.check_unchanged("while the batch has it")
             # An order holds its scene, of which there may be many.
             found[place] = (order, rendering) if taped else (None, rendered(order, [rendering]))
             if on_progress is not None:

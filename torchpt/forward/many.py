@@ -27,14 +27,14 @@ class Entry:
 
     Attributes:
         device: where it is rendered.
-        make: makes it ready; called when it is soon to begin.
+        make: makes it ready for a number of threads; called when it is soon to begin.
         done: told of the rendering.
         failed: told of an error instead, which it may raise as another one.
         run: once it is ready.
     """
 
     device: torch.device
-    make: Callable[[], Run]
+    make: Callable[[int], Run]
     done: Callable[[Rendering], None]
     failed: Callable[[BaseException], None]
     run: Run = field(init=False)
@@ -62,7 +62,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
             if entry is None:
                 break
             with undisturbed(entry.device), _blamed(entry), _beside(crew):
-                entry.run = entry.make()
+                entry.run = entry.make(crew.threads)
                 spans = entry.run.at_once()
             if spans is None:
                 _drain(crew, 0)
@@ -73,7 +73,6 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
             with _blamed(entry):
                 loop = entry.run.loop
                 assert loop is not None
-                loop.threads = crew.threads
                 crew.add(Job(entry, loop, loop.blocks(spans, tasks)))
             _drain(crew, AHEAD * crew.threads * tasks)
         _drain(crew, 0)

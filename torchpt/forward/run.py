@@ -44,7 +44,7 @@ __all__ = ["Run"]
 class Run:
     """One forward render: accumulates chunks into films; by several ranks where there is a ``group`` of them.
 
-    ``like``: see :func:`torchpt.forward.wave.make_wave`.
+    ``like``: see :func:`torchpt.forward.wave.make_wave`. ``threads``: that will take samples; None: torch's number.
     """
 
     def __init__(
@@ -55,6 +55,7 @@ class Run:
         dtype: torch.dtype,
         group: Group | None = None,
         like: Wave | None = None,
+        threads: int | None = None,
     ) -> None:
         self.start = time.perf_counter()
         self.split = None if group is None or group.size == 1 else Split(group)
@@ -79,7 +80,8 @@ class Run:
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.keeper.check(settings.render.resume)
-        self.loop = loop_of(scene, self.wave, self.eager) if looped(self.wave, settings, self.device) else None
+        compiled = looped(self.wave, settings, self.device)
+        self.loop = loop_of(scene, self.wave, self.eager, threads) if compiled else None
         how = "eager" if self.loop is None else "compiled"
         rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
         self.need = need_of(settings, self.device, how, len(self.wave.stages.world.materials.models), rows)

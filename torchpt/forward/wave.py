@@ -233,8 +233,11 @@ def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
     }
 
 
-def loop_of(scene: Scene, wave: Wave, eager: list[str]) -> Loop:
-    """The compiled loop of a render, whose kernels are kept with the scene; materials without kernels join ``eager``."""
+def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Loop:
+    """The compiled loop of a render on ``threads`` (None: as many as torch's), whose kernels are kept with the scene.
+
+    Materials without kernels join ``eager``.
+    """
     keeper = kept(scene)
     kernels = keeper.kernels = kernels_of(scene, wave, keeper.kernels)
     for number, reason in kernels.eager.items():
@@ -242,4 +245,4 @@ def loop_of(scene: Scene, wave: Wave, eager: list[str]) -> Loop:
         eager.append(f"{name}: {reason}")
         say_once(f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}")
     integrator = wave.integrator
-    return Loop(kernels, torch.get_num_threads(), integrator.clamp, integrator.strict, say_once)
+    return Loop(kernels, threads or torch.get_num_threads(), integrator.clamp, integrator.strict, say_once)

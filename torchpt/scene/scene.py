@@ -10,7 +10,7 @@ import threading
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
-from weakref import WeakValueDictionary, ref
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
@@ -30,10 +30,11 @@ from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
 from torchpt.scene.devices import device_of
+from torchpt.scene.editions import Editions
 from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, extent_of, middle_of
-from torchpt.scene.vetting import vet
+from torchpt.scene.vetting import check_tensor, shared, vet
 from torchpt.scene.view import through
 from torchpt.settings import Film, Settings
 from torchpt.shortage import needing
@@ -100,7 +101,7 @@ class Scene:
         #: The most that was held above import while the scene was read; 0 where it is not known.
         self.peak = after - meter.base() if after > before else 0
         self._begin()
-        self._vetted = {name: (ref(value), 0) for name, value in self.params.items()}  # a file's numbers were read
+        self._vetted = self.editions()  # numbers of a file were checked as they were read
 
     def _begin(self) -> None:
         """Nothing is made of the parameters yet."""
@@ -109,14 +110,17 @@ class Scene:
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
-        self._state: dict[str, tuple[Tensor, int]] = {}
+        self._seen, self._made_of = (
+            Editions(),
+            dict[str, int](),
+        )  # of what worlds are made; views of the scene have the same
         self._origin: Scene | None = None
         self._number()
 
     def _number(self) -> None:
         """Become another scene than any before."""
         self.textured: dict[Any, Scene] = {}  # of :mod:`torchpt.scene.textured`
-        self._vetted: dict[str, tuple[ref[Tensor], int]] = {}  # which tensors were checked, at which version
+        self._editions, self._vetted = Editions(), dict[str, int]()  # and by name the edition that was checked
         #: Of all scenes of this process, by which compiled graphs name it.
         self.number = next(_numbers)
         _scenes[self.number] = self
@@ -142,6 +146,7 @@ class Scene:
         view.__dict__.update(self.__dict__ | own)
         view._origin = self.origin
         view._number()
+        view.trust(self)
         return view
 
     def to(self, device: str | torch.device) -> Scene:
@@ -234,15 +239,13 @@ class Scene:
         Raises:
             SceneError: an unknown name, a tensor of another shape, numbers that no scene file could hold.
         """
+        if params is not None and not isinstance(params, Mapping):
+            raise SceneError("params", params, "a mapping from names of scene.params to tensors")
         for name, value in (params or {}).items():
             if name not in self.params:
-                close = difflib.get_close_matches(name, self.params, 3) or list(self.params)[:8]
+                close = difflib.get_close_matches(str(name), self.params, 3) or list(self.params)[:8]
                 raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {', '.join(close)}")
-            shape = self.params[name].shape
-            if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
-                found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
-                texels = ", or texels (H, W, C)" if self.spec(name).texture else ""
-                raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}{texels}")
+            check_tensor(name, value, self.params[name].shape, self.spec(name).texture)
             self.check_number(name, value.detach())
         check_sources(self._built.sources, params or {}, self.merged(params))
 
@@ -254,6 +257,14 @@ class Scene:
         """
         with outside_transforms():
             vet(self, self._vetted)
+
+    def trust(self, other: Scene) -> None:
+        """Take what another scene checked of tensors that both have as checked."""
+        self._vetted = shared(self, other, other._vetted)
+
+    def editions(self) -> dict[str, int]:
+        """Numbers of what :attr:`params` hold: see :class:`torchpt.scene.editions.Editions`."""
+        return self._editions.of(self.params)
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """All parameters, those of ``params`` (once checked) in place of the scene's."""
@@ -373,25 +384,16 @@ class Scene:
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""
-        # Tensors of torch.inference_mode count no versions, and are taken to have changed.
-        state = {name: (value, -1 if value.is_inference() else value._version) for name, value in self.params.items()}
-        # The tensors themselves are kept and compared: an id may be another tensor's by now.
-        changed = [
-            name
-            for name, (value, version) in state.items()
-            if name not in self._state
-            or value is not self._state[name][0]
-            or version != self._state[name][1]
-            or version < 0
-        ]
-        gone = any(name not in state and not name.startswith("camera.") for name in self._state)
+        now, before = self._seen.of(self.params), self._made_of.copy()
+        changed = [name for name, edition in now.items() if not 0 < edition == before.get(name)]
+        gone = any(name not in now and not name.startswith("camera.") for name in before)
         if not changed and not gone:
             return
         for name in changed:
-            if self.spec(name).place and name in self._state:
-                self.check_number(name, state[name][0].detach())
-        self._state.clear()  # views of the scene have the same
-        self._state.update(state)
+            if self.spec(name).place and name in before:
+                self.check_number(name, self.params[name].detach())
+        self._made_of.clear()
+        self._made_of.update(now)
         if not gone and all(name.startswith("camera.") for name in changed):  # nothing that is kept depends on it
             return
         self._worlds.clear()

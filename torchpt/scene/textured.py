@@ -22,7 +22,7 @@ from torchpt.spec import Refused
 from torchpt.taped import in_transform, outside_transforms
 from torchpt.textures import Node
 
-__all__ = ["with_texels"]
+__all__ = ["renew", "with_texels"]
 
 
 #: Scenes with texels that are kept beside one, the latest.
@@ -42,20 +42,35 @@ def with_texels(scene: Scene, params: Mapping[str, Tensor] | None) -> Scene:
         SceneError: texels where the scene's materials cannot read any, that are out of range, or on a mesh without uvs.
         NotBuiltError: texels for what a material tabulates.
     """
-    given = {**scene.params, **(params or {})}
     with outside_transforms():
-        return _reading_texels(scene, given)
+        texels = _texels(scene, params or {})
+        return _reading(scene, texels) if texels else scene
 
 
-def _reading_texels(scene: Scene, given: Mapping[str, Tensor]) -> Scene:
+def renew(made: Scene, scene: Scene, params: Mapping[str, Tensor]) -> None:
+    """Bring what :func:`with_texels` made of a scene up to date, as other renders may have put their texels in since.
+
+    Args:
+        made: it, or the scene itself where no texels were given.
+        scene: as it was loaded.
+        params: of the render.
+    """
+    if made is not scene:
+        with outside_transforms():
+            _bring(made, scene, _texels(scene, params))
+
+
+def _texels(scene: Scene, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Texels that stand where a scene was loaded with numbers, apart from their tape."""
     loaded = scene.built.parameters
-    texels = {
+    return {
         name: _plain(value, loaded[name])
-        for name, value in given.items()
+        for name, value in {**scene.params, **params}.items()
         if name in loaded and _is_texels(value, loaded[name].ndim)
     }
-    if not texels:
-        return scene
+
+
+def _reading(scene: Scene, texels: Mapping[str, Tensor]) -> Scene:
     # By size, so that threads that render with different ones at a time do not share a scene.
     key = tuple(sorted((name, tuple(value.shape)) for name, value in texels.items()))
     made = scene.textured.get(key)
@@ -65,13 +80,29 @@ def _reading_texels(scene: Scene, given: Mapping[str, Tensor]) -> Scene:
         for oldest in list(scene.textured)[: max(0, len(scene.textured) + 1 - KEPT)]:
             scene.textured.pop(oldest, None)
         scene.textured[key] = made
-    for name in made.params:
-        made.params[name] = texels.get(name, scene.params[name])
+    _bring(made, scene, texels)
     return made
 
 
+def _bring(made: Scene, scene: Scene, texels: Mapping[str, Tensor]) -> None:
+    """Put the tensors of a scene, and texels in place of some, into the one that reads texels."""
+    for name, value in scene.params.items():
+        new = texels.get(name, value)
+        if name not in texels or not _same_memory(made.params[name], new):
+            made.params[name] = new
+    made.trust(scene)
+
+
+def _same_memory(one: Tensor, other: Tensor) -> bool:
+    """Whether two tensors are one, of which one is apart from its tape maybe."""
+    layout = one.dtype, one.shape, one.stride()
+    return one.data_ptr() == other.data_ptr() and layout == (other.dtype, other.shape, other.stride())
+
+
 def _is_texels(value: object, dimensions: int) -> bool:
-    return dimensions < 2 and isinstance(value, Tensor) and value.dim() == 3 and value.is_floating_point()
+    if not isinstance(value, Tensor) or value.layout is not torch.strided:
+        return False
+    return dimensions < 2 and value.dim() == 3 and value.is_floating_point()
 
 
 def _plain(value: Tensor, loaded: np.ndarray) -> Tensor:
@@ -109,13 +140,13 @@ def _built(scene: Scene, texels: Mapping[str, Tensor]) -> Built:
         except Refused as error:
             raise SceneError(f"params.{name}", error.value, error.expected) from None
         nodes.setdefault(stem, {})[slot] = opener(texture, name)
-    parts = tuple(replace(part, material=_reading(part.material, nodes)) for part in before.parts)
-    copies = tuple(replace(copied, material=_reading(copied.material, nodes)) for copied in before.copies)
+    parts = tuple(replace(part, material=_material(part.material, nodes)) for part in before.parts)
+    copies = tuple(replace(copied, material=_material(copied.material, nodes)) for copied in before.copies)
     check_coordinates([*parts], texels, file)
     return replace(before, parts=parts, copies=copies, parameters=parameters)
 
 
-def _reading(material: ResolvedMaterial, nodes: Mapping[str, Mapping[str, Node]]) -> ResolvedMaterial:
+def _material(material: ResolvedMaterial, nodes: Mapping[str, Mapping[str, Node]]) -> ResolvedMaterial:
     """A material that reads nodes, by its name and their slots; so do those that it blends."""
-    inner = tuple(_reading(one, nodes) for one in material.inner)
+    inner = tuple(_material(one, nodes) for one in material.inner)
     return replace(material, values={**material.values, **nodes.get(material.name, {})}, inner=inner)

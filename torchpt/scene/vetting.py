@@ -3,23 +3,40 @@
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
-from weakref import ref
 
+import torch
 from torch import Tensor
 
 from torchpt.errors import SceneError
+from torchpt.scene.sources import check_sources
 
 if TYPE_CHECKING:
     from torchpt.scene.scene import Scene
 
-__all__ = ["Vetted", "vet"]
-
-#: By name the tensor that was checked, and its version then.
-Vetted = dict[str, tuple[ref[Tensor], int]]
+__all__ = ["check_tensor", "shared", "vet"]
 
 
-def vet(scene: Scene, vetted: Vetted) -> None:
-    """Check what was not yet; ``vetted`` is brought up to date.
+def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], texels: bool = False) -> None:
+    """Refuse what is no floating tensor of a shape, for a parameter; ``texels``: that might have its place.
+
+    Raises:
+        SceneError: it is not, or it holds no numbers.
+    """
+    if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
+        found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
+        refused = (
+            isinstance(value, Tensor) and value.is_floating_point() and value.dim() == 3
+        )  # they were looked at before
+        others = ", or texels (H, W, C)" if texels and not refused else ""
+        raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}{others}")
+    if value.layout is not torch.strided:
+        raise SceneError(f"params.{name}", f"a {value.layout} tensor", "a dense tensor")
+    if value.is_meta:
+        raise SceneError(f"params.{name}", "a tensor on the device meta", "a tensor that holds numbers")
+
+
+def vet(scene: Scene, vetted: dict[str, int]) -> None:
+    """Check what was not yet; ``vetted`` is brought up to date: by name the edition that was checked.
 
     Raises:
         SceneError: see :meth:`Scene.check_own`.
@@ -29,15 +46,23 @@ def vet(scene: Scene, vetted: Vetted) -> None:
         raise SceneError(
             f"params.{name}", "nothing" if name in own else name, "the names that the scene was loaded with"
         )
-    for name, value in scene.params.items():
-        # Tensors of torch.inference_mode count no versions, and are checked each time.
-        version = -1 if isinstance(value, Tensor) and value.is_inference() else getattr(value, "_version", -1)
-        seen = vetted.get(name)
-        if seen is not None and seen[0]() is value and seen[1] == version >= 0:
-            continue
-        shape = own[name].shape
-        if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
-            found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
-            raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}")
+    # What counts no changes is checked each time.
+    changed = {name: edition for name, edition in scene.editions().items() if not 0 < edition == vetted.get(name)}
+    if not changed:
+        return
+    for name in changed:
+        value = scene.params[name]
+        check_tensor(name, value, own[name].shape)
         scene.check_number(name, value.detach())
-        vetted[name] = ref(value), version
+    check_sources(scene.built.sources, changed, scene.merged(None))
+    vetted |= changed
+
+
+def shared(made: Scene, scene: Scene, vetted: dict[str, int]) -> dict[str, int]:
+    """Of what was checked of a scene, that which another one made of it has too: the same tensors, as they were checked."""
+    before, now = scene.editions(), made.editions()
+    return {
+        name: edition
+        for name, edition in now.items()
+        if 0 < before.get(name, 0) == vetted.get(name) and made.params[name] is scene.params[name]
+    }
