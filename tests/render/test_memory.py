@@ -337,6 +337,8 @@ def test_a_limit_changes_no_bit(box):
     whole = torchpt.render(box, spp=2, film=film_of(100, 80), compile="off", threads=2)
     with pytest.raises(SceneError, match="render.max_memory: expected at least"):
         torchpt.render(box, spp=2, film=film_of(100, 80), max_memory="1MB")
+    with pytest.raises(SceneError, match="at least [0-9]+MB .*, as bytes or with a unit such as 4GB, got '10 bytes'"):
+        torchpt.render(box, spp=2, film=film_of(100, 80), max_memory=10)
     limit = str(int(torchpt.render(box, spp=1, film=film_of(4), full=True).peak_memory / 1e6) + 300) + "MB"
     found = torchpt.render(box, spp=2, film=film_of(100, 80), compile="off", threads=2, max_memory=limit, full=True)
     assert torch.equal(found.image, whole) and found.peak_memory > 0

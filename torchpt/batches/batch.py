@@ -15,6 +15,7 @@ from torch import Tensor
 from torchpt.batches.inputs import Cameras, Seeds, cameras_of, named, params_of, scenes_of, seeds_of
 from torchpt.errors import SceneError
 from torchpt.forward import Entry, Rendering, Run, limited_threads, render_many
+from torchpt.forward.budget import too_little
 from torchpt.integrators.loop.schedule import TASKS
 from torchpt.integrators.wave import Wave
 from torchpt.native.memory import mb
@@ -261,4 +262,4 @@ def _check_memory(order: Order, total: int | None) -> None:
     _, _, width, height = film.crop or (0, 0, film.width, film.height)
     held = 2 * 3 * width * height * torch.finfo(order.dtype).bits // 8 * (total or 1)  # one by one, and then together
     if limit is not None and limit < held:
-        raise SceneError("render.max_memory", mb(limit), f"more than the {mb(held)} that the pictures alone take")
+        raise too_little(limit, f"more than the {mb(held)} that the pictures alone take")

@@ -14,7 +14,7 @@ import torch
 from torchpt.errors import SceneError
 from torchpt.native.memory import Meter, let_go, mb
 
-__all__ = ["Budget", "check_memory"]
+__all__ = ["Budget", "check_memory", "too_little"]
 
 #: Lanes of the first wave under a limit, after which all code is there: what it adds for good is no lane's.
 FEWEST = 4096
@@ -91,4 +91,11 @@ def check_memory(limit: int, device: torch.device, least: Callable[[int], int], 
     meter = Meter(device)
     enough = max(least(max(meter.now() - meter.base(), 0)), loading)
     if limit < enough:
-        raise SceneError("render.max_memory", mb(limit), f"at least {mb(enough)} for this scene and film")
+        raise too_little(limit, f"at least {mb(enough)} for this scene and film")
+
+
+def too_little(limit: int, expected: str) -> SceneError:
+    """The error of a limit that is too small; one below a megabyte was hardly meant in bytes."""
+    if limit >= 1_000_000:
+        return SceneError("render.max_memory", mb(limit), expected)
+    return SceneError("render.max_memory", f"{limit} bytes", f"{expected}, as bytes or with a unit such as 4GB")
