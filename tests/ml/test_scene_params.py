@@ -46,6 +46,10 @@ def put(name: str, value: Any) -> Callable[[torchpt.Scene], None]:
         (put(ALBEDO, torch.tensor([-3.0, 2.0, 2.0])), "params.materials.paint.reflectance: expected"),
         (put(ALBEDO, torch.rand(2)), r"expected a floating tensor of shape \(3,\)"),
         (put(ALBEDO, 0.5), r"expected a floating tensor of shape \(3,\), got 0.5"),
+        (
+            put(ALBEDO, torch.rand(3).to_sparse()),
+            r"expected a dense floating tensor of shape \(3,\).*sparse_coo tensor",
+        ),
         (put(ALBEDO, None), r"expected a floating tensor of shape \(3,\)"),
         (put("foo", torch.rand(3)), "params.foo: expected the names that the scene was loaded with"),
         (lambda own: own.params.pop(ALBEDO), "params.materials.paint.reflectance: .* got 'nothing'"),

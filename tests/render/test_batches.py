@@ -323,6 +323,12 @@ def test_views_follow_their_scene():
     assert torch.equal(torchpt.render(scene), torchpt.render(scene))
 
 
+def test_poses_as_nested_lists():
+    scene = room()
+    given = poses(scene, 2)
+    assert torch.equal(torchpt.render_batch(scene, given.tolist()), torchpt.render_batch(scene, given))
+
+
 # -- errors
 
 
@@ -334,6 +340,12 @@ def test_views_follow_their_scene():
         ({"cameras": [BLOCKS[0], 3]}, r"cameras\[1\]: "),
         ({"cameras": [BLOCKS[0], {**BLOCKS[0], "fov": -1}]}, r"^cameras\[1\]\.fov: "),
         ({"cameras": torch.eye(4)}, r"cameras: .*\(C, 4, 4\)"),
+        ({"cameras": torch.eye(4)[None].to_sparse()}, r"^cameras: .* dense tensor \(C, 4, 4\).*sparse_coo tensor"),
+        ({"cameras": [torch.eye(4).to_sparse()]}, r"^cameras\[0\]: .*dense.*sparse_coo tensor"),
+        ({"cameras": [[["a"] * 4] * 4]}, r"^cameras\[0\]: expected a pose \(4, 4\)"),
+        ({"cameras": [[1.0, 2.0]]}, r"^cameras\[0\]: .*shape \(4, 4\)"),
+        ({"cameras": np.array([["a"]])}, "^cameras: expected a sequence"),
+        ({"params": {"camera.to_world": torch.eye(4).expand(2, 4, 4).to_sparse()}}, "^params.camera.to_world: .*dense"),
         ({"cameras": torch.eye(3)[None]}, r"^cameras\[0\]: .*shape \(4, 4\)"),
         ({"cameras": torch.eye(4)[None], "params": {"camera.to_world": torch.eye(4)[None].repeat(2, 1, 1)}}, "poses"),
         (
@@ -353,7 +365,10 @@ def test_views_follow_their_scene():
         ({"seed": [1, -2]}, r"render\.seed: "),
         ({"spp": 0}, r"render\.spp: "),
         ({"checkpoint": "a.ckpt"}, "^render.checkpoint: "),
-        ({"max_memory": "1kB"}, "^render.max_memory: .*pictures alone"),
+        (
+            {"max_memory": "1kB"},
+            "^render.max_memory: .*pictures alone take, as bytes or with a unit such as 4GB, got '1000 b",
+        ),
         ({"film": {"aovs": ["depth"]}}, r"film\.aovs: .*full=True"),
     ),
     ids=str,

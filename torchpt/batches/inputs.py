@@ -16,7 +16,7 @@ from torchpt.scene.entry import as_scene
 
 __all__ = ["Cameras", "Seeds", "cameras_of", "named", "params_of", "scenes_of", "seeds_of"]
 
-#: Blocks of scene files, poses ``(4, 4)``, or a tensor of poses ``(C, 4, 4)``.
+#: Blocks of scene files, poses ``(4, 4)`` (lists of numbers too), or a tensor of poses ``(C, 4, 4)``.
 Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
 #: One for all, one for each scene, or one for each scene and camera.
 Seeds = int | Sequence[int] | Sequence[Sequence[int]] | None
@@ -49,25 +49,37 @@ def cameras_of(cameras: Cameras) -> Sequence[Mapping[str, Any] | Tensor | None]:
     """
     if cameras is None:
         return [None]
-    expected = "a sequence of camera blocks or poses (4, 4), or a tensor (C, 4, 4)"
+    expected = "a sequence of camera blocks or poses (4, 4), or a dense tensor (C, 4, 4)"
     if isinstance(cameras, Tensor | np.ndarray):
-        cameras = torch.as_tensor(cameras)
-        if cameras.dim() != 3 or not len(cameras):
-            raise SceneError("cameras", tuple(cameras.shape), expected)
-        return list(cameras.unbind())
+        poses = _pose("cameras", cameras, expected)
+        if poses.dim() != 3 or not len(poses):
+            raise SceneError("cameras", tuple(poses.shape), expected)
+        return list(poses.unbind())
     if not isinstance(cameras, Sequence) or isinstance(cameras, str) or not cameras:
         raise SceneError("cameras", cameras, expected)
     found: list[Mapping[str, Any] | Tensor] = []
     for c, camera in enumerate(cameras):
-        if not isinstance(camera, Mapping | Tensor | np.ndarray):
+        if not isinstance(camera, Mapping | Tensor | np.ndarray | list | tuple):
             raise SceneError(f"cameras[{c}]", camera, expected)
         if isinstance(camera, Mapping) and not _PLACES & camera.keys():
             whole = (
                 "a whole camera block, with origin and target, to_world, or R and t; hand single numbers over as params"
             )
             raise SceneError(f"cameras[{c}]", dict(camera), f"{whole}, such as camera.fov")
-        found.append(camera if isinstance(camera, Mapping) else torch.as_tensor(camera))
+        found.append(camera if isinstance(camera, Mapping) else _pose(f"cameras[{c}]", camera, "a pose (4, 4), dense"))
     return found
+
+
+def _pose(key: str, value: Any, expected: str) -> Tensor:
+    """A tensor as it is, an array as one; lists of numbers in float64. Shapes are not looked at."""
+    if isinstance(value, Tensor):
+        if value.layout is not torch.strided:
+            raise SceneError(key, f"a {value.layout} tensor", expected)
+        return value
+    try:
+        return torch.as_tensor(value, dtype=None if isinstance(value, np.ndarray) else torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise SceneError(key, value, expected) from None
 
 
 def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[str, Tensor]] | None:
@@ -88,6 +100,8 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[
             if own is not None and value.dim() <= own.dim():
                 expected = f"a first dimension that is the number of scenes, before those of {tuple(own.shape)}"
                 raise SceneError(f"params.{name}", tuple(value.shape), expected)
+            if value.layout is not torch.strided:
+                raise SceneError(f"params.{name}", f"a {value.layout} tensor", "a dense tensor")
             size = size or len(value)
             if len(value) != size:
                 raise SceneError(

@@ -22,17 +22,16 @@ def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], 
     Raises:
         SceneError: it is not, or it holds no numbers.
     """
-    if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
-        found = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else value
-        refused = (
-            isinstance(value, Tensor) and value.is_floating_point() and value.dim() == 3
-        )  # they were looked at before
-        others = ", or texels (H, W, C)" if texels and not refused else ""
-        raise SceneError(f"params.{name}", found, f"a floating tensor of shape {tuple(shape)}{others}")
-    if value.layout is not torch.strided:
-        raise SceneError(f"params.{name}", f"a {value.layout} tensor", "a dense tensor")
-    if value.is_meta:
-        raise SceneError(f"params.{name}", "a tensor on the device meta", "a tensor that holds numbers")
+    found, dense, others = value, True, ", or texels (H, W, C)" if texels else ""
+    if isinstance(value, Tensor):
+        dense, floats = value.layout is torch.strided, value.is_floating_point()
+        if dense and floats and value.shape == shape and not value.is_meta:
+            return
+        found = "a tensor on the device meta" if value.is_meta else (tuple(value.shape), value.dtype)
+        found = found if dense else f"a {value.layout} tensor"
+        others = "" if floats and value.dim() == 3 else others  # texels were looked at before
+    kind = "floating tensor" if dense else "dense floating tensor"
+    raise SceneError(f"params.{name}", found, f"a {kind} of shape {tuple(shape)}{others}")
 
 
 def vet(scene: Scene, vetted: dict[str, int]) -> None:
