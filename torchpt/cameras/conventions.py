@@ -28,8 +28,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchpt.cameras.opencv import PinholeMatrices
+from torchpt.cameras.pinhole import FOV_AXES
 from torchpt.errors import SceneError
 from torchpt.math.tensor_transforms import placed
+from torchpt.taped import in_transform
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -67,9 +70,9 @@ def from_opencv(K: Any, R: Any, t: Any, size: Size, first_pixel: float = 0.5) ->
         first_pixel: where ``K`` has the middle of the first pixel, along x and y: 0.5 as COLMAP, 0 as ``cv2``.
 
     Raises:
-        SceneError: numbers of another shape, or no size.
+        SceneError: numbers that are not finite or of another shape, or no size.
     """
-    inner, wide_and_tall = _moved(_tensor(K, "K", (3, 3)), 0.5 - first_pixel), _size(size)
+    inner, wide_and_tall = _moved(_tensor(K, "K", (3, 3)), 0.5 - _first(first_pixel)), _size(size)
     pose = {"R": _tensor(R, "R", (3, 3)), "t": _tensor(t, "t", (3,))}
     return {"type": "perspective", "K": inner, **pose, "size": wide_and_tall}
 
@@ -91,10 +94,10 @@ def to_opencv(
         first_pixel: where ``K`` is to have the middle of the first pixel.
 
     Raises:
-        SceneError: a camera that is no pinhole's.
+        SceneError: no scene, parameters or film settings that are wrong, or a camera that is no pinhole's.
     """
-    inner, turn, move = scene.pinhole(params, film, torch.float64)
-    return _moved(inner, first_pixel - 0.5).to(dtype), turn.to(dtype), move.to(dtype)
+    inner, turn, move = _seen(scene, params, film, dtype)
+    return _moved(inner, _first(first_pixel) - 0.5).to(dtype), turn.to(dtype), move.to(dtype)
 
 
 def from_opengl(
@@ -117,7 +120,8 @@ def from_opengl(
         first_pixel: where ``K`` has the middle of the first pixel.
 
     Raises:
-        SceneError: neither a ``fov`` nor ``K``, or both; a ``K`` without ``size``.
+        SceneError: neither a ``fov`` nor ``K``, or both; a ``K`` without ``size``; numbers that are not finite, of another
+            shape or out of range, or a matrix with an axis of no length.
     """
     if (fov is None) == (K is None):
         raise SceneError("fov", fov, "an angle in degrees, or K and size, one of the two")
@@ -129,8 +133,13 @@ def from_opengl(
         "to_world": placed(pose[:, :3] * pose.new_tensor([-1.0, 1.0, -1.0]), pose[:, 3]),
     }
     if K is None:
+        angle = _tensor(fov, "fov", ())
+        if not in_transform(angle) and not 0.0 < float(angle) < 180.0:
+            raise SceneError("fov", fov, "an angle in degrees above 0 and below 180")
+        if fov_axis not in FOV_AXES:
+            raise SceneError("fov_axis", fov_axis, f"one of {', '.join(FOV_AXES)}")
         return {**block, "fov": fov, "fov_axis": fov_axis}
-    return {**block, "K": _moved(_tensor(K, "K", (3, 3)), 0.5 - first_pixel), "size": _size(size)}
+    return {**block, "K": _moved(_tensor(K, "K", (3, 3)), 0.5 - _first(first_pixel)), "size": _size(size)}
 
 
 def to_opengl(
@@ -140,7 +149,7 @@ def to_opengl(
     dtype: torch.dtype = torch.float32,
 ) -> OpenGLCamera:
     """A scene's camera with OpenGL's axes. Arguments and errors as :func:`to_opencv`."""
-    inner, turn, move = scene.pinhole(params, film, torch.float64)
+    inner, turn, move = _seen(scene, params, film, dtype)
     width, height = scene.film_size(film)
     matrix = placed(turn.T * turn.new_tensor([1.0, -1.0, -1.0]), -(turn.T @ move))
     halves = inner.new_tensor([width, height]) * 0.5
@@ -166,7 +175,7 @@ def from_kornia(camera: PinholeCamera, index: int = 0) -> Block:
     except (IndexError, TypeError):
         raise SceneError("index", index, f"a whole number below {count}, the number of cameras") from None
     outer = camera.extrinsics[index]
-    size = int(camera.width[index]), int(camera.height[index])
+    size: Any = camera.width[index], camera.height[index]
     return from_opencv(camera.intrinsics[index, :3, :3], outer[:3, :3], outer[:3, 3], size, 0.0)
 
 
@@ -183,7 +192,8 @@ def to_kornia(
     """
     from kornia.geometry.camera import PinholeCamera
 
-    inner, turn, move = to_opencv(scene, params, film, torch.float64, 0.0)
+    inner, turn, move = _seen(scene, params, film, dtype)
+    inner = _moved(inner, -0.5)
     whole = placed(inner, torch.zeros_like(move))
     size = [torch.tensor([side], device=turn.device) for side in scene.film_size(film)]
     return PinholeCamera(whole[None].to(dtype), placed(turn, move)[None].to(dtype), size[1], size[0])
@@ -203,8 +213,10 @@ def from_pytorch3d(
         in_ndc: whether the two before are in PyTorch3D's normalized coordinates, whose smaller side is 2 long; else in pixels.
 
     Raises:
-        SceneError: numbers of another shape.
+        SceneError: numbers that are not finite or of another shape.
     """
+    if type(in_ndc) is not bool:
+        raise SceneError("in_ndc", in_ndc, "True or False")
     # Ours is the same camera space, and R's columns are its axes in the world.
     turn, move = _tensor(R, "R", (3, 3)), _tensor(T, "T", (3,))
     tall, wide = _size(_tensor(image_size, "image_size", (2,)), "image_size", "[height, width]")
@@ -228,7 +240,7 @@ def to_pytorch3d(
     dtype: torch.dtype = torch.float32,
 ) -> dict[str, Any]:
     """What PyTorch3D's ``PerspectiveCameras(**numbers)`` takes, a batch of one. Arguments and errors as :func:`to_opencv`."""
-    inner, turn, move = scene.pinhole(params, film, torch.float64)
+    inner, turn, move = _seen(scene, params, film, dtype)
     wide, tall = scene.film_size(film)
     half, flip = min(wide, tall) * 0.5, turn.new_tensor([-1.0, -1.0, 1.0])
     numbers = {
@@ -241,12 +253,41 @@ def to_pytorch3d(
     return {**found, "image_size": torch.tensor([[tall, wide]], device=turn.device), "in_ndc": True}
 
 
-def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
-    """Numbers in float64, of a shape or a batch of one."""
+def _seen(
+    scene: Any, params: Mapping[str, Tensor] | None, film: Mapping[str, Any] | None, dtype: Any
+) -> PinholeMatrices:
+    """A scene's camera in float64, once ``dtype``, which the caller is to give it, is one."""
+    if not hasattr(scene, "pinhole"):
+        raise SceneError("scene", scene, "a scene from torchpt.load")
+    if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
+        raise SceneError("dtype", dtype, "a floating dtype such as torch.float32")
+    return scene.pinhole(params, film, torch.float64)
+
+
+def _numbers(value: Any, key: str, expected: str) -> Tensor:
+    """Finite numbers in float64; of a transform of ``torch.func``, where values are not to be looked at, whatever they are."""
+    given = value if isinstance(value, Tensor) else None
+    if given is not None and (given.layout is not torch.strided or given.is_complex() or given.is_meta):
+        raise SceneError(
+            key, f"a {given.layout} tensor of {given.dtype} on {given.device}", f"{expected}, dense and real"
+        )
     try:
         found = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise SceneError(key, value, "numbers") from None
+        raise SceneError(key, value, expected) from None
+    if not in_transform(found) and not bool(found.isfinite().all()):
+        raise SceneError(key, value, "finite numbers")
+    return found
+
+
+def _first(value: Any) -> float:
+    """Where the middle of the first pixel is."""
+    return float(_tensor(value, "first_pixel", ()))
+
+
+def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
+    """Numbers in float64, of a shape or a batch of one."""
+    found = _numbers(value, key, "numbers")
     if shape is not None and found.shape == (1, *shape):
         found = found[0]
     if shape is not None and found.shape != shape:
@@ -269,14 +310,14 @@ def _size(size: Any, key: str = "size", sides: str = "[width, height]") -> list[
 
 def _pose(matrix: Any) -> Tensor:
     """``(3, 4)`` of a ``(4, 4)`` or ``(3, 4)``, its axes of length 1."""
-    try:
-        found = torch.as_tensor(matrix, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        raise SceneError("matrix", matrix, "a matrix (4, 4) or (3, 4)") from None
+    found = _numbers(matrix, "matrix", "a matrix (4, 4) or (3, 4)")
     if found.shape not in ((4, 4), (3, 4)):
         raise SceneError("matrix", f"shape {tuple(found.shape)}", "a matrix (4, 4) or (3, 4)")
     axes = found[:3, :3]
-    return torch.cat((axes / torch.linalg.vector_norm(axes, dim=0), found[:3, 3:]), 1)
+    lengths = torch.linalg.vector_norm(axes, dim=0)
+    if not in_transform(lengths) and not bool((lengths > 0.0).all()):
+        raise SceneError("matrix", matrix, "finite numbers, and axes of a length")
+    return torch.cat((axes / lengths, found[:3, 3:]), 1)
 
 
 def _moved(matrix: Tensor, offset: float) -> Tensor:

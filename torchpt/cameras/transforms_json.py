@@ -12,7 +12,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from torchpt.cameras import opencv
 from torchpt.cameras.conventions import from_opengl, to_opengl
 from torchpt.errors import AssetError, OutputError, SceneError
 from torchpt.files import read_regular
+from torchpt.images.decode import as_path
 from torchpt.spec import Refused, reading
 from torchpt.spec.declared import described
 
@@ -59,22 +60,26 @@ class Frame(NamedTuple):
 
 
 def frame_of(
-    scene: Scene, image: str, params: Mapping[str, Tensor] | None = None, film: Mapping[str, Any] | None = None
+    scene: Scene,
+    image: str | os.PathLike[str],
+    params: Mapping[str, Tensor] | None = None,
+    film: Mapping[str, Any] | None = None,
 ) -> Frame:
     """A scene's camera as a frame: as numbers, without gradients.
 
     Args:
         scene: whose camera.
-        image: the picture's file, as it is to be written.
+        image: the picture's file, as it is to be written: text or a path.
         params: tensors in place of the scene's.
         film: film settings in place of the scene's own.
 
     Raises:
-        SceneError: a camera that is no pinhole's.
+        SceneError: no scene or no file's name, parameters or film settings that are wrong, or a camera that is no pinhole's.
     """
+    name = _file(image, "image")
     with torch.no_grad():
         matrix, inner, _, size = to_opengl(scene, params, film, torch.float64)
-    return Frame(image, from_opengl(matrix, K=inner, size=size), size)
+    return Frame(name, from_opengl(matrix, K=inner, size=size), size)
 
 
 def read_transforms(path: str | os.PathLike[str]) -> list[Frame]:
@@ -83,10 +88,11 @@ def read_transforms(path: str | os.PathLike[str]) -> list[Frame]:
     ``torchpt.load({"camera": frame.camera, "film": {"width": w, "height": h}, ...})`` is a scene as a frame sees it.
 
     Raises:
+        SceneError: ``path`` is none.
         AssetError: a file that is missing or malformed, or a camera whose lens bends rays.
     """
     try:
-        whole = json.loads(read_regular(path, _MOST))
+        whole = json.loads(read_regular(as_path(path), _MOST))
     except OSError as error:
         raise AssetError(path, f"cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:
@@ -102,13 +108,17 @@ def write_transforms(path: str | os.PathLike[str], frames: Iterable[Frame]) -> N
 
     Args:
         path: of the file.
-        frames: of :func:`frame_of` or :func:`read_transforms`; others need ``to_world`` or ``R`` and ``t``, and ``K`` or
-            ``fov`` with what may stand beside it.
+        frames: of :func:`frame_of` or :func:`read_transforms`; others may have a path as ``image``, and need ``to_world`` or
+            ``R`` and ``t``, and ``K`` or ``fov`` with what may stand beside it.
 
     Raises:
-        SceneError: no frames, a frame without a size, a camera in another form, or one that no scene could have.
+        SceneError: ``path`` is none, no frames, a frame without a size, a camera in another form, or one that no scene could
+            have.
         OutputError: it cannot be written.
     """
+    place = as_path(path)
+    if not isinstance(frames, Iterable):
+        raise SceneError("frames", frames, "a sequence of Frames")
     rows = [_row(frame, f"frames.{number}") for number, frame in enumerate(frames)]
     if not rows:
         raise SceneError("frames", [], "one frame at least")
@@ -116,7 +126,7 @@ def write_transforms(path: str | os.PathLike[str], frames: Iterable[Frame]) -> N
     shared = {key: value for key, value in shared.items() if all(row.get(key) == value for row in rows)}
     kept = [{key: value for key, value in row.items() if key not in shared} for row in rows]
     text = json.dumps({"camera_model": "OPENCV", **shared, "frames": kept}, indent=1, allow_nan=False)
-    beside = Path(f"{os.fspath(path)}.part")
+    beside = Path(f"{place}.part")
     try:
         beside.write_text(text + "\n", encoding="utf-8")
         os.replace(beside, path)
@@ -166,8 +176,6 @@ def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
         camera = from_opengl(matrix, **lens, size=size)
     except SceneError as error:
         raise AssetError(path, f"{key}.transform_matrix: expected {error.expected}") from None
-    if not camera["to_world"].isfinite().all():
-        raise AssetError(path, f"{key}.transform_matrix: expected finite numbers, and axes of a length")
     return Frame(image, camera, size)
 
 
@@ -189,21 +197,29 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
+def _file(image: Any, key: str) -> str:
+    """A picture's file as it is written: with slashes, whatever the system has."""
+    found = image.as_posix() if isinstance(image, PurePath) else image
+    found = os.fspath(found) if isinstance(found, str | os.PathLike) else None
+    if not isinstance(found, str):
+        raise SceneError(key, image, "the picture's file, as text or a path")
+    return found
+
+
 def _row(frame: Frame, key: str) -> dict[str, Any]:
     """A frame as the file has it."""
     if not isinstance(frame, Frame):
         raise SceneError(key, frame, "a Frame, of frame_of(scene, image) or read_transforms")
-    if not isinstance(frame.image, str):
-        raise SceneError(f"{key}.image", frame.image, "the picture's file as text")
     try:
         wide, tall = size = opencv.size(frame.size)
     except Refused:
         raise SceneError(f"{key}.size", frame.size, "width and height of the picture in pixels") from None
+    image = _file(frame.image, f"{key}.image")
     inner, pose = _seen(frame.camera, size, f"{key}.camera")
     (fx, fy), (cx, cy) = inner.diagonal()[:2].tolist(), inner[:2, 2].tolist()
     matrix = pose * pose.new_tensor([-1.0, 1.0, -1.0, 1.0]) + 0.0  # no -0.0
     return {
-        "file_path": frame.image,
+        "file_path": image,
         "transform_matrix": matrix.tolist(),
         "w": wide,
         "h": tall,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from os import PathLike, fspath
-from pathlib import Path
+from os import PathLike
 from typing import TYPE_CHECKING
 
 from torchpt.images import write_image
+from torchpt.images.decode import as_path
 
 if TYPE_CHECKING:
     from torchpt.forward.result import Rendering
@@ -17,7 +17,7 @@ __all__ = ["beside", "write_denoised", "write_rendered"]
 
 def beside(path: str | PathLike[str]) -> str:
     """Where a denoised picture goes: ``a.exr`` as ``a.denoised.exr``."""
-    file = Path(fspath(path))
+    file = as_path(path)
     return str(file.with_name(f"{file.stem}.denoised{file.suffix}"))
 
 
@@ -30,7 +30,7 @@ def write_rendered(path: str | PathLike[str], rendering: Rendering, film: Film) 
     write_image(
         path,
         rendering.image,
-        rendering.layers if Path(fspath(path)).suffix.lower() == ".exr" else None,
+        rendering.layers if as_path(path).suffix.lower() == ".exr" else None,
         exposure=film.exposure,
         tonemap=film.tonemap,
         gamma=film.gamma,

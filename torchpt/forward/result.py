@@ -122,6 +122,7 @@ class Rendering:
             path: where to, ending in ``.exr .hdr .png .jpg .jpeg .ppm``.
 
         Raises:
+            SceneError: ``path`` is none.
             OutputError: an ending that is not written, or a place that cannot be written.
         """
         from torchpt.forward.files import beside, write_denoised, write_rendered

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpt.errors import AssetError
+from torchpt.errors import AssetError, SceneError
 from torchpt.files import read_regular
 from torchpt.images.png import plain_png
 
-__all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "complaint", "existing", "pixels_of"]
+__all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "as_path", "complaint", "existing", "pixels_of"]
 
 MAX_PIXELS = 64 * 2**20  # a header may claim anything: refuse before memory is asked for
 FLOAT_FORMATS = (".exr", ".hdr")
@@ -81,13 +81,26 @@ class Pixels:
         return self.values.dtype.kind in "ub" and self.white <= 255
 
 
+def as_path(path: Any) -> Path:
+    """A path as users give it.
+
+    Raises:
+        SceneError: something else.
+    """
+    found = fspath(path) if isinstance(path, str | PathLike) else None
+    if not isinstance(found, str):  # bytes neither
+        raise SceneError("path", path, "a file's path, as text or a pathlib.Path")
+    return Path(found)
+
+
 def existing(path: str | PathLike[str]) -> Path:
     """The path of a picture file that is there.
 
     Raises:
+        SceneError: no path.
         AssetError: an unknown ending, no such file, or no file.
     """
-    path = Path(fspath(path))
+    path = as_path(path)
     if path.suffix.lower() not in READABLE:
         raise AssetError(path, f"unknown kind of image {path.suffix!r}; known: {' '.join(READABLE)}")
     try:

@@ -61,6 +61,7 @@ def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
         Facts by name; empty for a file that has none, and for formats other than EXR. Fractions have float32's seven digits.
 
     Raises:
+        SceneError: ``path`` is none.
         AssetError: a file that is missing, of no known ending, or malformed.
     """
     path = existing(path)

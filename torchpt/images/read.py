@@ -30,6 +30,7 @@ def read_image(path: str | PathLike[str], linear: bool = False) -> Tensor:
         EXR with layers, the picture ``R G B [A]``; where it has none, its first layer.
 
     Raises:
+        SceneError: ``path`` is none.
         AssetError: a file that is missing, of no known ending, malformed, truncated, CMYK or larger than 64 Mpixel.
     """
     pixels = pixels_of(existing(path), MAX_PIXELS)
@@ -50,7 +51,7 @@ def read_layers(path: str | PathLike[str]) -> dict[str, Tensor]:
     `read_image` returns it.
 
     Raises:
-        AssetError: as `read_image`.
+        SceneError, AssetError: as `read_image`.
     """
     path = existing(path)
     if path.suffix.lower() != ".exr":

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from io import BytesIO
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from torch import Tensor
 
 from torchpt.errors import OutputError
 from torchpt.images.colour import display
+from torchpt.images.decode import as_path
 from torchpt.images.header import Fact, checked_header, put_header
 from torchpt.images.layers import channel_names
 
@@ -58,6 +59,7 @@ def write_image(
             ``torchpt:NAME``, and read by :func:`torchpt.read_header`.
 
     Raises:
+        SceneError: ``path`` is none.
         OutputError: an ending that is not written, or a place that cannot be written.
         ValueError: an image or layer of another shape, a header that no file could hold.
     """
@@ -119,7 +121,7 @@ def check_writable(path: str | PathLike[str], endings: tuple[str, ...] = WRITABL
 
 def place_of(path: str | PathLike[str], endings: tuple[str, ...] = WRITABLE) -> Path:
     """The file that is meant, links resolved; an ending that is not among those accepted is an OutputError."""
-    destination = Path(fspath(path))
+    destination = as_path(path)
     if destination.suffix.lower() not in endings:
         problem = f"cannot write the kind {destination.suffix!r}" if destination.suffix else "needs an ending"
         raise OutputError(path, f"{problem}; accepted: {' '.join(endings)}")
