@@ -8,6 +8,7 @@ module, no ``lambda``.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -129,7 +130,7 @@ class RenderDataset(Dataset):
 
     Raises:
         SceneError: arguments that are not accepted; on access, what ``load`` and ``render`` raise.
-        TypeError: an argument that ``render`` does not know.
+        TypeError: an argument that ``render`` does not know; on access, an index that is no whole number.
         IndexError: on access, an index that there is not.
     """
 
@@ -153,7 +154,11 @@ class RenderDataset(Dataset):
         return self.scenes * max(len(self._items.cameras), 1)
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        index = int(index)
+        try:
+            index = operator.index(index)
+        except TypeError:
+            shown = repr(index) if isinstance(index, int | float | str | None) else f"a {type(index).__name__}"
+            raise TypeError(f"index of a data set: expected a whole number, got {shown}") from None
         if not -len(self) <= index < len(self):
             raise IndexError(f"index {index} of a data set of {len(self)} items")
         return self._items.item(index % len(self))

@@ -6,6 +6,7 @@ import copy
 import pickle
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from scene_makers import FILM, dim, flat, room
@@ -108,6 +109,22 @@ def test_scenes_may_be_made_by_the_caller_and_items_are_without_gradients():
     scene.params["materials.wall.reflectance"].requires_grad_()
     item = RenderDataset(lambda _: scene, 1, spp=1)[0]
     assert not item["image"].requires_grad and item["image"].shape == (8, 10, 3)
+
+
+@pytest.mark.parametrize(
+    "index", [1.5, "a", "1", None, [1], torch.tensor([0, 1]), torch.tensor(1.0), slice(0, 2)], ids=str
+)
+def test_an_index_is_a_whole_number(index):
+    with pytest.raises(TypeError, match="^index of a data set: expected a whole number, got ") as caught:
+        data()[index]
+    assert "\n" not in str(caught.value)
+
+
+def test_indices_of_arrays_and_tensors():
+    made = data(layers=[], spp=1)
+    indices: list[Any] = [np.int64(1), torch.tensor(1), -3]
+    for index in indices:
+        assert int(made[index]["index"]) == 1
 
 
 @pytest.mark.parametrize(
