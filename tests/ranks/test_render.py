@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -225,3 +227,66 @@ def test_a_rank_that_says_nothing_is_given_up(box: torchpt.Scene, tmp_path: Path
 def test_a_group_needs_a_process_group() -> None:
     with pytest.raises(RenderError, match="init_process_group"):
         torchpt.ranks.Group()
+
+
+@pytest.mark.parametrize("timeout", ["a", None, True, 0, -1, float("nan"), float("inf"), 1e300, [1]])
+def test_a_timeout_is_a_number_of_seconds(timeout: Any) -> None:
+    with pytest.raises(SceneError, match="^timeout: expected a number of seconds above 0") as caught:
+        torchpt.ranks.Group(timeout=timeout)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_process_group(tmp_path: Path) -> None:
+    def work(group: Any) -> list[str]:
+        said = []
+        for wrong in ("x", 3, [0], object()):
+            with pytest.raises(
+                SceneError, match="^process_group: expected a process group of torch.distributed"
+            ) as caught:
+                torchpt.ranks.Group(wrong)
+            said.append(str(caught.value))
+        with pytest.raises(SceneError, match="^group: expected"):
+            torchpt.ranks.share([1], "x")  # type: ignore[arg-type]
+        return said
+
+    (said,) = in_ranks(1, work, tmp_path)
+    assert isinstance(said, list) and not any("\n" in line for line in said)
+
+
+#: The second of two ranks says nothing. Gloo gives up too just as Python ends, which holds its lock meanwhile.
+LEFT_ALONE = """
+import atexit, os, sys, time
+
+def hold():
+    while time.monotonic() < begun + 2.5:
+        pass
+
+atexit.register(hold)  # the first to come is the last to be called
+
+import torch.distributed as dist
+import torchpt
+
+other = os.fork()
+rank = 0 if other else 1
+dist.init_process_group("gloo", init_method="file://" + sys.argv[1], rank=rank, world_size=2)
+group = torchpt.ranks.Group(timeout=1.5)
+group.barrier()
+if rank == 1:
+    time.sleep(5.0)
+    os._exit(0)
+group.timeout, begun = 0.5, time.monotonic()
+try:
+    group.barrier()
+except torchpt.LostRankError as error:
+    print(error, flush=True)
+sys.setswitchinterval(100.0)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_process_that_lost_a_rank_ends_well(tmp_path: Path) -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", LEFT_ALONE, str(tmp_path / "store")], capture_output=True, text=True, timeout=100.0
+    )
+    assert found.returncode == 0, found.stderr[-300:]
+    assert found.stdout == "ranks: another rank did not answer for 0.5 s\n"

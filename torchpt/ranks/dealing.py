@@ -8,6 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from torchpt.errors import SceneError
 from torchpt.ranks.group import Group
 
 __all__ = ["blocks", "dealt", "share"]
@@ -63,7 +64,12 @@ def share(items: Sequence[T], group: Group | None) -> list[tuple[int, T]]:
     """The items of a list that this rank takes, each with its number in the list; all where ``group`` is None.
 
     Every item is one rank's. The numbers of items that two ranks take differ by one at most.
+
+    Raises:
+        SceneError: ``group`` is none.
     """
     if group is None:
         return list(enumerate(items))
+    if not hasattr(group, "rank"):
+        raise SceneError("group", group, "a torchpt.ranks.Group, or None")
     return [(number, items[number]) for number in _mine(len(items), group.rank, group.size)]

@@ -7,6 +7,7 @@ by the rounding of another kind of processor) the first rank takes it for all.
 
 from __future__ import annotations
 
+import ctypes
 import time
 import zlib
 from collections.abc import Callable, Iterator
@@ -17,12 +18,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.errors import LostRankError, OtherRankError, RenderError
+from torchpt.errors import LostRankError, OtherRankError, RenderError, SceneError
 
 __all__ = ["TIMEOUT", "Group", "together"]
 
 #: Seconds after which a rank that says nothing is given up. Ranks wait for the slowest one, which may have much to load.
 TIMEOUT = 1800.0
+#: The most of them that torch counts in milliseconds.
+LONGEST = 1e6
 #: Numbers that a rank says at once.
 WORDS = 8
 #: Seconds between two looks whether the others have answered, at first and at most: signals are heard in between.
@@ -38,7 +41,7 @@ class Group:
 
     Args:
         process_group: of torch.distributed, which must be initialized, by whatever backend; None: all processes.
-        timeout: seconds after which a rank that does not answer is given up.
+        timeout: seconds after which a rank that does not answer is given up, above 0 and at most a million.
 
     Attributes:
         rank: of this process, from 0.
@@ -47,15 +50,18 @@ class Group:
         over: whether ranks have parted: one is gone.
 
     Raises:
+        SceneError: something else than a process group, or than such a number.
         RenderError: there is no process group, or this process is not in it.
     """
 
     def __init__(self, process_group: Any = None, timeout: float = TIMEOUT) -> None:
         import torch.distributed as dist
 
+        if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0.0 < timeout <= LONGEST:
+            raise SceneError("timeout", timeout, f"a number of seconds above 0, at most {LONGEST:.0f}")
         if not dist.is_available() or not dist.is_initialized():
             raise RenderError("ranks: there is no process group; call torch.distributed.init_process_group first")
-        members = dist.get_process_group_ranks(process_group)
+        members = _members(dist, process_group)
         if dist.get_rank() not in members:
             raise RenderError("ranks: this process is not in the process group")
         # One of its own: what others send over theirs is never mixed up with it.
@@ -70,6 +76,7 @@ class Group:
             raise LostRankError(f"ranks: no connection between all of them ({_first_line(error)})") from None
         assert isinstance(own, dist.ProcessGroup)
         self._dist, self._of = dist, own
+        self._work: Any = None
         self.rank, self.size, self.timeout, self.over = members.index(dist.get_rank()), len(members), timeout, False
 
     # -- a few numbers
@@ -199,7 +206,8 @@ class Group:
         """Wait for what is sent, but not for ever, and with an ear for signals."""
         end, pause = time.monotonic() + self.timeout, SOON
         try:
-            work = begin()
+            # Kept until the next: what gloo's thread lets go last it needs Python for, which may be about to end.
+            self._work = work = begin()
             while not work.is_completed():
                 if time.monotonic() > end:
                     self.over = True
@@ -207,7 +215,10 @@ class Group:
                 time.sleep(pause)
                 pause = min(1.5 * pause, LATE)
             work.wait()
-        except RuntimeError:
+        except BaseException as error:
+            _never_freed(self._work)
+            if not isinstance(error, RuntimeError):
+                raise
             self.over = True
             raise LostRankError("ranks: another rank has ended, or cannot be reached any more") from None
 
@@ -230,6 +241,23 @@ def together(group: Group | None, what: str, content: Callable[[], bytes]) -> It
     with group.together():
         group.same(what, content())
         yield
+
+
+def _members(dist: Any, group: Any) -> list[int]:
+    """The ranks of a process group of torch.distributed; none of one that this process is not in."""
+    if group is dist.GroupMember.NON_GROUP_MEMBER:
+        return []
+    try:
+        if group is None or isinstance(group, dist.ProcessGroup):
+            return dist.get_process_group_ranks(group)
+    except (KeyError, ValueError, RuntimeError):  # it was destroyed
+        pass
+    raise SceneError("process_group", group, "a process group of torch.distributed, or None")
+
+
+def _never_freed(work: Any) -> None:
+    """Keep what is still under way beyond the end of Python: gloo's thread would free its tensors then, and abort."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(work))
 
 
 def _known(error: Exception) -> Exception:
