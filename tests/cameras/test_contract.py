@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 from typing import Any
 
@@ -155,3 +156,35 @@ def test_poses_out_of_range(kind):
     for matrix in (torch.zeros(4, 4), torch.full((4, 4), float("nan")), torch.eye(3)):
         with pytest.raises(SceneError, match=r"params\.camera\.to_world"):
             torchpt.render(scene, params={"camera.to_world": matrix}, spp=1)
+
+
+@pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_poses_are_held_to_what_files_are(kind):
+    scene = loaded(rows_of(kind)[0])
+    pose = scene.params["camera.to_world"]
+    sheared, larger = pose.clone(), pose.clone()
+    sheared[:3, 0] += 0.1 * pose[:3, 1]
+    larger[:3, :3] *= 1.01
+    for matrix in (sheared, larger):
+        ways: list[Callable[[], Any]] = [
+            lambda given=matrix: torchpt.render(scene, params={"camera.to_world": given}, spp=1),
+            lambda given=matrix: torchpt.render(
+                scene, params={"camera.to_world": given.clone().requires_grad_()}, spp=1
+            ),
+            lambda given=matrix: torchpt.render_batch(scene, [given], spp=1),
+            lambda given=matrix: scene.pinhole({"camera.to_world": given}),
+            lambda given=matrix: scene.seen_by({**CAMERAS[rows_of(kind)[0]], "to_world": given}),
+        ]
+        for way in ways:
+            with pytest.raises(SceneError, match="expected a pose without scale or shear") as caught:
+                way()
+            assert "\n" not in str(caught.value)
+        with pytest.raises(SceneError, match="without scale or shear"):
+            other = loaded(rows_of(kind)[0])
+            other.params["camera.to_world"].copy_(matrix)
+            torchpt.render(other, spp=1)
+    mirrored = pose @ torch.diag(torch.tensor([-1.0, 1, 1, 1]))
+    near = pose + 1e-4 * torch.eye(4)[:, [1, 2, 0, 3]] * torch.tensor([1.0, 1, 1, 0])
+    for matrix in (mirrored, near):  # as load does
+        torchpt.render(scene, params={"camera.to_world": matrix}, spp=1)

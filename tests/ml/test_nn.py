@@ -193,9 +193,9 @@ def test_what_is_refused_changes_nothing(last):
 
 def test_a_pose_that_is_not_reached_is_refused_before_anything_changes(renderer):
     before = copy.deepcopy(renderer.state_dict())
-    larger = torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0]))
+    mirrored = torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0]))
     with pytest.raises(SceneError, match="params.camera.to_world: expected the pose at first, turned and moved"):
-        renderer.assign({WALL: torch.ones(3), "camera.to_world": larger})
+        renderer.assign({WALL: torch.ones(3), "camera.to_world": mirrored})
     assert all(torch.equal(value, before[name]) for name, value in renderer.state_dict().items())
 
 
@@ -217,6 +217,8 @@ def test_poses_as_they_are(scene):
     found = Renderer(scene, "shapes.back.to_world", rigid=False)
     assert next(found.parameters()).shape == (4, 4)
     assert next(Renderer(scene, "shapes.back.to_world").parameters()).shape == (6,)
+    # Steps along 16 numbers would shear a camera, which is refused.
+    assert next(Renderer(scene, "camera.to_world", rigid=False).parameters()).shape == (6,)
 
 
 # -- state

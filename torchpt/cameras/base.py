@@ -128,8 +128,8 @@ class Camera(ABC):
     def covectors(self) -> Tensor:
         """Rows ``(3, 3)`` that tell how far a vector of the world goes along each of the :meth:`axes`.
 
-        Those are the axes themselves where they are at right angles, as poses in files are. Entries of a pose that are
-        differentiated may leave that, and rays follow the axes as they are.
+        Those are the axes themselves where they are at right angles, as poses are up to a thousandth. So far, and where
+        derivatives are taken by single entries, rays follow the axes as they are.
         """
         return torch.linalg.inv(torch.cat(self.axes(), 1))
 

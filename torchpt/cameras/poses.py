@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from torchpt.cameras import opencv
 from torchpt.errors import SceneError
-from torchpt.math.transforms import is_usable, look_at
+from torchpt.math.transforms import is_rigid, is_usable, look_at
 from torchpt.spec import Other, Point, Pose, Refused, Spec
 
 __all__ = ["POSES", "UP", "pose_of"]
@@ -35,6 +35,7 @@ POSES: Mapping[str, Spec] = {
     "up": _Told(None, doc="what is up in the picture, any direction but the viewing direction; [0, 1, 0] by default"),
     "to_world": Pose(
         None,
+        rigid=True,
         operations=False,
         doc="in place of these: from its own space (it looks along +z, +y is up, +x left in the picture) to the world",
     ),
@@ -69,8 +70,7 @@ def pose_of(values: Mapping[str, Any], given: frozenset[str], sized_by: str = ""
         name = next(key for key in _WAYS[ways[1]] if key in given)
         raise Refused(f"either {ways[0]} or {ways[1]}, not both", values[name], (name,))
     if ways == ["to_world"]:
-        turn = values["to_world"][:3, :3]
-        if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3:
+        if not is_rigid(values["to_world"]):
             hint = f" ({sized_by})" if sized_by else ""
             raise Refused(f"a pose without scale or shear{hint}", values["to_world"].tolist(), ("to_world",))
         return values["to_world"]

@@ -20,6 +20,7 @@ __all__ = [
     "WITHIN",
     "apply_points",
     "compose",
+    "is_rigid",
     "is_singular",
     "is_usable",
     "look_at",
@@ -98,6 +99,12 @@ def is_usable(matrix: Matrix) -> bool:
             return bool(np.abs(np.linalg.inv(matrix)).max() <= _LARGEST)  # False for NaN too
         except np.linalg.LinAlgError:  # entries so small that their products are 0 in float64
             return False
+
+
+def is_rigid(matrix: Matrix, tolerance: float = 1e-3) -> bool:
+    """Whether the linear part of a ``(4, 4)`` matrix keeps lengths: a rotation or a reflection, without scale or shear."""
+    linear = matrix[:3, :3]
+    return bool(np.abs(linear.T @ linear - np.eye(3)).max() <= tolerance)
 
 
 def similarity_scale(matrix: Matrix, tolerance: float = 1e-5) -> float | None:

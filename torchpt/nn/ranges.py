@@ -167,7 +167,7 @@ def range_of(spec: Spec, start: Tensor, rigid: bool = True, length: float = 1.0)
     ``rigid``: whether poses are turned and moved alone; ``length``: how large the scene is.
     """
     if isinstance(spec, Pose):
-        return Rigid(start, length) if rigid or spec.angles else Free()
+        return Rigid(start, length) if rigid or spec.angles or spec.rigid else Free()
     low, high = getattr(spec, "low", None), getattr(spec, "high", None)
     above, below = getattr(spec, "above", None), getattr(spec, "below", None)
     # Of an end that belongs to the range and one that does not, the tighter one counts.

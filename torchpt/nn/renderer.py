@@ -42,7 +42,7 @@ class Renderer(nn.Module):
         names: dotted names of ``scene.params``, and patterns of them such as ``materials.*.reflectance``; None: no parameters.
         seed: any integer from 0.
         rigid: whether poses are turned and moved alone (six numbers each); False: their 16 numbers are parameters, as they are,
-            where poses need not keep angles, as those of balls must.
+            where poses need not keep angles, as those of balls and cameras must.
         wishes: further arguments of ``torchpt.render`` for each call.
 
     Raises:

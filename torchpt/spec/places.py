@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from torchpt.math.transforms import WITHIN, is_usable, similarity_scale
+from torchpt.math.transforms import WITHIN, is_rigid, is_usable, similarity_scale
 from torchpt.spec import reading
 from torchpt.spec.base import Moves, Spec
 from torchpt.spec.reading import Refused
@@ -100,10 +100,13 @@ class Pose(Spec):
 
     Attributes:
         angles: whether it must keep angles (rotation, reflection, uniform scale).
+        rigid: whether a tensor in its place must keep lengths too (rotation, reflection). What is written is not held to it
+            here: kinds say what goes with a pose, and how a scale is meant.
         operations: whether it is written as a list of operations; else as a matrix.
     """
 
     angles: bool = field(default=False, kw_only=True)
+    rigid: bool = field(default=False, kw_only=True)
     operations: bool = field(default=True, kw_only=True)
     moves: Moves = field(default=Moves.SURFACES, kw_only=True)
 
@@ -137,3 +140,5 @@ class Pose(Spec):
             raise Refused("a transform whose last row is 0 0 0 1", matrix[3].tolist())
         if self.angles and similarity_scale(matrix, 1e-4) is None:
             raise Refused(self.expected, matrix.tolist())
+        if self.rigid and not is_rigid(matrix):
+            raise Refused("a pose without scale or shear (torchpt.nn.Renderer keeps one so)", matrix.tolist())
