@@ -9,8 +9,11 @@ import errno
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
-__all__ = ["MAX_BYTES", "Unfit", "check_regular", "is_regular", "read_regular"]
+from torchpt.errors import SceneError
+
+__all__ = ["MAX_BYTES", "Unfit", "as_path", "check_regular", "is_regular", "read_regular"]
 
 #: Bytes of the largest mesh or picture file that is read.
 MAX_BYTES = 4 * 2**30
@@ -20,6 +23,18 @@ _PIECE = 2**24  # bytes read at a time of a file that is longer than it said
 
 class Unfit(OSError):
     """Something that is there and is not read; ``strerror`` says why, as what "it" is or has."""
+
+
+def as_path(path: Any) -> Path:
+    """A path as users give it.
+
+    Raises:
+        SceneError: something else.
+    """
+    found = os.fspath(path) if isinstance(path, str | os.PathLike) else None
+    if not isinstance(found, str):  # bytes neither
+        raise SceneError("path", path, "a file's path, as text or a pathlib.Path")
+    return Path(found)
 
 
 def is_regular(path: str | os.PathLike[str]) -> bool:

@@ -271,13 +271,20 @@ UNWRITTEN: dict[str, tuple[cameras.Frame, str]] = {
         ),
         ("an unknown key", {"fov": 40, "aperture_radius": 0.1}, SIZE, "camera.aperture_radius: expected a known key"),
         ("both", {"fov": 40, "K": np.eye(3)}, SIZE, "camera: expected to_world or R and t, and K or fov"),
-        ("another size", {"fov": 40}, (24,), "size: expected width and height"),
-        ("no size", {"fov": 40}, (0, 5), "size: expected width and height"),
+        ("another size", {"fov": 40}, (24,), "size: expected .width, height. in pixels"),
+        ("no size", {"fov": 40}, (0, 5), "size: expected .width, height. in pixels"),
     )
 } | {
     "no block": (cameras.Frame("a.png", 3, SIZE), "camera: expected the block"),
     "no name": (cameras.Frame(3, {}, SIZE), "image: expected the picture's file"),
 }
+
+
+def test_sizes_of_frames_are_whole_numbers_in_any_form(tmp_path: Any) -> None:
+    sizes: list[Any] = [SIZE, np.array(SIZE), torch.tensor(SIZE), tuple(map(float, SIZE))]
+    for size in sizes:
+        cameras.write_transforms(tmp_path / "out.json", [cameras.Frame("a.png", {"to_world": POSE, "fov": 40}, size)])
+        assert cameras.read_transforms(tmp_path / "out.json")[0].size == SIZE
 
 
 @pytest.mark.parametrize("case", UNWRITTEN)
@@ -327,6 +334,13 @@ BAD = {
     json.dumps(
         {"camera_angle_x": 0.5, "frames": [{"transform_matrix": [[10**400] * 4] * 3}]}
     ): "transform_matrix: expected a matrix",
+    json.dumps({"camera_angle_x": 0.5, "w": 5, "frames": [{"transform_matrix": POSE}]}): "w and h belong together",
+    json.dumps(
+        {
+            "camera_angle_x": 0.5,
+            "frames": [{"transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 2]]}],
+        }
+    ): "transform_matrix: expected a matrix whose last row",
     json.dumps({"camera_angle_x": 0.5, "k1": 0.1, "frames": [{"transform_matrix": POSE}]}): "undistort",
     json.dumps({"camera_angle_x": 0.5, "camera_model": "OPENCV_FISHEYE", "frames": [{}]}): "OPENCV_FISHEYE",
 }
@@ -360,6 +374,8 @@ def _two_of_kornia() -> Any:
         (lambda: cameras.from_opencv(np.eye(3), np.eye(3), np.zeros(3), None), "size: expected .width, height. in pixels"),
         (lambda: cameras.from_opencv(np.eye(3), np.eye(3), np.zeros(3), (24,)), "size: expected .width, height. in pixels"),
         (lambda: cameras.from_opencv(np.eye(3), np.eye(3), np.zeros(3), "24"), "size: expected .width, height. in pixels"),
+        (lambda: cameras.from_opengl(2.0 * np.eye(4), 40.0), "matrix: expected a matrix whose last row is 0 0 0 1"),
+        (lambda: cameras.from_opengl(POSE, K=np.eye(3), size=(True, True)), "size: expected .width, height. in pixels"),
         (lambda: cameras.from_opengl(POSE, K=np.eye(3), size=(-2, 3)), "size: expected .width, height. in pixels"),
         (lambda: cameras.from_opengl([[10**400] * 4] * 3, 40.0), "matrix: expected a matrix"),
         (lambda: cameras.from_kornia(_two_of_kornia(), 5), "index: expected a whole number below 2, .* got 5"),

@@ -72,7 +72,7 @@ def from_opencv(K: Any, R: Any, t: Any, size: Size, first_pixel: float = 0.5) ->
     Raises:
         SceneError: numbers that are not finite or of another shape, or no size.
     """
-    inner, wide_and_tall = _moved(_tensor(K, "K", (3, 3)), 0.5 - _first(first_pixel)), _size(size)
+    inner, wide_and_tall = _moved(_tensor(K, "K", (3, 3)), 0.5 - _first(first_pixel)), size_of(size)
     pose = {"R": _tensor(R, "R", (3, 3)), "t": _tensor(t, "t", (3,))}
     return {"type": "perspective", "K": inner, **pose, "size": wide_and_tall}
 
@@ -139,7 +139,7 @@ def from_opengl(
         if fov_axis not in FOV_AXES:
             raise SceneError("fov_axis", fov_axis, f"one of {', '.join(FOV_AXES)}")
         return {**block, "fov": fov, "fov_axis": fov_axis}
-    return {**block, "K": _moved(_tensor(K, "K", (3, 3)), 0.5 - _first(first_pixel)), "size": _size(size)}
+    return {**block, "K": _moved(_tensor(K, "K", (3, 3)), 0.5 - _first(first_pixel)), "size": size_of(size)}
 
 
 def to_opengl(
@@ -219,7 +219,7 @@ def from_pytorch3d(
         raise SceneError("in_ndc", in_ndc, "True or False")
     # Ours is the same camera space, and R's columns are its axes in the world.
     turn, move = _tensor(R, "R", (3, 3)), _tensor(T, "T", (3,))
-    tall, wide = _size(_tensor(image_size, "image_size", (2,)), "image_size", "[height, width]")
+    tall, wide = size_of(_tensor(image_size, "image_size", (2,)), "image_size", "[height, width]")
     focal, point = _tensor(focal_length, "focal_length", None), _tensor(principal_point, "principal_point", (2,))
     if focal.numel() not in (1, 2):
         raise SceneError("focal_length", f"shape {tuple(focal.shape)}", "one number, or two")
@@ -295,12 +295,18 @@ def _tensor(value: Any, key: str, shape: tuple[int, ...] | None) -> Tensor:
     return found
 
 
-def _size(size: Any, key: str = "size", sides: str = "[width, height]") -> list[int]:
-    """Two sides of a picture in pixels."""
+def size_of(size: Any, key: str = "size", sides: str = "[width, height]") -> list[int]:
+    """Two sides of a picture in pixels, of whole numbers in any form.
+
+    Raises:
+        SceneError: something else.
+    """
     expected = f"{sides} in pixels, whole numbers >= 1"
     try:
         found = [] if isinstance(size, str) else [int(side) for side in size]
-        whole = len(found) == 2 and all(side >= 1 and side == given for side, given in zip(found, size, strict=True))
+        whole = len(found) == 2 and all(
+            side >= 1 and side == given and given is not True for side, given in zip(found, size, strict=True)
+        )
     except (TypeError, ValueError, OverflowError):
         whole, found = False, []
     if not whole:
@@ -313,6 +319,9 @@ def _pose(matrix: Any) -> Tensor:
     found = _numbers(matrix, "matrix", "a matrix (4, 4) or (3, 4)")
     if found.shape not in ((4, 4), (3, 4)):
         raise SceneError("matrix", f"shape {tuple(found.shape)}", "a matrix (4, 4) or (3, 4)")
+    last = found.new_tensor([0.0, 0.0, 0.0, 1.0])
+    if len(found) == 4 and not in_transform(found) and not found[3].detach().equal(last):
+        raise SceneError("matrix", found[3].tolist(), "a matrix whose last row is 0 0 0 1")
     axes = found[:3, :3]
     lengths = torch.linalg.vector_norm(axes, dim=0)
     if not in_transform(lengths) and not bool((lengths > 0.0).all()):

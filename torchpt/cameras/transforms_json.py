@@ -19,11 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.cameras import opencv
-from torchpt.cameras.conventions import from_opengl, to_opengl
+from torchpt.cameras.conventions import from_opengl, size_of, to_opengl
 from torchpt.errors import AssetError, OutputError, SceneError
-from torchpt.files import read_regular
-from torchpt.images.decode import as_path
+from torchpt.files import as_path, read_regular
 from torchpt.spec import Refused, reading
 from torchpt.spec.declared import described
 
@@ -163,7 +161,9 @@ def _frame(path: Any, key: str, row: Mapping[str, Any]) -> Frame:
     if not isinstance(image, str):
         raise AssetError(path, f"{key}.file_path: expected text, got {image!r}")
     known = {name: found for name in _NUMBERS if (found := _number(path, key, row, name)) is not None}
-    size = (int(known["w"]), int(known["h"])) if {"w", "h"} <= known.keys() else None
+    if ("w" in known) != ("h" in known):
+        raise AssetError(path, f"{key}: w and h belong together, the size of the picture; one of them is missing")
+    size = (int(known["w"]), int(known["h"])) if "w" in known else None
     pixels = [name for name in ("fl_x", "fl_y", "cx", "cy") if name in known]
     if size is None and pixels:
         raise AssetError(path, f"{key}: w and h are missing, the size of the picture that {pixels[0]} belongs to")
@@ -210,12 +210,9 @@ def _row(frame: Frame, key: str) -> dict[str, Any]:
     """A frame as the file has it."""
     if not isinstance(frame, Frame):
         raise SceneError(key, frame, "a Frame, of frame_of(scene, image) or read_transforms")
-    try:
-        wide, tall = size = opencv.size(frame.size)
-    except Refused:
-        raise SceneError(f"{key}.size", frame.size, "width and height of the picture in pixels") from None
+    wide, tall = size_of(frame.size, f"{key}.size")
     image = _file(frame.image, f"{key}.image")
-    inner, pose = _seen(frame.camera, size, f"{key}.camera")
+    inner, pose = _seen(frame.camera, (wide, tall), f"{key}.camera")
     (fx, fy), (cx, cy) = inner.diagonal()[:2].tolist(), inner[:2, 2].tolist()
     matrix = pose * pose.new_tensor([-1.0, 1.0, -1.0, 1.0]) + 0.0  # no -0.0
     return {

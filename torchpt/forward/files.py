@@ -5,8 +5,8 @@ from __future__ import annotations
 from os import PathLike
 from typing import TYPE_CHECKING
 
+from torchpt.files import as_path
 from torchpt.images import write_image
-from torchpt.images.decode import as_path
 
 if TYPE_CHECKING:
     from torchpt.forward.result import Rendering

@@ -10,18 +10,18 @@ import tempfile
 import warnings
 from dataclasses import dataclass
 from io import BytesIO
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpt.errors import AssetError, SceneError
-from torchpt.files import read_regular
+from torchpt.errors import AssetError
+from torchpt.files import as_path, read_regular
 from torchpt.images.png import plain_png
 
-__all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "as_path", "complaint", "existing", "pixels_of"]
+__all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "complaint", "existing", "pixels_of"]
 
 MAX_PIXELS = 64 * 2**20  # a header may claim anything: refuse before memory is asked for
 FLOAT_FORMATS = (".exr", ".hdr")
@@ -79,18 +79,6 @@ class Pixels:
     def eight_bit(self) -> bool:
         """Whether no more than 8 bits a value were stored."""
         return self.values.dtype.kind in "ub" and self.white <= 255
-
-
-def as_path(path: Any) -> Path:
-    """A path as users give it.
-
-    Raises:
-        SceneError: something else.
-    """
-    found = fspath(path) if isinstance(path, str | PathLike) else None
-    if not isinstance(found, str):  # bytes neither
-        raise SceneError("path", path, "a file's path, as text or a pathlib.Path")
-    return Path(found)
 
 
 def existing(path: str | PathLike[str]) -> Path:

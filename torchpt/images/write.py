@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from torchpt.errors import OutputError
+from torchpt.files import as_path
 from torchpt.images.colour import display
-from torchpt.images.decode import as_path
 from torchpt.images.header import Fact, checked_header, put_header
 from torchpt.images.layers import channel_names
 

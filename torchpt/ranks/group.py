@@ -211,7 +211,7 @@ class Group:
             while not work.is_completed():
                 if time.monotonic() > end:
                     self.over = True
-                    raise LostRankError(f"ranks: another rank did not answer for {self.timeout:g} s")
+                    raise self._silent()
                 time.sleep(pause)
                 pause = min(1.5 * pause, LATE)
             work.wait()
@@ -220,7 +220,12 @@ class Group:
             if not isinstance(error, RuntimeError):
                 raise
             self.over = True
+            if time.monotonic() > end:  # gloo noticed first
+                raise self._silent() from None
             raise LostRankError("ranks: another rank has ended, or cannot be reached any more") from None
+
+    def _silent(self) -> LostRankError:
+        return LostRankError(f"ranks: another rank did not answer for {self.timeout:g} s")
 
 
 @contextmanager
