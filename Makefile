@@ -19,8 +19,8 @@ ARGS ?=
 help:
 	@echo "make render    render configs/scene/$(SCENE).yaml to $(OUT)   (SCENE=name OUT=file ARGS='render.spp=256')"
 	@echo "make test      the fast tests"
-	@echo "make test-all  all tests, the slow ones and the comparison with Mitsuba included"
-	@echo "make stress    stiff and extreme cases, whole sweeps by every backend, to stress/"
+	@echo "make test-all  slow tests too, and the comparison with Mitsuba"
+	@echo "make stress    stiff and extreme cases, whole sweeps by every backend, to stress/; a thousand million rays; damaged files"
 	@echo "make check     ruff, pyright, import layers"
 	@echo "make format    let ruff rewrite the files"
 	@echo "make clean     remove the virtual environment and caches"
@@ -31,15 +31,16 @@ render: $(VENV)/run.stamp
 
 # Tests of ranks fork the process that they run in, so that it must not have worked for other tests before.
 test: $(VENV)/dev.stamp
-	$(PY) -m pytest -m "not slow and not gpu" tests/ranks
-	$(PY) -m pytest -m "not slow and not gpu" -n 2 --dist loadfile --ignore=tests/ranks $(ARGS)
+	$(PY) -m pytest -m "not slow and not long and not gpu" tests/ranks
+	$(PY) -m pytest -m "not slow and not long and not gpu" -n 2 --dist loadfile --ignore=tests/ranks $(ARGS)
 
 test-all: $(VENV)/bench.stamp
-	$(PY) -m pytest tests/ranks
-	$(PY) -m pytest -n 2 --dist loadfile --ignore=tests/ranks $(ARGS)
+	$(PY) -m pytest -m "not long" tests/ranks
+	$(PY) -m pytest -m "not long" -n 2 --dist loadfile --ignore=tests/ranks $(ARGS)
 
 stress: $(VENV)/dev.stamp
 	$(PY) -m torchpt stress "accel=[numba,torch,brute]" "compile=[on,off]" out=stress $(ARGS)
+	$(PY) -m pytest -m long -n 2
 
 check: $(VENV)/dev.stamp
 	$(PY) -m ruff check .

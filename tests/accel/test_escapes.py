@@ -95,7 +95,7 @@ def test_no_ray_escapes(name, place):
     assert escapes(name, place, BLOCK) == (0, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("place", [HERE, FAR])
 @pytest.mark.parametrize("name", MESHES)
 def test_none_of_a_thousand_million_rays_escapes(name, place):
@@ -103,7 +103,7 @@ def test_none_of_a_thousand_million_rays_escapes(name, place):
     assert escapes(name, place, 84_000_000) == (0, 0)
 
 
-@pytest.mark.parametrize("count", [4_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [4_000, pytest.param(1_000_000, marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", ["torch", "brute"])
 @pytest.mark.parametrize(("name", "place"), [("sphere", HERE), ("sphere", FAR), ("cube", HERE), ("cube", FAR)])
 def test_no_ray_escapes_the_other_searches(kind, name, place, count):

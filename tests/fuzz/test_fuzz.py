@@ -74,7 +74,7 @@ def batch(family: str, first: int, count: int, folder: Path) -> tuple[dict[str, 
     return counts, wrong
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("family", "first"), [(family, first) for family, count in LONG.items() for first in range(0, count, BATCH)]
 )
