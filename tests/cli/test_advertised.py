@@ -64,7 +64,11 @@ def commands(program: str) -> list[tuple[str, str]]:
     for where, text in texts():
         for span in spans(where, text):
             whole = program != "torchpt" or "=" in span or "--" in span  # else it is named, not shown
-            if span.startswith(f"{program} ") and whole and not re.search(r"\b(NAME|COMMAND|FILE|FOLDER|PATTERN)\b", span):
+            if (
+                span.startswith(f"{program} ")
+                and whole
+                and not re.search(r"\b(NAME|COMMAND|FILE|FOLDER|PATTERN)\b", span)
+            ):
                 found.setdefault(span.partition(" #")[0].strip(), where)
     return [(where, command) for command, where in found.items()]
 
