@@ -70,6 +70,7 @@ def test_there_is_one_file_of_each_kind() -> None:
     assert not [path for path in FILES if (ROOT / path).exists()]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_they_work_where_they_are_put(tmp_path: Path) -> None:
     for path, text in FILES.items():

@@ -74,7 +74,7 @@ def test_two_python_threads(layer, expected):
     assert _run(body, NUMBA_THREADING_LAYER=layer) == [expected] * 6
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_worker_processes_after_the_parent_worked(method, expected, tmp_path):
     script = tmp_path / "workers.py"
     script.write_text(

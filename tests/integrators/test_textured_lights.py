@@ -75,6 +75,7 @@ def test_emission_seen_directly_is_the_texture():
     assert torch.allclose(image[1, 6] + image[1, 1], top.sum(0)) and torch.equal(image[6, 6], image[1, 1])
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_texture_of_a_lamp():
     scene = torchpt.load(lit_by(LAMPS["rectangle"]), device="cpu")
     name = "shapes.lamp.material.emission.color0"

@@ -191,7 +191,16 @@ def scene_of(tmp_path) -> Callable[[str], torchpt.Scene]:
     return lambda name: torchpt.load(ROWS[name].scene(tmp_path), device="cpu")
 
 
-@pytest.mark.parametrize(("name", "mode"), [(name, mode) for name, row in ROWS.items() for mode in row.modes])
+def slow(name: str, mode: str) -> list[pytest.MarkDecorator]:
+    """Where kernels take long to compile; rows that are left compile most of what these do."""
+    rows = ("many lights", "textures and normal maps", "strategy light", "some materials")
+    return [pytest.mark.slow] * (mode == "compiled" and name in rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [pytest.param(name, mode, marks=slow(name, mode)) for name, row in ROWS.items() for mode in row.modes],
+)
 def test_the_same_bits(scene_of, monkeypatch, name, mode):
     scene, wish = scene_of(name), ROWS[name].wish
     whole = shot(scene, wish, mode)

@@ -196,7 +196,7 @@ def looped(scene: torchpt.Scene, threads: int = 2, **film: Any) -> Any:
     return torchpt.render(scene, spp=4, film=film, threads=threads, full=True, pilots=True)
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_compiled_loop_goes_on_with_one_thread_and_fewer_lanes(box, monkeypatch, capsys, threads):
     whole = looped(box, threads)
     made, kept = [0], rows.Memory.__init__

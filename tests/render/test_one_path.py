@@ -17,6 +17,8 @@ from torchpt.rendering import render_scene
 
 #: Shipped scenes that need no file, on films of a few pixels.
 SCENES = ["cornell_box", "cornell_transmissive", "cornell_rough_specular", "many_lights", "veach_mis", "noise"]
+#: Of them, those whose kernels take long to compile.
+LARGE = ("noise", "many_lights")
 SIZE = 12
 
 #: Beneath an image of a sky: a mirror, a see-through sheet, and glass.
@@ -105,7 +107,7 @@ def doubles(values: tuple[float, ...]) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LARGE)) for name in SCENES])
 def test_it_is_the_path_of_the_picture(name):
     paths = compared(torchpt.load(name, "cpu"))
     for path in paths:
