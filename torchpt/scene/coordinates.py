@@ -8,7 +8,6 @@ from torchpt.errors import SceneError
 from torchpt.scene.parameters import Parameters
 from torchpt.scene.parts import Part
 from torchpt.spec import Corners
-from torchpt.textures.atlas import ImageNode
 
 __all__ = ["check_coordinates", "declare_corners"]
 
@@ -34,7 +33,11 @@ def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str 
     Raises:
         SceneError: such a mesh, by the name of the texels.
     """
-    for part in parts if stated else ():
+    if not stated:
+        return
+    from torchpt.textures.atlas import ImageNode  # scenes without texels do without it
+
+    for part in parts:
         if part.kind != "triangle" or part.uvs is not None:
             continue
         for node in part.material.readings():
