@@ -175,10 +175,11 @@ def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dic
     """Parameters in place of the scene's, those of its own that want gradients among them.
 
     Raises:
-        SceneError: an unknown name, or no tensor. All else is checked where they are plain tensors (:mod:`torchpt.taped`).
+        SceneError: an unknown name, or no tensor that holds numbers. All else is checked where they are plain tensors
+            (:mod:`torchpt.taped`).
     """
     given = dict(params or {})
-    if any(name not in scene.params or not isinstance(value, Tensor) for name, value in given.items()):
+    if any(name not in scene.params or not isinstance(value, Tensor) or value.is_meta for name, value in given.items()):
         scene.check(given)
     if full and any(in_batch(value) for value in given.values()):
         raise SceneError("full", True, "False under torch.func.vmap, where a render gives pictures alone")
@@ -263,11 +264,9 @@ def _check_types(scene: Scene, full: Any, wishes: Mapping[str, Any]) -> None:
         raise SceneError("ranks", ranks, "a torchpt.ranks.Group")
     if params is not None and not isinstance(params, Mapping):
         raise SceneError("params", params, "a mapping from names of scene.params to tensors")
-    for name, value in (params or {}).items():
+    for name in params or {}:
         if not isinstance(name, str):
             raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
-        if isinstance(value, Tensor) and value.is_meta:
-            raise SceneError(f"params.{name}", "a tensor on the device meta", "a tensor that holds numbers")
 
 
 def _same(wish: str | torch.device, own: torch.device) -> bool:

@@ -87,7 +87,7 @@ REFUSED: dict[str, tuple[Callable[[torchpt.Scene], Any], str]] = {
     "params by number": (lambda s: pictures(s, params={3: torch.ones(3)}), "params: expected names of scene.params"),
     "params on meta": (
         lambda s: pictures(s, params={PAINT: torch.empty(3, device="meta")}),
-        f"params.{PAINT}: expected a tensor that holds numbers",
+        f"params.{PAINT}: expected a floating tensor .* on the device meta",
     ),
     "ranks a number": (lambda s: pictures(s, ranks=2), "ranks: expected a torchpt.ranks.Group, got 2"),
     "edges a word": (lambda s: pictures(s, edges="no"), "edges: expected True or False, got 'no'"),

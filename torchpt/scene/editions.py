@@ -9,10 +9,15 @@ from torch import Tensor
 
 from torchpt.errors import RenderError
 
-__all__ = ["AFTER", "Editions", "check_unchanged"]
+__all__ = ["AFTER", "Editions", "changes", "check_unchanged"]
 
 #: Since when a scene may not have changed whose gradient is asked for.
 AFTER = "after the picture whose gradient is asked for"
+
+
+def changes(before: Mapping[str, int], now: Mapping[str, int]) -> dict[str, int]:
+    """Of editions, those that are others than before, and those of which nobody can tell."""
+    return {name: edition for name, edition in now.items() if not 0 < edition == before.get(name)}
 
 
 def check_unchanged(before: Mapping[str, int], now: Mapping[str, int], since: str) -> None:

@@ -30,7 +30,7 @@ from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
 from torchpt.scene.devices import device_of
-from torchpt.scene.editions import Editions
+from torchpt.scene.editions import Editions, changes
 from torchpt.scene.info import describe
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, extent_of, middle_of
@@ -110,10 +110,8 @@ class Scene:
         self._worlds: dict[tuple[torch.dtype, bool, str], tuple[World, Geometry]] = {}
         self._accels: dict[tuple[str, int | None], Accel] = {}
         self._latest: dict[tuple[str, int | None], Accel] = {}  # for the next one to be made of
-        self._seen, self._made_of = (
-            Editions(),
-            dict[str, int](),
-        )  # of what worlds are made; views of the scene have the same
+        # What these were made of; views of the scene have the same.
+        self._sources, self._made_of = Editions(), dict[str, int]()
         self._origin: Scene | None = None
         self._number()
 
@@ -384,8 +382,8 @@ class Scene:
 
     def _refresh(self) -> None:
         """Forget what was made of parameters that have since been replaced or changed in place."""
-        now, before = self._seen.of(self.params), self._made_of.copy()
-        changed = [name for name, edition in now.items() if not 0 < edition == before.get(name)]
+        now, before = self._sources.of(self.params), self._made_of.copy()
+        changed = changes(before, now)
         gone = any(name not in now and not name.startswith("camera.") for name in before)
         if not changed and not gone:
             return

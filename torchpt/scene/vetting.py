@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchpt.errors import SceneError
+from torchpt.scene.editions import changes
 from torchpt.scene.sources import check_sources
 
 if TYPE_CHECKING:
@@ -45,8 +46,7 @@ def vet(scene: Scene, vetted: dict[str, int]) -> None:
         raise SceneError(
             f"params.{name}", "nothing" if name in own else name, "the names that the scene was loaded with"
         )
-    # What counts no changes is checked each time.
-    changed = {name: edition for name, edition in scene.editions().items() if not 0 < edition == vetted.get(name)}
+    changed = changes(vetted, scene.editions())
     if not changed:
         return
     for name in changed:
