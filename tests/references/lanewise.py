@@ -28,6 +28,7 @@ from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.loop.rows import HIT, Memory
 from torchpt.integrators.path import partition
 from torchpt.integrators.search import Search
+from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
 from torchpt.records import Hit, PathState, Shadow, rows
@@ -360,7 +361,8 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
 
 def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:
     """The preview has no vertices beyond the first: samples are compared whole."""
-    eager, tally = wave.radiance(0, pixels, 0, samples)
+    tally = Tally()
+    eager = wave.brought(wave.rays(0, pixels, 0, samples), tally)
     worker = Worker(kernels)
     took = worker.trace(Chunk(0, pixels, 0, samples))
     assert took.rays == tally.rays

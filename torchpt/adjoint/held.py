@@ -38,6 +38,7 @@ from torchpt.adjoint.tape import chunk_by_chunk
 from torchpt.forward.schedule import Span
 from torchpt.integrators.path import PathIntegrator
 from torchpt.integrators.search import Search
+from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave, camera_state
 from torchpt.math.vectors import dot, normalize, take
 from torchpt.records import PathState
@@ -247,7 +248,7 @@ def _rays(still: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
 
 def _brought(wave: Wave, state: PathState) -> Tensor:
     """Radiance ``(3, N)`` that camera rays bring."""
-    return wave.integrator.radiance(wave.stages, wave.accel, state, wave.first)[0]
+    return wave.integrator.radiance(wave.stages, wave.accel, state, wave.first, Tally())
 
 
 def _held(still: Wave, wave: Wave, state: PathState) -> _Seen:

@@ -25,6 +25,7 @@ from torchpt.integrators.compiled import Stages
 from torchpt.integrators.joint import Behind
 from torchpt.integrators.path import ENDLESS, Ends, partition, slides, trace
 from torchpt.integrators.search import Search
+from torchpt.integrators.tally import Tally
 from torchpt.math.gathers import gathered_by
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, rows
@@ -150,7 +151,7 @@ class _Chunk:
         limits = self.wave.limits
         assert limits is not None
         lanes = self.span[1] * self.span[3]
-        radiance, _ = trace(keeper, limits, self.wave.accel, state, lanes, depth, hit)
+        radiance = trace(keeper, limits, self.wave.accel, state, Tally(), lanes, depth, hit)
         return radiance, keeper
 
     # -- back

@@ -22,7 +22,8 @@ from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.loop.joint_kernels import JointKernels
 from torchpt.integrators.loop.kernels import Kernel
 from torchpt.integrators.loop.rows import HIT, Memory
-from torchpt.integrators.path import ENDLESS, Tally, slides
+from torchpt.integrators.path import ENDLESS, slides
+from torchpt.integrators.tally import Tally
 from torchpt.math.gathers import gathered_by
 from torchpt.records import Hit, PathState, Shadow
 from torchpt.samplers import salts

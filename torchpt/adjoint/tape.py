@@ -48,7 +48,7 @@ def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> N
     wave = assembly.taped
 
     def part(span: Span) -> tuple[Tensor, Tensor]:
-        radiance, _ = wave.radiance(*span)
+        radiance = wave.radiance(*span)
         share = asked_of(settings, radiance.detach(), asked[:, span[0] : span[0] + span[1]].to(radiance.dtype))
         # What is not finite must not meet its share of 0.
         return torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0), share

@@ -93,8 +93,9 @@ def render_batch(
 
     Picture ``[s, c]`` is to the bit ``torchpt.render(scenes[s].seen_by(cameras[c]), params=..., seed=...)``. Threads share one
     list of work over all pictures, and what is next is made ready while they trace. Worlds, search structures and kernels are
-    made once for all cameras of a scene. On CUDA, and where pictures are rendered by tensor operations, to a time or an error,
-    in bounded memory, or by several ``ranks`` (which share each picture's pixels), they are rendered one after another.
+    made once for all cameras of a scene. By tensor operations (on CUDA above all) pictures of one scene share waves; those of
+    different scenes are rendered one after another, as are all that a time or an error ends, in bounded memory, or by several
+    ``ranks`` (which share each picture's pixels).
 
     Args:
         scenes: from :func:`torchpt.load`: a sequence, or an iterator that loads them (while others are rendered), of any kinds,

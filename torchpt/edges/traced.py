@@ -11,6 +11,7 @@ from torch import Tensor
 from torchpt.forward import make_wave
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.plan import FOREVER
+from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave, camera_state
 from torchpt.records import PathState
 from torchpt.samplers import Sampler
@@ -53,7 +54,7 @@ class Traced:
         """
         wave = self.wave
         integrator = wave.integrator if depth is None else wave.integrator.but(max_depth=depth)
-        values, _ = integrator.radiance(wave.stages, wave.accel, self.state(o, d, key), wave.first)
+        values = integrator.radiance(wave.stages, wave.accel, self.state(o, d, key), wave.first, Tally())
         values = torch.where(torch.isfinite(values).all(0), values, 0.0).double()
         if self.clamp is not None:
             values = values * clamp_scale(values, self.clamp)

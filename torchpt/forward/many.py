@@ -1,15 +1,16 @@
-"""Several renders at once: their samples are one work list, and what is next is made ready while threads trace."""
+"""Several renders at once: their samples are one work list, and what is next is made ready while threads trace.
+
+By tensor operations, as on CUDA, pictures of a scene by several cameras share their waves.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
 
 import torch
 
-from torchpt.forward.result import Rendering
-from torchpt.forward.run import Run
+from torchpt.forward.crowd import Crowd, Entry, blamed
 from torchpt.integrators.loop.together import Job, Together
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.threads import one_thread
@@ -21,30 +22,12 @@ __all__ = ["Entry", "render_many"]
 AHEAD = 2
 
 
-@dataclass
-class Entry:
-    """A render of several.
-
-    Attributes:
-        device: where it is rendered.
-        make: makes it ready for a number of threads; called when it is soon to begin.
-        done: told of the rendering.
-        failed: told of an error instead, which it may raise as another one.
-        run: once it is ready.
-    """
-
-    device: torch.device
-    make: Callable[[int], Run]
-    done: Callable[[Rendering], None]
-    failed: Callable[[BaseException], None]
-    run: Run = field(init=False)
-
-
 def render_many(entries: Iterable[Entry], tasks: int) -> None:
     """Render them, each to the very bits that it has alone.
 
-    The renders that the compiled loop takes, and which nothing but their number of samples ends, share threads and a work list.
-    Others are rendered one after another: by tensor operations (on CUDA above all), to a time or an error, in bounded memory.
+    Of renders which nothing but their number of samples ends, those that the compiled loop takes share threads and a work list,
+    and those by tensor operations (on CUDA above all) share waves, where they differ in cameras and seeds alone and follow each
+    other. Others are rendered one after another: to a time or an error, in bounded memory.
 
     Args:
         entries: what is to be rendered; taken one by one.
@@ -53,7 +36,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
     Raises:
         Exception: what an entry's ``failed`` raises; the others are given up then.
     """
-    crew = Together[Entry](torch.get_num_threads())
+    crew, crowd = Together[Entry](torch.get_num_threads()), Crowd()
     waiting = iter(entries)
     try:
         while True:
@@ -61,21 +44,20 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 entry = next(waiting, None)
             if entry is None:
                 break
-            with undisturbed(entry.device), _blamed(entry), _beside(crew):
+            with undisturbed(entry.device), blamed(entry), _beside(crew):
                 entry.run = entry.make(crew.threads)
                 spans = entry.run.at_once()
             if spans is None:
                 _drain(crew, 0)
-                with undisturbed(entry.device), _blamed(entry):
-                    entry.done(entry.run.go(None))
-                del entry.run
+                crowd.add(entry)
                 continue
-            with _blamed(entry):
+            with blamed(entry):
                 loop = entry.run.loop
                 assert loop is not None
                 crew.add(Job(entry, loop, loop.blocks(spans, tasks)))
             _drain(crew, AHEAD * crew.threads * tasks)
         _drain(crew, 0)
+        crowd.settle()
     finally:
         crew.close()
 
@@ -85,16 +67,6 @@ def _beside(crew: Together[Entry]) -> Iterator[None]:
     """While all cores trace, tensor operations of this thread are its own: a team would wait for a core, and spin meanwhile."""
     with one_thread() if crew.pending else nullcontext():
         yield
-
-
-@contextmanager
-def _blamed(entry: Entry) -> Iterator[None]:
-    """Errors within are told to an entry."""
-    try:
-        yield
-    except Exception as error:
-        entry.failed(error)
-        raise
 
 
 def _drain(crew: Together[Entry], most: int) -> None:
@@ -107,7 +79,7 @@ def _drain(crew: Together[Entry], most: int) -> None:
             continue
         job, share = found
         entry = job.owner
-        with undisturbed(entry.device), _blamed(entry), _beside(crew):
+        with undisturbed(entry.device), blamed(entry), _beside(crew):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
                 job.loop.halt()

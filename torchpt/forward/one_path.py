@@ -186,7 +186,7 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         wave = replace(wave, stages=recorder)
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
         state = wave.rays_of(x, y, number)
-        brought, _ = wave.brought(state)
+        brought = wave.brought(state)
         return _Story(scene, recorder).told(settings, pixel, sample, brought)
 
 

@@ -1,22 +1,24 @@
-"""A piece of a pass by tensor operations, all or nothing: no allocation that fails leaves half a piece in the films."""
+"""Pieces of passes by tensor operations, all or nothing: no allocation that fails leaves half a piece in the films."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from torchpt.errors import RenderError
 from torchpt.forward.schedule import Span
-from torchpt.integrators.base import Tally
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
+from torchpt.integrators.tally import Tallies, Tally
 from torchpt.integrators.wave import Wave
+from torchpt.records import PathState, joined
 from torchpt.shortage import ran_out
 
-__all__ = ["Piece", "take"]
+__all__ = ["Piece", "Work", "take"]
 
 #: How often it is tried to write what is computed already.
 ATTEMPTS = 16
@@ -58,27 +60,82 @@ class Piece:
         return True
 
 
-def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
-    """Compute a piece of a plate; ``light`` is all light before and after the clamp so far, ``(2,)`` float64."""
-    first, count, sample, samples = span
-    piece = Piece()
+@dataclass(frozen=True)
+class Work:
+    """What a piece is to be of.
+
+    Attributes:
+        wave: of the render.
+        plate: that its samples go to.
+        light: all light before and after the clamp so far, ``(2,)`` float64.
+        span: which samples.
+    """
+
+    wave: Wave
+    plate: Plate
+    light: Tensor
+    span: Span
+
+    @property
+    def lanes(self) -> int:
+        """How many samples."""
+        _, pixels, _, samples = self.span
+        return pixels * samples
+
+    def rays(self) -> PathState:
+        """The camera rays of the samples."""
+        return self.wave.rays(*self.span, self.plate)
+
+
+def take(works: Sequence[Work]) -> list[Piece]:
+    """Compute pieces by one wave, to the very bits that each has alone.
+
+    Several are of renders of one scene that differ in their cameras and seeds alone.
+    """
+    wave, plate, sizes = works[0].wave, works[0].plate, [work.lanes for work in works]
+    pieces = [Piece() for _ in works]
     if wave.integrator.light:
-        radiance, tally = wave.radiance(first, count, sample, samples, plate)
-        piece.tally.rays += tally.rays
-        piece.tally.truncated += tally.truncated
-        finite = torch.isfinite(radiance).all(0)
-        if not bool(finite.all()):
-            piece.lost = Lost.of(radiance, first, sample, wave.crop, plate)
-        radiance = torch.where(finite, radiance, 0.0)
-        clamp = wave.integrator.clamp
-        if clamp is not None:
-            clamped = radiance * clamp_scale(radiance, clamp)
-            piece.writes.append((light, light + torch.stack((radiance.double().sum(), clamped.double().sum()))))
-            radiance = clamped
-        piece.writes += plate.film.after(radiance, first, sample)
+        several = Tallies(sizes, wave.centre.device) if len(works) > 1 else None
+        whole = several or Tally()
+        radiance = wave.brought(_state(works), whole).split(sizes, 1)
+        tallies = [whole] if several is None else several.each()
+        for work, piece, own, tally in zip(works, pieces, radiance, tallies, strict=True):
+            piece.tally = tally
+            _add_light(work, piece, own)
     if plate.layers:
-        layers = wave.layers(tuple(plate.layers), first, count, sample, samples, plate)
-        piece.tally.rays += count * samples
-        for name, values in layers.items():
-            piece.writes += plate.layers[name].after(values, first, sample)
-    return piece
+        layers = wave.seen(tuple(plate.layers), _state(works))
+        parts = {name: values.split(sizes, 1) for name, values in layers.items()}
+        for number, (work, piece) in enumerate(zip(works, pieces, strict=True)):
+            piece.tally.rays += work.lanes
+            first, pixels, sample, samples = work.span
+            for name, values in parts.items():
+                own = values[number].reshape(-1, samples, pixels)
+                piece.writes += work.plate.layers[name].after(own, first, sample)
+    return pieces
+
+
+def _state(works: Sequence[Work]) -> PathState:
+    """The camera rays of all samples; their lanes follow each other."""
+    states, before = [], 0
+    for work in works:
+        state = work.rays()
+        states.append(replace(state, lane=state.lane + before) if before else state)
+        before += work.lanes
+    return joined(states)
+
+
+def _add_light(work: Work, piece: Piece, radiance: Tensor) -> None:
+    """Put radiance ``(3, n)`` where it belongs, but for samples that are not finite."""
+    first, pixels, sample, samples = work.span
+    radiance = radiance.reshape(3, samples, pixels)
+    finite = torch.isfinite(radiance).all(0)
+    if not bool(finite.all()):
+        piece.lost = Lost.of(radiance, first, sample, work.wave.crop, work.plate)
+    radiance = torch.where(finite, radiance, 0.0)
+    clamp = work.wave.integrator.clamp
+    if clamp is not None:
+        clamped = radiance * clamp_scale(radiance, clamp)
+        sums = torch.stack((radiance.double().sum(), clamped.double().sum()))
+        piece.writes.append((work.light, work.light + sums))
+        radiance = clamped
+    piece.writes += work.plate.film.after(radiance, first, sample)

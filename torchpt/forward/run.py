@@ -17,7 +17,7 @@ from torchpt.forward.causes import told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.need import loaded, need_of, shape_of
 from torchpt.forward.picture import final, rendering_of
-from torchpt.forward.piece import take
+from torchpt.forward.piece import Piece, Work, take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, budget_of
@@ -26,10 +26,10 @@ from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
 from torchpt.forward.wave import loop_of, looped, make_wave, surface_layers
 from torchpt.forward.waves import Waves, say_once
-from torchpt.integrators.base import Tally
 from torchpt.integrators.loop.schedule import Block, Share
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
+from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
 from torchpt.native.memory import Meter, mb
@@ -135,12 +135,15 @@ class Run:
 
         None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
         """
-        render = self.settings.render
-        bound = self.keeps or self.split is not None or self.stop.open or render.max_memory is not None
-        if self.loop is None or self.twice is not None or bound:
+        if self.loop is None or not self.only_counts():
             return None
         self.begun = time.perf_counter()
-        return [(self.picture, 0, render.spp)]
+        return [(self.picture, 0, self.settings.render.spp)]
+
+    def only_counts(self) -> bool:
+        """Whether nothing but their number ends its samples, and memory is not bounded."""
+        open_ended = self.keeps or self.stop.open or self.twice is not None
+        return not open_ended and self.split is None and self.settings.render.max_memory is None
 
     def completed(self, rest: list[Block]) -> Rendering:
         """The picture of samples that were taken :meth:`at_once`, but for the blocks for which there was no memory."""
@@ -154,6 +157,17 @@ class Run:
                 self.taken = self.settings.render.spp
                 self.stop.told(self.taken, self.seconds_of_sampling(), None)
         loaded("eager" if self.loop is None else "compiled")
+        return final(self)
+
+    def completed_by(self, piece: Piece, begun: float) -> Rendering:
+        """The picture, of all samples at once, which were begun at a time of ``time.perf_counter``."""
+        self.begun = begun
+        with needing("a render"):
+            self._add(piece)
+        self.taken = self.settings.render.spp
+        self._advanced(self.width * self.height * self.taken, True)
+        self.stop.told(self.taken, self.seconds_of_sampling(), None)
+        loaded("eager")
         return final(self)
 
     def _all(self) -> None:
@@ -348,7 +362,10 @@ class Run:
 
     def _piece(self, plate: Plate, span: Span) -> None:
         """A piece by tensor operations: all of it, or nothing where it raises."""
-        piece = take(self.wave, plate, self.light, span)
+        (piece,) = take([Work(self.wave, plate, self.light, span)])
+        self._add(piece)
+
+    def _add(self, piece: Piece) -> None:
         self._count(piece.lost)
         piece.write()
         self.tally.rays += piece.tally.rays

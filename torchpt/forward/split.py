@@ -17,9 +17,9 @@ from torch import Tensor
 from torchpt import __version__
 from torchpt.film import Film
 from torchpt.forward.checkpoint import BLOCKS, FREE, State
-from torchpt.integrators.base import Tally
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
+from torchpt.integrators.tally import Tally
 from torchpt.lanes.graph import Unsupported
 from torchpt.ranks import Group, dealt
 from torchpt.scene import Scene

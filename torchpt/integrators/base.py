@@ -20,10 +20,11 @@ if TYPE_CHECKING:
     from torchpt.accel import Accel
     from torchpt.integrators.compiled import Stages
     from torchpt.integrators.first_surface import FirstSurface
+    from torchpt.integrators.tally import Tally
     from torchpt.records import PathState, World
     from torchpt.samplers import Points
 
-__all__ = ["LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits", "Tally"]
+__all__ = ["LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits"]
 
 #: Parameters that several kinds have.
 STRATEGY: dict[str, Spec] = {
@@ -58,14 +59,6 @@ class Limits:
         if depth < self.rr_depth:
             return 0.0
         return DEEP_CAP if self.max_depth < 0 and depth > DEEP else 1.0
-
-
-@dataclass
-class Tally:
-    """What a wave did."""
-
-    rays: int = 0
-    truncated: int = 0  # paths still alive at ENDLESS
 
 
 class Integrator(Valued):
@@ -111,7 +104,7 @@ class Integrator(Valued):
         """What happens at first surfaces, made once a scene and differentiable in its world; None where paths go on."""
         return None
 
-    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: Any) -> tuple[Tensor, Tally]:
+    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: Any, tally: Tally) -> Tensor:
         """What camera rays bring.
 
         Args:
@@ -119,8 +112,9 @@ class Integrator(Valued):
             accel: the search.
             state: camera rays, ``state.radiance`` zero; N lanes.
             first: of :meth:`first`.
+            tally: counts what it takes.
 
         Returns:
-            Radiance ``(3, N)``, and what it took.
+            Radiance ``(3, N)``.
         """
         raise NotImplementedError

@@ -87,7 +87,7 @@ def _again(wave: Wave, places: Sequence[Place], streams: Streams) -> list[Fault]
         torch.tensor([getattr(place, name) for place in places], device=wave.centre.device)
         for name in ("x", "y", "sample")
     )
-    radiance, _ = again.brought(again.rays_of(x, y, sample, streams))
+    radiance = again.brought(again.rays_of(x, y, sample, streams))
     if not watch.full:  # a path that is given up has brought nothing
         watch.look("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
     rest = Fault("not repeated", False, 0)

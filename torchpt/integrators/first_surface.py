@@ -8,11 +8,13 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
-from torchpt.integrators.base import Integrator, Tally
+from torchpt.integrators.base import Integrator
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import gather_light, partition
 from torchpt.integrators.search import Search
 from torchpt.integrators.stages import Plan
+from torchpt.integrators.tally import Tally
+from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import salts
 
@@ -67,13 +69,13 @@ class FirstSurfaceIntegrator(Integrator):
 
     looped = True
 
-    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: FirstSurface) -> tuple[Tensor, Tally]:
+    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: FirstSurface, tally: Tally) -> Tensor:
         """See :class:`Integrator`."""
         plan, world = stages.plan, stages.world
         search = Search(accel, world, plan.sampler, plan.dtype)
         slide = plan.attached or plan.dtype == torch.float64
         hit = search.nearest(state, 1)
-        tally = Tally(rays=len(state.lane))
+        tally.searched(state.lane)
         stages.met(1, state, hit)
         ends, groups = partition(world, hit)
         gather_light(stages, state, hit, ends, slide)
@@ -82,7 +84,7 @@ class FirstSurfaceIntegrator(Integrator):
             here, met = rows(state, index), rows(hit, index)
             radiance, shadow = first.shade(plan, world, model, here, met, salt, stages.pixel, slide)
             if shadow is not None:
-                tally.rays += len(shadow.t_max)
+                tally.searched(take(state.lane, index))
                 radiance = torch.addcmul(radiance, shadow.radiance, search.clear(shadow))
             state.radiance.scatter_add_(1, index.expand(3, -1), radiance)
-        return state.radiance, tally
+        return state.radiance

@@ -14,15 +14,16 @@ from torch import Tensor
 
 from torchpt import lights
 from torchpt.accel import Accel
-from torchpt.integrators.base import Integrator, Limits, Tally
+from torchpt.integrators.base import Integrator, Limits
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.plan import Plan
 from torchpt.integrators.search import Search
+from torchpt.integrators.tally import Tally
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, joined
 from torchpt.samplers import salts
 
-__all__ = ["ENDLESS", "Limits", "PathIntegrator", "Tally", "gather_light", "partition", "slides", "trace"]
+__all__ = ["ENDLESS", "Limits", "PathIntegrator", "gather_light", "partition", "slides", "trace"]
 
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
 #: paths that lose nothing none comes so far (``DEEP_CAP``): only those are cut that roulette was told to leave alone.
@@ -34,9 +35,9 @@ class PathIntegrator(Integrator):
 
     looped = True
 
-    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: None) -> tuple[Tensor, Tally]:
+    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: None, tally: Tally) -> Tensor:
         """See :class:`Integrator`."""
-        return trace(stages, self.limits, accel, state)
+        return trace(stages, self.limits, accel, state, tally)
 
 
 def trace(
@@ -44,16 +45,16 @@ def trace(
     limits: Limits,
     accel: Accel,
     state: PathState,
+    tally: Tally,
     lanes: int | None = None,
     depth: int = 1,
     hit: Hit | None = None,
-) -> tuple[Tensor, Tally]:
-    """Radiance ``(3, N)`` carried back along camera rays ``state``, and what it took.
+) -> Tensor:
+    """Radiance ``(3, N)`` carried back along camera rays ``state``; ``tally`` counts what it took.
 
     ``lanes, depth, hit``: of paths that go on from a vertex: of how many camera rays they are, the vertex, and what they met.
     """
     plan, world = stages.plan, stages.world
-    tally = Tally()
     n = len(state.lane)
     gathered = state.radiance.new_zeros(3, n if lanes is None else lanes)
 
@@ -70,7 +71,7 @@ def trace(
 
     last = limits.max_depth if limits.max_depth >= 0 else ENDLESS
     while n and depth <= last:
-        tally.rays += len(state.lane)
+        tally.searched(state.lane)
         if hit is None:
             hit = search.nearest(state, depth)
         if stages.met(depth, state, hit):
@@ -82,7 +83,8 @@ def trace(
         if depth == last:
             for _, index in groups:
                 retire(index)
-                tally.truncated += len(index) if limits.max_depth < 0 else 0
+                if limits.max_depth < 0:
+                    tally.cut(take(state.lane, index))
         if depth == last or not groups:
             break
         salt = salts(depth, state.lane.device)
@@ -93,7 +95,7 @@ def trace(
                 model, limits.roulette(depth), slide, following, state, hit, index, salt
             )
             if shadow is not None:
-                tally.rays += len(shadow.t_max)
+                tally.searched(take(state.lane, index))
                 clear = search.clear(shadow)
                 stages.cleared(clear)
                 after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
@@ -101,7 +103,7 @@ def trace(
         state = joined([after for after, _ in parts])
         hit = joined([found for _, found in parts if found is not None]) if plan.attached else None
         depth += 1
-    return gathered, tally
+    return gathered
 
 
 def slides(plan: Plan, world: World, depth: int) -> bool:

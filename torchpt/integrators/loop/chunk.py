@@ -32,8 +32,9 @@ from torchpt.integrators.loop.eager import bounce_eagerly
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.loop.rows import Memory
 from torchpt.integrators.loop.search import ChunkSearch
-from torchpt.integrators.path import ENDLESS, Tally
+from torchpt.integrators.path import ENDLESS
 from torchpt.integrators.plate import Plate
+from torchpt.integrators.tally import Tally
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.block import WIDTH
 

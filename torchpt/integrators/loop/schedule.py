@@ -18,8 +18,8 @@ from torchpt.integrators.loop.calls import Halted
 from torchpt.integrators.loop.chunk import LANES, Chunk, Worker
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.lost import Lost
-from torchpt.integrators.path import Tally
 from torchpt.integrators.plate import Plate
+from torchpt.integrators.tally import Tally
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.block import WIDTH
 from torchpt.lanes.kernel import HEAD
