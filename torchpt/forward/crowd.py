@@ -16,6 +16,7 @@ from torchpt.forward.piece import Work, take
 from torchpt.forward.result import Rendering
 from torchpt.forward.run import Run
 from torchpt.forward.schedule import LANES
+from torchpt.integrators.loop.schedule import Share
 from torchpt.native.memory import let_go
 from torchpt.native.modes import undisturbed
 from torchpt.shortage import ran_out
@@ -118,8 +119,12 @@ def _together(waiting: list[tuple[Entry, Work]]) -> bool:
     if not pieces:
         let_go()
         return False
-    for (entry, _), piece in zip(waiting, pieces, strict=True):
+    for (entry, work), piece in zip(waiting, pieces, strict=True):
+        run = entry.run
+        run.begun, run.left = begun, work.lanes
         with undisturbed(entry.device), blamed(entry):
-            entry.done(entry.run.completed_by(piece, begun))
+            piece.write()
+            run.took(Share(piece.tally, work.lanes, piece.lost))
+            entry.done(run.completed([]))
         del entry.run
     return True

@@ -17,7 +17,7 @@ from torchpt.forward.causes import told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.need import loaded, need_of, shape_of
 from torchpt.forward.picture import final, rendering_of
-from torchpt.forward.piece import Piece, Work, take
+from torchpt.forward.piece import Work, take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, budget_of
@@ -146,28 +146,17 @@ class Run:
         return not open_ended and self.split is None and self.settings.render.max_memory is None
 
     def completed(self, rest: list[Block]) -> Rendering:
-        """The picture of samples that were taken :meth:`at_once`, but for the blocks for which there was no memory."""
-        assert self.loop is not None
+        """The picture of samples that were taken at once, but for the blocks for which there was no memory."""
         with needing("a render"):
             if self.unsupported is not None:
                 self._eagerly(self.unsupported)
             else:
                 if rest:
+                    assert self.loop is not None
                     self.loop.take_rest(rest, self.took)
                 self.taken = self.settings.render.spp
                 self.stop.told(self.taken, self.seconds_of_sampling(), None)
         loaded("eager" if self.loop is None else "compiled")
-        return final(self)
-
-    def completed_by(self, piece: Piece, begun: float) -> Rendering:
-        """The picture, of all samples at once, which were begun at a time of ``time.perf_counter``."""
-        self.begun = begun
-        with needing("a render"):
-            self._add(piece)
-        self.taken = self.settings.render.spp
-        self._advanced(self.width * self.height * self.taken, True)
-        self.stop.told(self.taken, self.seconds_of_sampling(), None)
-        loaded("eager")
         return final(self)
 
     def _all(self) -> None:
@@ -363,9 +352,6 @@ class Run:
     def _piece(self, plate: Plate, span: Span) -> None:
         """A piece by tensor operations: all of it, or nothing where it raises."""
         (piece,) = take([Work(self.wave, plate, self.light, span)])
-        self._add(piece)
-
-    def _add(self, piece: Piece) -> None:
         self._count(piece.lost)
         piece.write()
         self.tally.rays += piece.tally.rays
