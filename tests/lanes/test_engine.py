@@ -6,11 +6,12 @@ import os
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from torchpt.lanes import engine
+from torchpt.lanes import cache, engine
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and modes of files here")
 
@@ -45,13 +46,14 @@ def entries(folder: Path) -> list[Path]:
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """The engine of this process as if nothing had been asked of it, with a cache of its own."""
+    """The engine of this process as if nothing had been asked of it, with a cache of its own; its folder."""
     folder = tmp_path / "kernels"
     monkeypatch.setenv("TORCHPT_CACHE", str(folder))
     monkeypatch.setattr(engine, "_functions", {})
     monkeypatch.setattr(engine, "_state", {**engine._state, "compiled": 0, "loaded": 0})
-    engine._state.pop("folder", None)
-    return folder
+    again()
+    yield folder
+    again()
 
 
 def ir(k: int = 0) -> str:
@@ -61,7 +63,8 @@ def ir(k: int = 0) -> str:
 def again() -> None:
     """Forget what this process has loaded, as a new one would."""
     engine._functions.clear()
-    engine._state.pop("folder", None)
+    cache._folder.cache_clear()
+    cache._tidied.cache_clear()
 
 
 def test_second_process_compiles_nothing(tmp_path):
@@ -99,7 +102,7 @@ def test_targets_have_entries_of_their_own(here):
 
 def test_switched_off(here, monkeypatch):
     monkeypatch.setenv("TORCHPT_CACHE", "")
-    assert engine.cache_folder() is None
+    assert cache.cache_folder() is None
     engine.compiled(ir())
     again()
     engine.compiled(ir())
@@ -110,7 +113,7 @@ def test_switched_off(here, monkeypatch):
 def test_folder_that_others_may_enter(here, mode):
     here.mkdir()
     here.chmod(mode)
-    assert engine.cache_folder() is None
+    assert cache.cache_folder() is None
     engine.compiled(ir())
     assert engine.counts() == (1, 0) and not entries(here)
 
@@ -120,7 +123,7 @@ def test_no_folder_can_be_made(here, tmp_path, monkeypatch):
     for place in (tmp_path / "file", tmp_path / "file" / "kernels"):
         monkeypatch.setenv("TORCHPT_CACHE", str(place))
         again()
-        assert engine.cache_folder() is None
+        assert cache.cache_folder() is None
         engine.compiled(ir())
     assert engine.counts() == (2, 0)
 
@@ -186,11 +189,11 @@ def test_owner(here, tmp_path, what):
     if what == "link":
         here.rename(tmp_path / "elsewhere")
         here.symlink_to(tmp_path / "elsewhere")
-        assert engine.cache_folder() == here  # this user's own link to this user's own folder
+        assert cache.cache_folder() == here  # this user's own link to this user's own folder
         os.chown(here, 12345, 12345, follow_symlinks=False)
     else:
         os.chown(here if what == "folder" else path, 12345, 12345)
-    assert (engine.cache_folder() is None) == (what != "entry")
+    assert (cache.cache_folder() is None) == (what != "entry")
     engine.compiled(ir())
     assert engine.counts() == (2, 0)
 
@@ -199,16 +202,63 @@ def test_places(tmp_path, monkeypatch):
     monkeypatch.delenv("TORCHPT_CACHE", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert engine.cache_folder() == tmp_path / "cache" / "torchpt" / "kernels"
+    assert cache.cache_folder() == tmp_path / "cache" / "torchpt" / "kernels"
     monkeypatch.chdir(tmp_path)
     for relative in ("", "cache"):  # not a path to rely on
         monkeypatch.setenv("XDG_CACHE_HOME", relative)
-        assert engine.cache_folder() == tmp_path / "home" / ".cache" / "torchpt" / "kernels"
+        assert cache.cache_folder() == tmp_path / "home" / ".cache" / "torchpt" / "kernels"
     monkeypatch.setenv("TORCHPT_CACHE", "own")
-    assert engine.cache_folder() == tmp_path / "own"
+    assert cache.cache_folder() == tmp_path / "own"
 
 
 def test_an_error_of_llvm_is_not_kept(here):
     with pytest.raises(RuntimeError, match="parsing"):
         engine.compiled("define void @kernel(")
     assert engine.counts() == (0, 0) and not entries(here)
+
+
+# -- how much is kept
+
+
+def kept(here: Path, names: list[str], days: float, size: int = 100) -> None:
+    """Files of a size that were last used some days ago."""
+    here.mkdir(mode=0o700, exist_ok=True)
+    for k, name in enumerate(names):
+        (here / name).write_bytes(bytes(size))
+        used = time.time() - (days * 86_400.0) - 10.0 * (len(names) - k)
+        os.utime(here / name, (used, used))
+
+
+def test_what_was_not_used_for_long_goes_first(here, monkeypatch):
+    monkeypatch.setattr(cache, "MOST", 1_000)
+    old, new = [f"{k:040x}.o" for k in range(8)], [f"{k:040x}.json" for k in range(3)]
+    kept(here, old, days=3.0)
+    kept(here, new, days=0.0)
+    kept(here, ["notes.txt", "unfinished-a"], days=9.0, size=0)
+    kept(here, ["unfinished-b"], days=0.0, size=0)
+    (here / "folder").mkdir()
+    cache.write(f"{99:040x}.o", b"code")
+    left = {path.name for path in here.iterdir()}
+    # Of eleven hundred bytes five hundred stay; what a killed process left is gone, what is nobody's and what is new is not.
+    assert left == {*old[6:], *new, "notes.txt", "unfinished-b", "folder", f"{99:040x}.o"}
+    assert cache.read(f"{99:040x}.o") == b"code"
+
+
+def test_nothing_goes_while_there_is_room(here, monkeypatch):
+    monkeypatch.setattr(cache, "MOST", 1_000)
+    names = [f"{k:040x}.o" for k in range(10)]
+    kept(here, names, days=99.0)
+    cache.write(f"{99:040x}.o", b"")
+    assert {path.name for path in here.iterdir()} == {*names, f"{99:040x}.o"}
+    cache.write(f"{98:040x}.o", bytes(5_000))  # looked at once a process
+    assert len(list(here.iterdir())) == 12
+
+
+def test_a_use_is_noted_once_a_day(here):
+    cache.write(f"{1:040x}.o", b"code")
+    path = here / f"{1:040x}.o"
+    for hours, noted in ((1.0, False), (50.0, True)):
+        before = time.time() - hours * 3600.0
+        os.utime(path, (before, before))
+        assert cache.read(path.name) == b"code"
+        assert (path.stat().st_mtime > before + 1.0) == noted

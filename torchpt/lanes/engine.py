@@ -1,36 +1,25 @@
-"""From IR to machine code: LLVM through llvmlite, and a cache on disk.
-
-The cache holds native code, so its folder is this user's alone (mode 0700, owner checked) and each entry carries a checksum.
-Where there can be no such folder, kernels are compiled in memory.
-"""
+"""From IR to machine code: LLVM through llvmlite."""
 
 from __future__ import annotations
 
 import ctypes
 import hashlib
-import os
-import stat
-import sys
-import tempfile
 import threading
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
+from torchpt.lanes import cache
 from torchpt.native.memory import MARGIN, room_for
 
 __all__ = [
     "Function",
     "Target",
-    "cache_folder",
     "compiled",
     "counts",
     "estimates",
     "host",
     "identity",
     "kept",
-    "read",
-    "write",
 ]
 
 #: Enters every key: entries of another form are never read.
@@ -97,12 +86,12 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         key = _key(ir, target)
         function = _functions.get(key)
         if function is None:
-            code = read(f"{key[:40]}.o")
+            code = cache.read(f"{key[:40]}.o")
             _check_room()
             if code is None:
                 code = _object(ir, target)
                 _state["compiled"] += 1
-                write(f"{key[:40]}.o", code)
+                cache.write(f"{key[:40]}.o", code)
             else:
                 _state["loaded"] += 1
             function = _functions[key] = _loaded(code, target, key)
@@ -123,7 +112,7 @@ def kept(key: str) -> Function | None:
     """A function of this machine by its key, from this process or from disk; None where there is none."""
     with _lock:
         function = _functions.get(key)
-        code = read(f"{key[:40]}.o") if function is None else None
+        code = cache.read(f"{key[:40]}.o") if function is None else None
         if code is not None:
             _check_room()
             _state["loaded"] += 1
@@ -190,76 +179,3 @@ def _loaded(code: bytes, target: Target, key: str) -> Function:
     engine.finalize_object()
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)(engine.get_function_address("kernel"))
     return Function(call, code, engine, key)
-
-
-def cache_folder() -> Path | None:
-    """Where kernels are kept: ``$TORCHPT_CACHE``, else the user's cache folder; None where that cannot be trusted."""
-    given = os.environ.get("TORCHPT_CACHE")
-    if given == "":
-        return None
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    if not os.path.isabs(base):  # as its specification says
-        base = os.path.join(os.path.expanduser("~"), ".cache")
-    folder = Path(given).absolute() if given else Path(base) / "torchpt" / "kernels"
-    if not folder.is_absolute():  # no home
-        return None
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        facts = [folder.stat(), folder.lstat()]  # a link must be this user's as well
-    except OSError:
-        return None
-    if not hasattr(os, "getuid"):  # no owners and modes to check
-        return folder
-    if any(fact.st_uid != os.getuid() for fact in facts) or stat.S_IMODE(facts[0].st_mode) & 0o077:
-        return None
-    return folder
-
-
-def _folder() -> Path | None:
-    if "folder" not in _state:
-        _state["folder"] = cache_folder()
-    return _state["folder"]
-
-
-def read(name: str) -> bytes | None:
-    """An entry of the cache; None where there is none, or a damaged or a doubtful one, which is made again."""
-    folder = _folder()
-    if folder is None:
-        return None
-    try:
-        handle = os.open(folder / name, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0))
-        with os.fdopen(handle, "rb") as file:
-            facts = os.fstat(handle)
-            if not stat.S_ISREG(facts.st_mode):
-                return None
-            # Whoever may rename the folder could have put another in its place since it was looked at.
-            if hasattr(os, "getuid") and (facts.st_uid != os.getuid() or facts.st_mode & 0o022):
-                return None
-            content = file.read()
-    except OSError:
-        return None
-    check, code = content[:32], content[32:]
-    return code if _check(name, code) == check else None
-
-
-def _check(name: str, code: bytes) -> bytes:
-    return hashlib.sha256(name.encode() + code).digest()
-
-
-def write(entry: str, code: bytes) -> None:
-    """Put an entry in its place at once or not at all; a full disk is no reason to stop."""
-    folder = _folder()
-    if folder is None:
-        return
-    path, name = folder / entry, None
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(_check(entry, code) + code)
-        os.replace(name, path)
-    except OSError:
-        if name is not None:
-            try:
-                os.unlink(name)
-            except OSError:
-                print(f"torchpt: {name} could not be removed", file=sys.stderr)

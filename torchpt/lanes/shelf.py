@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.lanes import engine
+from torchpt.lanes import cache, engine
 from torchpt.lanes.graph import DTYPES
 from torchpt.lanes.program import Program
 from torchpt.lanes.prologue import Guard, Source, Step, Table
@@ -69,7 +69,7 @@ def _canonical(value: Any) -> str:
 
 def load(key: str) -> Program | None:
     """A program from disk; None where there is none that can be used."""
-    content = engine.read(f"{key[:40]}.json")
+    content = cache.read(f"{key[:40]}.json")
     if content is None:
         return None
     facts = json.loads(content)
@@ -100,7 +100,7 @@ def store(key: str, program: Program) -> None:
         }
     except _NotKept:
         return
-    engine.write(f"{key[:40]}.json", json.dumps(facts).encode())
+    cache.write(f"{key[:40]}.json", json.dumps(facts).encode())
 
 
 def _frozen(value: Any) -> Any:
