@@ -51,7 +51,15 @@ def test_no_angle(fov: Any) -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [(key, value) for key in ("K", "R", "t", "first_pixel") for value in (None, "x", math.nan, [[1, 2], [3]], SPARSE)]
-    + [("K", np.full((3, 3), np.nan)), ("R", np.eye(4)), ("t", [1, 2]), ("t", [math.inf] * 3), ("size", "ab")],
+    + [
+        ("K", np.full((3, 3), np.nan)),
+        ("R", np.eye(4)),
+        ("R", 2.0 * np.eye(3)),
+        ("R", np.diag([1, 1, -1])),
+        ("t", [1, 2]),
+        ("t", [math.inf] * 3),
+        ("size", "ab"),
+    ],
 )
 def test_no_matrices_of_opencv(key: str, value: Any) -> None:
     given: dict[str, Any] = {"K": K, "R": np.eye(3), "t": np.zeros(3), "size": SIZE, key: value}

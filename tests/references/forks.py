@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping
@@ -90,9 +91,10 @@ class Command:
         return [process.exitcode for process in self.children]
 
     def lines(self) -> list[str]:
-        """What was said on stderr, but for notes that kernels compile."""
+        """What was said on stderr, but for notes that kernels compile, and what torch itself has to say."""
         every = self.errors.read_text().splitlines()
-        return [line for line in every if "compiling the search kernels" not in line]
+        own = [line for line in every if not re.match(r"\[Gloo\] |\[W\d+ .* \[c10d\] ", line)]
+        return [line for line in own if "compiling the search kernels" not in line]
 
 
 def command(

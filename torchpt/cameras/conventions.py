@@ -28,10 +28,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torchpt.cameras import opencv
 from torchpt.cameras.opencv import PinholeMatrices
 from torchpt.cameras.pinhole import FOV_AXES
 from torchpt.errors import SceneError
 from torchpt.math.tensor_transforms import placed
+from torchpt.spec import Refused
 from torchpt.taped import in_transform
 
 if TYPE_CHECKING:
@@ -70,10 +72,10 @@ def from_opencv(K: Any, R: Any, t: Any, size: Size, first_pixel: float = 0.5) ->
         first_pixel: where ``K`` has the middle of the first pixel, along x and y: 0.5 as COLMAP, 0 as ``cv2``.
 
     Raises:
-        SceneError: numbers that are not finite or of another shape, or no size.
+        SceneError: numbers that are not finite or of another shape, an ``R`` that is no rotation, or no size.
     """
     inner, wide_and_tall = _moved(_tensor(K, "K", (3, 3)), 0.5 - _first(first_pixel)), size_of(size)
-    pose = {"R": _tensor(R, "R", (3, 3)), "t": _tensor(t, "t", (3,))}
+    pose = {"R": _rotation(R), "t": _tensor(t, "t", (3,))}
     return {"type": "perspective", "K": inner, **pose, "size": wide_and_tall}
 
 
@@ -218,7 +220,7 @@ def from_pytorch3d(
     if type(in_ndc) is not bool:
         raise SceneError("in_ndc", in_ndc, "True or False")
     # Ours is the same camera space, and R's columns are its axes in the world.
-    turn, move = _tensor(R, "R", (3, 3)), _tensor(T, "T", (3,))
+    turn, move = _rotation(R), _tensor(T, "T", (3,))
     tall, wide = size_of(_tensor(image_size, "image_size", (2,)), "image_size", "[height, width]")
     focal, point = _tensor(focal_length, "focal_length", None), _tensor(principal_point, "principal_point", (2,))
     if focal.numel() not in (1, 2):
@@ -277,6 +279,17 @@ def _numbers(value: Any, key: str, expected: str) -> Tensor:
         raise SceneError(key, value, expected) from None
     if not in_transform(found) and not bool(found.isfinite().all()):
         raise SceneError(key, value, "finite numbers")
+    return found
+
+
+def _rotation(value: Any) -> Tensor:
+    """A rotation in float64."""
+    found = _tensor(value, "R", (3, 3))
+    if not in_transform(found):
+        try:
+            opencv.rotation(found.detach().tolist())
+        except Refused as error:
+            raise SceneError("R", value, error.expected) from None
     return found
 
 

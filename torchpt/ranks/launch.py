@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import threading
 import zlib
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from typing import Any
 
@@ -89,8 +89,9 @@ class Started:
         # torchrun keeps its store where it starts all ranks again, with the addresses of those that are gone.
         own: Any = PrefixStore(f"torchpt/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
         self._store = own.clone()  # a connection of its own: who waits by one keeps it for himself
-        dist.init_process_group("gloo", store=own, rank=rank, world_size=size, timeout=timeout)
-        self.group = Group(timeout=self._timeout)
+        with _output_to_errors():
+            dist.init_process_group("gloo", store=own, rank=rank, world_size=size, timeout=timeout)
+            self.group = Group(timeout=self._timeout)
         local = os.environ.get("LOCAL_RANK", "")
         if torch.cuda.is_available() and local.isdigit():  # `auto` and `cuda` are one GPU for each rank of a machine
             torch.cuda.set_device(int(local) % torch.cuda.device_count())
@@ -106,3 +107,20 @@ class Started:
         import torch.distributed as dist
 
         dist.destroy_process_group()
+
+
+@contextmanager
+def _output_to_errors() -> Iterator[None]:
+    """While gloo connects: that of older torch (2.8 to 2.10) tells stdout of it, where others read what a render came to."""
+    try:
+        kept = os.dup(1)
+    except OSError:  # it is closed
+        yield
+        return
+    try:
+        with suppress(OSError):
+            os.dup2(2, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
