@@ -31,6 +31,8 @@ __all__ = ["known", "opaque"]
 P = ParamSpec("P")
 R = TypeVar("R")
 
+#: What arguments that are written down in a graph may be. (Older torch traces no unions of types, but tuples of them.)
+_LISTS, _PLAIN = (list, tuple), (bool, int, str)
 #: While an operator is at work: what its forward pass made, which its backward pass is not to make again.
 _known: ContextVar[list[Rendering] | None] = ContextVar("known", default=None)
 
@@ -96,18 +98,18 @@ def _plain(value: Any) -> bool:
     """Whether a nest of values is one of numbers, words and None."""
     if isinstance(value, Mapping):
         return all([isinstance(key, str) and _plain(value[key]) for key in value])
-    if isinstance(value, list | tuple):
+    if isinstance(value, _LISTS):
         return all([_plain(item) for item in value])
     if isinstance(value, float):
         return -math.inf < value < math.inf
-    return value is None or isinstance(value, bool | int | str)
+    return value is None or isinstance(value, _PLAIN)
 
 
 def _text(value: Any) -> str:
     """A nest of plain values as Python writes it."""
     if isinstance(value, Mapping):
         return "{" + ", ".join([repr(key) + ": " + _text(value[key]) for key in value]) + "}"
-    if isinstance(value, list | tuple):
+    if isinstance(value, _LISTS):
         return "[" + ", ".join([_text(item) for item in value]) + "]"
     return repr(value)
 

@@ -154,13 +154,17 @@ class _Recorder(TorchDispatchMode):
 
 
 def test_the_audit_covers_what_waves_use(monkeypatch):
-    recorder, radiance = _Recorder(), Wave.radiance
+    recorder = _Recorder()
 
-    def recorded(self: Wave, *span: Any) -> Any:
-        with recorder:
-            return radiance(self, *span)
+    def recorded(method: Any) -> Any:
+        def call(*given: Any) -> Any:
+            with recorder:
+                return method(*given)
 
-    monkeypatch.setattr(Wave, "radiance", recorded)
+        return call
+
+    for name in ("rays", "brought"):
+        monkeypatch.setattr(Wave, name, recorded(getattr(Wave, name)))
     materials = torchpt.load(showcase(), device="cpu")
     for strategy in ("mis", "light", "uniform"):
         shoot(materials, 2, 0, "sobol", {"strategy": strategy, "max_depth": 4}, film_of(16), accel="brute")
