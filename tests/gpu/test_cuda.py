@@ -59,3 +59,18 @@ def test_many_lights_by_the_tree():
     cpu, cuda = (torchpt.render(torchpt.load("many_lights", device), **wish).cpu() for device in ("cpu", "cuda"))
     assert torch.isclose(cpu, cuda, rtol=1e-2, atol=1e-3).all(-1).float().mean() > 0.8
     assert abs(float(cpu.mean() / cuda.mean()) - 1) < 5e-3
+
+
+@pytest.mark.parametrize("integrator", [{"type": "path"}, {"type": "path", "clamp": 0.5}], ids=str)
+def test_cameras_of_a_batch_share_waves(integrator):
+    """To the bit what each is alone: no sum of a forward render is without an order."""
+    scene = torchpt.load("cornell_box", "cuda")
+    poses = scene.params["camera.to_world"].repeat(4, 1, 1)
+    poses[:, 0, 3] += 0.05 * torch.arange(4, device="cuda")
+    wish = {"spp": 4, "film": {**FILM, "aovs": ["depth"]}, "compile": "off", "integrator": integrator, "full": True}
+    batch = torchpt.render_batch(scene, poses, **wish)
+    for c, pose in enumerate(poses):
+        alone = torchpt.render(scene, params={"camera.to_world": pose}, **wish)
+        own = batch[0, c]
+        assert torch.equal(own.image, alone.image) and torch.equal(own.layers["depth"], alone.layers["depth"])
+        assert (own.rays, own.spp, own.complete) == (alone.rays, alone.spp, True)

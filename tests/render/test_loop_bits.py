@@ -20,7 +20,7 @@ import torchpt
 from torchpt.errors import RenderError
 from torchpt.format.description import settings
 from torchpt.integrators.loop.chunk import Chunk, Worker
-from torchpt.integrators.path import Tally
+from torchpt.integrators.tally import Tally
 from torchpt.rendering import Progress, Rendering, render_scene
 
 FILM = {**film_of(37, 23), "filter": "mitchell", "aovs": ["albedo", "normal", "variance"]}

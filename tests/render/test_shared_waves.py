@@ -192,13 +192,81 @@ def test_a_wave_has_no_more_lanes_than_it_may(monkeypatch, sizes):
     same(scene, {}, batch)
 
 
-def test_where_memory_runs_out_each_is_rendered_alone(monkeypatch):
-    def none(works):
-        raise MemoryError
+def test_where_memory_runs_out_waves_are_halved(monkeypatch):
+    sizes, take = [], crowd.take
 
-    monkeypatch.setattr(crowd, "take", none)
+    def scarce(works):
+        sizes.append(len(works))
+        if len(works) > 2:
+            raise MemoryError
+        return take(works)
+
+    monkeypatch.setattr(crowd, "take", scarce)
     scene = room()
+    batch = torchpt.render_batch(scene, CAMERAS * 2, full=True)
+    # Ten are too many, and five, and three; what is left over is rendered alone.
+    assert sizes == [10, 5, 2, 3, 2, 5, 2, 3, 2]
+    same(scene, {}, batch, CAMERAS * 2)
+    monkeypatch.setattr(crowd, "take", lambda works: (_ for _ in ()).throw(MemoryError))
     same(scene, {}, torchpt.render_batch(scene, CAMERAS, full=True))
+
+
+def test_waves_stay_small_once_memory_ran_out(monkeypatch):
+    sizes, take = [], crowd.take
+
+    def scarce(works):
+        sizes.append(len(works))
+        if len(works) > 2:
+            raise MemoryError
+        return take(works)
+
+    monkeypatch.setattr(crowd, "take", scarce)
+    monkeypatch.setitem(crowd.LANES, "cpu", 4 * 12 * 8 * 3)
+    torchpt.render_batch([room(), room()], CAMERAS[:4])
+    assert sizes == [4, 2, 2, 2, 2]
+
+
+def test_scenes_are_rendered_before_the_next_is_loaded():
+    told = []
+
+    def scenes():
+        for k in range(3):
+            told.append(f"load {k}")
+            yield room()
+
+    torchpt.render_batch(scenes(), CAMERAS[:2], on_progress=lambda done, total: told.append(done))
+    assert told == ["load 0", 1, 2, "load 1", 3, 4, "load 2", 5, 6]
+
+
+def test_pictures_with_kernels_do_not_overtake():
+    told = []
+    scenes = [room(), room(render={"spp": 3, "device": "cpu"})]
+    torchpt.render_batch(iter(scenes), on_progress=lambda done, total: told.append(done))
+    assert told == [1, 2]
+
+
+def test_parameters_that_change_the_world_share_no_wave_with_others(sizes):
+    scene, colours = room(), torch.rand(2, 3)
+    batch = torchpt.render_batch(scene, CAMERAS[:3], params={PAINT: colours})
+    assert sizes == [3, 3]
+    for s, colour in enumerate(colours):
+        for c, block in enumerate(CAMERAS[:3]):
+            assert torch.equal(batch[s, c], torchpt.render(scene.seen_by(block), params={PAINT: colour}))
+
+
+def test_an_error_is_that_of_its_picture(monkeypatch):
+    scene, rays = room(), crowd.Work.rays
+
+    def failing(work):
+        if float(work.wave.camera.to_world[0, 3]) > 1.5:
+            raise RenderError("broken")
+        return rays(work)
+
+    monkeypatch.setattr(crowd.Work, "rays", failing)
+    poses = scene.params["camera.to_world"].repeat(3, 1, 1)
+    poses[2, 0, 3] = 2.0
+    with pytest.raises(RenderError, match=r"^params\[2\]: broken"):
+        torchpt.render_batch(scene, params={"camera.to_world": poses})
 
 
 def test_samples_that_are_not_finite_are_those_of_their_picture(sizes):

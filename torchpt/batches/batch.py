@@ -58,12 +58,13 @@ class Renderings:
 
 @dataclass(frozen=True)
 class _Picture:
-    """One picture of a batch: where it belongs, its name in errors, what is asked for."""
+    """One picture of a batch: where it belongs, its name in errors, what is asked for; the last one of its world or not."""
 
     scene: int
     camera: int
     name: str
     order: Order
+    last: bool
 
 
 Pictures = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
@@ -194,7 +195,8 @@ def _pictures(
                 for key, value in asked.items():
                     if value != like[key]:
                         raise SceneError(f"film.{key}", value, f"{like[key]}, as of the first picture")
-            yield _Picture(s, c, name, order)
+            moves = not several or any(not key.startswith("camera.") for key in order.params)
+            yield _Picture(s, c, name, order, moves and c == len(cameras) - 1)
 
 
 def _ordered(
@@ -252,7 +254,7 @@ def _entries(
             with named(picture.name, None):
                 raise error
 
-        return Entry(order.scene.device, make, done, failed)
+        return Entry(order.scene.device, make, done, failed, picture.last)
 
     return map(entry, pictures)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import torch
 
-from torchpt.forward.piece import Work, take
+from torchpt.forward.piece import Piece, Work, take
 from torchpt.forward.result import Rendering
 from torchpt.forward.run import Run
 from torchpt.forward.schedule import LANES
@@ -33,6 +33,7 @@ class Entry:
         make: makes it ready for a number of threads; called when it is soon to begin.
         done: told of the rendering.
         failed: told of an error instead, which it may raise as another one.
+        last: whether none comes after it that could share a wave with it.
         run: once it is ready.
     """
 
@@ -40,6 +41,7 @@ class Entry:
     make: Callable[[int], Run]
     done: Callable[[Rendering], None]
     failed: Callable[[BaseException], None]
+    last: bool
     run: Run = field(init=False)
 
 
@@ -57,74 +59,97 @@ class Crowd:
     """Renders by tensor operations that wait until they fill a wave, or until one comes that cannot share it."""
 
     def __init__(self) -> None:
-        self._waiting: list[tuple[Entry, Work]] = []
+        self._waiting: list[Entry] = []
+        self._lanes = 0  # of those
+        self._most: int | None = None  # where memory did not suffice for the usual number
 
     def add(self, entry: Entry) -> None:
         """Let a render wait, or do it by itself; those that waited before may be done first."""
-        work = _whole(entry.run)
-        held = sum(other.lanes for _, other in self._waiting)
-        most = LANES.get(entry.device.type, LANES["cpu"])
-        if self._waiting and (
-            work is None or held + work.lanes > most or not _alike(entry.run, self._waiting[0][0].run)
-        ):
+        lanes = _lanes(entry.run)
+        most = self._most or LANES.get(entry.device.type, LANES["cpu"])
+        if lanes is None or 2 * lanes > most:
             self.settle()
-        if work is None:
             _alone(entry)
-        else:
-            self._waiting.append((entry, work))
+            return
+        if self._waiting and (self._lanes + lanes > most or not _alike(entry.run, self._waiting[0].run)):
+            self.settle()
+        self._waiting.append(entry)
+        self._lanes += lanes
+        if entry.last:
+            self.settle()
 
     def settle(self) -> None:
         """Do what waits."""
-        waiting, self._waiting = self._waiting, []
-        if len(waiting) < 2 or not _together(waiting):
-            for entry, _ in waiting:
+        waiting, self._waiting, self._lanes = self._waiting, [], 0
+        self._together(waiting)
+
+    def _together(self, entries: list[Entry]) -> None:
+        """Renders by one wave, or where memory is too short by several; the list is empty then."""
+        if len(entries) < 2:
+            while entries:
+                _alone(entries.pop())
+            return
+        begun, works = time.perf_counter(), [_work(entry.run) for entry in entries]
+        short = False
+        with undisturbed(entries[0].device):
+            try:
+                pieces = take(works)
+            except Exception as error:  # alone each of them meets it again, under its own name
+                pieces, short = [], ran_out(error)
+        if short:
+            let_go()
+            lanes = sum(work.lanes for work in works)
+            self._most = max(lanes // 2, 1)
+            del works
+            half = len(entries) // 2
+            first, entries[:half] = entries[:half], []
+            self._together(first)
+            self._together(entries)
+            return
+        while entries:
+            entry = entries.pop(0)
+            work = works.pop(0)
+            if pieces:
+                _done(entry, work.lanes, pieces.pop(0), begun)
+            else:
                 _alone(entry)
 
 
-def _whole(run: Run) -> Work | None:
-    """All samples of a render; None where its waves are its own: it has kernels, has no fixed end, or memory is bounded."""
+def _done(entry: Entry, lanes: int, piece: Piece, begun: float) -> None:
+    """Tell of a render, of which all samples are there."""
+    run = entry.run
+    run.begun, run.left = begun, lanes
+    with undisturbed(entry.device), blamed(entry):
+        piece.write()
+        run.took(Share(piece.tally, lanes, piece.lost))
+        entry.done(run.completed([]))
+    del entry.run
+
+
+def _lanes(run: Run) -> int | None:
+    """How many samples a render has; None where its waves are its own: it has kernels, no fixed end, or bounded memory."""
     if run.loop is not None or not run.only_counts():
         return None
+    return run.width * run.height * run.settings.render.spp
+
+
+def _work(run: Run) -> Work:
+    """All samples of a render."""
     return Work(run.wave, run.picture, run.light, (0, run.width * run.height, 0, run.settings.render.spp))
 
 
 def _alike(a: Run, b: Run) -> bool:
     """Whether one wave can take the samples of both: they differ in their cameras and seeds alone.
 
-    Textures that average over footprints want to know of one camera.
+    Textures that average over footprints want to know of one camera. Compiled stages repeat lanes, which would count for one.
     """
-    shared = (
-        a.wave.stages.world is b.wave.stages.world and a.wave.accel is b.wave.accel and a.wave.filter is b.wave.filter
-    )
-    same = a.wave.stages.plan == b.wave.stages.plan and a.integrator == b.integrator and list(a.seen) == list(b.seen)
-    return shared and same and a.wave.stages.pixel is None
+    one, other = a.wave, b.wave
+    shared = one.stages.world is other.stages.world and one.accel is other.accel and one.filter is other.filter
+    same = one.stages.plan == other.stages.plan and a.integrator == b.integrator and list(a.seen) == list(b.seen)
+    return shared and same and one.stages.pixel is None and not one.stages.compiled and not other.stages.compiled
 
 
 def _alone(entry: Entry) -> None:
     with undisturbed(entry.device), blamed(entry):
         entry.done(entry.run.go(None))
     del entry.run
-
-
-def _together(waiting: list[tuple[Entry, Work]]) -> bool:
-    """Renders by one wave; returns whether there was memory for it."""
-    first, begun = waiting[0][0], time.perf_counter()
-    with undisturbed(first.device), blamed(first):
-        try:
-            pieces = take([work for _, work in waiting])
-        except Exception as error:
-            if not ran_out(error):
-                raise
-            pieces = []
-    if not pieces:
-        let_go()
-        return False
-    for (entry, work), piece in zip(waiting, pieces, strict=True):
-        run = entry.run
-        run.begun, run.left = begun, work.lanes
-        with undisturbed(entry.device), blamed(entry):
-            piece.write()
-            run.took(Share(piece.tally, work.lanes, piece.lost))
-            entry.done(run.completed([]))
-        del entry.run
-    return True

@@ -51,6 +51,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 _drain(crew, 0)
                 crowd.add(entry)
                 continue
+            crowd.settle()
             with blamed(entry):
                 loop = entry.run.loop
                 assert loop is not None

@@ -95,13 +95,14 @@ def take(works: Sequence[Work]) -> list[Piece]:
     wave, plate, sizes = works[0].wave, works[0].plate, [work.lanes for work in works]
     pieces = [Piece() for _ in works]
     if wave.integrator.light:
-        several = Tallies(sizes, wave.centre.device) if len(works) > 1 else None
-        whole = several or Tally()
-        radiance = wave.brought(_state(works), whole).split(sizes, 1)
-        tallies = [whole] if several is None else several.each()
-        for work, piece, own, tally in zip(works, pieces, radiance, tallies, strict=True):
-            piece.tally = tally
-            _add_light(work, piece, own)
+        tally = Tally() if len(works) == 1 else Tallies(sizes, wave.centre.device)
+        radiance = wave.brought(_state(works), tally)
+        finite = torch.isfinite(radiance).all(0)
+        every = bool(finite.all())
+        of_each = zip(works, pieces, radiance.split(sizes, 1), finite.split(sizes), tally.each(), strict=True)
+        for work, piece, own, known, its in of_each:
+            piece.tally = its
+            _add_light(work, piece, own, None if every else known)
     if plate.layers:
         layers = wave.seen(tuple(plate.layers), _state(works))
         parts = {name: values.split(sizes, 1) for name, values in layers.items()}
@@ -124,14 +125,13 @@ def _state(works: Sequence[Work]) -> PathState:
     return joined(states)
 
 
-def _add_light(work: Work, piece: Piece, radiance: Tensor) -> None:
-    """Put radiance ``(3, n)`` where it belongs, but for samples that are not finite."""
+def _add_light(work: Work, piece: Piece, radiance: Tensor, finite: Tensor | None) -> None:
+    """Put radiance ``(3, n)`` where it belongs, but for samples that are not ``finite (n,)``; None: all are."""
     first, pixels, sample, samples = work.span
     radiance = radiance.reshape(3, samples, pixels)
-    finite = torch.isfinite(radiance).all(0)
-    if not bool(finite.all()):
+    if finite is not None:
         piece.lost = Lost.of(radiance, first, sample, work.wave.crop, work.plate)
-    radiance = torch.where(finite, radiance, 0.0)
+        radiance = torch.where(finite.view(samples, pixels), radiance, 0.0)
     clamp = work.wave.integrator.clamp
     if clamp is not None:
         clamped = radiance * clamp_scale(radiance, clamp)

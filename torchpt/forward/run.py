@@ -345,7 +345,7 @@ class Run:
         self.tally.truncated += share.tally.truncated
         self._count(share.lost)
         if self.integrator.clamp is not None:
-            self.light += torch.tensor(share.light, dtype=torch.float64)
+            self.light += torch.tensor(share.light, dtype=torch.float64, device=self.device)
         self.left -= share.samples
         return self._advanced(share.samples, self.left == 0 and self.split is None)
 

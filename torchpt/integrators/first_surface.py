@@ -14,7 +14,6 @@ from torchpt.integrators.path import gather_light, partition
 from torchpt.integrators.search import Search
 from torchpt.integrators.stages import Plan
 from torchpt.integrators.tally import Tally
-from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import salts
 
@@ -84,7 +83,7 @@ class FirstSurfaceIntegrator(Integrator):
             here, met = rows(state, index), rows(hit, index)
             radiance, shadow = first.shade(plan, world, model, here, met, salt, stages.pixel, slide)
             if shadow is not None:
-                tally.searched(take(state.lane, index))
+                tally.searched(here.lane)
                 radiance = torch.addcmul(radiance, shadow.radiance, search.clear(shadow))
             state.radiance.scatter_add_(1, index.expand(3, -1), radiance)
         return state.radiance

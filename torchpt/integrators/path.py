@@ -84,7 +84,7 @@ def trace(
             for _, index in groups:
                 retire(index)
                 if limits.max_depth < 0:
-                    tally.cut(take(state.lane, index))
+                    tally.cut(state.lane, index)
         if depth == last or not groups:
             break
         salt = salts(depth, state.lane.device)
@@ -95,7 +95,7 @@ def trace(
                 model, limits.roulette(depth), slide, following, state, hit, index, salt
             )
             if shadow is not None:
-                tally.searched(take(state.lane, index))
+                tally.searched(state.lane, index)
                 clear = search.clear(shadow)
                 stages.cleared(clear)
                 after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))

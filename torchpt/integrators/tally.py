@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.math.vectors import take
+
 __all__ = ["Tallies", "Tally"]
 
 
 @dataclass
 class Tally:
-    """What a wave did.
+    """What waves did.
 
     Attributes:
         rays: that were searched for, those of shadows too.
@@ -23,20 +25,24 @@ class Tally:
     rays: int = 0
     truncated: int = 0
 
-    def searched(self, lanes: Tensor) -> None:
-        """A ray of each of these lanes ``(n,)``."""
-        self.rays += len(lanes)
+    def searched(self, lanes: Tensor, index: Tensor | None = None) -> None:
+        """A ray of each of the lanes ``(n,)``, or of those at ``index`` among them."""
+        self.rays += len(lanes if index is None else index)
 
-    def cut(self, lanes: Tensor) -> None:
-        """The paths of these lanes ``(n,)`` were ended."""
-        self.truncated += len(lanes)
+    def cut(self, lanes: Tensor, index: Tensor) -> None:
+        """The paths of the lanes at ``index`` were ended."""
+        self.truncated += len(index)
+
+    def each(self) -> list[Tally]:
+        """Of each render that shares the wave: of the only one."""
+        return [self]
 
 
 class Tallies(Tally):
-    """The same, and of each of several renders besides.
+    """What a wave did for each of several renders.
 
     Args:
-        sizes: how many lanes of the wave each of them has; they follow each other.
+        sizes: how many of its lanes each of them has; they follow each other.
         device: where the lanes live.
     """
 
@@ -45,15 +51,13 @@ class Tallies(Tally):
         self._ends = torch.tensor(sizes, device=device).cumsum(0)
         self._counts = torch.zeros(2, len(sizes), dtype=torch.int64, device=device)
 
-    def searched(self, lanes: Tensor) -> None:
+    def searched(self, lanes: Tensor, index: Tensor | None = None) -> None:
         """See :class:`Tally`."""
-        super().searched(lanes)
-        self._count(0, lanes)
+        self._count(0, take(lanes, index))
 
-    def cut(self, lanes: Tensor) -> None:
+    def cut(self, lanes: Tensor, index: Tensor) -> None:
         """See :class:`Tally`."""
-        super().cut(lanes)
-        self._count(1, lanes)
+        self._count(1, take(lanes, index))
 
     def _count(self, row: int, lanes: Tensor) -> None:
         owner = torch.searchsorted(self._ends, lanes, right=True)
