@@ -37,6 +37,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import from_tests  # noqa: F401
 import numpy as np
 
 OURS, THEIRS = "torchpt", "mitsuba"

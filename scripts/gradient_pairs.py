@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import bench_files
+import from_tests  # noqa: F401
 import known_gradients
 import torch
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import bench_files
+import from_tests  # noqa: F401
 import torch
 from inverse_tasks import TASKS, described
 from torch import Tensor

@@ -7,11 +7,8 @@ Prints a table in Markdown for ``docs/lanes.md``: ``python scripts/measure_featu
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "references"))
-
+import from_tests  # noqa: F401
 from features import FEATURES, Feature, kernels, with_feature
 
 import torchpt

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -158,3 +160,13 @@ def test_a_turn_of_the_benchmark(engine, sampler, taken, tmp_path):
     assert picture.shape == (16, 16, 3)
     assert turn["mean"] == pytest.approx(picture.mean((0, 1)), rel=1e-5)
     assert not np.array_equal(picture, shoot(7, 2)[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bench_gradients", "gradient_pairs", "gradient_tasks", "measure_features"])
+def test_scripts_find_what_they_share_with_tests(name, tmp_path):
+    """Started as the docs say, by their path and nothing else."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    script = [sys.executable, str(SCRIPTS / f"{name}.py"), "--help"]
+    done = subprocess.run(script, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stdout.startswith("usage: "), done.stderr[-500:]
