@@ -116,6 +116,7 @@ def test_small_chunks_give_the_same_up_to_rounding(monkeypatch):
 
 
 @pytest.mark.parametrize("filter", ["box", "gaussian"])
+@pytest.mark.slow
 def test_bits_do_not_depend_on_threads_nor_memory(filter):
     """Enough paths for several chunks, each of more lanes than torch gives to one thread."""
     scene = torchpt.load({**CORNER, "film": {"width": 96, "height": 64, "filter": filter}}, "cpu")

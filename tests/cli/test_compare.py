@@ -310,6 +310,7 @@ def test_a_map_replaces_an_old_one_and_follows_links(pair: Path, capfd: Captured
     assert (pair / "link.png").is_symlink() and read_image("old.png").shape == (14, 18, 3)
 
 
+@pytest.mark.slow
 def test_nothing_of_hydra_is_imported(pair: Path) -> None:
     import subprocess
 

@@ -54,6 +54,7 @@ def test_a_full_disk_behind_stdout_is_told(words: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["2>&-", pytest.param("2>/dev/full", marks=needs_full), "1>&- 2>&-", "0<&-"])
+@pytest.mark.slow
 def test_nobody_need_listen_to_stderr(how: str, tmp_path: Path) -> None:
     found = shell(f"{TORCHPT} render {SMALL} {how}", tmp_path)
     assert found.returncode == 0
@@ -104,6 +105,7 @@ def test_a_picture_whose_folder_went_away_is_saved_elsewhere(tmp_path: Path) -> 
     assert torchpt.read_image(saved).shape == (64, 64, 3)
 
 
+@pytest.mark.slow
 def test_two_writers_of_one_picture(tmp_path: Path) -> None:
     """Each writes beside the file and puts it there in one step: what is left is one of both, whole."""
     words = [
@@ -126,6 +128,7 @@ def test_two_writers_of_one_picture(tmp_path: Path) -> None:
     assert torchpt.read_image(tmp_path / "a.exr").shape == (24, 24, 3)
 
 
+@pytest.mark.slow
 def test_two_writers_of_one_checkpoint(tmp_path: Path) -> None:
     """It is of the one or of the other, never of both: a render goes on from it to the bits of one that was left alone."""
     words = [sys.executable, "-m", "torchpt", "render", "scene=cornell_box", "film.width=24", "film.height=24"]
@@ -150,6 +153,7 @@ def test_a_folder_that_may_not_be_written(tmp_path: Path) -> None:
     assert found.returncode == 2 and "closed/a.png" in found.stderr and found.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_file_that_grows_no_further_leaves_nothing_half_written(tmp_path: Path) -> None:
     """A full disk, by the limit on the size of files: the picture that was there before is there still."""
     assert shell(f"{TORCHPT} render {SMALL}", tmp_path).returncode == 0

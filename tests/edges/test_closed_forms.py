@@ -168,6 +168,7 @@ def test_edges_can_be_left_out() -> None:
     assert leaf.grad is None or float(leaf.grad.abs().max()) == 0.0
 
 
+@pytest.mark.slow
 def test_gradients_are_the_same_for_any_threads_and_memory() -> None:
     shapes = {"it": {"type": "cube", "transform": [{"scale": 0.6}]}, "ball": {"type": "sphere", "center": [1, 1, 2]}}
     scene = torchpt.load({**BASE, "integrator": {"type": "path", "max_depth": 4}, "shapes": shapes}, "cpu")

@@ -106,6 +106,7 @@ def test_info_says_what_is_read(png: str):
     assert not any(word.startswith("textures") for word in info["left_out"])
 
 
+@pytest.mark.slow
 def test_a_texture_of_one_colour_is_that_colour():
     """The same picture whether numbers or textures give it, in every slot of every model that takes a number."""
     kinds: dict[str, dict[str, Any]] = {

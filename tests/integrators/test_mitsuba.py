@@ -264,6 +264,7 @@ def test_every_shape_is_as_bright_as_its_reference(compared, name, more):
 # The fast form of shapes_and_maps errs by a quarter of a percent: one percent stands out there only most of the time.
 @pytest.mark.parametrize("factor", [0.99, 1.01])
 @pytest.mark.parametrize("name", [name for name in MATERIALS if name != "shapes_and_maps"])
+@pytest.mark.slow
 def test_a_bias_of_one_percent_is_noticed_in_materials(compared, name, factor):
     found = compared(name, 1)
     with pytest.raises(AssertionError):

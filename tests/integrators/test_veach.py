@@ -47,6 +47,7 @@ def shapes(veach):
 
 @pytest.mark.parametrize("spp", [16, pytest.param(64, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.slow
 def test_every_strategy_has_the_same_mean(veach, reference, shapes, strategy, spp):
     film = {**film_of(FINE * WIDTH, FINE * HEIGHT), "aovs": ["variance"]}
     shot = shoot(veach, spp, 3, "sobol", {"strategy": strategy}, film)

@@ -33,6 +33,7 @@ def run(folder: Path) -> list[str]:
     "content",
     [None, pytest.param(b"", marks=pytest.mark.slow), pytest.param(b"\x80\x05garbage", marks=pytest.mark.slow)],
 )
+@pytest.mark.slow
 def test_a_damaged_cache_costs_a_compilation(ending: str, content: bytes | None, tmp_path: Path) -> None:
     (tmp_path / "kernel.py").write_text(KERNEL)
     assert run(tmp_path) == ["42", "1", "0"]

@@ -429,6 +429,7 @@ def test_a_picture_that_renders_alone_is_not_blamed_for_one_before(monkeypatch):
         torchpt.render_batch([bad, alone])
 
 
+@pytest.mark.slow
 def test_nothing_piles_up():
     """Workers go from scene to scene, and scenes without gradients go once they are rendered."""
     made, alive, seen = [], weakref.WeakSet(), []

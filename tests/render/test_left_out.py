@@ -96,6 +96,7 @@ print(*[name for name in sys.modules if name.startswith("torchpt.bsdfs.kinds.")]
 """
 
 
+@pytest.mark.slow
 def test_a_model_is_imported_where_a_scene_has_it():
     code = _IMPORTED.format(paths=[path for path in sys.path if path.endswith("references")])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

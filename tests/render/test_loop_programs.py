@@ -176,6 +176,7 @@ print(*engine.counts(), traced[0], float(image.double().sum()).hex())
 """
 
 
+@pytest.mark.slow
 def test_another_process_compiles_and_traces_nothing(tmp_path):
     folder = tmp_path / "kernels"
     environment = {**os.environ, "TORCHPT_CACHE": str(folder)}
@@ -298,6 +299,7 @@ def test_a_module_is_compiled_and_its_weights_are_read_anew(work):
     both()
 
 
+@pytest.mark.slow
 def test_a_model_whose_parts_are_replaced():
     """Not in place: another network, another number."""
     torch.manual_seed(1)

@@ -93,6 +93,7 @@ def same(a: Any, b: Any) -> bool:
 
 
 @pytest.mark.parametrize("step", [997, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_failure_at_any_operation_of_a_piece_changes_no_bit(box, step):
     """Each operation of a render fails once, the copies into the films included."""
     with in_pieces(lambda k: False, MemoryError) as counted:
@@ -108,6 +109,7 @@ def test_a_failure_at_any_operation_of_a_piece_changes_no_bit(box, step):
 
 
 @pytest.mark.parametrize("kind", FAILURES)
+@pytest.mark.slow
 def test_failures_again_and_again_halve_waves_further(box, kind, capsys):
     say_once.cache_clear()
     whole = eager(box, 24, pilots=True)
@@ -178,6 +180,7 @@ def backward_failing(
 
 
 @pytest.mark.parametrize("adjoint", ["autograd", pytest.param("replay", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_failure_anywhere_in_the_backward_pass_changes_rounding_at_most(box, adjoint, monkeypatch):
     whole, count = backward_failing(box, adjoint, lambda k: False, monkeypatch)
     assert count > 300 and float(whole.abs().min()) > 0
@@ -277,6 +280,7 @@ def limited(mode: str, more: int) -> tuple[str, str]:
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
 @pytest.mark.parametrize("mode", [pytest.param("off", marks=pytest.mark.slow), "on"])
+@pytest.mark.slow
 def test_under_a_limit_of_addresses_the_bits_are_the_same_or_it_is_one_line(mode):
     whole, _ = limited(mode, 0)
     same_bits = 0

@@ -77,6 +77,7 @@ def test_threads_and_workers_give_the_same_picture(tmp_path, way, name):
 
 
 @pytest.mark.parametrize("way", SCRIPTS)
+@pytest.mark.slow
 def test_under_the_workqueue_layer(tmp_path, way):
     found = run(tmp_path, SCRIPTS[way], "cornell_box", {"NUMBA_THREADING_LAYER": "workqueue"})
     assert set(found) == {expected("cornell_box")}

@@ -167,6 +167,7 @@ def pilots_at(seed: int, side: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("seeds", [150, pytest.param(2000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("way", ["target_error", "adaptive"])
+@pytest.mark.slow
 def test_no_bias(box, way, seeds):
     """Means over renders that end by their error, or share samples by it: those of renders that do neither.
 

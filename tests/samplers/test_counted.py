@@ -214,6 +214,7 @@ SOFT = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_errors_of_zsobol_are_blue():
     """Blurred over neighbours, its error is far below that of pixels with sequences of their own; alike pixel by pixel."""
     scene, film = torchpt.load(SOFT, device="cpu"), film_of(48)
@@ -234,6 +235,7 @@ def test_errors_of_zsobol_are_blue():
 
 
 @pytest.mark.parametrize("kind", COUNTED)
+@pytest.mark.slow
 def test_a_picture_is_that_of_independent_numbers(kind):
     scene = torchpt.load(SOFT, device="cpu")
     keys = {"max_depth": 3, "rr_depth": 2}

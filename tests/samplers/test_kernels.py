@@ -37,6 +37,7 @@ def test_bits_are_those_of_the_tensor_form(kind, n):
 
 
 @pytest.mark.parametrize("kind", KERNELS)
+@pytest.mark.slow
 def test_place_and_threads_do_not_matter(kind):
     key, points = keys(70_003, kind), points_of(kind)
     before = torch.get_num_threads()

@@ -216,6 +216,7 @@ GOLDEN_FURTHER = [
 ]
 
 
+@pytest.mark.slow
 def test_sobol_saves_error_on_the_cornell_box():
     """relMSE at 64 spp, box filter, 8 seeds, against Mitsuba's reference whose own variance is taken off: <= 0.60x."""
     layers = torchpt.read_layers(Path(__file__).parent.parent / "references" / "cornell_box.exr")

@@ -140,6 +140,7 @@ def _rendered(scene: torchpt.Scene, queue: Any) -> None:
     queue.put(torchpt.render(scene).numpy())
 
 
+@pytest.mark.slow
 def test_a_spawned_worker_gets_it():
     scene = torchpt.load(SCENE, "cpu")
     expected = torchpt.render(scene)

@@ -164,6 +164,7 @@ def test_parameters_follow_the_tensors_they_are_made_of(key: str, plain: torchpt
     assert torch.isclose((gradient * way).sum(), expected, rtol=2e-4, atol=2e-6), (gradient, expected)
 
 
+@pytest.mark.slow
 def test_a_picture_is_differentiated_as_by_params() -> None:
     keys = (
         "camera.target", "textures.paint.data", "materials.red.reflectance", "shapes.ball.transform.1.rotate.angle",
@@ -245,6 +246,7 @@ def test_a_tensor_that_fits_is_the_parameter_itself() -> None:
     assert kept.params["materials.red.base_color"].any() and not kept.params["materials.red.base_color"].requires_grad
 
 
+@pytest.mark.slow
 def test_one_tensor_in_two_places_gets_both_gradients() -> None:
     shared = wanted([0.3, 0.2, 0.1], torch.float32)
     material = {"type": "diffuse", "reflectance": shared}
@@ -325,6 +327,7 @@ def _with(key: str, **more: Any) -> dict[str, Any]:
     return placed(key, lambda block: {**block, **more})
 
 
+@pytest.mark.slow
 def test_texels_where_a_number_or_a_colour_stands() -> None:
     texels, rough = wanted(torch.rand(3, 2, 3).tolist(), torch.float32), wanted([[0.3, 0.6]], torch.float32)
     scene = put("materials.red.roughness", lambda _: rough, _with("materials.red", base_color=None))
