@@ -13,7 +13,7 @@ import re
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,6 +163,14 @@ def _refuse(line: str) -> int:
     return 2
 
 
+class JobFailedError(Exception):
+    """A job of a sweep that did not end well, in a process of its own which said why; ``code`` is what that is to exit with."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
 @dataclass
 class _Task:
     """What Hydra calls with every composed configuration. Plain data, so that launchers may send it elsewhere."""
@@ -174,12 +182,13 @@ class _Task:
     json: bool
     turn: dict[str, str]
     debug: dict[str, str]
+    process: int = field(default_factory=os.getpid)
 
     def __call__(self, cfg: DictConfig) -> int:
-        """Do one job. Ends the process (of this job) where it does not end well."""
+        """Do one job. Where it does not end well it ends this process, or, in a launcher's own, lets jobs beside it finish."""
         code = self._ended(lambda: self._of_hydra(cfg))
         if code:
-            raise SystemExit(code)
+            raise SystemExit(code) if os.getpid() == self.process else JobFailedError(code)
         return code
 
     def plainly(self, composed: dict[str, Any], words: list[str]) -> int:
@@ -303,6 +312,8 @@ def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
                 hydra.main(version_base="1.3", config_path=str(_configs()), config_name="config")(task)()
             except SystemExit as end:
                 return end.code if isinstance(end.code, int) and end.code != 1 else 2 if end.code else 0
+            except JobFailedError as end:
+                return end.code
             except Exception as error:
                 if _came_from_job(error):
                     raise

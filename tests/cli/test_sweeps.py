@@ -49,7 +49,7 @@ def test_jobs_of_several_processes_write_what_jobs_of_one_do(tmp_path: Path) -> 
 
 
 def test_a_job_that_is_wrong_leaves_the_others_pictures(tmp_path: Path) -> None:
-    done = sweep(tmp_path, "render.spp=1,-3", "out=y.exr")
+    done = sweep(tmp_path, "render.spp=1,-3,2", "out=y.exr")
     assert done.returncode == 2
     assert [line for line in done.stderr.splitlines() if line.startswith("torchpt: render.spp: expected")]
-    assert "Traceback" not in done.stderr and (tmp_path / "y_0.exr").exists()
+    assert "Traceback" not in done.stderr and all((tmp_path / f"y_{k}.exr").exists() for k in (0, 2))
