@@ -86,7 +86,8 @@ def _gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
     encoded = BytesIO()
     duration = times if len(times) > 1 else times[0]
     pictures[0].save(encoded, "GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
-    temporary.write_bytes(encoded.getbuffer())
+    with encoded.getbuffer() as content:
+        temporary.write_bytes(content)
 
 
 def _mp4(temporary: Path, frames: Iterable[Frame], fps: float) -> None:

@@ -112,7 +112,8 @@ def check_writable(path: str | PathLike[str], endings: tuple[str, ...] = WRITABL
         temporary = temporary_beside(destination)
         temporary.touch(exist_ok=False)
         temporary.unlink()
-        destination.exists()  # raises for a name too long
+        with suppress(FileNotFoundError):
+            os.stat(destination)  # a name too long is another error
         os.stat(destination.parent)
     except (OSError, ValueError) as problem:
         raise OutputError(path, reason_of(problem, destination)) from problem
@@ -189,7 +190,8 @@ def _encode_integer(temporary: Path, levels: np.ndarray) -> None:
     options: dict[str, Any] = {"quality": 95} if kind == "JPEG" else {}
     encoded = BytesIO()
     Image.fromarray(levels).save(encoded, kind, **options)  # a kind by name: else Pillow imports all that it knows
-    temporary.write_bytes(encoded.getbuffer())
+    with encoded.getbuffer() as content:
+        temporary.write_bytes(content)
 
 
 def _levels(pixels: np.ndarray, alpha: bool, exposure: float, tonemap: str, gamma: str | float) -> np.ndarray:
