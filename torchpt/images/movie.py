@@ -86,8 +86,7 @@ def _gif(temporary: Path, frames: Iterable[Frame], fps: float) -> None:
     encoded = BytesIO()
     duration = times if len(times) > 1 else times[0]
     pictures[0].save(encoded, "GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0)
-    with encoded.getbuffer() as content:
-        temporary.write_bytes(content)
+    temporary.write_bytes(encoded.getvalue())
 
 
 def _mp4(temporary: Path, frames: Iterable[Frame], fps: float) -> None:

@@ -190,8 +190,7 @@ def _encode_integer(temporary: Path, levels: np.ndarray) -> None:
     options: dict[str, Any] = {"quality": 95} if kind == "JPEG" else {}
     encoded = BytesIO()
     Image.fromarray(levels).save(encoded, kind, **options)  # a kind by name: else Pillow imports all that it knows
-    with encoded.getbuffer() as content:
-        temporary.write_bytes(content)
+    temporary.write_bytes(encoded.getvalue())
 
 
 def _levels(pixels: np.ndarray, alpha: bool, exposure: float, tonemap: str, gamma: str | float) -> np.ndarray:
