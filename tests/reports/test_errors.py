@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -16,11 +17,16 @@ from torchpt.settings import Film
 
 SHAPE = (40, 50, 3)
 
+needs_flip = pytest.mark.skipif(
+    find_spec("flip_evaluator") is None, reason="flip-evaluator is not installed (extra `compare`)"
+)
+
 
 def picture(seed: int) -> torch.Tensor:
     return torch.rand(SHAPE, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
+@needs_flip
 def test_an_exact_reference_gives_the_measures_of_all_pictures() -> None:
     image, exact = picture(0), Truth(picture(1), torch.zeros(SHAPE, dtype=torch.float64), (), {})
     found = measures(image, exact, MEASURES, Film())
@@ -48,6 +54,7 @@ def test_the_noise_of_the_reference_is_taken_off() -> None:
     assert debiased == pytest.approx(expected, rel=0.1) and plain == pytest.approx(5 * expected, rel=0.02)
 
 
+@needs_flip
 def test_what_has_no_value_is_not_a_number() -> None:
     small = Truth(torch.zeros(4, 4, 3, dtype=torch.float64), torch.zeros(4, 4, 3, dtype=torch.float64), (), {})
     found = measures(small.image, small, ("ssim", "flip", "relmse"), Film())
