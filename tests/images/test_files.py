@@ -228,7 +228,7 @@ def test_huge_headers_are_refused_before_memory_is_asked_for(tmp_path: Path, mon
         (tmp_path / "a.png").write_bytes(_png_claiming(size, size))
         with pytest.raises(AssetError, match="64 Mpixel|exceeds limit"):
             read_image(tmp_path / "a.png")
-    for width, problem in [(900000, "resolution|64 Mpixel"), (9000, "64 Mpixel")]:
+    for width, problem in [(900000, "resolution"), (9000, "64 Mpixel")]:
         header = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {width} +X {width}\n"
         (tmp_path / "a.hdr").write_bytes(header.encode() + b"\0" * 64)
         with pytest.raises(AssetError, match=problem):

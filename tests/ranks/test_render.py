@@ -289,6 +289,6 @@ def test_a_process_that_lost_a_rank_ends_well(tmp_path: Path) -> None:
         [sys.executable, "-c", LEFT_ALONE, str(tmp_path / "store")], capture_output=True, text=True, timeout=100.0
     )
     assert found.returncode == 0, found.stderr[-300:]
-    assert found.stdout.endswith(
-        "ranks: another rank did not answer for 0.5 s\n"
-    )  # older torch tells of its connections
+    # Older torch tells of its connections.
+    own = [line for line in found.stdout.splitlines() if not line.startswith("[Gloo] ")]
+    assert own == ["ranks: another rank did not answer for 0.5 s"]

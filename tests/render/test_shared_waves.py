@@ -61,6 +61,21 @@ def sizes(monkeypatch):
     return found
 
 
+@pytest.fixture
+def scarce(monkeypatch, sizes):
+    """The same, where there is memory for two renders and no more."""
+    take = crowd.take
+
+    def limited(works):
+        found = take(works)
+        if len(works) > 2:
+            raise MemoryError
+        return found
+
+    monkeypatch.setattr(crowd, "take", limited)
+    return sizes
+
+
 def same(scene, wishes, batch, cameras=CAMERAS, seeds=None):
     """Pictures, layers and facts of a batch are those of single renders."""
     for c, block in enumerate(cameras):
@@ -192,38 +207,20 @@ def test_a_wave_has_no_more_lanes_than_it_may(monkeypatch, sizes):
     same(scene, {}, batch)
 
 
-def test_where_memory_runs_out_waves_are_halved(monkeypatch):
-    sizes, take = [], crowd.take
-
-    def scarce(works):
-        sizes.append(len(works))
-        if len(works) > 2:
-            raise MemoryError
-        return take(works)
-
-    monkeypatch.setattr(crowd, "take", scarce)
+def test_where_memory_runs_out_waves_are_halved(monkeypatch, scarce):
     scene = room()
     batch = torchpt.render_batch(scene, CAMERAS * 2, full=True)
     # Ten are too many, and five, and three; what is left over is rendered alone.
-    assert sizes == [10, 5, 2, 3, 2, 5, 2, 3, 2]
+    assert scarce == [10, 5, 2, 3, 2, 5, 2, 3, 2]
     same(scene, {}, batch, CAMERAS * 2)
     monkeypatch.setattr(crowd, "take", lambda works: (_ for _ in ()).throw(MemoryError))
     same(scene, {}, torchpt.render_batch(scene, CAMERAS, full=True))
 
 
-def test_waves_stay_small_once_memory_ran_out(monkeypatch):
-    sizes, take = [], crowd.take
-
-    def scarce(works):
-        sizes.append(len(works))
-        if len(works) > 2:
-            raise MemoryError
-        return take(works)
-
-    monkeypatch.setattr(crowd, "take", scarce)
+def test_waves_stay_small_once_memory_ran_out(monkeypatch, scarce):
     monkeypatch.setitem(crowd.LANES, "cpu", 4 * 12 * 8 * 3)
     torchpt.render_batch([room(), room()], CAMERAS[:4])
-    assert sizes == [4, 2, 2, 2, 2]
+    assert scarce == [4, 2, 2, 2, 2]
 
 
 def test_scenes_are_rendered_before_the_next_is_loaded():

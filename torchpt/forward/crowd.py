@@ -130,7 +130,7 @@ def _lanes(run: Run) -> int | None:
     """How many samples a render has; None where its waves are its own: it has kernels, no fixed end, or bounded memory."""
     if run.loop is not None or not run.only_counts():
         return None
-    return run.width * run.height * run.settings.render.spp
+    return _work(run).lanes
 
 
 def _work(run: Run) -> Work:
