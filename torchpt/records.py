@@ -153,6 +153,8 @@ class Lights:
         Tensor | None
     )  # (K, 14) float64, see torchpt.lights.solid_angle.table_of; None without triangles and rectangles
     shapes: tuple[int, ...]  # codes of the shapes in `solid`; static
+    #: (S,) int64 the first row of each scene, in a world of several (torchpt.union); None: there is one
+    first: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -326,6 +328,7 @@ class Shadow:
     d: Tensor  # (3, N)
     t_max: Tensor  # (N,) in units of |d|; 0 where the light brings nothing
     radiance: Tensor  # (3, N)
+    scene: Tensor | None = None  # (N,) as of the paths
 
 
 @dataclass(frozen=True)
@@ -345,6 +348,7 @@ class PathState:
     #: same everywhere.
     p: Tensor | None = None
     n: Tensor | None = None
+    scene: Tensor | None = None  # (N,) int64 which scene of several; None: there is one
 
 
 R = TypeVar("R", PathState, Hit, Quadrics, Copies)

@@ -74,3 +74,18 @@ def test_cameras_of_a_batch_share_waves(integrator):
         own = batch[0, c]
         assert torch.equal(own.image, alone.image) and torch.equal(own.layers["depth"], alone.layers["depth"])
         assert (own.rays, own.spp, own.complete) == (alone.rays, alone.spp, True)
+
+
+@pytest.mark.parametrize("name", ["cornell_spheres", "instances", "many_lights", "shapes_and_maps"])
+def test_scenes_of_a_batch_share_waves(name):
+    """Likewise where each lane carries its scene."""
+    scene = torchpt.load(name, "cuda")
+    key = next(key for key in scene.params if key.endswith(".to_world") and key.startswith("shapes."))
+    poses = scene.params[key].repeat(3, 1, 1)
+    poses[:, 1, 3] += 0.01 * torch.arange(3, device="cuda")
+    wish = {"spp": 4, "film": {**FILM, "aovs": ["depth"]}, "compile": "off", "full": True}
+    batch = torchpt.render_batch(scene, params={key: poses}, **wish)
+    for s, pose in enumerate(poses):
+        alone, own = torchpt.render(scene, params={key: pose}, **wish), batch[s, 0]
+        assert torch.equal(own.image, alone.image) and torch.equal(own.layers["depth"], alone.layers["depth"])
+        assert own.rays == alone.rays

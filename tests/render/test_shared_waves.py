@@ -141,10 +141,18 @@ def test_paths_that_are_cut_are_counted_by_picture(monkeypatch, sizes):
 def test_scenes_one_after_another_each_with_its_cameras(sizes):
     scenes = [room(), room(film={**SIZE, "filter": "box"}), room()]
     batch = torchpt.render_batch(scenes, CAMERAS, full=True)
-    assert sizes == [5, 5, 5]
+    assert sizes == [5, 5, 5]  # their filters differ
     for s, scene in enumerate(scenes):
         for c, block in enumerate(CAMERAS):
             assert torch.equal(batch[s, c].image, torchpt.render(scene.seen_by(block)))
+
+
+def test_views_given_as_scenes(sizes):
+    scene = room()
+    views = [scene.seen_by(block) for block in CAMERAS]
+    batch = torchpt.render_batch(views, full=True)
+    assert sizes == [5]
+    assert all(torch.equal(batch[c, 0].image, torchpt.render(view)) for c, view in enumerate(views))
 
 
 def test_poses_and_parameters_of_the_camera(sizes):
@@ -223,13 +231,13 @@ def test_waves_stay_small_once_memory_ran_out(monkeypatch, scarce):
     assert scarce == [4, 2, 2, 2, 2]
 
 
-def test_scenes_are_rendered_before_the_next_is_loaded():
+def test_scenes_that_share_no_wave_are_rendered_before_the_next_is_loaded():
     told = []
 
     def scenes():
         for k in range(3):
             told.append(f"load {k}")
-            yield room()
+            yield room(integrator={"type": "ibl"})
 
     torchpt.render_batch(scenes(), CAMERAS[:2], on_progress=lambda done, total: told.append(done))
     assert told == ["load 0", 1, 2, "load 1", 3, 4, "load 2", 5, 6]
@@ -240,15 +248,6 @@ def test_pictures_with_kernels_do_not_overtake():
     scenes = [room(), room(render={"spp": 3, "device": "cpu"})]
     torchpt.render_batch(iter(scenes), on_progress=lambda done, total: told.append(done))
     assert told == [1, 2]
-
-
-def test_parameters_that_change_the_world_share_no_wave_with_others(sizes):
-    scene, colours = room(), torch.rand(2, 3)
-    batch = torchpt.render_batch(scene, CAMERAS[:3], params={PAINT: colours})
-    assert sizes == [3, 3]
-    for s, colour in enumerate(colours):
-        for c, block in enumerate(CAMERAS[:3]):
-            assert torch.equal(batch[s, c], torchpt.render(scene.seen_by(block), params={PAINT: colour}))
 
 
 def test_an_error_is_that_of_its_picture(monkeypatch):

@@ -41,14 +41,15 @@ class Lbvh(Accel):
         self.tree = build_tree(low[:, keep], high[:, keep], keep)
         self.build_seconds = time.perf_counter() - start
 
-    def _tensors(self) -> list[Tensor]:
+    def tensors(self) -> list[Tensor]:
+        """What the traversal reads."""
         return [self.corners, self.rows, self.quadrics, self.tree.children, self.tree.boxes, self.tree.order]
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
+        return _intersect(o, d, t_max, self.tensors(), self.counts, self.tree.depth)
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
+        return _occluded(o, d, t_max, self.tensors(), self.counts, self.tree.depth)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`."""
@@ -59,7 +60,7 @@ class Lbvh(Accel):
             "leaves": self.tree.order.shape[0],
             "sah_cost": sah_cost(self.tree),
             "depth": self.tree.depth,
-            "bytes": sum(x.nbytes for x in self._tensors()),
+            "bytes": sum(x.nbytes for x in self.tensors()),
             "build_seconds": self.build_seconds,
         }
 

@@ -1,4 +1,4 @@
-"""Renders of one scene by several cameras, as waves of tensor operations that they share: a lane carries its camera's ray.
+"""Renders that share waves of tensor operations: a lane carries its camera's ray, and which scene it is in.
 
 Small pictures by themselves fill no wave, and on CUDA a wave costs its launches, however few lanes it has.
 """
@@ -16,7 +16,9 @@ from torchpt.forward.piece import Piece, Work, take
 from torchpt.forward.result import Rendering
 from torchpt.forward.run import Run
 from torchpt.forward.schedule import LANES
+from torchpt.forward.shared import ROOM, alike, joinable, room_of
 from torchpt.integrators.loop.schedule import Share
+from torchpt.integrators.wave import Wave
 from torchpt.native.memory import let_go
 from torchpt.native.modes import undisturbed
 from torchpt.shortage import ran_out
@@ -33,7 +35,7 @@ class Entry:
         make: makes it ready for a number of threads; called when it is soon to begin.
         done: told of the rendering.
         failed: told of an error instead, which it may raise as another one.
-        last: whether none comes after it that could share a wave with it.
+        last: whether none of the same scene comes after it.
         run: once it is ready.
     """
 
@@ -61,6 +63,7 @@ class Crowd:
     def __init__(self) -> None:
         self._waiting: list[Entry] = []
         self._lanes = 0  # of those
+        self._room = 0  # bytes of their worlds
         self._most: int | None = None  # where memory did not suffice for the usual number
 
     def add(self, entry: Entry) -> None:
@@ -71,16 +74,28 @@ class Crowd:
             self.settle()
             _alone(entry)
             return
-        if self._waiting and (self._lanes + lanes > most or not _alike(entry.run, self._waiting[0].run)):
+        wave, room = entry.run.wave, self._room_for(entry.run.wave)
+        if self._waiting and (self._lanes + lanes > most or self._room + room > ROOM or not self._joins(entry.run)):
             self.settle()
+            room = self._room_for(wave)
         self._waiting.append(entry)
         self._lanes += lanes
-        if entry.last:
+        self._room += room
+        if entry.last and not joinable(wave):
             self.settle()
+
+    def _room_for(self, wave: Wave) -> int:
+        """Bytes that another world takes, where it is none of those that wait."""
+        known = any(entry.run.wave.stages.world is wave.stages.world for entry in self._waiting)
+        return 0 if known else room_of(wave)
+
+    def _joins(self, run: Run) -> bool:
+        first = self._waiting[0].run
+        return list(first.seen) == list(run.seen) and alike(first.wave, run.wave)
 
     def settle(self) -> None:
         """Do what waits."""
-        waiting, self._waiting, self._lanes = self._waiting, [], 0
+        waiting, self._waiting, self._lanes, self._room = self._waiting, [], 0, 0
         self._together(waiting)
 
     def _together(self, entries: list[Entry]) -> None:
@@ -136,17 +151,6 @@ def _lanes(run: Run) -> int | None:
 def _work(run: Run) -> Work:
     """All samples of a render."""
     return Work(run.wave, run.picture, run.light, (0, run.width * run.height, 0, run.settings.render.spp))
-
-
-def _alike(a: Run, b: Run) -> bool:
-    """Whether one wave can take the samples of both: they differ in their cameras and seeds alone.
-
-    Textures that average over footprints want to know of one camera. Compiled stages repeat lanes, which would count for one.
-    """
-    one, other = a.wave, b.wave
-    shared = one.stages.world is other.stages.world and one.accel is other.accel and one.filter is other.filter
-    same = one.stages.plan == other.stages.plan and a.integrator == b.integrator and list(a.seen) == list(b.seen)
-    return shared and same and one.stages.pixel is None and not one.stages.compiled and not other.stages.compiled
 
 
 def _alone(entry: Entry) -> None:

@@ -1,6 +1,6 @@
 """Several renders at once: their samples are one work list, and what is next is made ready while threads trace.
 
-By tensor operations, as on CUDA, pictures of a scene by several cameras share their waves.
+By tensor operations, as on CUDA, pictures of several cameras and scenes share their waves.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
     """Render them, each to the very bits that it has alone.
 
     Of renders which nothing but their number of samples ends, those that the compiled loop takes share threads and a work list,
-    and those by tensor operations (on CUDA above all) share waves, where they differ in cameras and seeds alone and follow each
-    other. Others are rendered one after another: to a time or an error, in bounded memory.
+    and those by tensor operations (on CUDA above all) share waves, where they follow each other and are
+    :func:`torchpt.forward.shared.alike`. Others are rendered one after another: to a time or an error, in bounded memory.
 
     Args:
         entries: what is to be rendered; taken one by one.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchpt.errors import RenderError
 from torchpt.forward.schedule import Span
+from torchpt.forward.shared import shared_wave
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
@@ -88,15 +89,13 @@ class Work:
 
 
 def take(works: Sequence[Work]) -> list[Piece]:
-    """Compute pieces by one wave, to the very bits that each has alone.
-
-    Several are of renders of one scene that differ in their cameras and seeds alone.
-    """
-    wave, plate, sizes = works[0].wave, works[0].plate, [work.lanes for work in works]
+    """Compute pieces by one wave, to the very bits that each has alone; several are :func:`torchpt.forward.shared.alike`."""
+    wave, scenes = shared_wave([work.wave for work in works])
+    plate, sizes = works[0].plate, [work.lanes for work in works]
     pieces = [Piece() for _ in works]
     if wave.integrator.light:
         tally = Tally() if len(works) == 1 else Tallies(sizes, wave.centre.device)
-        radiance = wave.brought(_state(works), tally)
+        radiance = wave.brought(_state(works, scenes), tally)
         finite = torch.isfinite(radiance).all(0)
         every = bool(finite.all())
         of_each = zip(works, pieces, radiance.split(sizes, 1), finite.split(sizes), tally.each(), strict=True)
@@ -104,7 +103,7 @@ def take(works: Sequence[Work]) -> list[Piece]:
             piece.tally = its
             _add_light(work, piece, own, None if every else known)
     if plate.layers:
-        layers = wave.seen(tuple(plate.layers), _state(works))
+        layers = wave.seen(tuple(plate.layers), _state(works, scenes))
         parts = {name: values.split(sizes, 1) for name, values in layers.items()}
         for number, (work, piece) in enumerate(zip(works, pieces, strict=True)):
             piece.tally.rays += work.lanes
@@ -115,12 +114,16 @@ def take(works: Sequence[Work]) -> list[Piece]:
     return pieces
 
 
-def _state(works: Sequence[Work]) -> PathState:
-    """The camera rays of all samples; their lanes follow each other."""
+def _state(works: Sequence[Work], scenes: Sequence[int] | None) -> PathState:
+    """The camera rays of all samples; their lanes follow each other. ``scenes``: which one each piece is of, of several."""
     states, before = [], 0
-    for work in works:
+    for number, work in enumerate(works):
         state = work.rays()
-        states.append(replace(state, lane=state.lane + before) if before else state)
+        if before:
+            state = replace(state, lane=state.lane + before)
+        if scenes is not None:
+            state = replace(state, scene=torch.full_like(state.lane, scenes[number]))
+        states.append(state)
         before += work.lanes
     return joined(states)
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpt.accel import Accel
+    from torchpt.accel.forest import Forest
     from torchpt.integrators.compiled import Stages
     from torchpt.integrators.first_surface import FirstSurface
     from torchpt.integrators.tally import Tally
@@ -104,7 +105,7 @@ class Integrator(Valued):
         """What happens at first surfaces, made once a scene and differentiable in its world; None where paths go on."""
         return None
 
-    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: Any, tally: Tally) -> Tensor:
+    def radiance(self, stages: Stages, accel: Accel | Forest, state: PathState, first: Any, tally: Tally) -> Tensor:
         """What camera rays bring.
 
         Args:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
+from torchpt.accel.forest import Forest
 from torchpt.integrators.base import Integrator
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import gather_light, partition
@@ -68,7 +69,9 @@ class FirstSurfaceIntegrator(Integrator):
 
     looped = True
 
-    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: FirstSurface, tally: Tally) -> Tensor:
+    def radiance(
+        self, stages: Stages, accel: Accel | Forest, state: PathState, first: FirstSurface, tally: Tally
+    ) -> Tensor:
         """See :class:`Integrator`."""
         plan, world = stages.plan, stages.world
         search = Search(accel, world, plan.sampler, plan.dtype)

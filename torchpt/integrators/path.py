@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchpt import lights
 from torchpt.accel import Accel
+from torchpt.accel.forest import Forest
 from torchpt.integrators.base import Integrator, Limits
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.plan import Plan
@@ -35,7 +36,7 @@ class PathIntegrator(Integrator):
 
     looped = True
 
-    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: None, tally: Tally) -> Tensor:
+    def radiance(self, stages: Stages, accel: Accel | Forest, state: PathState, first: None, tally: Tally) -> Tensor:
         """See :class:`Integrator`."""
         return trace(stages, self.limits, accel, state, tally)
 
@@ -43,7 +44,7 @@ class PathIntegrator(Integrator):
 def trace(
     stages: Stages,
     limits: Limits,
-    accel: Accel,
+    accel: Accel | Forest,
     state: PathState,
     tally: Tally,
     lanes: int | None = None,

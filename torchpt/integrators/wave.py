@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
+from torchpt.accel.forest import Forest
 from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.base import Integrator, Limits
@@ -40,6 +41,8 @@ class Wave:
         crop: ``(x, y, width, height)`` of the picture on the film.
         centre: ``(3,)`` float64, see Space.shift.
         first: what happens at first surfaces; None where paths go on.
+        forest: what is searched instead of ``accel`` where lanes are in several scenes (:mod:`torchpt.union`), whose world the
+            stages have; what is of one camera or one sampler here then has no say.
     """
 
     stages: Stages
@@ -51,6 +54,7 @@ class Wave:
     crop: tuple[int, int, int, int]
     centre: Tensor
     first: FirstSurface | None = None
+    forest: Forest | None = None
 
     @property
     def limits(self) -> Limits | None:
@@ -93,7 +97,7 @@ class Wave:
     def brought(self, state: PathState, tally: Tally | None = None) -> Tensor:
         """Radiance ``(3, N)`` that camera rays bring, weighted by the filter; ``tally`` counts what it takes."""
         tally = Tally() if tally is None else tally
-        radiance = self.integrator.radiance(self.stages, self.accel, state, self.first, tally)
+        radiance = self.integrator.radiance(self.stages, self.forest or self.accel, state, self.first, tally)
         return radiance * self.weight(state) if self.filter.signed else radiance
 
     def weight(self, state: PathState) -> Tensor:
@@ -120,7 +124,7 @@ class Wave:
         from torchpt.integrators import aov
 
         plan, world = self.stages.plan, self.stages.world
-        search = Search(self.accel, world, plan.sampler, plan.dtype)
+        search = Search(self.forest or self.accel, world, plan.sampler, plan.dtype)
         found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel, slide)
         return aov.weighted(found, self.weight(state)) if self.filter.signed else found
 

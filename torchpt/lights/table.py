@@ -9,6 +9,7 @@ gathered.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -48,6 +49,7 @@ def sample(
     offset: float,
     n: Tensor | None = None,
     mis: bool = True,
+    scene: Tensor | None = None,
 ) -> LightSample:
     """A point on the lights, seen from ``x (3, N)``.
 
@@ -61,13 +63,19 @@ def sample(
         n: normals ``(3, N)`` of surfaces that nothing lights from behind, zero for others; None: no such surface. Asked for
             where the choice is local, see :func:`torchpt.lights.choice.local`.
         mis: whether BSDF sampling shares the work: an environment map then leaves it the dim directions.
+        scene: where the table is that of several scenes, which one each lane has ``(N,)``.
     """
     row: Tensor | None = None
     probability: Tensor | float = 1.0
     if lights.choice is not None and which is not None:
-        row, probability, rest = choice.draw(lights.choice, which, x, n)
+        row, probability, rest = choice.draw(lights.choice, which, x, n, scene)
         u = torch.stack((rest.to(u.dtype).clamp_max(1.0 - 2.0**-24), u[1]))
+    if lights.first is not None and scene is not None:
+        first = take(lights.first, scene)
+        row = first if row is None else first + row
     at, number = taken(lights, row), _numbers(lights, row)
+    if scene is not None and lights.environment is not None:
+        at = replace(at, environment=_around(lights, scene))
     surfaces = _surfaces(lights)
     drawn = _on_surfaces(lights, at, row, number, x, u, offset, probability) if surfaces else None
     bare: Tensor | None = None
@@ -174,7 +182,9 @@ def _textured(
     return Interaction(p, normal, normal, None, None, prim, prim, None, place[0], place[1], own)
 
 
-def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def emitted(
+    lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None, scene: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """What emitters that were hit send back along ``wi``.
 
     Args:
@@ -183,6 +193,7 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | 
         at: points on emissive primitives.
         wi: unit directions from ``x`` to them ``(3, N)``.
         n: normals ``(3, N)`` where they came from, as :func:`sample` was given them.
+        scene: as of :func:`sample`.
 
     Returns:
         Radiance ``(3, N)``, zero from behind, and the density ``(N,)`` with which :func:`sample` would have drawn ``wi``.
@@ -198,7 +209,9 @@ def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | 
         facing = dot(wi, at.ng) < 0
         pdf = safe_reciprocal(inverse)
         if lights.choice is not None and row is not None:
-            pdf = pdf * choice.probability(lights.choice, row, x, n)
+            if lights.first is not None and scene is not None:
+                row = row - take(lights.first, scene)
+            pdf = pdf * choice.probability(lights.choice, row, x, n, scene)
         pdf = torch.where(facing, pdf, 0.0)
     return torch.where(facing, table.radiance, 0.0), pdf
 
@@ -210,10 +223,18 @@ def _environment(lights: Lights) -> type[Environment]:
     return kind
 
 
-def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
-    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS."""
-    radiance, pdf = _environment(lights).arriving(lights.environment, d, mis=True)
-    return radiance, pdf * choice.environment(lights.choice)
+def _around(lights: Lights, scene: Tensor | None) -> Any:
+    """What the environment's functions are given; of several scenes' what the lanes have."""
+    return lights.environment if scene is None else _environment(lights).of(lights.environment, scene)
+
+
+def environment(lights: Lights, d: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS.
+
+    ``scene``: as of :func:`sample`.
+    """
+    radiance, pdf = _environment(lights).arriving(_around(lights, scene), d, mis=True)
+    return radiance, pdf * choice.environment(lights.choice, scene)
 
 
 def surroundings(lights: Lights | None) -> Surroundings | None:

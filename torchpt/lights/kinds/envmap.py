@@ -21,8 +21,9 @@ less than a tenth of its light above the mean, spread over more than a tenth of 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -32,7 +33,7 @@ from torch import Tensor
 from torchpt.images.given import TEXELS, check_source, texels_of
 from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.math.angles import azimuth
-from torchpt.math.distributions import Cells, invert_linear
+from torchpt.math.distributions import Cells, Spans, invert_linear
 from torchpt.math.threads import sum_all
 from torchpt.math.vectors import dot, luminance, safe_reciprocal, take
 from torchpt.records import Lights, LightSample
@@ -42,7 +43,19 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = ["EVEN", "EnvironmentMap", "Envmap", "Grid", "build", "environment", "pdf", "radiance", "sample"]
+__all__ = [
+    "EVEN",
+    "EnvironmentMap",
+    "Envmap",
+    "Grid",
+    "build",
+    "environment",
+    "joined",
+    "of",
+    "pdf",
+    "radiance",
+    "sample",
+]
 
 #: A map is near-constant with less than this share of its light above the mean, over more than this share of the sphere.
 EVEN = 0.1
@@ -80,6 +93,9 @@ class EnvironmentMap:
         mean: ``()`` mean luminance over the sphere, ``scale`` left out; detached.
         plain: the density by luminance.
         compensated: the density for MIS; None where it is ``plain``.
+        starts: ``(3, N)`` int64, where a lane's own map begins among those of several scenes: in ``texels``, in ``halves``, in
+            ``steps``; then ``size``, ``turn``, ``scale`` and what the densities hold of one number are lanes' too. None: there
+            is one map.
     """
 
     texels: Tensor
@@ -93,6 +109,7 @@ class EnvironmentMap:
     mean: Tensor
     plain: Grid
     compensated: Grid | None
+    starts: Tensor | None = None
 
     def grid(self, mis: bool) -> Grid:
         """The density in use: for MIS with BSDF sampling, or alone."""
@@ -177,7 +194,8 @@ class _Place(NamedTuple):
 
 def _place(map: EnvironmentMap, d: Tensor) -> _Place:
     """The cells of unit directions ``(3, N)`` of the world."""
-    local = [dot(map.turn[k][:, None], d) for k in range(3)]
+    turn = map.turn if map.turn.dim() > 2 else map.turn[..., None]
+    local = [dot(turn[k], d) for k in range(3)]
     square = torch.addcmul(local[0] * local[0], local[2], local[2])
     radius = square.clamp_min(torch.finfo(d.dtype).tiny).sqrt()
     # Not by acos, which near the poles knows an angle only to a square root of the rounding.
@@ -199,6 +217,8 @@ def _corners(map: EnvironmentMap, row: Tensor, column: Tensor) -> _Corners:
     width = map.size[1]
     right = torch.where(column == width - 1, 0, column + 1)
     first = row * width
+    if map.starts is not None:
+        first = first + map.starts[0]
     return (
         take(map.texels, first + column),
         take(map.texels, first + right),
@@ -223,7 +243,8 @@ def _density(map: EnvironmentMap, grid: Grid, at: _Place, corners: _Corners) -> 
     step = math.pi / (map.size[0] - 1).to(at.y.dtype)
     y = at.y.detach()
     # A difference of cosines as a product, which does not cancel.
-    down = torch.sin((0.5 * step) * y) * torch.sin(step * (at.row + 0.5 * y)) * take(map.steps, at.row)
+    place = at.row if map.starts is None else at.row + map.starts[2]
+    down = torch.sin((0.5 * step) * y) * torch.sin(step * (at.row + 0.5 * y)) * take(map.steps, place)
     return _mix(_values(grid, corners), at.x.detach(), down.clamp_max(1.0)) * grid.factor
 
 
@@ -266,7 +287,8 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
         down = invert_linear(rest[1], a + b, c + d)
         x = invert_linear(rest[0], a + (c - a) * down, b + (d - b) * down)
         density = _mix((a, b, c, d), x, down) * grid.factor
-        above, below = take(map.halves, row), take(map.halves, row + 1)
+        place = row if map.starts is None else row + map.starts[1]
+        above, below = take(map.halves, place), take(map.halves, place + 1)
         half = above + (below - above) * down
         tall, wide = map.size[0].to(u.dtype), map.size[1].to(u.dtype)
         phi = (x + (column + 0.5)) * (2.0 * math.pi / wide)
@@ -279,6 +301,62 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
     if map.turn.requires_grad:
         return wi, density, radiance(map, wi)  # which follows the turn
     return wi, density, _mix(corners, x, y) * map.scale
+
+
+def joined(maps: Sequence[EnvironmentMap]) -> EnvironmentMap:
+    """The maps of several scenes one after another, for :func:`of`; numbers of a map are ``(..., S)``."""
+
+    def starts(sizes: list[int]) -> list[int]:
+        return [0, *accumulate(sizes)][:-1]
+
+    def grid(grids: Sequence[Grid]) -> Grid:
+        cells = [grid.cells for grid in grids]
+        device = cells[0].rows.device
+        rows, columns = (
+            Spans.of([len(x) for x in own], device) for own in zip(*((c.rows, c.columns) for c in cells), strict=True)
+        )
+        every = Cells(
+            torch.cat([c.rows for c in cells]),
+            torch.cat([c.columns for c in cells]),
+            torch.stack([c.width for c in cells]),
+            (rows, columns, torch.arange(len(cells), device=device)),
+        )
+        return Grid(every, torch.stack([g.floor for g in grids]), torch.stack([g.factor for g in grids]))
+
+    one, heights = maps[0], [map.height for map in maps]
+    begin = [starts([map.texels.shape[1] for map in maps]), starts(heights), starts([h - 1 for h in heights])]
+    finer = [map.compensated for map in maps if map.compensated is not None]
+    return EnvironmentMap(
+        texels=torch.cat([map.texels for map in maps], 1),
+        height=max(heights),
+        width=max(map.width for map in maps),
+        size=torch.stack([map.size for map in maps], 1),
+        turn=torch.stack([map.turn for map in maps], 2),
+        scale=torch.stack([map.scale for map in maps]),
+        halves=torch.cat([map.halves for map in maps], 1),
+        steps=torch.cat([map.steps for map in maps]),
+        mean=torch.stack([map.mean for map in maps]),
+        plain=grid([map.plain for map in maps]),
+        compensated=grid(finer) if finer else None,
+        starts=torch.tensor(begin, device=one.texels.device),
+    )
+
+
+def of(maps: EnvironmentMap, scene: Tensor) -> EnvironmentMap:
+    """Of what was :func:`joined` the numbers that lanes of scenes ``(N,)`` have, in place of those of one map."""
+
+    def grid(grid: Grid) -> Grid:
+        assert grid.cells.spans is not None
+        rows, columns, _ = grid.cells.spans
+        cells = replace(grid.cells, width=take(grid.cells.width, scene), spans=(rows, columns, scene))
+        return Grid(cells, take(grid.floor, scene), take(grid.factor, scene))
+
+    assert maps.starts is not None
+    own = {name: take(getattr(maps, name), scene) for name in ("size", "scale", "mean", "starts")}
+    turn = take(maps.turn.reshape(9, -1), scene).view(3, 3, -1)
+    return replace(
+        maps, **own, turn=turn, plain=grid(maps.plain), compensated=maps.compensated and grid(maps.compensated)
+    )
 
 
 class Envmap(Environment):
@@ -340,6 +418,16 @@ class Envmap(Environment):
     def arriving(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
         """See :class:`Environment`."""
         return environment(around, d, mis)
+
+    @classmethod
+    def joined(cls, arounds: Sequence[EnvironmentMap]) -> EnvironmentMap:
+        """See :class:`Environment`."""
+        return joined(arounds)
+
+    @classmethod
+    def of(cls, around: EnvironmentMap, scene: Tensor) -> EnvironmentMap:
+        """See :class:`Environment`."""
+        return of(around, scene)
 
     @classmethod
     def surroundings(cls, around: EnvironmentMap) -> Surroundings:
