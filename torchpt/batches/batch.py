@@ -94,7 +94,7 @@ def render_batch(
 
     Picture ``[s, c]`` is to the bit ``torchpt.render(scenes[s].seen_by(cameras[c]), params=..., seed=...)``. Threads share one
     list of work over all pictures, and what is next is made ready while they trace. Worlds, search structures and kernels are
-    made once for all cameras of a scene. By tensor operations (on CUDA above all) pictures of one scene share waves, and those of
+    made once for all cameras of a scene. By tensor operations (on CUDA above all) pictures of a scene share waves, and those of
     scenes of one form. One after another are rendered all that a time or an error ends, in bounded memory, or by several
     ``ranks`` (which share each picture's pixels).
 

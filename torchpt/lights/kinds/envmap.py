@@ -22,8 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import accumulate
+from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -31,9 +30,10 @@ import torch
 from torch import Tensor
 
 from torchpt.images.given import TEXELS, check_source, texels_of
+from torchpt.lights import several_maps
 from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.math.angles import azimuth
-from torchpt.math.distributions import Cells, Spans, invert_linear
+from torchpt.math.distributions import Cells, invert_linear
 from torchpt.math.threads import sum_all
 from torchpt.math.vectors import dot, luminance, safe_reciprocal, take
 from torchpt.records import Lights, LightSample
@@ -43,19 +43,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = [
-    "EVEN",
-    "EnvironmentMap",
-    "Envmap",
-    "Grid",
-    "build",
-    "environment",
-    "joined",
-    "of",
-    "pdf",
-    "radiance",
-    "sample",
-]
+__all__ = ["EVEN", "EnvironmentMap", "Envmap", "Grid", "build", "environment", "pdf", "radiance", "sample"]
 
 #: A map is near-constant with less than this share of its light above the mean, over more than this share of the sphere.
 EVEN = 0.1
@@ -93,9 +81,9 @@ class EnvironmentMap:
         mean: ``()`` mean luminance over the sphere, ``scale`` left out; detached.
         plain: the density by luminance.
         compensated: the density for MIS; None where it is ``plain``.
-        starts: ``(3, N)`` int64, where a lane's own map begins among those of several scenes: in ``texels``, in ``halves``, in
-            ``steps``; then ``size``, ``turn``, ``scale`` and what the densities hold of one number are lanes' too. None: there
-            is one map.
+        starts: where lanes have the maps of several scenes (:mod:`torchpt.lights.several_maps`), ``(3, N)`` int64: where a lane's
+            own begins in ``texels``, ``halves`` and ``steps``. Then ``size``, ``turn``, ``scale`` and the densities' numbers are
+            lanes' too. None: there is one map.
     """
 
     texels: Tensor
@@ -303,62 +291,6 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
     return wi, density, _mix(corners, x, y) * map.scale
 
 
-def joined(maps: Sequence[EnvironmentMap]) -> EnvironmentMap:
-    """The maps of several scenes one after another, for :func:`of`; numbers of a map are ``(..., S)``."""
-
-    def starts(sizes: list[int]) -> list[int]:
-        return [0, *accumulate(sizes)][:-1]
-
-    def grid(grids: Sequence[Grid]) -> Grid:
-        cells = [grid.cells for grid in grids]
-        device = cells[0].rows.device
-        rows, columns = (
-            Spans.of([len(x) for x in own], device) for own in zip(*((c.rows, c.columns) for c in cells), strict=True)
-        )
-        every = Cells(
-            torch.cat([c.rows for c in cells]),
-            torch.cat([c.columns for c in cells]),
-            torch.stack([c.width for c in cells]),
-            (rows, columns, torch.arange(len(cells), device=device)),
-        )
-        return Grid(every, torch.stack([g.floor for g in grids]), torch.stack([g.factor for g in grids]))
-
-    one, heights = maps[0], [map.height for map in maps]
-    begin = [starts([map.texels.shape[1] for map in maps]), starts(heights), starts([h - 1 for h in heights])]
-    finer = [map.compensated for map in maps if map.compensated is not None]
-    return EnvironmentMap(
-        texels=torch.cat([map.texels for map in maps], 1),
-        height=max(heights),
-        width=max(map.width for map in maps),
-        size=torch.stack([map.size for map in maps], 1),
-        turn=torch.stack([map.turn for map in maps], 2),
-        scale=torch.stack([map.scale for map in maps]),
-        halves=torch.cat([map.halves for map in maps], 1),
-        steps=torch.cat([map.steps for map in maps]),
-        mean=torch.stack([map.mean for map in maps]),
-        plain=grid([map.plain for map in maps]),
-        compensated=grid(finer) if finer else None,
-        starts=torch.tensor(begin, device=one.texels.device),
-    )
-
-
-def of(maps: EnvironmentMap, scene: Tensor) -> EnvironmentMap:
-    """Of what was :func:`joined` the numbers that lanes of scenes ``(N,)`` have, in place of those of one map."""
-
-    def grid(grid: Grid) -> Grid:
-        assert grid.cells.spans is not None
-        rows, columns, _ = grid.cells.spans
-        cells = replace(grid.cells, width=take(grid.cells.width, scene), spans=(rows, columns, scene))
-        return Grid(cells, take(grid.floor, scene), take(grid.factor, scene))
-
-    assert maps.starts is not None
-    own = {name: take(getattr(maps, name), scene) for name in ("size", "scale", "mean", "starts")}
-    turn = take(maps.turn.reshape(9, -1), scene).view(3, 3, -1)
-    return replace(
-        maps, **own, turn=turn, plain=grid(maps.plain), compensated=maps.compensated and grid(maps.compensated)
-    )
-
-
 class Envmap(Environment):
     """An environment given by a picture of all directions."""
 
@@ -422,12 +354,12 @@ class Envmap(Environment):
     @classmethod
     def joined(cls, arounds: Sequence[EnvironmentMap]) -> EnvironmentMap:
         """See :class:`Environment`."""
-        return joined(arounds)
+        return several_maps.joined(arounds)
 
     @classmethod
     def of(cls, around: EnvironmentMap, scene: Tensor) -> EnvironmentMap:
         """See :class:`Environment`."""
-        return of(around, scene)
+        return several_maps.of(around, scene)
 
     @classmethod
     def surroundings(cls, around: EnvironmentMap) -> Surroundings:
