@@ -81,9 +81,9 @@ class EnvironmentMap:
         mean: ``()`` mean luminance over the sphere, ``scale`` left out; detached.
         plain: the density by luminance.
         compensated: the density for MIS; None where it is ``plain``.
-        starts: where lanes have the maps of several scenes (:mod:`torchpt.lights.several_maps`), ``(3, N)`` int64: where a lane's
-            own begins in ``texels``, ``halves`` and ``steps``. Then ``size``, ``turn``, ``scale`` and the densities' numbers are
-            lanes' too. None: there is one map.
+        starts: ``(3, N)`` int64 where lanes have the maps of several scenes (:mod:`torchpt.lights.several_maps`): where
+            their own begin in ``texels``, ``halves``, ``steps``. Then ``size``, ``turn``, ``scale`` and the densities'
+            numbers are the lanes' too. None: there is one map.
     """
 
     texels: Tensor
