@@ -72,6 +72,7 @@ def test_a_small_render_imports_nothing_needless(tmp_path: Path) -> None:
     assert json.loads(done.stdout.splitlines()[-1]) == []
 
 
+@pytest.mark.slow
 def test_the_first_pixel_is_not_far_behind_torch(tmp_path: Path) -> None:
     words = ("-m", "torchpt", *SMALL, f"out={tmp_path}/a.png")
     cpu_seconds(*words)  # may compile
@@ -89,6 +90,7 @@ def test_the_first_pixel_is_close_behind_torch(tmp_path: Path) -> None:
 UNIX_ONLY = ("fcntl", "grp", "pwd", "resource", "termios")
 
 
+@pytest.mark.slow
 def test_nothing_of_unix_alone_is_needed() -> None:
     """Imported and rendered with what Windows lacks taken away; torch and numba, which bring their own ways, come first."""
     code = f"""

@@ -64,6 +64,7 @@ def test_import_loads_no_numba():
 
 
 @pytest.mark.parametrize("layer", ["default", "workqueue"])
+@pytest.mark.slow
 def test_two_python_threads(layer, expected):
     body = """
     out = []
@@ -94,6 +95,7 @@ def test_worker_processes_after_the_parent_worked(method, expected, tmp_path):
     assert done.stdout.split() == [expected] * 4
 
 
+@pytest.mark.slow
 def test_no_folder_for_the_cache():
     body = """
     from numba.core import caching

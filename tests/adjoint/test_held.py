@@ -85,6 +85,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("tent", "mitchel
 
 
 @pytest.mark.parametrize("filter", ["box", "gaussian", *SLOW])
+@pytest.mark.slow
 def test_agrees_with_differences(filter):
     scene = torchpt.load({**CORNER, "film": {**CORNER["film"], "filter": filter}}, "cpu")
     name, step = "camera.to_world", 0.04

@@ -18,6 +18,7 @@ PLATE = {"type": "diffuse", "reflectance": [0.6, 0.5, 0.4]}
 NAME = "materials.plate.reflectance"
 
 
+@pytest.mark.slow
 def test_bits_do_not_depend_on_threads_nor_memory(monkeypatch):
     from torchpt.adjoint import loop
 
@@ -30,6 +31,7 @@ def test_bits_do_not_depend_on_threads_nor_memory(monkeypatch):
         assert all(torch.equal(first, other) for other in others)
 
 
+@pytest.mark.slow
 def test_bits_do_not_depend_on_memory_by_tensor_operations():
     scene = torchpt.load(room(PLATE), "cpu")
     first, other = (gradient_of(scene, NAME, compile="off", max_memory=memory) for memory in (None, "3GB"))

@@ -37,6 +37,7 @@ def test_a_reader_that_has_enough_is_no_error(words: str, tmp_path: Path) -> Non
     assert (tmp_path / "a.png").exists() == words.startswith("render s")
 
 
+@pytest.mark.slow
 def test_a_reader_that_is_gone_already(tmp_path: Path) -> None:
     found = shell(f"{TORCHPT} render {SMALL} | true", tmp_path)
     assert found.returncode == 0 and "Traceback" not in found.stderr and (tmp_path / "a.png").exists()
@@ -86,6 +87,7 @@ def test_a_working_folder_that_is_gone(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_picture_whose_folder_went_away_is_saved_elsewhere(tmp_path: Path) -> None:
     place, home = tmp_path / "place", tmp_path / "home"
     place.mkdir()
@@ -167,6 +169,7 @@ def test_a_file_that_grows_no_further_leaves_nothing_half_written(tmp_path: Path
 
 
 @pytest.mark.skipif(os.name != "posix", reason="processes are asked by signals")
+@pytest.mark.slow
 def test_folders_of_killed_sweeps_go_with_the_next(tmp_path: Path) -> None:
     """Hydra's sweeper wants a folder; that of a process which is gone is nobody's, that of a living one is not touched."""
     gone = subprocess.Popen([sys.executable, "-c", ""])

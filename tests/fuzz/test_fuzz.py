@@ -23,7 +23,7 @@ LONG = {"documents": 10_000, "assets": 4_000}
 BATCH = 500
 
 
-@pytest.mark.parametrize(("family", "count"), [("documents", 40), ("assets", 80)])
+@pytest.mark.parametrize(("family", "count"), [("documents", 15), ("assets", 30)])
 def test_damaged_input_is_refused_in_a_line(
     family: str, count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

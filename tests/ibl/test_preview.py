@@ -123,6 +123,7 @@ def test_a_lone_convex_body_is_as_the_path_tracer_has_it(material: dict[str, Any
         assert float(found[3:13, 3:13].mean()) == pytest.approx(float(wanted[3:13, 3:13].mean()), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_other_lights_are_added_with_their_shadows(sky: dict[str, Any]) -> None:
     point = {"bulb": {"type": "point", "position": [0.0, 0.0, 3.0], "intensity": 5.0}}
     lamp = {"type": "rectangle", "emission": 4.0, "transform": [{"scale": 0.2}, {"translate": [0, 0.3, -2.5]}]}

@@ -153,6 +153,7 @@ class _Recorder(TorchDispatchMode):
         return out
 
 
+@pytest.mark.slow
 def test_the_audit_covers_what_waves_use(monkeypatch):
     recorder = _Recorder()
 
@@ -239,6 +240,7 @@ def _large(folder: Path) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_no_operation_of_a_render_depends_on_the_threads(tmp_path):
     """From the files to the picture and its error; waves, and what is made for them once."""
     description = _large(tmp_path)

@@ -74,8 +74,8 @@ SLOW = pytest.mark.slow
     [
         (0.99, "mis", "on"),
         (0.99, "bsdf", "off"),
-        (0.999, "mis", "on"),
-        (0.999, "bsdf", "on"),
+        pytest.param(0.999, "mis", "on", marks=SLOW),
+        pytest.param(0.999, "bsdf", "on", marks=SLOW),
         pytest.param(0.99, "mis", "off", marks=SLOW),
         pytest.param(0.999, "mis", "off", marks=SLOW),
         pytest.param(0.999, "bsdf", "off", marks=SLOW),

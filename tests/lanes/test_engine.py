@@ -67,6 +67,7 @@ def again() -> None:
     cache._tidied.cache_clear()
 
 
+@pytest.mark.slow
 def test_second_process_compiles_nothing(tmp_path):
     folder = tmp_path / "deep" / "kernels"
     assert finish(start(folder)) == (2, 0)
@@ -78,6 +79,7 @@ def test_second_process_compiles_nothing(tmp_path):
     assert [(path.name, path.stat().st_mtime_ns) for path in entries(folder)] == before
 
 
+@pytest.mark.slow
 def test_two_processes_at_once(tmp_path):
     processes = [start(tmp_path / "kernels") for _ in range(2)]
     assert all(sum(finish(process)) == 2 for process in processes)

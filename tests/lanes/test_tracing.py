@@ -264,6 +264,7 @@ print(hashlib.sha256(test_tracing.trace(test_tracing.many, test_tracing.X, table
 """
 
 
+@pytest.mark.slow
 def test_ir_is_the_same_in_every_process():
     folder = os.path.dirname(__file__)
     found = set()

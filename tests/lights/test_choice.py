@@ -178,6 +178,7 @@ def test_weights_of_both_strategies_sum_to_one(sky):
 
 
 @pytest.mark.parametrize("strategy", ["mis", "light"])
+@pytest.mark.slow
 def test_the_picture_does_not_depend_on_the_choice(strategy):
     scene = torchpt.load(every_kind(), device="cpu")
     pictures = {}
@@ -238,6 +239,7 @@ def test_a_floor_under_many_points_and_its_derivatives():
     assert float(intensity[0]) == pytest.approx(float(powers.grad[strongest]), rel=0.05)
 
 
+@pytest.mark.slow
 def test_compiled_stages_choose_by_the_tree_too():
     description = every_kind()
     for shape in description["shapes"].values():

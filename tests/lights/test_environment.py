@@ -158,6 +158,7 @@ def test_a_black_map(tmp_path):
     torch.testing.assert_close(shoot(lit, 4).image, shoot(alone, 4).image, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_pictures_are_linear_in_the_map(quadrants):
     """So the derivative with respect to texels and scale is exact: the picture is their sum weighted by it."""
     scene = torchpt.load(under({"type": "envmap", "path": str(quadrants), "scale": 1.5}), "cpu")

@@ -148,6 +148,7 @@ def check(scene: torchpt.Scene, truth: Truth, way: str, count: int) -> None:
 
 
 @pytest.mark.parametrize("way", ["one render", "two renders, shared samples"])
+@pytest.mark.slow
 def test_which_gradients_are_without_bias(scene, truth, way):
     check(scene, truth, way, 40)
 
@@ -158,6 +159,7 @@ def test_which_gradients_are_without_bias_by_many_renders(scene, truth, way):
     check(scene, truth, way, 1500)
 
 
+@pytest.mark.slow
 def test_the_value_of_one_render_holds_its_variance_and_that_of_two_does_not(scene, truth):
     picture = ALBEDO * truth.mean
     right, variance = float((picture - truth.target).square().mean()), ALBEDO**2 * float(truth.variance.mean())

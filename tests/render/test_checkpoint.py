@@ -259,7 +259,7 @@ def killed(folder: Path, kills: int, spp: int) -> tuple[int, int]:
 @pytest.mark.parametrize("kills", [2, pytest.param(200, marks=pytest.mark.slow)])
 def test_the_bits_after_kills(kills: int, tmp_path: Path) -> None:
     """At random times; no file is lost, and none of those that were being written comes to be taken for whole."""
-    spp = 250 * kills + 2000
+    spp = 300 * kills + 500
     done, after = killed(tmp_path, kills, spp)
     film = {"width": 96, "height": 96, "aovs": ["albedo"]}
     whole = torchpt.render(torchpt.load("cornell_box", "cpu"), spp=spp, film=film, pilots=True, full=True)

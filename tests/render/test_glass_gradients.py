@@ -178,6 +178,7 @@ WORN = {"type": "blend", "weight": 0.4, "a": {"type": "diffuse", "reflectance": 
         pytest.param(under_a_lamp(WORN), of_it(weight=0.05), 4, 8, id="blend"),
     ],
 )
+@pytest.mark.slow
 def test_gradients_agree_with_differences_in_the_mean(scene, wanted, spp, spp_difference):
     judge(scene, wanted, spp, spp_difference)
 

@@ -192,9 +192,10 @@ def scene_of(tmp_path) -> Callable[[str], torchpt.Scene]:
 
 
 def slow(name: str, mode: str) -> list[pytest.MarkDecorator]:
-    """Where kernels take long to compile; rows that are left compile most of what these do."""
+    """Where kernels take long to compile, or one of a kind is left that shows the same."""
     rows = ("many lights", "textures and normal maps", "strategy light", "some materials")
-    return [pytest.mark.slow] * (mode == "compiled" and name in rows)
+    others = name.startswith(("sampler ", "filter ", "strategy ")) and name not in ("sampler sobol", "filter mitchell")
+    return [pytest.mark.slow] * (others or (mode == "compiled" and name in rows))
 
 
 @pytest.mark.parametrize(

@@ -60,13 +60,17 @@ def agreeing(name: str | Mapping[str, Any], side: int, samples: int, **wishes: A
     return set(found.kernels())
 
 
-@pytest.mark.parametrize("name", ["cornell_box", "games101_spheres", "env_teapot"])
+@pytest.mark.parametrize(
+    "name",
+    ["cornell_box", *(pytest.param(name, marks=pytest.mark.slow) for name in ("games101_spheres", "env_teapot"))],
+)
 def test_kernels_beside_stages(name):
     kernels = agreeing(name, 24, 8)
     assert "generate" in kernels and "nearest" in kernels
     assert any(kernel.endswith("with roulette") for kernel in kernels)
 
 
+@pytest.mark.slow
 def test_kernels_of_surfaces_that_let_rays_through():
     kernels = agreeing(showcase("lace", "lattice", "glass", "tiles"), 32, 8)
     assert {"apart bounce dielectric", "apart escape", "apart emit", "light", "nearest"} <= kernels

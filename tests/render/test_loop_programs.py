@@ -78,6 +78,7 @@ TEXTURED: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("which", ["cornell_box", "textured"])
+@pytest.mark.slow
 def test_the_same_scene_otherwise(work, which):
     scene = torchpt.load(TEXTURED if which == "textured" else which, "cpu")
     rendered(scene, render={"spp": 16})  # so many paths that all stages are asked for
@@ -134,6 +135,7 @@ def test_another_scene_of_the_same_structure(work):
     assert float((found.image - eager.image).abs().mean()) < 1e-3 * float(eager.image.mean())
 
 
+@pytest.mark.slow
 def test_larger_pictures_and_maps(work, tmp_path):
     from torchpt.images import write_image
 

@@ -120,6 +120,7 @@ def test_failures_again_and_again_halve_waves_further(box, kind, capsys):
     assert capsys.readouterr().err.count("memory ran out") == 1
 
 
+@pytest.mark.slow
 def test_where_a_single_lane_does_not_fit_it_is_one_line(box):
     with (
         in_pieces(lambda k: True, MemoryError),
@@ -200,6 +201,7 @@ def looped(scene: torchpt.Scene, threads: int = 2, **film: Any) -> Any:
 
 
 @pytest.mark.parametrize("threads", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
 def test_the_compiled_loop_goes_on_with_one_thread_and_fewer_lanes(box, monkeypatch, capsys, threads):
     whole = looped(box, threads)
     made, kept = [0], rows.Memory.__init__
@@ -235,6 +237,7 @@ def test_chunks_of_the_loop_are_added_whole(box, monkeypatch, method):
     assert same(looped(box), whole)
 
 
+@pytest.mark.slow
 def test_the_loop_ends_in_a_line_where_nothing_fits(box, monkeypatch):
     def failing(self: Worker, *args: Any) -> Any:
         raise MemoryError

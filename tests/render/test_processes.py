@@ -70,7 +70,8 @@ def run(tmp_path: Path, body: str, name: str, environment: dict[str, str]) -> li
     return found.stdout.split()
 
 
-@pytest.mark.parametrize("name", ["cornell_box", "cornell_bunny"])  # both CPU searches: packets and the wide tree
+# Both CPU searches: packets and the wide tree.
+@pytest.mark.parametrize("name", ["cornell_box", pytest.param("cornell_bunny", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("way", SCRIPTS)
 def test_threads_and_workers_give_the_same_picture(tmp_path, way, name):
     assert set(run(tmp_path, SCRIPTS[way], name, {})) == {expected(name)}
@@ -83,6 +84,7 @@ def test_under_the_workqueue_layer(tmp_path, way):
     assert set(found) == {expected("cornell_box")}
 
 
+@pytest.mark.slow
 def test_without_a_writable_cache_folder(tmp_path):
     # A copy of the package beside which nothing can be written, and no home to fall back to.
     blocked = tmp_path / "file"

@@ -183,7 +183,7 @@ def test_gradients_are_those_of_single_renders():
 @pytest.mark.parametrize(
     "wishes",
     (
-        {"max_memory": "4GB"},
+        pytest.param({"max_memory": "4GB"}, marks=pytest.mark.slow),
         {"time_limit": 100.0},
         {"pilots": True},
         {"compile": "auto"},  # kernels
@@ -215,6 +215,7 @@ def test_a_wave_has_no_more_lanes_than_it_may(monkeypatch, sizes):
     same(scene, {}, batch)
 
 
+@pytest.mark.slow
 def test_where_memory_runs_out_waves_are_halved(monkeypatch, scarce):
     scene = room()
     batch = torchpt.render_batch(scene, CAMERAS * 2, full=True)

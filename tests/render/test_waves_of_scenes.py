@@ -281,7 +281,9 @@ def test_scenes_of_one_form(kind, accel, waves):
     ),
     ids=str,
 )
-@pytest.mark.parametrize("kind", (plain, lit, textured), ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize(
+    "kind", (plain, *(pytest.param(kind, marks=pytest.mark.slow, id=kind.__name__) for kind in (lit, textured)))
+)
 def test_whatever_is_wished(kind, wishes, waves):
     scenes = [scene(kind(k)) for k in range(3)]
     batch = torchpt.render_batch(scenes, full=True, accel="torch", **wishes)

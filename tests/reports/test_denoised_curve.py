@@ -85,6 +85,7 @@ def topic(folder: Path) -> Topic:
 
 
 @there
+@pytest.mark.slow
 def test_a_second_curve_stands_beside_each_and_changes_nothing_of_it(folder: Path) -> None:
     found, plain = told(folder / "study"), told(folder / "plain")
     assert [curve["label"] for curve in found] == LABELS
@@ -153,6 +154,7 @@ def test_no_figure_of_the_others_is_found_by_them(folder: Path) -> None:
 
 
 @there
+@pytest.mark.slow
 def test_denoised_pictures_are_kept_like_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[bool] = []
     render = measure.render_scene

@@ -6,9 +6,12 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 CODE = "import torchpt; from torchpt.scene.digest import digest; print(digest(torchpt.load('cornell_box', 'cpu')))"
 
 
+@pytest.mark.slow
 def test_two_processes_agree() -> None:
     found = set()
     for number in ("1", "2"):

@@ -56,6 +56,7 @@ def test_texels_by_params_are_those_of_the_dict() -> None:
     assert torchpt.render(scene).equal(before) and scene.params[WALL].shape == (3,)
 
 
+@pytest.mark.slow
 def test_other_sizes_and_other_parameters_follow() -> None:
     scene = torchpt.load(SCENE, "cpu")
     torchpt.render(scene, params={WALL: TEXELS})
