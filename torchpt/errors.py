@@ -12,6 +12,7 @@ __all__ = [
     "OutputError",
     "RenderError",
     "SceneError",
+    "ShortageError",
     "TorchptError",
 ]
 
@@ -95,6 +96,10 @@ class OutputError(TorchptError):
 
 class RenderError(TorchptError):
     """A render that could not be carried out as asked (device, compiler, strict mode)."""
+
+
+class ShortageError(RenderError):
+    """There is not enough memory."""
 
 
 class LostRankError(RenderError):

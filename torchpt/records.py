@@ -7,7 +7,7 @@ Directions (pbrt): ``wo`` points toward the previous vertex, ``wi`` toward the n
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, is_dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from torchpt.math.vectors import take
 
@@ -160,6 +160,10 @@ class Lights:
 @dataclass(frozen=True)
 class LaneGeometry:
     """Where surfaces lie, as the lanes gather it: P primitives, and I copies (see :class:`Copies`)."""
+
+    counted: ClassVar = (
+        "counts",
+    )  # of what is static, here and below: what worlds that are joined need not have alike
 
     kinds: tuple[type[Primitive], ...]  # those that there are, in the order of KINDS; static
     counts: tuple[int, int, int, int, int]  # as in Geometry; static: lanes read `ends`

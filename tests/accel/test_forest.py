@@ -66,6 +66,8 @@ def test_mixed_structures():
     o, d, t_max = rays(1, 3000)
     scene = torch.arange(3000) % 3
     assert torch.equal(forest.occluded(o, d, t_max, scene), whole.occluded(o, d, t_max, scene))
+    found, expected = forest.intersect(o, d, t_max, scene)[1].long(), whole.intersect(o, d, t_max, scene)[1].long()
+    assert (found == expected).float().mean() > 0.999  # of primitives that touch either
 
 
 def test_numbers_are_by_kind_and_then_by_scene():

@@ -50,7 +50,7 @@ def test_several_grids_are_each_its_own():
     rows = Spans.of([len(cells.rows) for cells in grids], torch.device("cpu"))
     columns = Spans.of([len(cells.columns) for cells in grids], torch.device("cpu"))
     width = torch.stack([cells.width for cells in grids])[of]
-    every = Cells(torch.cat([c.rows for c in grids]), torch.cat([c.columns for c in grids]), width, (rows, columns, of))
+    every = Cells(torch.cat([c.rows for c in grids]), torch.cat([c.columns for c in grids]), width, (rows, columns), of)
     found = every.sample(u)
     for number, cells in enumerate(grids):
         mine = of == number

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import math
+import weakref
+from typing import ClassVar
+
 import pytest
 import torch
 import trimesh
@@ -9,6 +14,10 @@ import trimesh
 import torchpt
 from torchpt.errors import RenderError
 from torchpt.forward import crowd, shared
+from torchpt.forward.run import Run
+from torchpt.forward.waves import say_once
+from torchpt.math.warps import cosine_hemisphere
+from torchpt.records import BsdfSample
 
 FLOOR = {
     "type": "rectangle",
@@ -238,8 +247,9 @@ def waves(monkeypatch):
     found = []
 
     def watched(works):
+        pieces = take(works)  # what fails is no wave
         found.append((len(works), len({id(work.wave.stages.world) for work in works})))
-        return take(works)
+        return pieces
 
     take = crowd.take
     monkeypatch.setattr(crowd, "take", watched)
@@ -254,7 +264,7 @@ def same(alone, own):
     for fact in ("rays", "paths", "spp", "truncated_paths", "nonfinite_samples", "clamped", "complete"):
         assert getattr(own, fact) == getattr(alone, fact), fact
     assert own.rays > 0
-    assert float(own.image.sum()) > 0
+    assert float(own.image.detach().sum()) > 0
 
 
 @pytest.mark.parametrize("accel", ("torch", "auto"))
@@ -363,7 +373,7 @@ def test_what_asks_for_one_scene_in_advance_goes_apart(waves):
 
 def test_joined_worlds_have_room(waves, monkeypatch):
     scenes = [scene(plain(k)) for k in (0, 0, 1, 1)]
-    room = crowd.room_of(crowd_wave(scenes[3]))
+    room = crowd.room_of(wave_of(scenes[3]))
     monkeypatch.setattr(crowd, "ROOM", 2 * room)
     torchpt.render_batch(scenes)
     assert waves == [(2, 2), (2, 2)]
@@ -371,9 +381,106 @@ def test_joined_worlds_have_room(waves, monkeypatch):
     monkeypatch.setattr(shared, "ROOM", room)  # half of it for one
     torchpt.render_batch(scenes)
     assert waves == []
+    monkeypatch.setattr(crowd, "ROOM", room - 1)  # which cameras of one scene do not ask for
+    torchpt.render_batch(scenes[3], [CAMERA] * 3)
+    assert waves == [(3, 1)]
 
 
-def crowd_wave(each):
+class Netted(torchpt.Bsdf):
+    """Diffuse reflection of a colour that a network holds."""
+
+    name = "netted"
+    parameters: ClassVar = {}
+    delta = transmits = refracts = anisotropic = False
+
+    def __init__(self, colour):
+        self.net = torch.nn.Linear(1, 3, bias=False)
+        self.set(colour)
+
+    def set(self, colour):
+        """Another colour."""
+        with torch.no_grad():
+            self.net.weight.copy_(torch.tensor(colour)[:, None])
+
+    def eval(self, parameters, wo, wi):
+        """Lambert's."""
+        return self.net.weight.expand(3, wo.shape[1]) * (wi[2].clamp_min(0) / math.pi) * (wo[2] > 0)
+
+    def pdf(self, parameters, wo, wi):
+        """By the cosine."""
+        return wi[2].clamp_min(0) / math.pi * (wo[2] > 0)
+
+    def sample(self, parameters, wo, lobe, u):
+        """Likewise."""
+        wi = cosine_hemisphere(u)
+        pdf = self.pdf(parameters, wo, wi)
+        weight = self.eval(parameters, wo, wi) / torch.where(pdf > 0, pdf, 1.0)
+        return BsdfSample(wi, pdf, weight)
+
+
+def netted(model):
+    """A floor of a model of one's own."""
+    blocks = plain(0)
+    blocks["materials"]["paint"] = {"type": "netted"}
+    base = {
+        "camera": CAMERA,
+        "film": {"width": 12, "height": 8},
+        "render": {"spp": 3, "device": "cpu", "compile": "off"},
+    }
+    return torchpt.load(base | blocks, bsdfs={"netted": model})
+
+
+def test_models_of_ones_own_go_apart(waves):
+    models = [Netted([0.9, 0.5, 0.1]), Netted([0.1, 0.5, 0.9])]
+    scenes = [netted(model) for model in models]
+    batch = torchpt.render_batch(scenes, [CAMERA] * 2, full=True)
+    assert waves == [(2, 1), (2, 1)]
+    for s, each in enumerate(scenes):
+        same(torchpt.render(each, full=True), batch[s, 0])
+
+
+def test_weights_may_change_from_scene_to_scene(waves):
+    model, colours = Netted([0.0, 0.0, 0.0]), ([0.9, 0.5, 0.1], [0.1, 0.5, 0.9])
+
+    def scenes():
+        for colour in colours:
+            model.set(colour)
+            yield netted(model)
+
+    batch = torchpt.render_batch(scenes())
+    for s, colour in enumerate(colours):
+        assert torch.equal(batch[s, 0], torchpt.render(netted(Netted(colour))))
+
+
+def test_where_memory_runs_out_for_the_next_those_that_wait_are_done_first(waves, monkeypatch):
+    scenes, alive, begin = [scene(plain(k)) for k in range(5)], weakref.WeakSet(), Run._begin
+
+    def scarce(run):
+        alive.add(run)
+        gc.collect()
+        if len(alive) > 2:
+            raise MemoryError
+        begin(run)
+
+    monkeypatch.setattr(Run, "_begin", scarce)
+    batch = torchpt.render_batch(scenes, full=True)
+    assert waves == [(2, 2), (2, 2)]
+    monkeypatch.undo()
+    for s, each in enumerate(scenes):
+        same(torchpt.render(each, full=True), batch[s, 0])
+
+
+def test_a_wave_that_fails_by_itself_is_told(monkeypatch, capsys):
+    say_once.cache_clear()
+    monkeypatch.setattr(shared, "joined_world", lambda worlds: 1 / 0)
+    scenes = [scene(plain(k)) for k in range(2)]
+    batch = torchpt.render_batch(scenes, full=True)
+    assert "could share a wave were rendered one by one: ZeroDivisionError" in capsys.readouterr().err
+    for s, each in enumerate(scenes):
+        same(torchpt.render(each, full=True), batch[s, 0])
+
+
+def wave_of(each):
     """The wave of a scene as a batch makes it."""
     from torchpt.forward.wave import make_wave
     from torchpt.orders import ordered

@@ -6,7 +6,7 @@ Small pictures by themselves fill no wave, and on CUDA a wave costs its launches
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -16,9 +16,9 @@ from torchpt.forward.piece import Piece, Work, take
 from torchpt.forward.result import Rendering
 from torchpt.forward.run import Run
 from torchpt.forward.schedule import LANES
-from torchpt.forward.shared import ROOM, alike, joinable, room_of
+from torchpt.forward.shared import ROOM, alike, common, room_of
+from torchpt.forward.waves import say_once
 from torchpt.integrators.loop.schedule import Share
-from torchpt.integrators.wave import Wave
 from torchpt.native.memory import let_go
 from torchpt.native.modes import undisturbed
 from torchpt.shortage import ran_out
@@ -35,7 +35,7 @@ class Entry:
         make: makes it ready for a number of threads; called when it is soon to begin.
         done: told of the rendering.
         failed: told of an error instead, which it may raise as another one.
-        last: whether none of the same scene comes after it.
+        last: whether none of the same scene comes after it: where no other scene may share its waves, none is waited for.
         run: once it is ready.
     """
 
@@ -63,39 +63,53 @@ class Crowd:
     def __init__(self) -> None:
         self._waiting: list[Entry] = []
         self._lanes = 0  # of those
-        self._room = 0  # bytes of their worlds
+        self._worlds: dict[int, int] = {}  # theirs by id, and how many bytes each takes
+        self._common: Hashable | None = None  # what their scenes have in common
         self._most: int | None = None  # where memory did not suffice for the usual number
+
+    def __bool__(self) -> bool:
+        """Whether any waits."""
+        return bool(self._waiting)
 
     def add(self, entry: Entry) -> None:
         """Let a render wait, or do it by itself; those that waited before may be done first."""
-        lanes = _lanes(entry.run)
+        lanes, wave = _lanes(entry.run), entry.run.wave
         most = self._most or LANES.get(entry.device.type, LANES["cpu"])
         if lanes is None or 2 * lanes > most:
             self.settle()
             _alone(entry)
             return
-        wave, room = entry.run.wave, self._room_for(entry.run.wave)
-        if self._waiting and (self._lanes + lanes > most or self._room + room > ROOM or not self._joins(entry.run)):
+        with undisturbed(entry.device), blamed(entry):
+            joins = self._joins(entry, lanes, most)
+        if not joins:
             self.settle()
-            room = self._room_for(wave)
+        if not self._waiting:
+            with undisturbed(entry.device), blamed(entry):
+                self._common = common(wave)
+        world = id(wave.stages.world)
+        if world not in self._worlds:
+            self._worlds[world] = room_of(wave)
         self._waiting.append(entry)
         self._lanes += lanes
-        self._room += room
-        if entry.last and not joinable(wave):
+        if entry.last and self._common is None:
             self.settle()
 
-    def _room_for(self, wave: Wave) -> int:
-        """Bytes that another world takes, where it is none of those that wait."""
-        known = any(entry.run.wave.stages.world is wave.stages.world for entry in self._waiting)
-        return 0 if known else room_of(wave)
-
-    def _joins(self, run: Run) -> bool:
-        first = self._waiting[0].run
-        return list(first.seen) == list(run.seen) and alike(first.wave, run.wave)
+    def _joins(self, entry: Entry, lanes: int, most: int) -> bool:
+        """Whether a render can share a wave with those that wait."""
+        if not self._waiting or self._lanes + lanes > most:
+            return False
+        first, run = self._waiting[0].run, entry.run
+        if list(first.seen) != list(run.seen) or not alike(first.wave, run.wave):
+            return False
+        if id(run.wave.stages.world) in self._worlds:
+            return True
+        if self._common is None or sum(self._worlds.values()) + room_of(run.wave) > ROOM:
+            return False
+        return common(run.wave) == self._common
 
     def settle(self) -> None:
         """Do what waits."""
-        waiting, self._waiting, self._lanes, self._room = self._waiting, [], 0, 0
+        waiting, self._waiting, self._lanes, self._worlds = self._waiting, [], 0, {}
         self._together(waiting)
 
     def _together(self, entries: list[Entry]) -> None:
@@ -105,12 +119,12 @@ class Crowd:
                 _alone(entries.pop())
             return
         begun, works = time.perf_counter(), [_work(entry.run) for entry in entries]
-        short = False
+        short, wrong = False, ""
         with undisturbed(entries[0].device):
             try:
                 pieces = take(works)
             except Exception as error:  # alone each of them meets it again, under its own name
-                pieces, short = [], ran_out(error)
+                pieces, short, wrong = [], ran_out(error), f"{type(error).__name__} {error}"
         if short:
             let_go()
             lanes = sum(work.lanes for work in works)
@@ -128,6 +142,8 @@ class Crowd:
                 _done(entry, work.lanes, pieces.pop(0), begun)
             else:
                 _alone(entry)
+        if wrong:  # and none of them met it
+            say_once(f"torchpt: pictures that could share a wave were rendered one by one: {wrong}")
 
 
 def _done(entry: Entry, lanes: int, piece: Piece, begun: float) -> None:

@@ -10,11 +10,15 @@ from contextlib import contextmanager, nullcontext
 
 import torch
 
+from torchpt.errors import ShortageError
 from torchpt.forward.crowd import Crowd, Entry, blamed
 from torchpt.integrators.loop.together import Job, Together
+from torchpt.integrators.plate import Plate
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.threads import one_thread
+from torchpt.native.memory import let_go
 from torchpt.native.modes import undisturbed
+from torchpt.shortage import ran_out
 
 __all__ = ["Entry", "render_many"]
 
@@ -44,9 +48,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 entry = next(waiting, None)
             if entry is None:
                 break
-            with undisturbed(entry.device), blamed(entry), _beside(crew):
-                entry.run = entry.make(crew.threads)
-                spans = entry.run.at_once()
+            spans = _ready(entry, crew, crowd)
             if spans is None:
                 _drain(crew, 0)
                 crowd.add(entry)
@@ -61,6 +63,29 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
         crowd.settle()
     finally:
         crew.close()
+
+
+def _ready(entry: Entry, crew: Together[Entry], crowd: Crowd) -> list[tuple[Plate, int, int]] | None:
+    """Make a render ready; its samples, where the compiled loop takes all of them at once.
+
+    Where memory runs out, those that wait are done first.
+    """
+
+    def ready() -> list[tuple[Plate, int, int]] | None:
+        with undisturbed(entry.device), _beside(crew):
+            entry.run = entry.make(crew.threads)
+            return entry.run.at_once()
+
+    with blamed(entry):
+        try:
+            return ready()
+        except Exception as error:
+            if not crowd or not (isinstance(error, ShortageError) or ran_out(error)):
+                raise
+    crowd.settle()
+    let_go()
+    with blamed(entry):
+        return ready()
 
 
 @contextmanager

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import replace
-
-import torch
 
 from torchpt.accel.forest import Forest
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.wave import Wave
 from torchpt.union import form_of, joined_world, size_of
 
-__all__ = ["ROOM", "alike", "joinable", "room_of", "shared_wave"]
+__all__ = ["ROOM", "alike", "common", "room_of", "shared_wave"]
 
 #: Bytes of worlds that are joined, at most: a joined world is a copy, and large scenes fill waves by themselves.
 ROOM = 1 << 28
-
-
-def joinable(wave: Wave) -> bool:
-    """Whether scenes besides this one may share its waves.
-
-    Textures that average over footprints want to know of one camera. Compiled stages have the scene's tensors in them, and
-    split-sum shading has the scene's environment in advance.
-    """
-    return wave.first is None and wave.stages.pixel is None and not wave.stages.compiled and room_of(wave) <= ROOM // 2
 
 
 def room_of(wave: Wave) -> int:
@@ -32,17 +21,28 @@ def room_of(wave: Wave) -> int:
     return size_of(wave.stages.world)
 
 
+def common(wave: Wave) -> Hashable | None:
+    """What scenes must have in common to share a wave with this one; None where no other may.
+
+    Textures that average over footprints want to know of one camera. Compiled stages have the scene's tensors in them, and
+    split-sum shading has the scene's environment in advance. What models of a caller's own hold may change from scene to scene.
+    """
+    world = wave.stages.world
+    own = wave.first is not None or wave.stages.pixel is not None or wave.stages.compiled
+    if own or room_of(wave) > ROOM // 2 or any(True for model in world.materials.models for _ in model.weights()):
+        return None
+    return tuple(wave.centre.tolist()), form_of(world)
+
+
 def alike(one: Wave, other: Wave) -> bool:
-    """Whether one wave can take the samples of both, but for its room."""
+    """Whether one wave can take the samples of both, their scenes apart."""
     if one.stages.plan != other.stages.plan or one.integrator != other.integrator or one.filter is not other.filter:
         return False
-    if one.stages.world is other.stages.world:
-        # Compiled stages repeat lanes, which would count for one camera.
-        plain = one.stages.pixel is None and not one.stages.compiled and not other.stages.compiled
-        return plain and one.accel is other.accel
-    if not joinable(one) or not joinable(other) or not torch.equal(one.centre, other.centre):
-        return False
-    return form_of(one.stages.world) == form_of(other.stages.world)
+    if one.stages.world is not other.stages.world:
+        return True
+    # Compiled stages repeat lanes, which would count for one camera.
+    plain = one.stages.pixel is None and not one.stages.compiled and not other.stages.compiled
+    return plain and one.accel is other.accel
 
 
 def shared_wave(waves: Sequence[Wave]) -> tuple[Wave, list[int] | None]:

@@ -110,7 +110,7 @@ class Integrator(Valued):
 
         Args:
             stages: bound to the scene.
-            accel: the search.
+            accel: the search; a forest where lanes are in several scenes (``state.scene``).
             state: camera rays, ``state.radiance`` zero; N lanes.
             first: of :meth:`first`.
             tally: counts what it takes.

@@ -34,7 +34,6 @@ def joined(maps: Sequence[EnvironmentMap]) -> EnvironmentMap:
         scale=torch.stack([map.scale for map in maps]),
         halves=torch.cat([map.halves for map in maps], 1),
         steps=torch.cat([map.steps for map in maps]),
-        mean=torch.stack([map.mean for map in maps]),
         plain=_joined([map.plain for map in maps]),
         compensated=_joined(finer) if finer else None,
         starts=torch.tensor(begin, device=maps[0].texels.device),
@@ -52,7 +51,6 @@ def _joined(grids: Sequence[Grid]) -> Grid:
         spans=(
             Spans.of([len(own.rows) for own in cells], device),
             Spans.of([len(own.columns) for own in cells], device),
-            torch.arange(len(cells), device=device),
         ),
     )
     floor, factor = torch.stack([grid.floor for grid in grids]), torch.stack([grid.factor for grid in grids])
@@ -61,14 +59,12 @@ def _joined(grids: Sequence[Grid]) -> Grid:
 
 def of(maps: EnvironmentMap, scene: Tensor) -> EnvironmentMap:
     """Of what was :func:`joined` the numbers that lanes of scenes ``(N,)`` have, in place of those of one map."""
-    own = {name: take(getattr(maps, name), scene) for name in ("size", "scale", "mean", "starts")}
+    own = {name: take(getattr(maps, name), scene) for name in ("size", "scale", "starts")}
     turn = take(maps.turn.reshape(9, -1), scene).view(3, 3, -1)
     finer = None if maps.compensated is None else _of(maps.compensated, scene)
     return replace(maps, **own, turn=turn, plain=_of(maps.plain, scene), compensated=finer)
 
 
 def _of(grid: Grid, scene: Tensor) -> Grid:
-    assert grid.cells.spans is not None
-    rows, columns, _ = grid.cells.spans
-    cells = replace(grid.cells, width=take(grid.cells.width, scene), spans=(rows, columns, scene))
+    cells = replace(grid.cells, width=take(grid.cells.width, scene), which=scene)
     return replace(grid, cells=cells, floor=take(grid.floor, scene), factor=take(grid.factor, scene))

@@ -65,6 +65,7 @@ def sample(
         mis: whether BSDF sampling shares the work: an environment map then leaves it the dim directions.
         scene: where the table is that of several scenes, which one each lane has ``(N,)``.
     """
+    assert (lights.first is None) == (scene is None)
     row: Tensor | None = None
     probability: Tensor | float = 1.0
     if lights.choice is not None and which is not None:
@@ -94,7 +95,8 @@ def sample(
 
 
 def chosen(lights: Lights, which: Tensor | None, x: Tensor, n: Tensor | None) -> Tensor:
-    """Rows ``(N,)`` of the lights that :func:`sample` draws."""
+    """Rows ``(N,)`` of the lights that :func:`sample` draws; of one scene."""
+    assert lights.first is None
     if lights.choice is None or which is None:
         return torch.zeros(x.shape[1], dtype=torch.int64, device=x.device)
     return choice.draw(lights.choice, which, x, n)[0]
@@ -198,7 +200,7 @@ def emitted(
     Returns:
         Radiance ``(3, N)``, zero from behind, and the density ``(N,)`` with which :func:`sample` would have drawn ``wi``.
     """
-    assert lights.row_of_prim is not None
+    assert lights.row_of_prim is not None and (lights.first is None) == (scene is None)
     row = take(lights.row_of_prim, at.slot) if len(lights.area) > 1 else None
     table = taken(lights, row)
     with torch.no_grad():
@@ -225,6 +227,7 @@ def _environment(lights: Lights) -> type[Environment]:
 
 def _around(lights: Lights, scene: Tensor | None) -> Any:
     """What the environment's functions are given; of several scenes' what the lanes have."""
+    assert (lights.first is None) == (scene is None)
     return lights.environment if scene is None else _environment(lights).of(lights.environment, scene)
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -39,6 +40,8 @@ class LightTree:
     Several trees may lie one after another (:func:`joined`): then ``count`` is ``(S,)``, and rows count from the first of a
     lane's own tree.
     """
+
+    counted: ClassVar = ("levels",)  # see LaneGeometry
 
     nodes: Tensor  # (M, F, 8) float32
     child: Tensor  # (M, 8) int32: a node, or ~row

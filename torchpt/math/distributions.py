@@ -137,14 +137,15 @@ class Cells:
         columns: ``(R C + 1,)`` float64: row number plus the cumulative sums within that row. It never falls, so that one
             binary search finds a cell of any row.
         width: ``()`` int64 C.
-        spans: where several grids follow each other, those of their ``rows`` and of their ``columns``, and which grid each
-            lane has ``(N,)``; ``width`` is ``(N,)`` then. None: there is one.
+        spans: where several grids follow each other, those of their ``rows`` and of their ``columns``; None: there is one.
+        which: of several the one that each lane has ``(N,)``; ``width`` is the lanes' too then.
     """
 
     rows: Tensor
     columns: Tensor
     width: Tensor
-    spans: tuple[Spans, Spans, Tensor] | None = None
+    spans: tuple[Spans, Spans] | None = None
+    which: Tensor | None = None
 
     @staticmethod
     def of(weights: Tensor) -> Cells:
@@ -174,7 +175,8 @@ class Cells:
             cell = torch.searchsorted(self.columns, across, right=True) - 1
             left = _within(self.columns, cell, across), _within(self.rows, row, v[1])
         else:
-            rows, columns, of = self.spans
+            (rows, columns), of = self.spans, self.which
+            assert of is not None
             row = rows.search(self.rows, v[1], of) - 1
             across = v[0] + row
             cell = columns.search(self.columns, across, of) - 1

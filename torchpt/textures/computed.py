@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -159,6 +159,8 @@ class ComputedTable(Table):
             where none does.
         factor: ``(M,)`` of the values; None where it is 1.
     """
+
+    counted: ClassVar = ("rows",)  # see LaneGeometry
 
     texture: Computed
     rows: int

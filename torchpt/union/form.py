@@ -13,12 +13,12 @@ from torchpt.records import World, tensors_of
 
 __all__ = ["form_of", "size_of"]
 
-#: What is static in a record but may differ: how many there are of something.
-_NUMBERS = frozenset({"counts", "height", "levels", "rows", "width"})
-
 
 def form_of(world: World) -> Hashable:
-    """What is static in a world, and which of its tensors are there: equal where worlds can be joined."""
+    """What is static in a world, and which of its tensors are there: equal where worlds can be joined.
+
+    Records name those of their static fields that may differ in ``counted``.
+    """
     return _form(world)
 
 
@@ -34,10 +34,8 @@ def _form(value: Any) -> Hashable:
         return tuple(sorted((key, _form(item)) for key, item in value.items()))
     if isinstance(value, tuple | list):
         return tuple(_form(item) for item in value)
-    if is_dataclass(value) and not isinstance(value, type | Bsdf):
-        return type(value), tuple(_form(getattr(value, f.name)) for f in fields(value) if not _number(value, f.name))
-    return value
-
-
-def _number(record: Any, name: str) -> bool:
-    return name in _NUMBERS and not isinstance(getattr(record, name), Tensor)
+    if is_dataclass(value) and not isinstance(value, type | Bsdf) and tensors_of(value):
+        counted = getattr(value, "counted", ())
+        return type(value), tuple(_form(getattr(value, f.name)) for f in fields(value) if f.name not in counted)
+    # The hash first, as in a dict: a model may hold tensors, which two of can not be compared.
+    return hash(value), value

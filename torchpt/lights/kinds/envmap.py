@@ -83,8 +83,10 @@ class EnvironmentMap:
         compensated: the density for MIS; None where it is ``plain``.
         starts: ``(3, N)`` int64 where lanes have the maps of several scenes (:mod:`torchpt.lights.several_maps`): where
             their own begin in ``texels``, ``halves``, ``steps``. Then ``size``, ``turn``, ``scale`` and the densities'
-            numbers are the lanes' too. None: there is one map.
+            numbers are the lanes' too, and ``mean`` says nothing. None: there is one map.
     """
+
+    counted: ClassVar = ("height", "width")  # see LaneGeometry
 
     texels: Tensor
     height: int
