@@ -20,6 +20,11 @@ def _little_to_collect() -> None:
     gc.freeze()
 
 
+def pytest_sessionfinish() -> None:
+    """What ends with the process is to be collected then."""
+    gc.unfreeze()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what this machine cannot run, and say why."""
     no_mitsuba = pytest.mark.skip(reason="mitsuba is not installed (extra `bench`)")
