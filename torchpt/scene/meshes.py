@@ -107,10 +107,11 @@ def solid(piece: MeshPart, pose: np.ndarray) -> tuple[np.ndarray, int]:
     """Faces that have an area, and how many do not."""
     columns = pose[:3, :3] @ piece.vertices.T
     p0, p1, p2 = (columns[:, piece.faces[:, k]] for k in range(3))
+    first, second = p1 - p0, p2 - p0
     # Relative to the longest edge, so that neither tiny nor huge meshes are mistaken for degenerate ones.
-    longest = np.maximum(np.abs(p1 - p0), np.abs(p2 - p0)).max(0)
+    longest = np.maximum(np.abs(first), np.abs(second)).max(0)
     safe = np.where(longest > 0, longest, 1.0)
-    (ax, ay, az), (bx, by, bz) = (p1 - p0) / safe, (p2 - p0) / safe
+    (ax, ay, az), (bx, by, bz) = first / safe, second / safe
     square = (ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2
     kept = (longest > 0) & (square > 1e-24)
     return np.ascontiguousarray(piece.faces[kept]), int((~kept).sum())

@@ -24,6 +24,8 @@ NEAR, ALIKE = 1e-6, 1e-5
 PAIRS = 2_000_000
 #: Pairs that looking at one face costs as much as.
 FACE = 100
+#: The corners of a rectangle in its own space.
+_SQUARE = np.array([[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]])
 
 
 @dataclass(frozen=True)
@@ -67,21 +69,22 @@ def warn_of_touching(parts: Sequence[Part], copies: Sequence[Copy], file: str | 
 
 
 def _refracting(parts: Sequence[Part], copies: Sequence[Copy]) -> Iterator[_Faces]:
-    own: dict[str, Array] = {}
+    known = {part.name: part for part in parts}
     for part in parts:
-        if part.kind == "rectangle":
-            flat = np.array([[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]])
-        elif part.vertices is not None and part.faces is not None:
-            flat = part.vertices[part.faces]
-        else:
-            continue
-        own[part.name] = flat
         if any(material.model.refracts for material in part.material.all()):
             pose = part.to_world if part.local is None else part.to_world @ part.local
-            yield _Faces(part.name, _moved(flat, pose))
+            yield from _faces(part.name, part, pose)
     for copy in copies:
-        if copy.of in own and any(material.model.refracts for material in copy.material.all()):
-            yield _Faces(copy.name, _moved(own[copy.of], copy.to_world))
+        if copy.of in known and any(material.model.refracts for material in copy.material.all()):
+            yield from _faces(copy.name, known[copy.of], copy.to_world)
+
+
+def _faces(name: str, part: Part, pose: Array) -> Iterator[_Faces]:
+    """Those of a part under a pose, where it has flat ones."""
+    if part.kind == "rectangle":
+        yield _Faces(name, _moved(_SQUARE, pose))
+    elif part.vertices is not None and part.faces is not None:
+        yield _Faces(name, _moved(part.vertices[part.faces], pose))
 
 
 def _moved(corners: Array, pose: Array) -> Array:
