@@ -12,6 +12,7 @@ import torch
 import trimesh
 
 import torchpt
+from torchpt import union
 from torchpt.errors import RenderError
 from torchpt.forward import crowd, shared
 from torchpt.forward.run import Run
@@ -472,7 +473,7 @@ def test_where_memory_runs_out_for_the_next_those_that_wait_are_done_first(waves
 
 def test_a_wave_that_fails_by_itself_is_told(monkeypatch, capsys):
     say_once.cache_clear()
-    monkeypatch.setattr(shared, "joined_world", lambda worlds: 1 / 0)
+    monkeypatch.setattr(union, "joined_world", lambda worlds: 1 / 0)
     scenes = [scene(plain(k)) for k in range(2)]
     batch = torchpt.render_batch(scenes, full=True)
     assert "could share a wave were rendered one by one: ZeroDivisionError" in capsys.readouterr().err

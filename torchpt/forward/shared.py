@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
-from torchpt.accel.forest import Forest
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.wave import Wave
-from torchpt.union import form_of, joined_world, size_of
+from torchpt.records import tensors_of
 
 __all__ = ["ROOM", "alike", "common", "room_of", "shared_wave"]
 
@@ -18,7 +17,7 @@ ROOM = 1 << 28
 
 def room_of(wave: Wave) -> int:
     """Bytes of its world."""
-    return size_of(wave.stages.world)
+    return sum(tensor.nbytes for tensor in tensors_of(wave.stages.world))
 
 
 def common(wave: Wave) -> Hashable | None:
@@ -31,6 +30,8 @@ def common(wave: Wave) -> Hashable | None:
     own = wave.first is not None or wave.stages.pixel is not None or wave.stages.compiled
     if own or room_of(wave) > ROOM // 2 or any(True for model in world.materials.models for _ in model.weights()):
         return None
+    from torchpt.union import form_of
+
     return tuple(wave.centre.tolist()), form_of(world)
 
 
@@ -51,6 +52,9 @@ def shared_wave(waves: Sequence[Wave]) -> tuple[Wave, list[int] | None]:
     worlds = {id(wave.stages.world): wave for wave in waves}
     if len(worlds) == 1:
         return first, None
+    from torchpt.accel.forest import Forest
+    from torchpt.union import joined_world
+
     world, numbers = joined_world([wave.stages.world for wave in worlds.values()])
     forest = Forest([wave.accel for wave in worlds.values()], numbers)
     places = {key: number for number, key in enumerate(worlds)}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
-from torchpt.accel.forest import Forest
 from torchpt.integrators.base import Integrator
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import gather_light, partition
@@ -17,6 +17,9 @@ from torchpt.integrators.stages import Plan
 from torchpt.integrators.tally import Tally
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import salts
+
+if TYPE_CHECKING:
+    from torchpt.accel.forest import Forest
 
 __all__ = ["FirstSurface", "FirstSurfaceIntegrator"]
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchpt import lights
 from torchpt.accel import Accel
-from torchpt.accel.forest import Forest
 from torchpt.integrators.base import Integrator, Limits
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.plan import Plan
@@ -23,6 +23,9 @@ from torchpt.integrators.tally import Tally
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, joined
 from torchpt.samplers import salts
+
+if TYPE_CHECKING:
+    from torchpt.accel.forest import Forest
 
 __all__ = ["ENDLESS", "Limits", "PathIntegrator", "gather_light", "partition", "slides", "trace"]
 

@@ -6,17 +6,21 @@ straight to the search.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
-from torchpt.accel.forest import Forest
 from torchpt.integrators.surfaces import opacity_map
 from torchpt.lanes.tracing import tracing
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import Dimension, Draws, Points, salts
 from torchpt.shapes import interact, offset_origin
+
+if TYPE_CHECKING:
+    from torchpt.accel.forest import Forest
 
 __all__ = ["PASSES", "Search", "beyond", "opacity_at"]
 

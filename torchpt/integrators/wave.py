@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchpt.accel import Accel
-from torchpt.accel.forest import Forest
 from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.base import Integrator, Limits
@@ -22,6 +21,7 @@ from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, Streams, salts
 
 if TYPE_CHECKING:
+    from torchpt.accel.forest import Forest
     from torchpt.integrators.first_surface import FirstSurface
 
 __all__ = ["Wave", "camera_state"]

@@ -9,7 +9,7 @@ So worlds of one form alone are joined: where one scene lacks smooth normals, la
 
 from __future__ import annotations
 
-from torchpt.union.form import form_of, size_of
+from torchpt.union.form import form_of
 from torchpt.union.worlds import joined_world
 
-__all__ = ["form_of", "joined_world", "size_of"]
+__all__ = ["form_of", "joined_world"]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpt.bsdfs import Bsdf
 from torchpt.records import World, tensors_of
 
-__all__ = ["form_of", "size_of"]
+__all__ = ["form_of"]
 
 
 def form_of(world: World) -> Hashable:
@@ -20,11 +20,6 @@ def form_of(world: World) -> Hashable:
     Records name those of their static fields that may differ in ``counted``.
     """
     return _form(world)
-
-
-def size_of(world: World) -> int:
-    """Bytes of its tensors."""
-    return sum(tensor.nbytes for tensor in tensors_of(world))
 
 
 def _form(value: Any) -> Hashable:
