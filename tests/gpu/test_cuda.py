@@ -6,7 +6,6 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.forward import crowd
 
 pytestmark = [
     pytest.mark.gpu,
@@ -62,21 +61,6 @@ def test_many_lights_by_the_tree():
     assert abs(float(cpu.mean() / cuda.mean()) - 1) < 5e-3
 
 
-@pytest.fixture
-def waves(monkeypatch):
-    """Of how many renders each shared wave was."""
-    found = []
-
-    def watched(works):
-        pieces = take(works)  # what fails is no wave
-        found.append(len(works))
-        return pieces
-
-    take = crowd.take
-    monkeypatch.setattr(crowd, "take", watched)
-    return found
-
-
 @pytest.mark.parametrize("integrator", [{"type": "path"}, {"type": "path", "clamp": 0.5}], ids=str)
 def test_cameras_of_a_batch_share_waves(integrator, waves):
     """To the bit what each is alone: no sum of a forward render is without an order."""
@@ -85,7 +69,7 @@ def test_cameras_of_a_batch_share_waves(integrator, waves):
     poses[:, 0, 3] += 0.05 * torch.arange(4, device="cuda")
     wish = {"spp": 4, "film": {**FILM, "aovs": ["depth"]}, "compile": "off", "integrator": integrator, "full": True}
     batch = torchpt.render_batch(scene, poses, **wish)
-    assert waves == [4]
+    assert waves == [(4, 1)]
     for c, pose in enumerate(poses):
         alone = torchpt.render(scene, params={"camera.to_world": pose}, **wish)
         own = batch[0, c]
@@ -102,7 +86,7 @@ def test_scenes_of_a_batch_share_waves(name, waves):
     poses[:, 1, 3] += 0.01 * torch.arange(3, device="cuda")
     wish = {"spp": 4, "film": {**FILM, "aovs": ["depth"]}, "compile": "off", "full": True}
     batch = torchpt.render_batch(scene, params={key: poses}, **wish)
-    assert waves == [3]
+    assert waves == [(3, 3)]
     for s, pose in enumerate(poses):
         alone, own = torchpt.render(scene, params={key: pose}, **wish), batch[s, 0]
         assert torch.equal(own.image, alone.image) and torch.equal(own.layers["depth"], alone.layers["depth"])

@@ -48,22 +48,7 @@ def room(**more):
 
 
 @pytest.fixture
-def sizes(monkeypatch):
-    """How many renders each wave of tensor operations was shared by."""
-    found = []
-
-    def watched(works):
-        pieces = take(works)  # what fails is no wave
-        found.append(len(works))
-        return pieces
-
-    take = crowd.take
-    monkeypatch.setattr(crowd, "take", watched)
-    return found
-
-
-@pytest.fixture
-def scarce(monkeypatch, sizes):
+def scarce(monkeypatch, waves):
     """The same, where there is memory for two renders and no more."""
     take = crowd.take
 
@@ -74,7 +59,7 @@ def scarce(monkeypatch, sizes):
         return found
 
     monkeypatch.setattr(crowd, "take", limited)
-    return sizes
+    return waves
 
 
 def same(scene, wishes, batch, cameras=CAMERAS, seeds=None):
@@ -114,56 +99,56 @@ def same(scene, wishes, batch, cameras=CAMERAS, seeds=None):
     ),
     ids=str,
 )
-def test_cameras_of_every_kind(wishes, sizes):
+def test_cameras_of_every_kind(wishes, waves):
     scene = room()
     batch = torchpt.render_batch(scene, CAMERAS, full=True, **wishes)
-    assert sizes == [len(CAMERAS)]
+    assert waves == [(len(CAMERAS), 1)]
     same(scene, wishes, batch)
 
 
-def test_each_with_its_own_seed(sizes):
+def test_each_with_its_own_seed(waves):
     scene, seeds = room(), [3, 1, 4, 1, 5]
     batch = torchpt.render_batch(scene, CAMERAS, full=True, seed=[seeds])
-    assert sizes == [5]
+    assert waves == [(5, 1)]
     same(scene, {}, batch, seeds=seeds)
 
 
-def test_paths_that_are_cut_are_counted_by_picture(monkeypatch, sizes):
+def test_paths_that_are_cut_are_counted_by_picture(monkeypatch, waves):
     from torchpt.integrators import path
 
     monkeypatch.setattr(path, "ENDLESS", 4)
     scene = room(integrator={"type": "path", "max_depth": -1, "rr_depth": 99})
     batch = torchpt.render_batch(scene, CAMERAS, full=True)
-    assert sizes == [5]
+    assert waves == [(5, 1)]
     assert len({batch[0, c].truncated_paths for c in range(5)}) > 2
     same(scene, {}, batch)
 
 
-def test_scenes_one_after_another_each_with_its_cameras(sizes):
+def test_scenes_one_after_another_each_with_its_cameras(waves):
     scenes = [room(), room(film={**SIZE, "filter": "box"}), room()]
     batch = torchpt.render_batch(scenes, CAMERAS, full=True)
-    assert sizes == [5, 5, 5]  # their filters differ
+    assert waves == [(5, 1), (5, 1), (5, 1)]  # their filters differ
     for s, scene in enumerate(scenes):
         for c, block in enumerate(CAMERAS):
             assert torch.equal(batch[s, c].image, torchpt.render(scene.seen_by(block)))
 
 
-def test_views_given_as_scenes(sizes):
+def test_views_given_as_scenes(waves):
     scene = room()
     views = [scene.seen_by(block) for block in CAMERAS]
     batch = torchpt.render_batch(views, full=True)
-    assert sizes == [5]
+    assert waves == [(5, 1)]
     assert all(torch.equal(batch[c, 0].image, torchpt.render(view)) for c, view in enumerate(views))
 
 
-def test_poses_and_parameters_of_the_camera(sizes):
+def test_poses_and_parameters_of_the_camera(waves):
     scene = room()
     poses = scene.params["camera.to_world"].repeat(4, 1, 1)
     poses[:, 0, 3] += 0.2 * torch.arange(4)
     batch = torchpt.render_batch(scene, poses)
     angles = torch.tensor([30.0, 40.0, 50.0])
     zoomed = torchpt.render_batch(scene, params={"camera.fov": angles})
-    assert sizes == [4, 3]
+    assert waves == [(4, 1), (3, 1)]
     for picture, pose in zip(batch[0], poses, strict=True):
         assert torch.equal(picture, torchpt.render(scene, params={"camera.to_world": pose}))
     for picture, angle in zip(zoomed[:, 0], angles, strict=True):
@@ -191,28 +176,28 @@ def test_gradients_are_those_of_single_renders():
     ),
     ids=str,
 )
-def test_what_keeps_to_itself(wishes, sizes):
+def test_what_keeps_to_itself(wishes, waves):
     scene = room()
     batch = torchpt.render_batch(scene, CAMERAS[:2], **wishes)
-    assert sizes == []
+    assert waves == []
     for picture, block in zip(batch[0], CAMERAS, strict=False):
         assert torch.equal(picture, torchpt.render(scene.seen_by(block), **wishes))
 
 
-def test_textures_that_average_over_footprints_keep_to_themselves(sizes):
+def test_textures_that_average_over_footprints_keep_to_themselves(waves):
     floor = {"type": "image", "data": torch.rand(8, 8, 3), "filter": "trilinear"}
     scene = room(materials={"paint": {"type": "diffuse", "reflectance": floor}, "glass": {"type": "dielectric"}})
     batch = torchpt.render_batch(scene, CAMERAS[:2])
-    assert sizes == []
+    assert waves == []
     for picture, block in zip(batch[0], CAMERAS, strict=False):
         assert torch.equal(picture, torchpt.render(scene.seen_by(block)))
 
 
-def test_a_wave_has_no_more_lanes_than_it_may(monkeypatch, sizes):
+def test_a_wave_has_no_more_lanes_than_it_may(monkeypatch, waves):
     monkeypatch.setitem(crowd.LANES, "cpu", 2 * 12 * 8 * 3)
     scene = room()
     batch = torchpt.render_batch(scene, CAMERAS, full=True)
-    assert sizes == [2, 2]  # and the last one alone
+    assert waves == [(2, 1), (2, 1)]  # and the last one alone
     same(scene, {}, batch)
 
 
@@ -221,7 +206,7 @@ def test_where_memory_runs_out_waves_are_halved(monkeypatch, scarce):
     scene = room()
     batch = torchpt.render_batch(scene, CAMERAS * 2, full=True)
     # Ten are too many, and five, and three; what is left over is rendered alone.
-    assert scarce == [10, 5, 2, 3, 2, 5, 2, 3, 2]
+    assert scarce == [(10, 1), (5, 1), (2, 1), (3, 1), (2, 1), (5, 1), (2, 1), (3, 1), (2, 1)]
     same(scene, {}, batch, CAMERAS * 2)
     monkeypatch.setattr(crowd, "take", lambda works: (_ for _ in ()).throw(MemoryError))
     same(scene, {}, torchpt.render_batch(scene, CAMERAS, full=True))
@@ -230,7 +215,7 @@ def test_where_memory_runs_out_waves_are_halved(monkeypatch, scarce):
 def test_waves_stay_small_once_memory_ran_out(monkeypatch, scarce):
     monkeypatch.setitem(crowd.LANES, "cpu", 4 * 12 * 8 * 3)
     torchpt.render_batch([room(), room()], CAMERAS[:4])
-    assert scarce == [4, 2, 2, 2, 2]
+    assert scarce == [(4, 1), (2, 1), (2, 1), (2, 1), (2, 1)]
 
 
 def test_scenes_that_share_no_wave_are_rendered_before_the_next_is_loaded():
@@ -267,13 +252,13 @@ def test_an_error_is_that_of_its_picture(monkeypatch):
         torchpt.render_batch(scene, params={"camera.to_world": poses})
 
 
-def test_samples_that_are_not_finite_are_those_of_their_picture(sizes):
+def test_samples_that_are_not_finite_are_those_of_their_picture(waves):
     scene = room()
     scene.params["lights.sky.radiance"].fill_(float("nan"))
     scene.check_own = lambda: None  # which refuses that
     views = CAMERAS[3:4] + CAMERAS[:1]
     batch = torchpt.render_batch(scene, views, full=True)
-    assert sizes == [2]
+    assert waves == [(2, 1)]
     assert batch[0, 0].nonfinite_samples == 12 * 8 * 3 > batch[0, 1].nonfinite_samples > 0
     with pytest.raises(RenderError, match=r"^scenes\[0\]: integrator\.strict: sample 0 of pixel"):
         torchpt.render_batch([scene], views, integrator={"type": "path", "strict": True})

@@ -242,21 +242,6 @@ def many_models(k):
 KINDS = [plain, lit, under_the_sky, under_the_sky_alone, grey, textured, copied, many_models]
 
 
-@pytest.fixture
-def waves(monkeypatch):
-    """Of how many renders and of how many scenes each shared wave was."""
-    found = []
-
-    def watched(works):
-        pieces = take(works)  # what fails is no wave
-        found.append((len(works), len({id(work.wave.stages.world) for work in works})))
-        return pieces
-
-    take = crowd.take
-    monkeypatch.setattr(crowd, "take", watched)
-    return found
-
-
 def same(alone, own):
     """A picture of a batch is that of a single render, with layers and facts."""
     assert torch.equal(own.image, alone.image)

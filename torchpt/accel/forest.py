@@ -7,7 +7,7 @@ Either way a ray meets what it meets alone, to the bit: primitives, boxes and th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -34,13 +34,14 @@ class Forest:
         trees = [accel for accel in accels if isinstance(accel, Lbvh)]
         # In some scenes quadrics may be told by fewer numbers than in others.
         joins = len(trees) == len(accels) and len({len(tree.quadrics) for tree in trees}) == 1
-        self._trees = _joined(trees, numbers) if joins else None
+        self._nodes = _nodes_of(trees, numbers) if joins else None
+        self._roots = _roots_of(trees, numbers.of.device)
 
     @torch.no_grad()
     def intersect(self, o: Tensor, d: Tensor, t_max: Tensor, scene: Tensor) -> Hits:
         """As :meth:`Accel.intersect`, in scenes ``(N,)`` int64; ``prim``, of any integers, counts among all."""
-        if self._trees is not None:
-            return traverse.intersect(*as_rays(o, d, t_max), *self._trees.given, take(self._trees.root, scene))
+        if self._nodes is not None:
+            return traverse.intersect(*as_rays(o, d, t_max), self._nodes, take(self._roots, scene))
         t = torch.full_like(t_max, torch.inf, dtype=torch.float32)
         # Of copies in many scenes there may be more primitives than int32 counts.
         hits = t, torch.full_like(t, -1, dtype=torch.int64), torch.zeros_like(t), torch.zeros_like(t)
@@ -56,8 +57,8 @@ class Forest:
     @torch.no_grad()
     def occluded(self, o: Tensor, d: Tensor, t_max: Tensor, scene: Tensor) -> Tensor:
         """As :meth:`Accel.occluded`, in scenes ``(N,)`` int64."""
-        if self._trees is not None:
-            return traverse.occluded(*as_rays(o, d, t_max), *self._trees.given, take(self._trees.root, scene))
+        if self._nodes is not None:
+            return traverse.occluded(*as_rays(o, d, t_max), self._nodes, take(self._roots, scene))
         blocked = torch.zeros_like(t_max, dtype=torch.bool)
 
         def search(number: int, lanes: Tensor) -> None:
@@ -75,33 +76,30 @@ class Forest:
                 search(number, lanes)
 
 
-@dataclass(frozen=True)
-class _Trees:
-    """Trees one after another; ``given``: what :mod:`torchpt.accel.traverse` takes, ``root (S,)`` the first node of each."""
+def _roots_of(accels: Sequence[Lbvh], device: torch.device) -> Tensor:
+    """The first node of each tree ``(S,)``, all trees one after another."""
+    sizes = [accel.tree.children.shape[1] for accel in accels]
+    firsts = [
+        first if size else traverse.NONE for first, size in zip(accumulate(sizes, initial=0), sizes, strict=False)
+    ]
+    return torch.tensor(firsts, dtype=torch.int64, device=device)
 
-    given: tuple[list[Tensor], list[int], int]
-    root: Tensor
 
-
-def _joined(accels: Sequence[Lbvh], numbers: Numbers) -> _Trees:
+def _nodes_of(accels: Sequence[Lbvh], numbers: Numbers) -> traverse.Nodes:
     """The trees of all scenes."""
-    children, boxes, order, root = [], [], [], []
+    children, order = [], []
     nodes = leaves = 0
     for number, accel in enumerate(accels):
         tree = accel.tree
         children.append(torch.where(tree.children < 0, tree.children - leaves, tree.children + nodes))
-        boxes.append(tree.boxes)
         order.append(take(numbers.own(number), tree.order.long()).int())
-        count = tree.children.shape[1]
-        root.append(nodes if count else traverse.NONE)
-        nodes, leaves = nodes + count, leaves + tree.order.shape[0]
+        nodes, leaves = nodes + tree.children.shape[1], leaves + tree.order.shape[0]
     tensors = [
         numbers.primitives([accel.corners for accel in accels]),
         numbers.primitives([accel.rows for accel in accels]),
         torch.cat([accel.quadrics for accel in accels], 1),
         torch.cat(children, 1),
-        torch.cat(boxes, 1),
+        torch.cat([accel.tree.boxes for accel in accels], 1),
         torch.cat(order),
     ]
-    given = tensors, list(numbers.counts), max(accel.tree.depth for accel in accels)
-    return _Trees(given, torch.tensor(root, device=numbers.of.device))
+    return traverse.Nodes(tensors, list(numbers.counts), max(accel.tree.depth for accel in accels))

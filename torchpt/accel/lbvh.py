@@ -41,15 +41,14 @@ class Lbvh(Accel):
         self.tree = build_tree(low[:, keep], high[:, keep], keep)
         self.build_seconds = time.perf_counter() - start
 
-    def tensors(self) -> list[Tensor]:
-        """What the traversal reads."""
+    def _tensors(self) -> list[Tensor]:
         return [self.corners, self.rows, self.quadrics, self.tree.children, self.tree.boxes, self.tree.order]
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(o, d, t_max, self.tensors(), self.counts, self.tree.depth)
+        return _intersect(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(o, d, t_max, self.tensors(), self.counts, self.tree.depth)
+        return _occluded(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`."""
@@ -60,7 +59,7 @@ class Lbvh(Accel):
             "leaves": self.tree.order.shape[0],
             "sah_cost": sah_cost(self.tree),
             "depth": self.tree.depth,
-            "bytes": sum(x.nbytes for x in self.tensors()),
+            "bytes": sum(x.nbytes for x in self._tensors()),
             "build_seconds": self.build_seconds,
         }
 
@@ -79,7 +78,7 @@ def sah_cost(tree: Tree) -> float:
 def _intersect(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return traverse.intersect(o, d, t_max, tensors, counts, depth)
+    return traverse.intersect(o, d, t_max, traverse.Nodes(tensors, counts, depth))
 
 
 @operator(
@@ -87,4 +86,4 @@ def _intersect(
     lambda o, d, t_max, *scene: torch.empty_like(t_max, dtype=torch.bool),
 )
 def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> Tensor:
-    return traverse.occluded(o, d, t_max, tensors, counts, depth)
+    return traverse.occluded(o, d, t_max, traverse.Nodes(tensors, counts, depth))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from torchpt.accel.leaf import Rays, distances, prepare_rays
 
-__all__ = ["NONE", "intersect", "occluded"]
+__all__ = ["NONE", "Nodes", "intersect", "occluded"]
 
 #: Lanes that travel together; bounds memory to some 100 MB.
 CHUNK = 1 << 18
@@ -17,40 +19,40 @@ NONE = 1 << 30
 _SLACK = 1.0 + 2.0**-20
 
 
+class Nodes(NamedTuple):
+    """What rays travel through: one tree, or several one after another.
+
+    Attributes:
+        tensors: as :class:`torchpt.accel.lbvh.Lbvh` has them.
+        counts: primitives of each kind.
+        depth: of the deepest tree.
+    """
+
+    tensors: list[Tensor]
+    counts: list[int]
+    depth: int
+
+
 def intersect(
-    o: Tensor,
-    d: Tensor,
-    t_max: Tensor,
-    tensors: list[Tensor],
-    counts: list[int],
-    depth: int,
-    root: Tensor | None = None,
+    o: Tensor, d: Tensor, t_max: Tensor, nodes: Nodes, root: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Nearest hits; arguments as :class:`torchpt.accel.lbvh.Lbvh` holds them.
+    """Nearest hits.
 
     ``root (N,)`` int64: the node that each ray begins at, :data:`NONE` where it meets nothing; None: node 0.
     """
     t, prim = torch.full_like(t_max, torch.inf), torch.full_like(t_max, -1, dtype=torch.int32)
     u, v = torch.zeros_like(t_max), torch.zeros_like(t_max)
     for lanes in _live(o, d, t_max):
-        hit, found = _Wave(o, d, t_max, lanes, tensors, counts, depth, root).run(any_hit=False)
+        hit, found = _Wave(o, d, t_max, lanes, nodes, root).run(any_hit=False)
         t[hit], prim[hit], u[hit], v[hit] = found[0], found[1].int(), found[2], found[3]
     return t, prim, u, v
 
 
-def occluded(
-    o: Tensor,
-    d: Tensor,
-    t_max: Tensor,
-    tensors: list[Tensor],
-    counts: list[int],
-    depth: int,
-    root: Tensor | None = None,
-) -> Tensor:
+def occluded(o: Tensor, d: Tensor, t_max: Tensor, nodes: Nodes, root: Tensor | None = None) -> Tensor:
     """Whether anything is hit; see :func:`intersect`."""
     blocked = torch.zeros_like(t_max, dtype=torch.bool)
     for lanes in _live(o, d, t_max):
-        hit, _ = _Wave(o, d, t_max, lanes, tensors, counts, depth, root).run(any_hit=True)
+        hit, _ = _Wave(o, d, t_max, lanes, nodes, root).run(any_hit=True)
         blocked[hit] = True
     return blocked
 
@@ -64,19 +66,9 @@ def _live(o: Tensor, d: Tensor, t_max: Tensor) -> list[Tensor]:
 class _Wave:
     """The state of the lanes that still travel, and the hits of those that do not."""
 
-    def __init__(
-        self,
-        o: Tensor,
-        d: Tensor,
-        t_max: Tensor,
-        lanes: Tensor,
-        tensors: list[Tensor],
-        counts: list[int],
-        depth: int,
-        root: Tensor | None,
-    ) -> None:
-        self.corners, self.rows, self.quadrics, self.children, self.boxes, self.order = tensors
-        self.counts = counts
+    def __init__(self, o: Tensor, d: Tensor, t_max: Tensor, lanes: Tensor, nodes: Nodes, root: Tensor | None) -> None:
+        self.corners, self.rows, self.quadrics, self.children, self.boxes, self.order = nodes.tensors
+        self.counts = nodes.counts
         self.lanes = lanes
         self.rays = prepare_rays(o[:, lanes], d[:, lanes])
         self.t = t_max[lanes].clone()
@@ -84,7 +76,7 @@ class _Wave:
         self.u, self.v = torch.zeros_like(self.t), torch.zeros_like(self.t)
         self.node = torch.full_like(lanes, 0 if self.children.shape[1] else NONE) if root is None else root[lanes]
         self.top = torch.zeros_like(lanes)  # entries on the stack
-        self.stack = torch.full((depth + 1, len(lanes)), NONE, dtype=torch.int32, device=lanes.device)
+        self.stack = torch.full((nodes.depth + 1, len(lanes)), NONE, dtype=torch.int32, device=lanes.device)
         self.finished: list[tuple[Tensor, ...]] = []
 
     def run(self, any_hit: bool) -> tuple[Tensor, list[Tensor]]:

@@ -79,23 +79,22 @@ class Crowd:
             self.settle()
             _alone(entry)
             return
+        world = id(wave.stages.world)
         with undisturbed(entry.device), blamed(entry):
-            joins = self._joins(entry, lanes, most)
+            room = self._worlds.get(world) or room_of(wave)
+            joins = self._joins(entry, lanes, most, room)
         if not joins:
             self.settle()
-        if not self._waiting:
             with undisturbed(entry.device), blamed(entry):
-                self._common = common(wave)
-        world = id(wave.stages.world)
-        if world not in self._worlds:
-            self._worlds[world] = room_of(wave)
+                self._common = common(wave, room)
         self._waiting.append(entry)
+        self._worlds[world] = room
         self._lanes += lanes
         if entry.last and self._common is None:
             self.settle()
 
-    def _joins(self, entry: Entry, lanes: int, most: int) -> bool:
-        """Whether a render can share a wave with those that wait."""
+    def _joins(self, entry: Entry, lanes: int, most: int, room: int) -> bool:
+        """Whether a render of so many lanes, whose world takes ``room``, can share a wave with those that wait."""
         if not self._waiting or self._lanes + lanes > most:
             return False
         first, run = self._waiting[0].run, entry.run
@@ -103,9 +102,9 @@ class Crowd:
             return False
         if id(run.wave.stages.world) in self._worlds:
             return True
-        if self._common is None or sum(self._worlds.values()) + room_of(run.wave) > ROOM:
+        if self._common is None or sum(self._worlds.values()) + room > ROOM:
             return False
-        return common(run.wave) == self._common
+        return common(run.wave, room) == self._common
 
     def settle(self) -> None:
         """Do what waits."""

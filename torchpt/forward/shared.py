@@ -20,15 +20,15 @@ def room_of(wave: Wave) -> int:
     return sum(tensor.nbytes for tensor in tensors_of(wave.stages.world))
 
 
-def common(wave: Wave) -> Hashable | None:
-    """What scenes must have in common to share a wave with this one; None where no other may.
+def common(wave: Wave, room: int) -> Hashable | None:
+    """What scenes must have in common to share a wave with this one, of so much :func:`room_of`; None where no other may.
 
     Textures that average over footprints want to know of one camera. Compiled stages have the scene's tensors in them, and
     split-sum shading has the scene's environment in advance. What models of a caller's own hold may change from scene to scene.
     """
     world = wave.stages.world
     own = wave.first is not None or wave.stages.pixel is not None or wave.stages.compiled
-    if own or room_of(wave) > ROOM // 2 or any(True for model in world.materials.models for _ in model.weights()):
+    if own or room > ROOM // 2 or any(True for model in world.materials.models for _ in model.weights()):
         return None
     from torchpt.union import form_of
 
