@@ -116,7 +116,7 @@ print(*(name in code for name in ("zmm", "ymm", "xmm")))
     [("haswell", "+avx2", ["False", "True", "True"]), ("nehalem", "", ["False", "False", "True"])],
 )
 def test_shorter_vectors_give_the_same_bits(cpu, features, registers, tmp_path):
-    settings = {"NUMBA_CPU_NAME": cpu, "NUMBA_CPU_FEATURES": features, "NUMBA_CACHE_DIR": str(tmp_path)}
+    settings = {"NUMBA_CPU_NAME": cpu, "NUMBA_CPU_FEATURES": features, "TORCHPT_CACHE": str(tmp_path)}
     root = Path(__file__).resolve().parents[2]
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT.format(tests=str(Path(__file__).parent))],

@@ -95,18 +95,6 @@ def test_worker_processes_after_the_parent_worked(method, expected, tmp_path):
     assert done.stdout.split() == [expected] * 4
 
 
-@pytest.mark.slow
-def test_no_folder_for_the_cache():
-    body = """
-    from numba.core import caching
-    caching.CompileResultCacheImpl._locator_classes = []  # numba then raises "no locator available"
-    from torchpt.accel import kernels_brute, kernels_build, kernels_search
-    from torchpt.native.jit import jit
-    print(jit()(lambda x: x + 1)(1), type(kernels_search.nearest._cache).__name__)
-    """
-    assert _run(body) == ["2", "NullCache"]
-
-
 CACHE = """
 from numba.core import event
 
@@ -127,7 +115,7 @@ print(sum("torchpt" in name or "CPUDispatcher" in name for name in Compiled.name
 
 @pytest.mark.slow  # compiles everything anew
 def test_a_second_process_compiles_nothing_and_says_nothing(tmp_path):
-    env = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    env = {"TORCHPT_CACHE": str(tmp_path / "cache")}
     first, said = _run(CACHE, errors=True, **env)
     assert int(first[0]) > 20 and said.count("compiling the search kernels") == 1
     second, said = _run(CACHE, errors=True, **env)

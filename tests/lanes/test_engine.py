@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from torchpt.lanes import cache, engine
+from torchpt.lanes import engine
+from torchpt.native import cache
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and modes of files here")
 
@@ -152,7 +153,7 @@ def test_disk_full(here, monkeypatch):
     assert engine.counts() == (1, 0) and not list(here.iterdir())  # the temporary file is gone
 
 
-@pytest.mark.parametrize("what", ["flipped", "truncated", "empty", "another's", "folder", "writable", "link"])
+@pytest.mark.parametrize("what", ["flipped", "truncated", "empty", "another's", "folder", "writable", "link", "pipe"])
 def test_damaged_entries_are_made_again(here, what):
     code = engine.compiled(ir()).code
     (path,) = entries(here)
@@ -169,6 +170,9 @@ def test_damaged_entries_are_made_again(here, what):
     elif what == "folder":
         path.unlink()
         path.mkdir()
+    elif what == "pipe":  # to which nobody writes
+        path.unlink()
+        os.mkfifo(path)
     elif what == "writable":
         path.chmod(0o666)
     else:

@@ -89,7 +89,7 @@ def test_without_a_writable_cache_folder(tmp_path):
     # A copy of the package beside which nothing can be written, and no home to fall back to.
     blocked = tmp_path / "file"
     blocked.write_text("")
-    found = run(tmp_path, "print(digest())", "cornell_box", {"NUMBA_CACHE_DIR": str(blocked / "cache")})
+    found = run(tmp_path, "print(digest())", "cornell_box", {"TORCHPT_CACHE": str(blocked / "cache")})
     assert set(found) == {expected("cornell_box")}
 
 

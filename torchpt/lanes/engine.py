@@ -8,7 +8,7 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
-from torchpt.lanes import cache
+from torchpt.native import cache
 from torchpt.native.memory import MARGIN, room_for
 
 __all__ = [

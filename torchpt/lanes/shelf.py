@@ -9,19 +9,18 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.lanes import cache, engine
+from torchpt.lanes import engine
 from torchpt.lanes.graph import DTYPES
 from torchpt.lanes.program import Program
 from torchpt.lanes.prologue import Guard, Source, Step, Table
+from torchpt.native import cache
+from torchpt.native.content import code_of_folder
 
 __all__ = ["key_of", "load", "store"]
 
@@ -34,24 +33,10 @@ class _NotKept(Exception):
     """Something that no entry can hold."""
 
 
-@lru_cache(maxsize=1)
-def _sources() -> str:
-    """This version of the package: names, sizes and times of its files."""
-    root = Path(__file__).parent.parent
-    facts = []
-    for folder, _, names in os.walk(root):
-        for name in names:
-            if name.endswith(".py"):
-                path = os.path.join(folder, name)
-                state = os.stat(path)
-                facts.append((os.path.relpath(path, root), state.st_size, state.st_mtime_ns))
-    return repr(sorted(facts))
-
-
 def key_of(structure: Any) -> str | None:
     """The name of an entry; None where the structure holds objects that only this process knows."""
     try:
-        text = "\n".join((_sources(), torch.__version__, engine.identity(), _canonical(structure)))
+        text = "\n".join((code_of_folder(), torch.__version__, engine.identity(), _canonical(structure)))
     except _NotKept:
         return None
     return hashlib.sha256(text.encode()).hexdigest()

@@ -5,21 +5,26 @@ Importing this module imports numba; only the numba backends do so.
 
 from __future__ import annotations
 
-import functools
+import hashlib
 import os
+import pickle
 import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
+import llvmlite
 import numba
 import torch
 from numba.core import config as numba_config
+from numba.core import serialize
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
 
+from torchpt.native import cache
+from torchpt.native.content import code_of_function
 from torchpt.native.memory import MARGIN, room_for
 
 __all__ = ["compiled", "jit", "launch", "parallel_allowed", "part"]
@@ -46,53 +51,56 @@ if hasattr(os, "register_at_fork"):
 
 
 def jit(**options: Any) -> Callable[[Callable], Any]:
-    """``numba.njit`` with the house's options, cached on disk where a folder can be written.
+    """``numba.njit`` with the house's options, cached on disk by content.
 
     ``error_model="numpy"`` is not a choice: Python's check for division by zero keeps LLVM from using vectors.
     """
     settings: dict[str, Any] = {"error_model": "numpy", "nogil": True, **options}
 
     def wrap(function: Callable) -> Any:
-        try:
-            kernel: Any = numba.njit(cache=True, **settings)(function)
-            if hasattr(kernel._cache, "_cache_file"):
-                kernel._cache._cache_file._source_stamp = _stamp()
-                _forgive(kernel._cache)
-            return kernel
-        except (RuntimeError, OSError):  # numba: "no locator available", no folder for its cache
-            return numba.njit(**settings)(function)
+        kernel: Any = numba.njit(**settings)(function)
+        kernel._cache = _ByContent(kernel)
+        return kernel
 
     return wrap
 
 
-def _forgive(cache: Any) -> None:
-    """Let a cache that fails cost time and nothing else: a full disk, an entry that is damaged or another process is at."""
-    save, load = cache.save_overload, cache.load_overload
+class _ByContent(NullCache):
+    """A kernel's machine code on disk, found by what it was made of; a cache that fails costs time and nothing else.
 
-    def save_overload(signature: Any, data: Any) -> None:
-        with suppress(OSError, RuntimeError):  # numba: "no compiled object yet"
-            save(signature, data)
+    Numba's own looks at the time of a kernel's file only: a checkout compiles all kernels, and an edit of what is inlined none.
+    """
 
-    def load_overload(signature: Any, target: Any) -> Any:
+    def __init__(self, kernel: Any) -> None:
+        self._kernel = kernel
+        self._content: str | None = None
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        target_context.refresh()
+        content = cache.read(self._entry(sig, target_context.codegen()))
+        if content is None:
+            return None
         try:
-            return load(signature, target)
-        except Exception:  # whatever a damaged file raises: it is emptied, and the kernel compiled anew
-            with suppress(OSError):
-                cache.flush()
+            return CompileResult._rebuild(target_context, *pickle.loads(content))
+        except Exception:  # whatever an entry of another making raises: the kernel is compiled anew
             return None
 
-    cache.save_overload, cache.load_overload = save_overload, load_overload
+    def save_overload(self, sig: Any, cres: Any) -> None:
+        if not cres.library.has_dynamic_globals:  # addresses of this process
+            cache.write(self._entry(sig, cres.library.codegen), serialize.dumps(cres._reduce()))
 
-
-@functools.cache
-def _stamp() -> tuple[float, int]:
-    """When the files of kernels last changed and how large they are.
-
-    Numba keeps a kernel until the kernel's own file changes, and would not see that what is inlined into it has.
-    """
-    native = Path(__file__).parent
-    files = [path.stat() for path in (*native.rglob("*.py"), *native.parent.glob("*/kernels*.py"))]
-    return max(file.st_mtime for file in files), sum(file.st_size for file in files)
+    def _entry(self, sig: Any, codegen: Any) -> str:
+        if self._content is None:
+            self._content = code_of_function(self._kernel)
+        facts = (
+            numba.__version__,
+            llvmlite.__version__,
+            sys.version_info[:2],
+            codegen.magic_tuple(),
+            str(sig),
+            self._content,
+        )
+        return hashlib.sha256(repr(facts).encode()).hexdigest()[:40] + ".nbc"
 
 
 def part(**options: Any) -> Callable[[Callable], Any]:

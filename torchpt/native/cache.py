@@ -1,7 +1,8 @@
-"""What is kept on disk of kernels: a folder of entries, never larger than it may be.
+"""Keep kernels on disk: a folder of entries, never larger than it may be.
 
-Entries are native code, so the folder is this user's alone (mode 0700, owner checked) and each carries a checksum. Where there
-can be no such folder, nothing is kept.
+An entry is found by the content that it was made of, so that all checkouts and processes of a user share the folder. Entries
+are native code, so the folder is this user's alone (mode 0700, owner checked) and each carries a checksum. Where there can be
+no such folder, nothing is kept.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ DAY = 86_400.0
 #: Begins the names of entries that are being written.
 _UNFINISHED = "unfinished-"
 #: What may be removed: the folder may hold files of others.
-_OURS = re.compile(rf"[0-9a-f]{{40}}\.(o|json)|{_UNFINISHED}.*")
+_OURS = re.compile(rf"[0-9a-f]{{40}}\.(o|json|nbc)|{_UNFINISHED}.*")
 
 
 def cache_folder() -> Path | None:
@@ -63,7 +64,9 @@ def read(name: str) -> bytes | None:
     if folder is None:
         return None
     try:
-        handle = os.open(folder / name, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0))
+        # A pipe in the place of an entry would be waited for.
+        flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
+        handle = os.open(folder / name, os.O_RDONLY | flags)
         with os.fdopen(handle, "rb") as file:
             facts = os.fstat(handle)
             if not stat.S_ISREG(facts.st_mode):
