@@ -383,7 +383,7 @@ def _first_line(error: object) -> str:
 
 
 def _configs() -> Path:
-    from torchpt.paths import configs
+    from torchpt.files import configs
 
     return configs()
 

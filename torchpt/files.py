@@ -1,4 +1,4 @@
-"""Files that others name: regular ones only, and no larger than is said.
+"""Files: those that others name, regular ones only and no larger than is said, and those that ship with torchpt.
 
 A scene may name anything: ``/dev/zero`` has no end, and a pipe is opened only once somebody writes to it.
 """
@@ -13,11 +13,12 @@ from typing import Any
 
 from torchpt.errors import SceneError
 
-__all__ = ["MAX_BYTES", "Unfit", "as_path", "check_regular", "is_regular", "read_regular"]
+__all__ = ["MAX_BYTES", "Unfit", "as_path", "check_regular", "configs", "is_regular", "read_regular"]
 
 #: Bytes of the largest mesh or picture file that is read.
 MAX_BYTES = 4 * 2**30
 
+_PACKAGE = Path(__file__).resolve().parent
 _PIECE = 2**24  # bytes read at a time of a file that is longer than it said
 
 
@@ -85,3 +86,9 @@ def read_regular(path: str | os.PathLike[str], most: int = MAX_BYTES) -> bytes:
             parts.append(file.read(min(_PIECE, most + 1 - total)))
             total += len(parts[-1])
     return parts[0] if total == len(parts[0]) else b"".join(parts)  # not twice in memory
+
+
+def configs() -> Path:
+    """Return the folder of the config groups that ship (``scene/``, ...), in an installed wheel or in a checkout."""
+    installed = _PACKAGE / "share" / "configs"
+    return installed if installed.is_dir() else _PACKAGE.parent / "configs"

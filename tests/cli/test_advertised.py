@@ -15,8 +15,8 @@ import torch
 
 from torchpt import cli
 from torchpt.cli import main
+from torchpt.files import configs
 from torchpt.images import write_image
-from torchpt.paths import configs
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

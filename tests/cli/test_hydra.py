@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from torchpt.cli import GROUPS, main
-from torchpt.paths import configs
+from torchpt.files import configs
 from torchpt.settings import TYPED
 from torchpt.spec import not_built, parameters_of
 

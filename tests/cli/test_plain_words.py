@@ -12,7 +12,7 @@ from torchpt.cli import main
 from torchpt.commands import render
 from torchpt.commands.plain_words import compose_plainly
 from torchpt.commands.render import Job
-from torchpt.paths import configs
+from torchpt.files import configs
 
 PLAIN = [
     [],

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchpt import paths
 from torchpt.errors import AssetError, NotBuiltError, SceneError
+from torchpt.files import configs
 from torchpt.format.cameras import read_camera
 from torchpt.format.description import read_description, scene_names, settings
 from torchpt.scene.build import build_parts
@@ -244,7 +244,7 @@ def test_shipped_scenes_need_no_assets(name: str, monkeypatch: pytest.MonkeyPatc
     for key, part in found.shapes.items():
         if part.values.get("path") is not None:
             assert found.resolve(part["path"], f"shapes.{key}.path").is_file()
-    first = (paths.configs() / "scene" / f"{name}.yaml").read_text().splitlines()[0]
+    first = (configs() / "scene" / f"{name}.yaml").read_text().splitlines()[0]
     assert first.startswith(f"# torchpt render scene={name} ")
 
 

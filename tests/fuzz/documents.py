@@ -13,9 +13,9 @@ import torch
 import yaml
 from damage import damaged
 
-from torchpt import paths
 from torchpt.bsdfs import KINDS as MATERIALS
 from torchpt.cameras import KINDS as CAMERAS
+from torchpt.files import configs
 from torchpt.film import FILTERS
 from torchpt.format.yaml_file import read_yaml
 from torchpt.integrators import KINDS as INTEGRATORS
@@ -72,7 +72,7 @@ def strange() -> list[Any]:
 def whole_documents() -> list[dict[str, Any]]:
     """Sound documents: the scenes that ship, and a small one of each kind of everything."""
     found = []
-    for file in sorted((paths.configs() / "scene").glob("*.yaml")):
+    for file in sorted((configs() / "scene").glob("*.yaml")):
         raw = read_yaml(file, str(file))
         names = list(raw.get("shapes", {}))
         kept = set(names[:MOST_SHAPES]) | {

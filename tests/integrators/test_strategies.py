@@ -11,7 +11,7 @@ import yaml
 from trials import film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt import paths
+from torchpt.files import configs
 
 SMALL = film_of(24)
 
@@ -22,7 +22,7 @@ def cornell():
 
 
 def cornell_dict() -> dict[str, Any]:
-    return yaml.safe_load((paths.configs() / "scene" / "cornell_box.yaml").read_text())
+    return yaml.safe_load((configs() / "scene" / "cornell_box.yaml").read_text())
 
 
 def pictures(scene: Any, count: int, spp: int, first_seed: int, **integrator: Any):

@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any
 
 from torchpt.commands.arguments import GROUPS
-from torchpt.paths import configs
+from torchpt.files import configs
 
 __all__ = ["known_keys", "listed", "options", "scenes", "types", "unknown"]
 

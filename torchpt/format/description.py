@@ -8,11 +8,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from torchpt import paths
 from torchpt import settings as run_settings
 from torchpt.bsdfs import Bsdf
 from torchpt.errors import AssetError, SceneError
-from torchpt.files import MAX_BYTES, check_regular, is_regular
+from torchpt.files import MAX_BYTES, check_regular, configs, is_regular
 from torchpt.format.cameras import read_camera
 from torchpt.format.materials import Kind, check_material, material_types, read_material
 from torchpt.format.textures import check_texture, texture_of
@@ -126,7 +125,7 @@ class Description:
 
 def scene_names() -> list[str]:
     """The scenes that ship, by name."""
-    return sorted(path.stem for path in (paths.configs() / "scene").glob("*.yaml"))
+    return sorted(path.stem for path in (configs() / "scene").glob("*.yaml"))
 
 
 def read_description(
@@ -166,7 +165,7 @@ def read_description(
     if file.endswith((".yaml", ".yml")):
         path = Path(file)
     elif file in scene_names():
-        path = paths.configs() / "scene" / f"{file}.yaml"
+        path = configs() / "scene" / f"{file}.yaml"
         file = str(path)
     else:
         raise SceneError("scene", file, f"one of {', '.join(scene_names())}, or a path ending in .yaml")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from torchpt import paths
 from torchpt.errors import SceneError
+from torchpt.files import configs
 from torchpt.format.yaml_file import read_yaml
 from torchpt.settings import BLOCKS
 from torchpt.spec.validate import check_keys
@@ -138,7 +138,7 @@ def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[s
 
 def _group(group: str, name: Any, file: str | None) -> dict[str, Any]:
     """What a group's file sets: ``integrator=path`` is ``configs/integrator/path.yaml``."""
-    folder = paths.configs() / group
+    folder = configs() / group
     names = sorted(path.stem for path in folder.glob("*.yaml"))
     if name not in names:
         raise SceneError(group, name, f"one of {', '.join(names)}", file)

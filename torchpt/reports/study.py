@@ -12,8 +12,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
-from torchpt import paths
 from torchpt.errors import SceneError
+from torchpt.files import configs
 from torchpt.format.yaml_file import plain, read_yaml
 from torchpt.images.metrics import METRICS
 from torchpt.reports.grid import Variant, blocks_of, denoised_label, flat, variants_of
@@ -190,7 +190,7 @@ def read_study(name: str) -> tuple[dict[str, Any], str]:
     Raises:
         SceneError: no such file, no valid YAML, no mapping.
     """
-    shipped = {path.stem: str(path) for path in sorted((paths.configs() / "study").glob("*.yaml"))}
+    shipped = {path.stem: str(path) for path in sorted((configs() / "study").glob("*.yaml"))}
     if not name.endswith((".yaml", ".yml")) and name not in shipped:
         raise SceneError("study", name, f"one of {', '.join(shipped)}, or a path ending in .yaml")
     path = shipped.get(name, name)
