@@ -1,4 +1,4 @@
-"""Tables of the docs are what the kinds declare, and Python in them is Python."""
+"""Tables of the docs are what the kinds declare, Python in them is Python, and the glossary names what is in the code."""
 
 from __future__ import annotations
 
@@ -19,6 +19,19 @@ def test_python_blocks_compile(name: str) -> None:
     text = (DOCS.parent / name).read_text(encoding="utf-8")
     for block in re.finditer(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
         compile("\n" * text.count("\n", 0, block.start(1)) + block[1], name, "exec")
+
+
+def test_the_last_column_of_the_glossary_is_in_the_code() -> None:
+    rows = [line for line in (DOCS / "glossary.md").read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
+    found = 0
+    for row in rows:
+        names = re.findall(r"`([^`]+)`", row.removesuffix(" |").rsplit("|", 1)[-1])
+        files = [name for name in names if name.endswith(".py")]
+        code = "".join((DOCS.parent / "torchpt" / file).read_text(encoding="utf-8") for file in files)
+        for name in names if files else ():
+            assert name in files or re.search(rf"\b{name}\b", code), f"glossary.md: {name} is not in {files}"
+            found += 1
+    assert found > 100
 
 
 def test_a_changed_table_is_noticed() -> None:
