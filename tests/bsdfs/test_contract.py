@@ -4,14 +4,17 @@ Each promise is tested as if the model broke it. Statistics are judged at one si
 against float64 cubature of the model's own ``eval`` and ``pdf``, on float32 lanes as a render runs them.
 
 All cases from all directions are slow tests, with a quarter of a million draws each: a million would find errors half the
-size, and take an hour. One case of each model is fast.
+size, and take an hour. One case of each model is fast. A test takes the cases of one model: its failure names the one that
+broke the promise.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -43,12 +46,46 @@ def heavy(model: bsdfs.Bsdf) -> bool:
     return getattr(model, "energy_compensation", False) and (model.refracts or model.anisotropic)
 
 
-def first_fast(cases: list[Case], tables: bool = False) -> list[Any]:
-    """Parameters of which only the first of each model is fast, where its ``tables`` are differentiated if not heavy."""
-    first = {str(case.model): case for case in reversed(cases)}.values()
-    quick = [any(case is one for one in first) and not (tables and heavy(case.model)) for case in cases]
-    slow = [pytest.mark.slow]
-    return [pytest.param(c, marks=[] if fast else slow, id=str(c)) for c, fast in zip(cases, quick, strict=True)]
+def by_model(cases: list[Case], tables: bool = False) -> list[Any]:
+    """Return lists of cases of one model as parameters: the first case is fast, the others together are slow.
+
+    Where the ``tables`` of a heavy model are differentiated the first is slow too.
+    """
+    groups: dict[str, list[Case]] = {}
+    for case in cases:
+        groups.setdefault(str(case.model), []).append(case)
+    slow, parameters = [pytest.mark.slow], []
+    for name, (first, *others) in groups.items():
+        parameters.append(pytest.param([first], marks=slow if tables and heavy(first.model) else [], id=name))
+        if others:
+            parameters.append(pytest.param(others, marks=slow, id=f"{name} others"))
+    return parameters
+
+
+def each(cases: list[Case], tables: bool = False) -> Callable[[Callable[[Case], None]], Callable[[list[Case]], None]]:
+    """Make a test of a check of one case, see :func:`by_model`."""
+
+    def made(check: Callable[[Case], None]) -> Callable[[list[Case]], None]:
+        @pytest.mark.parametrize("cases", by_model(cases, tables))
+        def test(cases: list[Case]) -> None:
+            for case in cases:
+                with named(case):
+                    check(case)
+
+        test.__doc__ = check.__doc__
+        return test
+
+    return made
+
+
+@contextmanager
+def named(what: object) -> Iterator[None]:
+    """Say which case an assertion failed for."""
+    try:
+        yield
+    except AssertionError as error:
+        error.add_note(f"of {what}")
+        raise
 
 
 def towards(angle: float, below: bool = False, azimuth: float = AZIMUTH) -> Tensor:
@@ -256,14 +293,6 @@ class Experiment:
         return weight.mean(1), weight.std(1) / math.sqrt(self.number)
 
 
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param(s, marks=[pytest.mark.slow] if s.full else [], id=str(s)) for s in SETTINGS],
-)
-def experiment(request) -> Experiment:
-    return Experiment(request.param)
-
-
 def test_every_model_has_cases_and_edges():
     missing = [str(model) for model in MODELS if not cases_of(model) or not edges_of(model)]
     assert not missing, f"no case for {missing}"
@@ -282,7 +311,7 @@ def test_variants_are_what_scenes_ask_for():
 # --- Draws against the density
 
 
-def test_draws_follow_the_density(experiment):
+def draws_follow_the_density(experiment: Experiment) -> None:
     if experiment.case.smooth:
         assert not experiment.spread.any()
         assert experiment.integral.value.abs().max() == 0
@@ -291,7 +320,7 @@ def test_draws_follow_the_density(experiment):
     assert p > EACH, f"p = {p:.3g}, limit {EACH:.2g}"
 
 
-def test_the_density_holds_at_most_one(experiment):
+def the_density_holds_at_most_one(experiment: Experiment) -> None:
     integral = experiment.integral
     mass, error = float(integral.value[0].sum()), float(integral.error[0].sum())
     assert error < 2e-3, f"the cubature is known to {error:.2g} only"
@@ -300,7 +329,7 @@ def test_the_density_holds_at_most_one(experiment):
     assert abs(mass - (1 - share)) < error + 1e-5 + 5 * math.sqrt(max(share * (1 - share), 1e-9) / experiment.number)
 
 
-def test_the_mean_weight_is_the_integral_of_eval(experiment):
+def the_mean_weight_is_the_integral_of_eval(experiment: Experiment) -> None:
     integral = experiment.integral
     mean, error = experiment.mean(experiment.spread)
     expected, doubt = integral.value[1:].sum(1), integral.error[1:].sum(1)
@@ -309,22 +338,22 @@ def test_the_mean_weight_is_the_integral_of_eval(experiment):
     assert ((mean - expected).abs() <= limit).all(), f"{mean.tolist()} against {expected.tolist()} +- {limit.tolist()}"
 
 
-def test_no_energy_is_created(experiment):
+def no_energy_is_created(experiment: Experiment) -> None:
     if not (experiment.model.conserves and experiment.case.conserves):
-        pytest.skip("this material may reflect more than it receives")
+        return  # this material may reflect more than it receives
     mean, error = experiment.mean(experiment.draws.pdf > 0, radiance=True)
     assert (mean <= 1 + experiment.case.furnace + Z * error + 2e-5).all(), f"albedo {mean.tolist()} +- {error.tolist()}"
 
 
-def test_white_furnace(experiment):
+def white_furnace(experiment: Experiment) -> None:
     case = experiment.case
     if not case.lossless:
-        pytest.skip("this material absorbs, or loses light between its facets")
+        return  # this material absorbs, or loses light between its facets
     mean, error = experiment.mean(experiment.draws.pdf > 0, radiance=True)
     assert ((mean - 1).abs() <= case.furnace + Z * error + 2e-5).all(), f"{mean.tolist()} +- {error.tolist()}"
 
 
-def test_weight_is_eval_over_pdf(experiment):
+def weight_is_eval_over_pdf(experiment: Experiment) -> None:
     """The draw's density and weight are those of ``eval`` and ``pdf`` asked anew for the same directions, in other company."""
     wi, pdf, weight = (x[..., :LANES] for x in (experiment.draws.wi, experiment.draws.pdf, experiment.draws.weight))
     spread = experiment.spread[:LANES]
@@ -348,7 +377,7 @@ def test_weight_is_eval_over_pdf(experiment):
     torch.testing.assert_close(value[:, spread], (weight * pdf)[:, spread], rtol=1e-3, atol=1e-7)
 
 
-def test_deltas_go_where_they_may(experiment):
+def deltas_go_where_they_may(experiment: Experiment) -> None:
     """A delta reflects by the mirror's law, refracts by Snell's or passes straight; ``eta`` says which."""
     case, wi = experiment.case, experiment.draws.wi[:, experiment.delta].double()
     sides = experiment.draws.eta
@@ -369,6 +398,36 @@ def test_deltas_go_where_they_may(experiment):
         torch.testing.assert_close(
             sides[live].double(), torch.where(through, index, 1.0)[live].double(), rtol=1e-6, atol=0
         )
+
+
+PROMISES: tuple[Callable[[Experiment], None], ...] = (
+    draws_follow_the_density,
+    the_density_holds_at_most_one,
+    the_mean_weight_is_the_integral_of_eval,
+    no_energy_is_created,
+    white_furnace,
+    weight_is_eval_over_pdf,
+    deltas_go_where_they_may,
+)
+
+
+def by_case() -> Iterator[Any]:
+    """Lists of settings: the fast ones of a model, and all directions of a case, which are slow."""
+    groups: dict[tuple[str, bool], list[Setting]] = {}
+    for setting in SETTINGS:
+        name = str(setting.case) if setting.full else str(setting.case.model)
+        groups.setdefault((name, setting.full), []).append(setting)
+    for (name, full), group in groups.items():
+        yield pytest.param(group, marks=[pytest.mark.slow] if full else [], id=name)
+
+
+@pytest.mark.parametrize("settings", list(by_case()))
+def test_draws_keep_all_promises(settings):
+    for setting in settings:
+        experiment = Experiment(setting)
+        for promise in PROMISES:
+            with named(f"{setting}: {promise.__name__}"):
+                promise(experiment)
 
 
 # --- Delta lobes against closed forms
@@ -415,11 +474,10 @@ def gradients(value: Tensor, inputs: list[Tensor]) -> list[Tensor]:
     return [torch.zeros_like(x) if g is None else g for g, x in zip(found, inputs, strict=True)]
 
 
-@pytest.mark.parametrize("angle", ANGLES)
-@pytest.mark.parametrize("case", first_fast([case for case in CASES if case.model.name in CLOSED]))
-def test_deltas_carry_what_fresnel_gives_them(case, angle):
+@each([case for case in CASES if case.model.name in CLOSED])
+def test_deltas_carry_what_fresnel_gives_them(case):
     """In the mean over ``lobe``, with its gradient in every number: a probability is detached, an amount is not."""
-    for below in (False, True) if case.model.transmits else (False,):
+    for angle, below in itertools.product(ANGLES, (False, True) if case.model.transmits else (False,)):
         wo = towards(angle, below).double()
         values = tensors(case.values, torch.float64)
         inputs = [t.requires_grad_() for t in leaves(values)]
@@ -458,11 +516,9 @@ def pairs(case: Case, n: int, dtype: torch.dtype, generator: torch.Generator) ->
     return normalize(wo.to(dtype)), normalize(wi.to(dtype))
 
 
-@pytest.mark.parametrize("case", first_fast(CASES))
+@each([case for case in CASES if case.model.reciprocal])
 def test_reciprocity(case):
     """``f(wo, wi) = f(wi, wo)`` on one side; across, the radiance of either is divided by its squared index."""
-    if not case.model.reciprocal:
-        pytest.skip("not reciprocal by its definition")
     wo, wi = pairs(case, 4096, torch.float64, torch.Generator().manual_seed(3))
     p = lanes(case.rows(torch.float64), wo.shape[1])
     there = case.model.eval(p, wo, wi) * wo[2].abs()
@@ -474,10 +530,8 @@ def test_reciprocity(case):
     torch.testing.assert_close(there, back, rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.parametrize("case", first_fast(CASES))
+@each([case for case in CASES if not case.model.transmits])
 def test_opaque_models_are_black_from_behind(case):
-    if case.model.transmits:
-        pytest.skip("light passes")
     wo, wi = pairs(case, 512, torch.float32, torch.Generator().manual_seed(4))
     p = lanes(case.rows(), wo.shape[1])
     wi = torch.stack((wi[0], wi[1], -wi[2]))
@@ -553,7 +607,7 @@ def edge_lanes(case: Case) -> tuple[Tensor, Tensor, Tensor]:
     return wo, wi, u
 
 
-@pytest.mark.parametrize("case", first_fast(EDGES))
+@each(EDGES)
 def test_edge_numbers_stay_finite(case):
     model = case.model
     wo, wi, u = edge_lanes(case)
@@ -589,14 +643,12 @@ def test_edge_numbers_stay_finite(case):
     assert torch.isfinite(albedo).all() and (albedo >= 0).all()
 
 
-@pytest.mark.parametrize("case", first_fast(EDGES, tables=True))
+@each([case for case in EDGES if leaves(case.values)], tables=True)
 def test_gradients_stay_finite_at_the_edges(case):
     """Through ``prepare``: of eval, and of the weights of all draws, deltas and failed ones too."""
     wo, wi, u = edge_lanes(case)
     values = tensors(case.values, torch.float32)
     inputs = [t.requires_grad_() for t in leaves(values)]
-    if not inputs:
-        pytest.skip("no parameters")
     p = lanes(bsdfs.stacked([case.model.prepare(values)]), wo.shape[1])
     # Of directions as well: they depend on vertices.
     wo, wi = wo.clone().requires_grad_(), wi.clone().requires_grad_()
@@ -633,9 +685,7 @@ def inside(values: bsdfs.Parameters) -> bsdfs.Parameters:
     return out
 
 
-@pytest.mark.parametrize(
-    "case", first_fast([case for case in CASES if case.differentiable and not case.smooth], tables=True)
-)
+@each([case for case in CASES if case.differentiable and not case.smooth], tables=True)
 def test_gradients_of_eval(case):
     """Finite differences in every number that a material is given, at directions within its lobes."""
     values = inside(tensors(case.values, torch.float64))
