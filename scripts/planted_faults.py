@@ -47,7 +47,7 @@ MARKERS = "not slow and not long and not gpu"
 #: Faults of the whole table that the tests are to catch.
 LEAST = 57
 #: In a copy its anchor is gone: that test says nothing of what users see.
-IGNORED = "tests/test_planted_faults.py"
+IGNORED = "test_planted_faults.py"
 #: What tests need of a tree that is no git checkout.
 COPIED = ("torchpt", "tests", "configs", "scenes", "scripts", "docs")
 #: Notes the test that runs, and the first that fails, beside the copy.
@@ -68,9 +68,8 @@ def pytest_runtest_logstart(nodeid, location):
 
 def pytest_runtest_logreport(report):
     if report.failed:
-        last = (report.longreprtext.strip().splitlines() or [""])[-1]
-        crash = getattr(getattr(report.longrepr, "reprcrash", None), "message", "")
-        _note(test=report.nodeid, failed=True, message=(crash.splitlines() or [last])[0][:300])
+        crash = getattr(getattr(report.longrepr, "reprcrash", None), "message", "") or report.longreprtext[-300:]
+        _note(test=report.nodeid, failed=True, message=" ".join(crash.split())[:300])
 """
 
 
@@ -234,9 +233,8 @@ class Campaign:
         _copy(tree, self.clean)
         compileall.compile_dir(self.clean / "torchpt", quiet=2)  # once for all copies
         (scratch / "planted_faults_plugin.py").write_text(PLUGIN)
-        self.folders = sorted(
-            path.name for path in (self.clean / "tests").iterdir() if path.is_dir() and any(path.glob("test_*.py"))
-        )
+        files = (self.clean / "tests").rglob("test_*.py")
+        self.tests = {file: file.read_text(encoding="utf-8") for file in files if file.name != IGNORED}
         self._valid: dict[str, bool] = {}
         self._lock = threading.Lock()
         self._running: set[subprocess.Popen[bytes]] = set()
@@ -249,7 +247,7 @@ class Campaign:
         shutil.copytree(self.clean, folder)
         try:
             (folder / file).write_text(site.planted(fault.after), encoding="utf-8")
-            stages = [run for stage in self._stages(fault) for run in stage]
+            stages = [run for stage in self._stages(fault, file) for run in stage]
             while stages and not result.verdict:
                 if self._stage(folder, stages[0], result):
                     stages.pop(0)
@@ -310,7 +308,7 @@ class Campaign:
                 environment.setdefault("TORCHPT_ASSETS", str(assets))
             command = [
                 *(sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "planted_faults_plugin"),
-                *("-m", MARKERS, f"--ignore={IGNORED}", *(f"--deselect={test}" for test in without), *targets),
+                *("-m", MARKERS, *(f"--deselect={test}" for test in without), *targets),
             ]
             with open(os.devnull, "r+b") as nothing:
                 process = subprocess.Popen(
@@ -328,27 +326,31 @@ class Campaign:
             text = note.read()
         return code, json.loads(text) if text else {}
 
-    def _stages(self, fault: Fault) -> list[list[list[str]]]:
-        """Tests of a fault's room, those that concern it too, and the others; ranks fork, so they want their own process."""
+    def _stages(self, fault: Fault, file: Path) -> list[list[list[str]]]:
+        """Files of tests: of the fault's room, of those that concern it too, and all others.
+
+        In each, those come first that are named after the module ``file``, then those that import it.
+        """
         own, *others = fault.tests.split()
-        room = fault.room.partition("/")[0].removesuffix(".py")
-        importing = [name for name in self.folders if _mentions(self.clean / "tests" / name, f"torchpt.{room}")]
-        second = [name for name in dict.fromkeys((*others, *importing)) if name != own and name in self.folders]
-        third = [name for name in self.folders if name not in (own, *second)]
-        alone = sorted(
-            path.name for path in (self.clean / "tests").glob("test_*.py") if f"tests/{path.name}" != IGNORED
-        )
-        return [_apart([own]), _apart(second), _apart([*third, *alone])]
+        *_, stem = module = file.with_suffix("").parts
+        dotted, room = ".".join(module), ".".join(module[:2])
+
+        def order(test: Path) -> tuple[int, str]:
+            return 0 if stem in test.stem else 1 if dotted in self.tests[test] else 2, test.as_posix()
+
+        importing = {test.parent.name for test, text in self.tests.items() if room in text}
+        second = {*others, *importing} - {own, "tests"}
+        stages: list[list[Path]] = [[], [], []]
+        for test in sorted(self.tests, key=order):
+            stages[0 if test.parent.name == own else 1 if test.parent.name in second else 2].append(test)
+        return [_apart([test.relative_to(self.clean) for test in stage]) for stage in stages]
 
 
-def _apart(names: Sequence[str]) -> list[list[str]]:
-    """Targets of processes: the ranks' alone, all others together."""
-    others = [f"tests/{name}" for name in names if name != "ranks"]
-    return [*([["tests/ranks"]] if "ranks" in names else []), *([others] if others else [])]
-
-
-def _mentions(folder: Path, words: str) -> bool:
-    return any(words in path.read_text(encoding="utf-8") for path in folder.glob("*.py"))
+def _apart(files: Sequence[Path]) -> list[list[str]]:
+    """Files for each process: those of ranks fork, and so want one in which nothing else has worked before."""
+    ranks = [file.as_posix() for file in files if file.parent.name == "ranks"]
+    others = [file.as_posix() for file in files if file.parent.name != "ranks"]
+    return [names for names in (ranks, others) if names]
 
 
 def _copy(tree: Path, to: Path) -> None:

@@ -17,7 +17,7 @@ class Fault:
 
     Attributes:
         name: of the fault.
-        room: file under ``torchpt/`` where the function stood last; a hint for readers and for the choice of tests.
+        room: file under ``torchpt/`` where the function stood last; a hint for readers.
         tests: folders of ``tests/``, divided by spaces: the first is that of the room, the others concern the fault too.
         function: qualified name of a function or class, such as ``Phong.eval_pdf``.
         before: the right expression.
