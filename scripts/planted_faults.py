@@ -428,6 +428,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--only: no fault is called {', '.join(unknown)}")
     faults = [known[name] for name in asked.only] if asked.only else list(FAULTS)
     tree = asked.tree.resolve()
+    if not (tree / "torchpt").is_dir():
+        parser.error(f"--tree: {asked.tree} holds no package torchpt")
     if asked.list:
         for fault in faults:
             print(
