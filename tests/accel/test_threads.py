@@ -58,6 +58,7 @@ def test_threads_and_slices_do_not_change_a_bit(kind):
         assert torch.equal(dark[a:b], two.occluded(o[:, a:b], d[:, a:b], t_max[a:b]))
 
 
+@pytest.mark.slow
 def test_import_loads_no_numba():
     out = _run("print('numba' in sys.modules); build(soup(0), 'torch'); print('numba' in sys.modules)")
     assert out == ["False", "False"]
@@ -75,7 +76,8 @@ def test_two_python_threads(layer, expected):
     assert _run(body, NUMBA_THREADING_LAYER=layer) == [expected] * 6
 
 
-@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.slow
 def test_worker_processes_after_the_parent_worked(method, expected, tmp_path):
     script = tmp_path / "workers.py"
     script.write_text(

@@ -162,7 +162,7 @@ def pooled(picture: Tensor, side: int) -> Tensor:
     return torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], side)[0]
 
 
-@pytest.mark.parametrize("name", ["cornell_box", "cornell_bunny"])
+@pytest.mark.parametrize("name", ["cornell_box", pytest.param("cornell_bunny", marks=pytest.mark.slow)])
 def test_stored_references(name):
     assets = os.environ.get("TORCHPT_ASSETS")
     if name == "cornell_bunny" and not (assets and (Path(assets) / "bunny.ply").is_file()):

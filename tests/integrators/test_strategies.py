@@ -55,12 +55,12 @@ def by_mis(cornell):
     ("strategy", "keys", "spp"),
     [
         ("light", {}, 64),
-        ("bsdf", {}, 256),
-        ("uniform", {}, 256),
-        ("mis", {"rr_depth": 1000}, 32),
+        ("bsdf", {}, 128),
+        pytest.param("uniform", {}, 256, marks=pytest.mark.slow),
+        pytest.param("mis", {"rr_depth": 1000}, 32, marks=pytest.mark.slow),
         ("mis", {"rr_depth": 1}, 64),
         ("mis", {"rr_depth": 1, "rr_prob": 0.6}, 64),
-        ("mis", {"rr_depth": 2, "rr_prob": 1.0}, 32),
+        pytest.param("mis", {"rr_depth": 2, "rr_prob": 1.0}, 32, marks=pytest.mark.slow),
     ],
 )
 def test_every_strategy_and_roulette_has_the_same_mean(cornell, by_mis, strategy, keys, spp):

@@ -192,7 +192,7 @@ def test_the_same_bits_without_workers(expected):
     assert same(by_index(DataLoader(data(), batch_size=2)), expected)
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_the_same_bits_in_workers(expected, method):
     loader = DataLoader(data(), batch_size=2, num_workers=2, multiprocessing_context=method, timeout=300)
     assert same(by_index(loader), expected)

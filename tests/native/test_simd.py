@@ -8,7 +8,7 @@ import pytest
 from torchpt.native import simd
 from torchpt.native.jit import jit
 
-LANES = (4, 8, 16)
+LANES = (pytest.param(4, marks=pytest.mark.slow), 8, pytest.param(16, marks=pytest.mark.slow))
 SPECIAL = np.array(
     [0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan, 1e-45, -1e-45, 1.1754942e-38, 3.4028235e38, -3.4028235e38],
     np.float32,

@@ -195,7 +195,8 @@ def slow(name: str, mode: str) -> list[pytest.MarkDecorator]:
     """Where kernels take long to compile, or one of a kind is left that shows the same."""
     rows = ("many lights", "textures and normal maps", "strategy light", "some materials")
     others = name.startswith(("sampler ", "filter ", "strategy ")) and name not in ("sampler sobol", "filter mitchell")
-    return [pytest.mark.slow] * (others or (mode == "compiled" and name in rows))
+    eager = ("every kind of primitive", "opacity", "textures and normal maps", "many lights", "layers")
+    return [pytest.mark.slow] * (others or (name in rows if mode == "compiled" else name not in eager))
 
 
 @pytest.mark.parametrize(

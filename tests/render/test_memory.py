@@ -326,9 +326,8 @@ WISHES = {
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
-@pytest.mark.parametrize(
-    "name", ["compiled", *(pytest.param(name, marks=pytest.mark.slow) for name in ("pilots", "eager"))]
-)
+@pytest.mark.parametrize("name", ["compiled", "pilots", "eager"])
+@pytest.mark.slow
 def test_too_small_a_limit_names_the_least_that_works(name):
     measured("8GB", WISHES[name])  # kernels are compiled once a machine, which takes memory of its own
     said, _ = measured("1MB", WISHES[name])

@@ -34,6 +34,13 @@ def worker(method):
     process.join()
 """
 SCRIPTS = {
+    "threads, then a fork": """
+found = []
+threads = [threading.Thread(target=lambda: found.append(digest())) for _ in range(2)]
+[t.start() for t in threads]; [t.join() for t in threads]
+print(*found, sep="\\n")
+worker('fork')
+""",
     "threads": """
 found = []
 threads = [threading.Thread(target=lambda: found.append(digest())) for _ in range(2)]
@@ -72,7 +79,7 @@ def run(tmp_path: Path, body: str, name: str, environment: dict[str, str]) -> li
 
 # Both CPU searches: packets and the wide tree.
 @pytest.mark.parametrize("name", ["cornell_box", pytest.param("cornell_bunny", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("way", SCRIPTS)
+@pytest.mark.parametrize("way", [pytest.param(x, marks=[] if "then" in x else [pytest.mark.slow]) for x in SCRIPTS])
 def test_threads_and_workers_give_the_same_picture(tmp_path, way, name):
     assert set(run(tmp_path, SCRIPTS[way], name, {})) == {expected(name)}
 
