@@ -13,17 +13,18 @@ SCENE ?= cornell_box
 OUT ?= $(notdir $(basename $(SCENE))).png
 ARGS ?=
 
-.PHONY: help render test test-all stress check format clean
+.PHONY: help render test test-quick test-all stress check format clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make render    render configs/scene/$(SCENE).yaml to $(OUT)   (SCENE=name OUT=file ARGS='render.spp=256')"
-	@echo "make test      the fast tests"
-	@echo "make test-all  slow tests too, and the comparison with Mitsuba"
-	@echo "make stress    stiff and extreme cases, whole sweeps by every backend, to stress/; a thousand million rays; damaged files"
-	@echo "make check     ruff, pyright, import layers"
-	@echo "make format    let ruff rewrite the files"
-	@echo "make clean     remove the virtual environment and caches"
+	@echo "make render      render configs/scene/$(SCENE).yaml to $(OUT)   (SCENE=name OUT=file ARGS='render.spp=256')"
+	@echo "make test        the fast tests"
+	@echo "make test-quick  contracts alone: every model, light, shape, texture, camera, sampler, filter and integrator"
+	@echo "make test-all    slow tests too, and the comparison with Mitsuba"
+	@echo "make stress      stiff and extreme cases, whole sweeps by every backend, to stress/; a thousand million rays; damaged files"
+	@echo "make check       ruff, pyright, import layers"
+	@echo "make format      let ruff rewrite the files"
+	@echo "make clean       remove the virtual environment and caches"
 
 render: $(VENV)/run.stamp
 	@$(PY) -m torchpt render "scene=$(SCENE)" "out=$(OUT)" $(ARGS)
@@ -34,9 +35,12 @@ test: $(VENV)/dev.stamp
 	$(PY) -m pytest -m "not slow and not long and not gpu" tests/ranks
 	$(PY) -m pytest -m "not slow and not long and not gpu" -n 2 --dist loadfile --ignore=tests/ranks $(ARGS)
 
+test-quick: $(VENV)/dev.stamp
+	$(PY) -m pytest -q -m "not slow and not long and not gpu" -n 2 $(wildcard tests/*/test_contract.py) $(ARGS)
+
 test-all: $(VENV)/bench.stamp
-	$(PY) -m pytest -m "not long" tests/ranks
-	$(PY) -m pytest -m "not long" -n 2 --dist loadfile --ignore=tests/ranks $(ARGS)
+	$(PY) -m pytest -m "not long" --hypothesis-profile=random tests/ranks
+	$(PY) -m pytest -m "not long" --hypothesis-profile=random -n 2 --dist loadfile --ignore=tests/ranks $(ARGS)
 
 stress: $(VENV)/dev.stamp
 	$(PY) -m torchpt stress "accel=[numba,torch,brute]" "compile=[on,off]" out=stress $(ARGS)

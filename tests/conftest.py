@@ -7,6 +7,12 @@ import importlib.util
 import os
 
 import pytest
+from hypothesis import settings
+
+# Examples are the same in each run; `make test-all` draws more of them, others each time (--hypothesis-profile=random).
+settings.register_profile("fixed", max_examples=30, derandomize=True, database=None, deadline=None)
+settings.register_profile("random", max_examples=300, deadline=None, print_blob=True)
+settings.load_profile("fixed")
 
 # Workers share the cores: threads of their own would only wait for each other. (Before torch is imported.)
 if "PYTEST_XDIST_WORKER" in os.environ:
