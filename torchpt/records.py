@@ -6,9 +6,10 @@ Directions (pbrt): ``wo`` points toward the previous vertex, ``wi`` toward the n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
+from torchpt.core.tree import map_leaves
 from torchpt.math.vectors import take
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ __all__ = [
     "World",
     "joined",
     "rows",
-    "tensors_of",
 ]
 
 #: Primitive kinds in the order in which a :class:`Geometry` stores them; each is a file in ``shapes/primitives/``.
@@ -355,19 +355,13 @@ class PathState:
     scene: Tensor | None = None  # (N,) int64 which scene of several; None: there is one
 
 
+T = TypeVar("T")
 R = TypeVar("R", PathState, Hit, Quadrics, Copies)
 
 
-def rows(record: R, index: Tensor | None) -> R:
-    """The lanes ``index`` of a record of tensors (None: all); what is static stays."""
-    if index is None:
-        return record
-    values: dict[str, Any] = {f.name: getattr(record, f.name) for f in fields(record)}
-    static = (tuple, type(None))
-    lanes: dict[str, Any] = {
-        name: value if isinstance(value, static) else take(value, index) for name, value in values.items()
-    }
-    return type(record)(**lanes)
+def rows(record: T, index: Tensor | None) -> T:
+    """Return the lanes ``index`` of all tensors in a record (None: all); what is static stays."""
+    return record if index is None else map_leaves(lambda table: take(table, index), record)
 
 
 def joined(records: list[R]) -> R:
@@ -379,18 +373,3 @@ def joined(records: list[R]) -> R:
     columns = {f.name: [getattr(r, f.name) for r in records] for f in fields(records[0])}
     whole: dict[str, Any] = {name: None if c[0] is None else torch.cat(c, -1) for name, c in columns.items()}
     return type(records[0])(**whole)
-
-
-def tensors_of(record: object) -> list[Tensor]:
-    """All tensors of a record, its dicts, tuples and inner records."""
-    import torch
-
-    if isinstance(record, torch.Tensor):
-        return [record]
-    if isinstance(record, dict):
-        return [t for value in record.values() for t in tensors_of(value)]
-    if isinstance(record, tuple | list):
-        return [t for value in record for t in tensors_of(value)]
-    if is_dataclass(record):
-        return [t for f in fields(record) for t in tensors_of(getattr(record, f.name))]
-    return []

@@ -15,10 +15,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
+from torchpt.core.tree import leaves
 from torchpt.format.description import settings
 from torchpt.integrators.loop import programs
 from torchpt.lanes.program import Program
-from torchpt.records import tensors_of
 
 
 class _Counter(TorchDispatchMode):
@@ -30,7 +30,7 @@ class _Counter(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         out = func(*args, **(kwargs or {}))
         self.calls[func._schema.name] += 1
-        self.elements += sum(t.numel() for t in tensors_of(out)) if not isinstance(out, bool) else 0
+        self.elements += sum(t.numel() for t in leaves(out)) if not isinstance(out, bool) else 0
         return out
 
 
@@ -43,7 +43,7 @@ def counted(described: dict[str, Any]) -> tuple[Counter[str], int, torch.Tensor,
         image = torchpt.render(
             scene, spp=4, film=film_of(32), compile="off", integrator={"type": "path", "max_depth": 4}
         )
-    return counter.calls, counter.elements, image, len(tensors_of(world))
+    return counter.calls, counter.elements, image, len(leaves(world))
 
 
 @pytest.mark.parametrize("unused", ["glass", "comb", "lace", "ember", "shell", "window"])

@@ -7,24 +7,23 @@ are differentiated with respect to its tensors, and their sums go back through i
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torchpt.adjoint.sums import Sums
+from torchpt.core.tree import leaves, map_leaves
 from torchpt.forward.schedule import Span
 from torchpt.forward.wave import make_wave
 from torchpt.forward.waves import Waves
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.wave import Wave
 from torchpt.ranks import Group, blocks
-from torchpt.records import tensors_of
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
-__all__ = ["Assembly", "rebuilt"]
+__all__ = ["Assembly"]
 
 
 class Assembly:
@@ -98,7 +97,7 @@ class Assembly:
         opacity, maps = world.materials.opacity, world.textures.opacity
         if opacity is None:
             return False
-        read = [] if maps is None else [x for k in maps.tables for x in tensors_of(world.textures.tables[k])]
+        read = [] if maps is None else [x for k in maps.tables for x in leaves(world.textures.tables[k])]
         return any(x.requires_grad for x in (opacity, *read))
 
     def blocks(self, pixels: int, samples: int) -> list[tuple[int, int]]:
@@ -133,23 +132,5 @@ class Assembly:
 def _over(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
     """A wave with other tensors; stages run as tensor operations."""
     stages = wave.stages
-    world, pixel, camera, first = rebuilt((stages.world, stages.pixel, wave.camera, wave.first), change)
+    world, pixel, camera, first = map_leaves(change, (stages.world, stages.pixel, wave.camera, wave.first))
     return replace(wave, stages=Stages(stages.plan, world, pixel), camera=camera, first=first)
-
-
-def rebuilt(record: Any, change: Callable[[Tensor], Tensor]) -> Any:
-    """A record with other tensors in place of its own; what holds none of these stays itself."""
-    if isinstance(record, Tensor):
-        return change(record)
-    if isinstance(record, dict):
-        made = {name: rebuilt(value, change) for name, value in record.items()}
-        return made if any(made[name] is not value for name, value in record.items()) else record
-    if isinstance(record, tuple | list):
-        parts = [rebuilt(value, change) for value in record]
-        return type(record)(parts) if any(a is not b for a, b in zip(parts, record, strict=True)) else record
-    if is_dataclass(record) and not isinstance(record, torch.nn.Module | type):
-        own = {field.name: getattr(record, field.name) for field in fields(record)}
-        new = {name: rebuilt(value, change) for name, value in own.items()}
-        new = {name: value for name, value in new.items() if value is not own[name]}
-        return replace(record, **new) if new else record
-    return record

@@ -35,10 +35,6 @@ class Held:
     prim: Tensor  # (N,) int64 as the search gives them
     a: Tensor  # (3, N) float64
 
-    def taken(self, index: Tensor) -> Held:
-        """Some of them."""
-        return Held(take(self.prim, index), take(self.a, index))
-
 
 @dataclass(frozen=True)
 class Bodies:

@@ -8,11 +8,12 @@ A curve is written in the numbers of its primitive (:mod:`torchpt.edges.bodies`)
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from torchpt.core.tree import map_leaves
 from torchpt.edges.bodies import Bodies, Held
 from torchpt.edges.topology import Edges
 from torchpt.math.vectors import cross, dot, take
@@ -31,10 +32,6 @@ class View:
     e: Tensor
     w: Tensor | float
 
-    def taken(self, index: Tensor) -> View:
-        """Some of ``N`` places."""
-        return View(take(self.e, index), take(self.w, index) if isinstance(self.w, Tensor) else self.w)
-
     def toward(self, p: Tensor) -> Tensor:
         """From points ``(3, N)`` to where they are seen from; of no particular length."""
         return self.e - p * self.w
@@ -52,10 +49,6 @@ class Curves:
     round: Tensor  # (N,) bool
     low: Tensor  # (N,) from where t runs
     high: Tensor  # (N,) to where
-
-    def taken(self, index: Tensor) -> Curves:
-        """Some of them."""
-        return Curves(*(take(getattr(self, f.name), index) for f in fields(self)))
 
     def within(self, low: Tensor, high: Tensor) -> Curves:
         """The same from ``low`` to ``high``."""
@@ -77,8 +70,8 @@ class Curves:
 
 
 def joined(parts: list[Curves]) -> Curves:
-    """Curves one after another."""
-    return Curves(*(torch.cat([getattr(part, f.name) for part in parts], -1) for f in fields(Curves)))
+    """Return curves one after another."""
+    return map_leaves(lambda *same: torch.cat(same, -1), *parts)
 
 
 def straight(prim: Tensor, begin: Tensor, end: Tensor, mate: Tensor | None = None) -> Curves:

@@ -16,7 +16,7 @@ from torchpt.lights import KINDS, SURFACES
 from torchpt.lights.base import Environment, taken
 from torchpt.math.vectors import dot, luminance, take
 from torchpt.math.warps import concentric_disk, uniform_sphere, uniform_triangle
-from torchpt.records import Interaction, Lights, LightSample, World
+from torchpt.records import Interaction, Lights, LightSample, World, rows
 from torchpt.shapes import quadrics
 
 __all__ = ["Beam", "Sources", "sources_of"]
@@ -39,11 +39,6 @@ class Beam:
     row: Tensor
     u: Tensor
     chance: Tensor
-
-    def taken(self, index: Tensor) -> Beam:
-        """Some of the lanes."""
-        view = self.view.taken(index)
-        return Beam(view, self.held.taken(index), take(self.row, index), take(self.u, index), take(self.chance, index))
 
 
 @dataclass(frozen=True)
@@ -117,7 +112,7 @@ class Sources:
             mine = (self._of(k, beam.row) & (beam.row >= 0)).nonzero().squeeze(1)
             if not len(mine):
                 continue
-            part = beam.taken(mine)
+            part = rows(beam, mine)
             at = taken(lights, part.row if len(lights.area) > 1 else None)
             if name in SURFACES:
                 found[:, mine] = self._shone(name, lights, at, part, take(x, mine))

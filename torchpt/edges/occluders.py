@@ -13,6 +13,7 @@ from torchpt.edges.curves import Curves, View, generator, joined, round_outline,
 from torchpt.edges.draws import Choice
 from torchpt.edges.sets import Rounds, folds_of, plain_of, rounds_of
 from torchpt.math.vectors import cross, dot, take
+from torchpt.records import rows
 from torchpt.scene import Scene
 from torchpt.shapes.quadrics import Form
 
@@ -41,13 +42,6 @@ class Passed:
     p: Tensor
     along: Tensor
     density: Tensor
-
-    def taken(self, index: Tensor) -> Passed:
-        """Some of the lanes."""
-        lane, mate, p, along, density = (
-            take(x, index) for x in (self.lane, self.mate, self.p, self.along, self.density)
-        )
-        return Passed(lane, self.held.taken(index), mate, p, along, density)
 
 
 @dataclass(frozen=True)
@@ -86,13 +80,13 @@ class Occluders:
             coin: in [0, 1): which of two lines.
             view: ``N`` places or directions.
         """
-        curves, form = self.curves.taken(index), take(self.form, index)
+        curves, form = rows(self.curves, index), take(self.form, index)
         some, chance = torch.ones_like(form, dtype=torch.bool), chance.clone()
         for number in range(len(self.forms) + 1):
             mine = (form == number).nonzero().squeeze(1)
             if not len(mine):
                 continue
-            part, prim = view.taken(mine), take(curves.prim, mine)
+            part, prim = rows(view, mine), take(curves.prim, mine)
             if number == 0:
                 found, there = round_outline(self.bodies, prim, part)
             else:
@@ -105,11 +99,11 @@ class Occluders:
         span = curves.high - curves.low
         held, p, along = curves.moving(self.bodies, curves.low + rest * span)
         across = cross(along, view.toward(p))
-        one, two = (dot(across, self.bodies.points(other.taken(index)) - p) for other in self.others)
+        one, two = (dot(across, self.bodies.points(rows(other, index)) - p) for other in self.others)
         some &= ~take(self.folded, index) | (one * two >= 0)
         some &= dot(across, across) > 0
         passed = Passed(torch.arange(len(index), device=index.device), held, curves.mate, p, along, chance / span)
-        return passed.taken(some.nonzero().squeeze(1))
+        return rows(passed, some.nonzero().squeeze(1))
 
 
 def occluders_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Occluders | None:

@@ -23,6 +23,7 @@ from torchpt.edges.shared import share_of
 from torchpt.edges.steps import steps_at
 from torchpt.edges.traced import Traced
 from torchpt.math.vectors import take
+from torchpt.records import rows
 
 __all__ = ["Along", "Primary"]
 
@@ -85,7 +86,7 @@ class Primary:
         number = torch.arange(first, first + count, device=self.pieces.weight.device)
         u = (number.double() + self.numbers.of(number, 0)) / total
         index, rest, chance = self.choice.draw(u)
-        pieces = self.pieces.taken(index)
+        pieces = rows(self.pieces, index)
         t, density = pieces.place(rest)
         held, p, along = pieces.curves.moving(self.bodies, t)
         s, jacobian = slopes(self.bodies.camera, p)
@@ -99,7 +100,7 @@ class Primary:
         mate = take(pieces.curves.mate, index)
         step = steps_at(self.bodies, (take(held.prim, index), mate), s)
         o, d = self._beside(s, unit, step)
-        share = self._share(held.taken(index), mate, p, s, step, o, d)
+        share = self._share(rows(held, index), mate, p, s, step, o, d)
         seen = (share > 0).nonzero().squeeze(1)
         both = torch.cat((seen, seen + len(index)))
         o, d, index = take(o, both), take(d, both), take(index, seen)
@@ -115,7 +116,7 @@ class Primary:
             t, prim = self.traced.nearest(o, d)
             met = prim >= 0
             beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, normal.repeat(1, 2) * each
-        return Along(held.taken(index), normal * (worthy / chance), beside)
+        return Along(rows(held, index), normal * (worthy / chance), beside)
 
     def _beside(self, s: Tensor, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
         """Rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""

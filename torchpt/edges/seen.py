@@ -13,6 +13,7 @@ from torchpt.edges.curves import Curves, View, generator, joined, round_outline
 from torchpt.edges.film import film_places
 from torchpt.edges.sets import Folds, folds_of, plain_of, rounds_of
 from torchpt.math.vectors import cross, dot, take
+from torchpt.records import rows
 from torchpt.scene import Scene
 
 __all__ = ["Pieces", "pieces_of", "view_of"]
@@ -38,10 +39,6 @@ class Pieces:
     curves: Curves
     near: Tensor
     weight: Tensor
-
-    def taken(self, index: Tensor) -> Pieces:
-        """Some of them."""
-        return Pieces(self.curves.taken(index), take(self.near, index), take(self.weight, index))
 
     def place(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """``t (N,)`` of places ``u`` in [0, 1) along each piece on the film, and ``du / dt``."""
@@ -72,7 +69,7 @@ def pieces_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bo
     fixed = plain_of(scene, bodies)
     if fixed is not None:
         for mine, cut in ((fixed.round, _arcs), (~fixed.round, _lines)):
-            some = fixed.taken(mine.nonzero().squeeze(1))
+            some = rows(fixed, mine.nonzero().squeeze(1))
             found.append(cut(bodies, some, torch.ones_like(some.low), bounds))
     for rounds in rounds_of(scene, bodies):
         if rounds.form is None:
@@ -99,7 +96,7 @@ def _silhouettes(bodies: Bodies, folds: Folds, view: View) -> tuple[Curves, Tens
     importance = (dot(apart, apart).sqrt() * 0.5).clamp(_CREASE, 1.0)
     importance = torch.where(outline, 1.0, torch.where(folds.crease, importance, 0.0))
     index = (importance > 0).nonzero().squeeze(1)
-    return folds.curves.taken(index), take(importance, index)
+    return rows(folds.curves, index), take(importance, index)
 
 
 def _lines(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -> Pieces:
@@ -126,7 +123,7 @@ def _lines(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -
     first, last = begin + (end - begin) * low, begin + (end - begin) * high
     length = _apart(first, last)
     index = ((high > low) & (first[2] > 0) & (last[2] > 0) & (length * importance > 0)).nonzero().squeeze(1)
-    cut = curves.within(low, high).taken(index)
+    cut = rows(curves.within(low, high), index)
     return Pieces(cut, torch.stack((take(first[2], index), take(last[2], index))), take(length * importance, index))
 
 
@@ -139,11 +136,11 @@ def _apart(first: Tensor, last: Tensor) -> Tensor:
 def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -> Pieces:
     """Round curves in pieces that may lie on the film; one that comes near the camera weighs as much as the film is wide."""
     some = (importance > 0).nonzero().squeeze(1)
-    curves, importance = curves.taken(some), take(importance, some)
+    curves, importance = rows(curves, some), take(importance, some)
     many = torch.arange(len(some), device=some.device).repeat_interleave(_CUTS)
     step = 2.0 * math.pi / _CUTS
     low = torch.arange(_CUTS, dtype=torch.float64, device=some.device).repeat(len(some)) * step
-    cut = curves.taken(many).within(low, low + step)
+    cut = rows(curves, many).within(low, low + step)
     ends = [bodies.camera.film_of(cut.moving(bodies, t)[1]) for t in (cut.low, cut.high)]
     first, last = ends
     assert first is not None and last is not None
@@ -158,4 +155,4 @@ def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) ->
     weight = torch.where(behind | (front & outside), 0.0, length.clamp_max(whole)) * take(importance, many)
     index = (weight > 0).nonzero().squeeze(1)
     one = torch.ones(2, len(index), dtype=torch.float64, device=index.device)
-    return Pieces(cut.taken(index), one, take(weight, index))
+    return Pieces(rows(cut, index), one, take(weight, index))

@@ -26,6 +26,7 @@ from torchpt.edges.traced import Traced
 from torchpt.edges.vertices import Spot, met
 from torchpt.math.vectors import cross, dot, take
 from torchpt.math.warps import uniform_sphere
+from torchpt.records import rows
 
 __all__ = ["Cast", "Shadows"]
 
@@ -120,7 +121,7 @@ class Shadows:
         if self.sources is not None:
             beam = self.sources.draw(self.numbers, number)
             passed = self.occluders.place(index, rest, chance, coin, beam.view)
-            beam = beam.taken(passed.lane)
+            beam = rows(beam, passed.lane)
         else:
             beam, passed = self._reflected(number, index, rest, chance, coin)
         beam, passed, spot, outward = self._past(beam, passed)
@@ -148,7 +149,7 @@ class Shadows:
         some = (prim >= 0).nonzero().squeeze(1)
         prim, y = take(prim, some), take(y, some)
         held = self._held(prim, take(torch.stack(numbers), some), y)
-        passed = passed.taken(some)
+        passed = rows(passed, some)
         row = torch.full_like(prim, -1)
         one = torch.ones_like(y[0])
         beam = Beam(View(y, one), held, row, torch.zeros_like(y[:2]), one / (4.0 * math.pi))
@@ -179,7 +180,7 @@ class Shadows:
         spot = met(self.traced, take(o, index), take(way, index) + take(step, index) * side)
         some = (spot.hit.prim >= 0).nonzero().squeeze(1)
         index = take(index, some)
-        return beam.taken(index), passed.taken(index), spot.taken(some), take(outward, some)
+        return rows(beam, index), rows(passed, index), spot.taken(some), take(outward, some)
 
     def _cast(
         self, number: Tensor, beam: Beam, passed: Passed, spot: Spot, outward: Tensor, worth: Worth, total: int

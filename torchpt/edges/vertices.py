@@ -46,8 +46,7 @@ class Spot:
 
     def taken(self, index: Tensor) -> Spot:
         """Some of the lanes."""
-        o, d, p, n = (take(x, index) for x in (self.o, self.d, self.p, self.n))
-        return Spot(self.traced, o, d, rows(self.hit, index), p, n)
+        return Spot(self.traced, *rows((self.o, self.d, self.hit, self.p, self.n), index))
 
     def _each(self, found: list[Tensor], make: Callable[[int, Tensor, Interaction], list[Tensor]]) -> None:
         """Fill in what each model makes of its lanes."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
+from torchpt.core.tree import leaves
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.wave import Wave
-from torchpt.records import tensors_of
 
 __all__ = ["ROOM", "alike", "common", "room_of", "shared_wave"]
 
@@ -17,7 +17,7 @@ ROOM = 1 << 28
 
 def room_of(wave: Wave) -> int:
     """Bytes of its world."""
-    return sum(tensor.nbytes for tensor in tensors_of(wave.stages.world))
+    return sum(tensor.nbytes for tensor in leaves(wave.stages.world))
 
 
 def common(wave: Wave, room: int) -> Hashable | None:

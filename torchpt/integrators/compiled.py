@@ -18,10 +18,11 @@ import torch
 from torch import Tensor
 
 from torchpt.cameras import Camera
+from torchpt.core.tree import leaves
 from torchpt.film import Filter
 from torchpt.integrators import stages
 from torchpt.integrators.stages import Plan
-from torchpt.records import Hit, PathState, Shadow, World, tensors_of
+from torchpt.records import Hit, PathState, Shadow, World
 
 __all__ = ["CompiledStages", "Stages"]
 
@@ -97,7 +98,7 @@ class CompiledStages(Stages):
     def __init__(self, plan: Plan, world: World, pixel: Tensor | None = None) -> None:
         super().__init__(plan, world, pixel)
         # Only lanes vary in number; a scene's tables do not.
-        for table in tensors_of(world):
+        for table in leaves(world):
             torch._dynamo.mark_static(table)
         self.graphs: dict[str, int] = {}
         self._made: dict[tuple[Any, ...], Callable[..., Any]] = {}

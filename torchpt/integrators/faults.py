@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchpt.core.tree import leaves
 from torchpt.integrators.compiled import Stages
 from torchpt.integrators.first_surface import FirstSurface
 from torchpt.integrators.lost import Place
 from torchpt.integrators.plan import Plan
 from torchpt.integrators.recorder import Bounced, Left, Met, Record, Recorder, Shone
 from torchpt.integrators.wave import Wave
-from torchpt.records import Hit, PathState, Shadow, World, tensors_of
+from torchpt.records import Hit, PathState, Shadow, World
 from torchpt.samplers import Streams
 
 __all__ = ["CAUSES", "Fault", "faults_of"]
@@ -170,7 +171,7 @@ def _of_vertex(record: Bounced, world: World) -> Iterator[tuple[str, Tensor]]:
 
     read = "texture" if world.materials.textures[record.model] is not None else "material"
     yield of("surface", torch.cat((record.at.p, record.at.ng, record.at.ns)))
-    for value in tensors_of(surface.parameters):
+    for value in leaves(surface.parameters):
         if value.dim() and value.shape[-1] == len(spoiled):
             yield of(read, value.reshape(-1, len(spoiled)))
     frame = surface.frame

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.prologue import Guard, Name, Source, Step, Table, names_of, replayed
 
-__all__ = ["Program", "Tables", "bound", "holds", "laid_out", "signature"]
+__all__ = ["Program", "Tables", "bound", "holds", "laid_out"]
 
 
 @dataclass(frozen=True)
@@ -161,38 +161,3 @@ def holds(program: Program, leaves: Mapping[str, Tensor]) -> bool:
         return value.item() if isinstance(value, Tensor) else value
 
     return all(number(tensor(guard.source)) == guard.value for guard in program.guards)
-
-
-def signature(record: Any) -> Any:
-    """What a trace may ask of a record beside the numbers in its tensors: hashable."""
-    if isinstance(record, Tensor):
-        return record.dtype, tuple(record.shape)
-    if isinstance(record, dict):
-        return tuple((key, signature(value)) for key, value in record.items())
-    if isinstance(record, tuple | list):
-        return tuple(signature(value) for value in record)
-    if is_dataclass(record) and not isinstance(record, torch.nn.Module | type):
-        values = tuple((field.name, signature(getattr(record, field.name))) for field in fields(record))
-        return type(record), values
-    if record is None or isinstance(record, bool | int | float | str | bytes | type | torch.dtype):
-        return record
-    return record, _contents(record, set())
-
-
-def _contents(value: Any, seen: set[int]) -> Any:
-    """What a trace may have read of an object of the user's own: its plain numbers, and which tensors it holds.
-
-    Tensors enter by identity: what is in them is memory, and those that a program reads live as long as it does.
-    """
-    if value is None or isinstance(value, bool | int | float | str | bytes | type | torch.dtype):
-        return value
-    if id(value) in seen:
-        return None
-    if isinstance(value, Tensor):
-        return id(value), value.dtype, tuple(value.shape)
-    seen = seen | {id(value)}
-    if isinstance(value, dict):
-        return tuple((str(key), _contents(item, seen)) for key, item in value.items())
-    if isinstance(value, tuple | list):
-        return tuple(_contents(item, seen) for item in value)
-    return id(value), _contents(getattr(value, "__dict__", {}), seen)

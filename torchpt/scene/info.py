@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from torchpt import bsdfs
 from torchpt.accel import Accel
+from torchpt.core.tree import leaves
 from torchpt.film import FILTERS
 from torchpt.lights import KINDS as LIGHTS
 from torchpt.lights import SURFACES, Environment
 from torchpt.lights.choice import ByTree
-from torchpt.records import KINDS, Lights, World, tensors_of
+from torchpt.records import KINDS, Lights, World
 from torchpt.settings import Settings
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
             "of": copy.of.removeprefix("shapes."),
             "material": copy.material.name,
         }
-    memory = sum(x.numel() * x.element_size() for x in tensors_of(world))
+    memory = sum(x.numel() * x.element_size() for x in leaves(world))
     made: dict[str, Any] = {
         "accel": accel.describe(),
         "bsdfs": _groups(world),
@@ -63,7 +64,7 @@ def describe(description: Description, built: Built, world: World, accel: Accel,
     }
     reads = sum(table.count for table in world.textures.tables)
     if reads:
-        tensors = tensors_of(world.textures.tables)
+        tensors = leaves(world.textures.tables)
         made["textures"] = {"reads": reads, "bytes": sum(x.numel() * x.element_size() for x in tensors)}
     if built.centre.any():
         made["origin_moved_to"] = built.centre.tolist()
@@ -164,7 +165,7 @@ def _groups(world: World) -> dict[str, int]:
         if textures is not None:
             maps = ["normal_map"] * (textures.normal is not None) + ["bump_map"] * (textures.bump is not None)
             name = f"{name}, textured: {', '.join([*_keys(textures.readings), *maps])}"
-            bindings = tensors_of(textures)
+            bindings = leaves(textures)
             rows = max([rows, *(len(binding) for binding in bindings)])
         while name in found:
             name += ", again"
@@ -181,5 +182,5 @@ def _keys(readings: dict[str, Any]) -> list[str]:
 
 def _rows(table: bsdfs.Parameters) -> int:
     """How many materials share a model's stacked parameters."""
-    found = tensors_of(table)
+    found = leaves(table)
     return max((value.shape[-1] if value.dim() < 2 or len(value) == 3 else len(value) for value in found), default=1)

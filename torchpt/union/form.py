@@ -9,7 +9,8 @@ from typing import Any
 from torch import Tensor
 
 from torchpt.bsdfs import Bsdf
-from torchpt.records import World, tensors_of
+from torchpt.core.tree import leaves
+from torchpt.records import World
 
 __all__ = ["form_of"]
 
@@ -29,7 +30,7 @@ def _form(value: Any) -> Hashable:
         return tuple(sorted((key, _form(item)) for key, item in value.items()))
     if isinstance(value, tuple | list):
         return tuple(_form(item) for item in value)
-    if is_dataclass(value) and not isinstance(value, type | Bsdf) and tensors_of(value):
+    if is_dataclass(value) and not isinstance(value, type | Bsdf) and leaves(value):
         counted = getattr(value, "counted", ())
         return type(value), tuple(_form(getattr(value, f.name)) for f in fields(value) if f.name not in counted)
     # The hash first, as in a dict: a model may hold tensors, which two of can not be compared.

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
+from torchpt.core.tree import leaves
 from torchpt.ibl import IblMaps, Sky, brdf_table, maps
 from torchpt.integrators import stages as pure
 from torchpt.integrators.base import LIGHT_CHOICE, SAMPLES
@@ -19,7 +20,7 @@ from torchpt.integrators.first_surface import FirstSurface, FirstSurfaceIntegrat
 from torchpt.integrators.split_sum import under
 from torchpt.integrators.stages import Plan
 from torchpt.math.vectors import dot
-from torchpt.records import Hit, PathState, Shadow, World, tensors_of
+from torchpt.records import Hit, PathState, Shadow, World
 from torchpt.shapes import interact
 
 __all__ = ["Ibl", "Preview"]
@@ -67,7 +68,7 @@ class Preview(FirstSurface):
     def again(self, world: World) -> Preview:
         """See :class:`FirstSurface`."""
         environment = None if world.lights is None else world.lights.environment
-        return Preview.of(world) if any(t.requires_grad for t in tensors_of(environment)) else self
+        return Preview.of(world) if any(t.requires_grad for t in leaves(environment)) else self
 
     def shade(
         self,

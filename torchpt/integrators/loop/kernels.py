@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from torchpt.core.tree import signature
 from torchpt.integrators.loop import opacity, output, vertex
 from torchpt.integrators.loop import packets as packet_kernels
 from torchpt.integrators.loop.handed import Handed
@@ -23,7 +24,7 @@ from torchpt.integrators.loop.layout import Layout
 from torchpt.integrators.loop.leaves import Leaves
 from torchpt.integrators.loop.programs import program_of
 from torchpt.lanes.graph import Unsupported
-from torchpt.lanes.program import Program, Tables, bound, signature
+from torchpt.lanes.program import Program, Tables, bound
 from torchpt.lanes.sinks import Sinks
 
 if TYPE_CHECKING:

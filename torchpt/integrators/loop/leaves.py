@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
 from typing import Any
 
 from torch import Tensor
 
-__all__ = ["Leaves", "State", "leaves_of"]
+from torchpt.core.tree import named_leaves
+
+__all__ = ["Leaves", "State"]
 
 #: A tensor, and which of the contents that it has had.
 State = tuple[Tensor, object]
-
-
-def leaves_of(record: Any, path: str) -> Iterator[tuple[str, Tensor]]:
-    """All tensors of a record by path."""
-    if isinstance(record, Tensor):
-        yield path, record
-    elif isinstance(record, dict):
-        for name, value in record.items():
-            yield from leaves_of(value, f"{path}.{name}")
-    elif isinstance(record, tuple | list):
-        for k, value in enumerate(record):
-            yield from leaves_of(value, f"{path}.{k}")
-    elif is_dataclass(record):
-        for field in fields(record):
-            yield from leaves_of(getattr(record, field.name), f"{path}.{field.name}")
 
 
 class Leaves:
@@ -47,7 +32,7 @@ class Leaves:
         self._walked: dict[str, tuple[Any, list[tuple[str, Tensor]]]] = {}
         for name, record in records.items():
             same = name in known and known[name][0] is record and not isinstance(record, dict)
-            self._walked[name] = known[name] if same else (record, list(leaves_of(record, name)))
+            self._walked[name] = known[name] if same else (record, list(named_leaves(record, name)))
         self.tensors = dict(leaf for _, leaves in self._walked.values() for leaf in leaves)
         self.ids = {id(tensor): (path, tensor) for path, tensor in self.tensors.items()}
         # A tensor is the same one only as long as nobody wrote into it; of inference tensors that cannot be known.

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from torchpt.bsdfs.resolved import ResolvedMaterial
+from torchpt.core.tree import leaves
 from torchpt.errors import SceneError
-from torchpt.records import Geometry, LaneGeometry, LaneMaterials, LaneTextures, World, tensors_of
+from torchpt.records import Geometry, LaneGeometry, LaneMaterials, LaneTextures, World
 from torchpt.scene.assembly.charts import charts_of
 from torchpt.scene.assembly.copies import copies_of, copy_maps
 from torchpt.scene.assembly.corners import corners_of_all
@@ -114,7 +115,7 @@ def assemble(
 def _lit_by(parts: Sequence[Part], corners: Sequence[Corners], primitives: Primitives) -> Primitives:
     """The primitives, without derivatives where no part that emits has any: what is cut out of the whole would seem to."""
     moving = any(
-        part.emission is not None and any(x.requires_grad for x in tensors_of(own))
+        part.emission is not None and any(x.requires_grad for x in leaves(own))
         for part, own in zip(parts, corners, strict=True)
     )
     return primitives if moving else primitives.still()
