@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 from torchpt.errors import SceneError
@@ -224,9 +225,12 @@ class Settings:
         """How a light is chosen; where no light is sampled it does not matter."""
         return self.integrator.light_choice
 
-    def plain(self) -> dict[str, Any]:
-        """As a scene file would state them."""
-        return {name: _plain(getattr(self, name)) for name in BLOCKS}
+    def plain(self, without: Mapping[str, Collection[str]] = MappingProxyType({})) -> dict[str, Any]:
+        """Return them as a scene file would state them, but for the keys ``without``, by block."""
+        told = {name: _plain(getattr(self, name)) for name in BLOCKS}
+        return {
+            block: {k: v for k, v in keys.items() if k not in without.get(block, ())} for block, keys in told.items()
+        }
 
 
 def _plain(value: Any) -> Any:

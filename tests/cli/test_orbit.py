@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image, ImageSequence
+from textured_quad import repeated, textured_quad
 
 import torchpt
 from torchpt.cli import main
@@ -134,6 +135,18 @@ def test_another_scene_is_refused(folder: Path, renderer: Renderer, capsys: pyte
     assert main(["orbit", "scene=s.yaml", *TINY]) == 2
     line = capsys.readouterr().err
     assert line.startswith("torchpt: s.gif.frames: holds frames of other settings (the scene was another)")
+
+
+def test_what_a_mesh_file_says_of_its_texture_is_part_of_the_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, renderer: Renderer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    textured_quad(tmp_path)
+    words = ["orbit", "scene=quad.yaml", *TINY]
+    assert main([*words, "keep=true"]) == 0
+    repeated(tmp_path, 3)
+    assert main(words) == 2
+    assert "the scene was another" in capsys.readouterr().err and len(renderer.settings) == 4
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from textured_quad import repeated, textured_quad
 from trials import film_of
 
 import torchpt
@@ -144,6 +145,16 @@ def test_a_checkpoint_of_another_scene_is_refused(tmp_path: Path, box: torchpt.S
     other = torchpt.load("cornell_specular", device="cpu")
     with pytest.raises(AssetError, match=r"another render \(its scene\.materials are others\)"):
         shot(other, checkpoint=str(file), resume=True)
+
+
+def test_what_a_mesh_file_says_of_its_texture_is_part_of_the_scene(tmp_path: Path) -> None:
+    file, where = textured_quad(tmp_path), str(tmp_path / "a.ckpt")
+    shot(torchpt.load(str(file), device="cpu"), 24 * 24 * 8, checkpoint=where)
+    repeated(tmp_path, 3)
+    with pytest.raises(AssetError, match=r"another render \(its scene\.parts are others\)"):
+        shot(torchpt.load(str(file), device="cpu"), checkpoint=where, resume=True)
+    repeated(tmp_path, 1)
+    assert shot(torchpt.load(str(file), device="cpu"), checkpoint=where, resume=True).complete
 
 
 def test_settings_that_no_sample_depends_on_may_differ(box: torchpt.Scene, tmp_path: Path) -> None:

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from textured_quad import repeated, textured_quad
 
 from torchpt.errors import OutputError
+from torchpt.reports.measure import prepare
 from torchpt.reports.store import Store, name_of, write_whole
+from torchpt.reports.study import study_of
 
 FACTS = {"spp": 4, "seed": 7, "seconds": 0.5, "nonfinite_samples": 0}
 
@@ -35,6 +38,16 @@ def test_half_a_run_is_none(tmp_path: Path) -> None:
 def test_names_follow_from_everything() -> None:
     names = {name_of(facts) for facts in ({"spp": 1}, {"spp": 2}, {"spp": 1, "seed": 0}, {"settings": {"clamp": None}})}
     assert len(names) == 4 and name_of({"spp": 1, "seed": 2}) == name_of({"seed": 2, "spp": 1})
+
+
+def test_what_a_mesh_file_says_of_its_texture_is_part_of_a_name(tmp_path: Path) -> None:
+    names = set()
+    textured_quad(tmp_path)
+    for times in (1, 3, 1):
+        repeated(tmp_path, times)
+        (measured,) = prepare(study_of({"scene": str(tmp_path / "quad.yaml"), "render.device": "cpu"}))
+        names.add(name_of(measured.curves[0].job.facts))
+    assert len(names) == 2
 
 
 def test_places_that_cannot_be_written(tmp_path: Path) -> None:

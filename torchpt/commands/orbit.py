@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from torchpt.scene import Scene
+    from torchpt.settings import Settings
 
 __all__ = ["HELP", "Turn", "orbit", "poses"]
 
@@ -55,7 +56,7 @@ Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the fin
 """
 _MOST_FRAMES = 100_000
 #: Settings that leave a frame as it is.
-_FREE = ("render.threads", "render.max_memory", "render.preview", "render.checkpoint", "render.resume")
+_FREE = {"render": ("threads", "max_memory", "preview", "checkpoint", "resume")}
 _MANIFEST = "orbit.json"
 
 
@@ -307,21 +308,18 @@ class Frames:
             self.folder.rmdir()
 
 
-def _facts(scene: Scene, wishes: Any, turn: Turn) -> dict[str, Any]:
-    """What frames depend on, by dotted name: the turn, the settings, and a digest of the scene."""
-    from torchpt.scene.digest import digest
-    from torchpt.spec.declared import Described
+def _facts(scene: Scene, wishes: Settings, turn: Turn) -> dict[str, Any]:
+    """Return what frames depend on, by dotted name: the turn, the settings, and a hash of the scene."""
+    from torchpt.scene.fingerprint import fingerprint
 
-    facts: dict[str, Any] = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
-    stack: list[tuple[str, Any]] = [("", wishes)]
-    while stack:
-        name, value = stack.pop()
-        if isinstance(value, Described):
-            value = {"type": value.name, **value.values}
-        elif hasattr(value, "__dict__"):
-            value = vars(value)
+    facts = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
+    return {**facts, **dict(_dotted(wishes.plain(_FREE))), "scene": fingerprint(scene)}
+
+
+def _dotted(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested mappings with their dotted names."""
+    for name, value in values.items():
         if isinstance(value, Mapping):
-            stack += [(f"{name}.{key}" if name else str(key), inside) for key, inside in value.items()]
+            yield from _dotted(value, f"{prefix}{name}.")
         else:
-            facts[name] = plain(value) if isinstance(value, int | float | None) else str(value)
-    return {**{name: facts[name] for name in sorted(facts) if name not in _FREE}, "scene": digest(scene)}
+            yield f"{prefix}{name}", value

@@ -1,4 +1,4 @@
 """What every room may use, and nothing of rendering.
 
-Start with ``tree.py``: one walker over nested records. Nothing of the package may be imported here but :mod:`torchpt.errors`.
+Start with ``tree.py``: one walker over nested records. No other room of the package is imported here.
 """

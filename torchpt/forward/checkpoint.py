@@ -7,7 +7,6 @@ nothing is executed; it is written beside its place and moved there, so there is
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import time
@@ -23,16 +22,17 @@ import torch
 from torch import Tensor
 
 from torchpt import __version__
+from torchpt.core.tree import fingerprint
 from torchpt.errors import AssetError, OutputError
 from torchpt.files import check_regular
 from torchpt.forward.archive import read_arrays
 from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
 from torchpt.integrators.lost import Lost
-from torchpt.scene.digest import digest
+from torchpt.scene.fingerprint import fingerprints
 from torchpt.scene.scene import Scene
 from torchpt.settings import Settings
 
-__all__ = ["BLOCKS", "EVERY", "FREE", "Keeper", "State", "identity"]
+__all__ = ["EVERY", "FREE", "Keeper", "State", "identity"]
 
 #: Seconds between two checkpoints, at least; and at least so many times as long as it takes to write one.
 EVERY, PATIENCE = 5.0, 20.0
@@ -44,8 +44,6 @@ FREE = {
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
 _FORMAT = 2
-#: Of a scene's description.
-BLOCKS = ("camera", "textures", "materials", "shapes", "lights")
 
 
 @dataclass
@@ -65,25 +63,14 @@ def identity(
     scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
 ) -> dict[str, Any]:
     """What a render is of: where two have the same, one goes on from the other's checkpoint."""
-    told = settings.plain()
-    for group, keys in FREE.items():
-        told[group] = {key: value for key, value in told[group].items() if key not in keys}
-    blocks = {name: _hashed(repr(getattr(scene.description, name)).encode()) for name in BLOCKS}
-    given = {
-        name: _hashed(value.detach().cpu().contiguous().numpy().tobytes()) for name, value in (params or {}).items()
-    }
     return {
         "torchpt": __version__,
-        "scene": {**blocks, "files": digest(scene)},
-        "params": given,
+        "scene": fingerprints(scene),
+        "params": {name: fingerprint(value).hex() for name, value in (params or {}).items()},
         "dtype": str(dtype).removeprefix("torch."),
         "device": scene.device.type,
-        **json.loads(json.dumps(told)),
+        **json.loads(json.dumps(settings.plain(FREE))),
     }
-
-
-def _hashed(content: bytes) -> str:
-    return hashlib.blake2b(content, digest_size=6).hexdigest()
 
 
 class Keeper:

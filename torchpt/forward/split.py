@@ -6,7 +6,6 @@ holds, sample by sample, so a film has the bits that it has in one process, whoe
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -15,14 +14,16 @@ import torch
 from torch import Tensor
 
 from torchpt import __version__
+from torchpt.core import tree
 from torchpt.film import Film
-from torchpt.forward.checkpoint import BLOCKS, FREE, State
+from torchpt.forward.checkpoint import FREE, State
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
 from torchpt.lanes.graph import Unsupported
 from torchpt.ranks import Group, dealt
 from torchpt.scene import Scene
+from torchpt.scene.fingerprint import fingerprints
 from torchpt.settings import Settings
 
 if TYPE_CHECKING:
@@ -147,23 +148,12 @@ class Split:
         return every
 
 
-def _digest(value: Tensor) -> str:
-    """Of a tensor's numbers."""
-    numbers = value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy()
-    return hashlib.blake2b(numbers.tobytes(), digest_size=16).hexdigest()
-
-
 def _films(plate: Plate) -> list[Film]:
     return [plate.film, *plate.layers.values()]
 
 
 def stamp(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype) -> bytes:
-    """What ranks must have in common to render one picture: what the description says, not the files it names."""
-    told = settings.plain()
-    for group, keys in FREE.items():
-        told[group] = {key: value for key, value in told[group].items() if key not in keys or key in DECIDED}
-    told["render"].pop("device")
-    tensors = {**scene.params, **(params or {})}
-    given = {name: _digest(tensors[name]) for name in sorted(tensors)}
-    blocks = [repr(getattr(scene.description, name)) for name in BLOCKS]
-    return repr((__version__, told, blocks, given, str(dtype))).encode()
+    """Return a hash of what ranks must have in common to render one picture."""
+    free = {block: {*keys} - {*DECIDED} for block, keys in FREE.items()}
+    free["render"].add("device")
+    return tree.fingerprint((__version__, settings.plain(free), fingerprints(scene, params), dtype))

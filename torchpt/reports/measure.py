@@ -25,7 +25,7 @@ from torchpt.reports.grid import Variant
 from torchpt.reports.store import Run, Store, name_of
 from torchpt.reports.study import Study
 from torchpt.scene.devices import device_of
-from torchpt.scene.digest import digest
+from torchpt.scene.fingerprint import fingerprint
 from torchpt.scene.scene import Scene
 from torchpt.settings import Settings
 
@@ -160,23 +160,15 @@ def _job(
     device = str(device_of(wishes.render.device))
     if device not in loaded:
         scene = Scene(description, device_of(device))
-        loaded[device] = scene, digest(scene)
+        loaded[device] = scene, fingerprint(scene)
     scene, named = loaded[device]
-    return Job(scene, wishes, {"scene": named, "device": device, "settings": _told_settings(wishes)}, purpose)
-
-
-def _told_settings(wishes: Settings) -> dict[str, Any]:
-    """The settings that runs depend on."""
-    told = wishes.plain()
-    for group, keys in _FREE.items():
-        told[group] = {key: value for key, value in told[group].items() if key not in keys}
-    return told
+    return Job(scene, wishes, {"scene": named, "device": device, "settings": wishes.plain(_FREE)}, purpose)
 
 
 def _denoised(job: Job) -> Job:
     """The same runs with the layers that the denoiser looks at."""
     wishes = replace(job.wishes, film=job.wishes.film.but(denoise=True))
-    facts = {**job.facts, "settings": _told_settings(wishes), "denoiser": denoiser_version()}
+    facts = {**job.facts, "settings": wishes.plain(_FREE), "denoiser": denoiser_version()}
     return Job(job.scene, wishes, facts, job.purpose)
 
 

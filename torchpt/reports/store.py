@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from torchpt import __version__
+from torchpt.core.tree import fingerprint
 from torchpt.errors import OutputError
 from torchpt.images import read_image, write_image
 from torchpt.images.write import temporary_beside
@@ -112,7 +113,7 @@ def write_whole(path: Path, content: bytes) -> None:
 def name_of(facts: Mapping[str, Any]) -> str:
     """The name of a run that depends on these facts, on this renderer and on this machine."""
     whole = {"facts": facts, "torchpt": __version__, "source": _source(), "torch": torch.__version__, **machine()}
-    return hashlib.blake2b(json.dumps(whole, sort_keys=True).encode(), digest_size=12).hexdigest()
+    return fingerprint(json.dumps(whole, sort_keys=True)).hex()
 
 
 @lru_cache(maxsize=1)

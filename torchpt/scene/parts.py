@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchpt.bsdfs.resolved import ResolvedMaterial
+from torchpt.core.tree import UNPRINTED
 from torchpt.shapes.quadrics import Quadric
 from torchpt.textures import Node
 
@@ -64,8 +65,8 @@ class Part:
     colors: np.ndarray | None = None
     smooth: bool = False
     dropped: int = 0
-    source: str = ""
-    ignored: tuple[str, ...] = field(default=())
+    source: str = field(default="", metadata=UNPRINTED)
+    ignored: tuple[str, ...] = field(default=(), metadata=UNPRINTED)
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import create_model
 
+from torchpt.core.tree import UNPRINTED
 from torchpt.errors import NotBuiltError, SceneError
 from torchpt.spec import REQUIRED, Block, Map, Refused, Spec, not_built, parameters_of
 from torchpt.spec.memo import Memo
@@ -32,11 +33,7 @@ class Described:
 
     kind: Any
     values: dict[str, Any]
-    given: frozenset[str] = frozenset()
-
-    def __repr__(self) -> str:
-        """The same in every process, as names of scenes are made of it: a set's own order is not."""
-        return f"Described({self.kind!r}, {self.values!r}, {sorted(self.given)!r})"
+    given: frozenset[str] = field(default=frozenset(), metadata=UNPRINTED)  # a default that is stated is no other one
 
     @property
     def name(self) -> str:
