@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,10 +21,13 @@ from textured_quad import repeated, textured_quad
 from trials import film_of
 
 import torchpt
+from torchpt.cli import main
 from torchpt.errors import AssetError, OutputError, SceneError, TorchptError
 from torchpt.format.description import settings
 from torchpt.forward import checkpoint
 from torchpt.forward.result import Progress
+from torchpt.forward.resume import ends_a_pass
+from torchpt.forward.run import Run
 from torchpt.rendering import Rendering, render_scene
 
 
@@ -124,7 +129,6 @@ def kept(scene: torchpt.Scene, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
-        ({"spp": 41}, "render.spp: 40 there, 41 here"),
         ({"seed": 1}, "render.seed: 0 there, 1 here"),
         ({"film": film_of(25)}, "film.width: 24 there, 25 here"),
         ({"sampler": "independent"}, 'sampler.type: "sobol" there, "independent" here'),
@@ -183,6 +187,217 @@ def test_a_damaged_checkpoint_is_refused_in_a_line(damage: str, box: torchpt.Sce
         shot(box, checkpoint=str(file), resume=True)
     assert str(file) in str(caught.value) and "\n" not in str(caught.value)
     assert "whole checkpoint" in str(caught.value) or damage == "folder"
+
+
+def changed(file: Path, change: Any) -> None:
+    """Change what a checkpoint holds, and write it as a render would."""
+    arrays = dict(np.load(file))
+    facts = json.loads(arrays["facts"].tobytes())
+    change(facts, arrays)
+    arrays["facts"] = np.frombuffer(json.dumps(facts).encode(), np.uint8)
+    with open(file, "wb") as out:
+        np.savez(out, **arrays)
+
+
+def put(name: str, value: Any, place: Any = 0) -> Any:
+    def change(facts: dict[str, Any], arrays: dict[str, Any]) -> None:
+        if name in arrays:
+            arrays[name].reshape(-1)[place] = value
+        else:
+            facts[name] = value
+
+    return change
+
+
+LOST = [[3, 0, 0, 0, 1, True]]
+WRONG: dict[str, tuple[Any, str]] = {
+    "sums that are no numbers": (put("picture.sums", np.nan), "picture.sums"),
+    "infinite sums": (put("picture.sums", np.inf, 99), "picture.sums"),
+    "first samples that are none": (put("picture.first", np.nan), "picture.sums"),
+    "pilots that are none": (put("pilots.sums", -np.inf), "pilots.sums"),
+    "light that is none": (put("light", np.nan, 1), "light"),
+    "negative counts": (put("picture.counts", -1), "picture.counts"),
+    "counts of none": (put("picture.counts", 0, slice(None)), "picture.counts"),
+    "a count too many": (put("picture.counts", 9, 5), "picture.counts"),
+    "other pilots": (put("pilots.counts", 9), "pilots.counts"),
+    "other layers": (put("layers.albedo.counts", 7), "layers.albedo.counts"),
+    "nothing taken": (put("taken", 0), "picture.counts"),
+    "more taken than there is": (put("taken", 39), "picture.counts"),
+    "far too much taken": (put("taken", 10**9), "taken"),
+    "half a sample taken": (put("taken", 7.5), "taken is 7.5"),
+    "a negative number taken": (put("taken", -8), "taken is -8"),
+    "other paths": (put("done", 17), "done"),
+    "more truncated than there are": (put("truncated", 10**9), "truncated"),
+    "seconds that are none": (put("seconds", float("nan")), "seconds"),
+    "a cut of two": (put("cut", 2), "cut"),
+    "lost ones of another pixel": (put("lost", {"nan": 1, "infinite": 0, "places": [[3, 24, 0, 0, 1, True]]}), "lost"),
+    "lost ones of another sample": (put("lost", {"nan": 1, "infinite": 0, "places": [[8, 0, 0, 0, 1, True]]}), "lost"),
+    "lost ones of another stream": (put("lost", {"nan": 1, "infinite": 0, "places": [[3, 0, 0, 9, 1, True]]}), "lost"),
+    "more lost than taken": (put("lost", {"nan": 10**9, "infinite": 0, "places": LOST}), "lost"),
+    "no spp": (lambda facts, arrays: facts["of"]["render"].pop("spp"), "spp"),
+    "another spp": (lambda facts, arrays: facts["of"]["render"].update(spp="4"), "spp"),
+    "no settings": (lambda facts, arrays: facts["of"].update(render="4"), "whole checkpoint"),
+}
+
+
+@pytest.fixture(scope="module")
+def rich(box: torchpt.Scene, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A checkpoint with pilots, a layer and a sum of light after 8 samples."""
+    file = tmp_path_factory.mktemp("rich") / "kept.ckpt"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint, "EVERY", 0.0)
+        patch.setattr(checkpoint, "PATIENCE", 0.0)
+        shot(box, 8 * (24 * 24 + 36), checkpoint=str(file), **RICH)
+    return file.read_bytes()
+
+
+RICH: dict[str, Any] = {"pilots": True, "film": film_of(24) | {"aovs": ["albedo"]}}
+
+
+@pytest.mark.parametrize("case", ["as it was", *WRONG])
+def test_numbers_that_no_render_comes_to_are_refused(
+    case: str, rich: bytes, box: torchpt.Scene, tmp_path: Path
+) -> None:
+    file = tmp_path / "kept.ckpt"
+    file.write_bytes(rich)
+    if case == "as it was":
+        changed(file, lambda facts, arrays: facts.update(lost={"nan": 1, "infinite": 0, "places": LOST}))
+        again = shot(box, checkpoint=str(file), resume=True, **RICH)
+        assert again.complete and again.nonfinite_samples == 1
+        return
+    change, says = WRONG[case]
+    changed(file, change)
+    before = file.read_bytes()
+    with pytest.raises(AssetError) as caught:
+        shot(box, checkpoint=str(file), resume=True, **RICH)
+    assert says in str(caught.value) and "whole checkpoint" in str(caught.value) and "\n" not in str(caught.value)
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["picture.counts", "pilots.counts"])
+def test_counts_of_adaptive_sampling_go_together(name: str, box: torchpt.Scene, tmp_path: Path) -> None:
+    file, wishes = tmp_path / "kept.ckpt", {**CASES["adaptive"], "checkpoint": str(tmp_path / "kept.ckpt")}
+    shot(box, **wishes)
+    changed(file, lambda facts, arrays: arrays[name].__iadd__(1))
+    with pytest.raises(AssetError, match=r"no render comes to its pilots\.counts"):
+        shot(box, resume=True, **wishes)
+
+
+# -- more samples than it was of
+
+MORE: dict[str, tuple[int, int, dict[str, Any]]] = {
+    "plain": (4, 8, {}),
+    "odd": (5, 12, {"film": film_of(24) | {"aovs": ["albedo"]}}),
+    "eager": (3, 7, {"compile": "off"}),
+    "independent": (4, 9, {"sampler": "independent"}),
+    "pilots": (6, 40, {"pilots": True}),
+    "weights": (6, 40, {"film": film_of(24) | {"filter": "mitchell"}}),
+    "variance": (20, 41, {"film": film_of(24) | {"aovs": ["variance"]}}),
+    "target": (8, 1000, {"target_error": 2e-2}),
+    "time": (7, 12, {"time_limit": 1e6}),
+    "adaptive, not yet": (10, 100, {"sampler": {"type": "sobol", "adaptive": True}}),
+    "adaptive": (16, 100, {"sampler": {"type": "sobol", "adaptive": True}}),
+    "adaptive target": (32, 100, {"sampler": {"type": "sobol", "adaptive": True}, "target_error": 1e-3}),
+}
+
+
+@pytest.mark.parametrize("case", MORE)
+def test_more_samples_later_are_the_bits_of_all_at_once(case: str, box: torchpt.Scene, tmp_path: Path) -> None:
+    few, many, wishes = MORE[case]
+    file = str(tmp_path / "a.ckpt")
+    first = shot(box, checkpoint=file, **{**wishes, "spp": few})
+    again = shot(box, checkpoint=file, resume=True, **{**wishes, "spp": many})
+    whole = shot(box, **{**wishes, "spp": many})
+    assert first.complete and first.spp < again.spp and equal(again, whole)
+    once_more = shot(box, checkpoint=file, resume=True, **{**wishes, "spp": many})
+    assert equal(once_more, whole)
+
+
+def test_fewer_samples_do_where_no_more_are_there(box: torchpt.Scene, tmp_path: Path) -> None:
+    file = kept(box, tmp_path)
+    assert equal(shot(box, checkpoint=str(file), resume=True, spp=20), shot(box, spp=20))
+
+
+ADAPTIVE = {"sampler": {"type": "sobol", "adaptive": True}}
+
+
+@pytest.mark.parametrize(
+    ("few", "many", "wishes", "says"),
+    [
+        (4, 8, {"sampler": "stratified"}, "where stratified points lie depends on how many there are"),
+        (4, 8, {"sampler": "hammersley"}, "where hammersley points lie depends on how many there are"),
+        (4, 8, {"sampler": "zsobol"}, "where zsobol points lie depends on how many there are"),
+        (8, 4, {}, "it holds 8 samples a pixel already"),
+        (1, 2, {"film": film_of(8) | {"aovs": ["variance"]}}, "the variance is of 1 streams there, of 2 here"),
+        (255, 256, {"film": film_of(8) | {"aovs": ["variance"]}}, "the variance is of 2 streams there, of 4 here"),
+        (40, 100, ADAPTIVE, "a round of adaptive sampling was as long as spp let it be"),
+        (64, 32, ADAPTIVE, "a round of adaptive sampling was as long as spp let it be"),
+        (7, 40, {"target_error": 1e-9}, "with render.target_error no pass ends at 7 samples"),
+        (100, 200, {"target_error": 1e-9}, "with render.target_error no pass ends at 100 samples"),
+    ],
+)
+def test_more_samples_that_would_be_others_are_refused(
+    few: int, many: int, wishes: dict[str, Any], says: str, box: torchpt.Scene, tmp_path: Path
+) -> None:
+    file = tmp_path / "a.ckpt"
+    shot(box, checkpoint=str(file), **{**wishes, "spp": few})
+    before = file.read_bytes()
+    with pytest.raises(AssetError) as caught:
+        shot(box, checkpoint=str(file), resume=True, **{**wishes, "spp": many})
+    assert f"render.spp: {few} there, {many} here; {says})" in str(caught.value) and "\n" not in str(caught.value)
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize("spp", [1, 2, 3, 16, 18, 20, 24, 48, 63, 64, 96, 112])
+def test_passes_of_a_render_that_ends_by_its_error(spp: int, box: torchpt.Scene) -> None:
+    """Where a pass ends follows from the samples alone, and it is known without taking them."""
+    run = Run(box, settings(box.description, {"render": {"target_error": 1.0, "spp": 10**6}}), None, torch.float32)
+    ends, end = set(), 0
+    while end < 128:
+        ends.add(end := end + run.stop.step(end))
+    assert ends_a_pass(run, spp) == (spp in ends)
+
+
+# -- where none can be written
+
+
+def test_a_render_whose_checkpoint_cannot_be_written_goes_on(
+    box: torchpt.Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file, full = tmp_path / "a.ckpt", []
+
+    def no_space(*given: Any, **more: Any) -> None:
+        full.append(1)
+        if len(full) != 2:  # room for one of them
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        savez(*given, **more)
+
+    savez = np.savez
+    monkeypatch.setattr(np, "savez", no_space)
+    assert equal(shot(box, checkpoint=str(file)), shot(box))
+    said = capfd.readouterr().err.splitlines()
+    assert said == [f"torchpt: {file}: cannot be written (No space left on device); the render goes on without it"]
+    assert len(full) > 3 and os.listdir(tmp_path) == ["a.ckpt"]
+    assert equal(shot(box, checkpoint=str(file), resume=True), shot(box)), "the one that was written is whole"
+
+
+def test_a_picture_is_saved_though_the_folder_of_its_checkpoint_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").mkdir()
+    take = Run.take_alone
+
+    def gone(run: Run, spans: Any) -> bool:
+        shutil.rmtree("there", ignore_errors=True)
+        return take(run, spans)
+
+    monkeypatch.setattr(Run, "take_alone", gone)
+    words = ["film.width=8", "film.height=8", "render.spp=4", "render.checkpoint=there/a.ckpt", "out=a.exr"]
+    assert main(["render", "scene=cornell_box", *words]) == 0
+    said = [line for line in capfd.readouterr().err.splitlines() if "checkpoint" in line or "a.ckpt" in line]
+    assert len(said) == 1 and said[0].startswith("torchpt: there/a.ckpt: cannot be written: there is no folder")
+    assert os.listdir(tmp_path) == ["a.exr"]
 
 
 def test_a_checkpoint_that_is_there_is_not_written_over(box: torchpt.Scene, tmp_path: Path) -> None:

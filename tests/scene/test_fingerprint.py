@@ -372,8 +372,12 @@ def test_models_of_ones_own_count_by_code_and_state() -> None:
     first = fingerprint(scene())
     assert first == fingerprint(scene()) == fingerprint(scene(f"# words\n{MODEL}"))
     texts = [MODEL.replace("2.0", "2.5"), MODEL.replace("1.0", "1.5"), MODEL.replace("wi[2]", "wo[2]")]
-    found = {first, *(fingerprint(scene(text)) for text in texts), fingerprint(scene(weights=torch.ones(3)))}
+    found = {first, *(fingerprint(scene(text)) for text in texts), fingerprint(scene(table=torch.ones(3)))}
     assert len(found) == 5
+    changing = scene(table=torch.ones(3))
+    before = fingerprint(changing)
+    vars(changing.own_models[0])["table"][1] = 2.0
+    assert fingerprint(changing) != before
     with pytest.raises(SceneError, match="models whose contents can be compared"):
         fingerprint(scene(lock=threading.Lock()))
 

@@ -11,7 +11,7 @@ import json
 import os
 import time
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +43,7 @@ FREE = {
 }
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
-_FORMAT = 2
+_FORMAT = 3
 
 
 @dataclass
@@ -110,6 +110,14 @@ class Keeper:
             OutputError: it cannot be written; the one that was there is still whole.
         """
         begun = time.perf_counter()
+        try:
+            self._write(state)
+        finally:
+            self._last = time.perf_counter()
+            self._took = self._last - begun
+            self.seconds += self._took
+
+    def _write(self, state: State) -> None:
         destination = place_of(self.path, (self.path.suffix.lower(),))
         temporary = temporary_beside(destination)
         text = json.dumps({"format": _FORMAT, "of": self._of, **state.facts})
@@ -125,15 +133,13 @@ class Keeper:
         finally:
             with suppress(OSError):  # it is only there after a failure
                 temporary.unlink()
-        self._last = time.perf_counter()
-        self._took = self._last - begun
-        self.seconds += self._took
 
-    def read(self, like: State) -> State | None:
-        """The checkpoint; None where there is none.
+    def read(self, like: State, check: Callable[[State], None] | None = None) -> State | None:
+        """Return the checkpoint, with ``render.spp`` as it was among its facts; None where there is none.
 
         Args:
             like: a state of this render: facts and arrays of the same names, kinds and sizes are there, or it is refused.
+            check: looks at the facts before the arrays, and may refuse them.
 
         Raises:
             AssetError: a file that is no whole checkpoint, or one of another render.
@@ -147,27 +153,35 @@ class Keeper:
             facts = json.loads(arrays.pop(_FACTS).tobytes())
             if facts["format"] != _FORMAT or not isinstance(facts["of"], dict):
                 raise ValueError("another format")
+            facts["spp"] = facts["of"]["render"].pop("spp")
+            if type(facts["spp"]) is not int or not 1 <= facts["spp"] < 2**62:
+                raise ValueError("spp")
         except (
             OSError,
             ValueError,
             KeyError,
             TypeError,
+            AttributeError,
             EOFError,
             RecursionError,
             RuntimeError,
             zipfile.BadZipFile,
         ) as problem:
             raise AssetError(self.path, f"is no whole checkpoint ({_said(problem)})") from None
-        for key, there, here in _differences(facts.pop("of"), self._of):
+        of = {**self._of, "render": {name: value for name, value in self._of["render"].items() if name != "spp"}}
+        for key, there, here in _differences(facts.pop("of"), of):
             said = f"its {key} are others" if key.startswith("scene.") else f"{key}: {there} there, {here} here"
             raise AssetError(self.path, f"is the checkpoint of another render ({said})")
         state = State(facts, {name: torch.from_numpy(value) for name, value in arrays.items()})
-        _check(state, like, self.path)
+        _check_facts(state, like, self.path)
+        if check is not None:
+            check(state)
+        _check_arrays(state, like, self.path)
         return state
 
 
-def _check(state: State, like: State, path: Path) -> None:
-    """Refuse a state that the render could not hold."""
+def _check_facts(state: State, like: State, path: Path) -> None:
+    """Refuse facts of other kinds."""
     for name, value in like.facts.items():
         there: Any = state.facts.get(name)
         if name == "lost":
@@ -179,6 +193,10 @@ def _check(state: State, like: State, path: Path) -> None:
         kind = isinstance(there, int | type(value)) and not isinstance(there, bool)
         if not kind or not 0 <= there < 2**62:
             raise AssetError(path, f"is no whole checkpoint ({name} is {str(there)[:40]})")
+
+
+def _check_arrays(state: State, like: State, path: Path) -> None:
+    """Refuse arrays that the render could not hold."""
     for name, value in like.arrays.items():
         found = state.arrays.get(name)
         if found is None or found.shape != value.shape or found.dtype != value.dtype:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -9,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchpt.errors import LostRankError, RenderError
+from torchpt.errors import LostRankError, OutputError, RenderError
 from torchpt.film import Film
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.budget import check_memory
@@ -19,6 +20,7 @@ from torchpt.forward.need import loaded, need_of, shape_of
 from torchpt.forward.picture import final, rendering_of
 from torchpt.forward.piece import Work, take
 from torchpt.forward.result import Progress, Rendering
+from torchpt.forward.resume import check_samples, check_whole
 from torchpt.forward.room import check_room
 from torchpt.forward.schedule import Span, budget_of
 from torchpt.forward.split import Split
@@ -76,6 +78,7 @@ class Run:
         self.eager: list[str] = []
         self.unsupported: Unsupported | None = None
         self.keeper: Keeper | None = None
+        self.warned = False  # that it cannot write
         self.keeps = settings.render.checkpoint is not None
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
@@ -105,6 +108,7 @@ class Run:
         self.picture = Plate(film, layers, streams)
         self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
         self.tally, self.done, self.left, self.taken, self.ended = Tally(), 0, 0, 0, False
+        self.cut = False  # whether a round of adaptive sampling was shortened
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
         bounded = self.keeps or self.split is not None  # a rank that is gone is noticed after a pass
         self.stop = Stop(self.settings.render, streams.count, EVERY if bounded else None)
@@ -192,6 +196,8 @@ class Run:
         """Pass by pass, until a rule says that it is enough."""
         self.begun = time.perf_counter()
         while not self._adapts() and (size := self.stop.step(self.taken)):
+            if self.settings.adaptive:  # the first round is the same whatever spp and the seconds of a pass
+                size = min(size, FIRST_ROUND - self.taken)
             spans = [(self.picture, self.taken, size)]
             if self.twice is not None:
                 spans.append((self.twice.plate, self.taken, size))
@@ -222,6 +228,7 @@ class Run:
             if not spans:  # no block's samples can be doubled within what is left
                 self.stop.reason = "spp" if more == wish else "time_limit"
                 break
+            self.cut |= more < mean
             whole = self._take(spans)
             self._join()
             shares.put_back()
@@ -233,8 +240,8 @@ class Run:
 
     # -- what a killed render goes on from
 
-    def _films(self) -> dict[str, Film]:
-        """All that samples are added to, by name."""
+    def films(self) -> dict[str, Film]:
+        """Return all that samples are added to, by name."""
         films = {"picture": self.picture.film}
         films |= {f"layers.{name}": film for name, film in self.picture.layers.items()}
         return films if self.twice is None else films | {"pilots": self.twice.plate.film}
@@ -247,7 +254,16 @@ class Run:
         if due if self.split is None else self.split.due(due):
             self._join()
             if self.keeper is not None:
-                self.keeper.write(self._state())
+                self._write(self.keeper)
+
+    def _write(self, keeper: Keeper) -> None:
+        """Write a checkpoint; where that fails the render goes on, as its picture may have a better place."""
+        try:
+            keeper.write(self._state())
+        except OutputError as problem:
+            if not self.warned:
+                print(f"torchpt: {problem}; the render goes on without it", file=sys.stderr, flush=True)
+            self.warned = True
 
     def _state(self) -> State:
         """Where the render is."""
@@ -257,29 +273,38 @@ class Run:
             "rays": self.tally.rays,
             "truncated": self.tally.truncated,
             "seconds": self.seconds_of_sampling(),
+            "cut": int(self.cut),
             "lost": self.lost.plain(),
         }
-        arrays = {f"{name}.{key}": value for name, film in self._films().items() for key, value in film.state().items()}
+        arrays = {f"{name}.{key}": value for name, film in self.films().items() for key, value in film.state().items()}
         return State(facts, arrays | {"light": self.light})
 
     def _resume(self) -> None:
         """Go on from the checkpoint, where that is wished and there is one."""
         if not self.keeps or not self.settings.render.resume:
             return
-        state = None if self.keeper is None else self.keeper.read(self._state())
+        state = None if self.keeper is None else self._kept(self.keeper)
         if state is None and self.keeper is not None:
             say_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
         if self.split is not None:
             state = self.split.state(state, self._state())
         if state is None:
             return
-        for name, film in self._films().items():
+        for name, film in self.films().items():
             film.restore({key: state.arrays[f"{name}.{key}"].to(self.device) for key in film.state()})
         self.lost, self.light = Lost.read(state.facts["lost"]), state.arrays["light"].to(self.device)
         self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
         self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
+        self.cut = bool(state.facts["cut"])
         mean = float(self.picture.film.counts.double().mean()) if self._adapts() else self.taken
         self._reached(mean, self.before)
+
+    def _kept(self, keeper: Keeper) -> State | None:
+        """Return the checkpoint, once it is known to be one that this render can go on from; None where there is none."""
+        state = keeper.read(self._state(), lambda state: check_samples(self, state, keeper.path))
+        if state is not None:
+            check_whole(self, state, keeper.path)
+        return state
 
     def _reached(self, mean: float, seconds: float) -> None:
         """Tell the rules what was reached; where ranks share a render, as the first one sees it."""
