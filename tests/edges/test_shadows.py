@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 
 import torchpt
 
@@ -58,14 +59,17 @@ def test_a_blocker_under_the_sun() -> None:
 
 @pytest.mark.parametrize(
     ("blocker", "area"),
-    [
-        ({"type": "sphere", "radius": 0.5}, math.pi * 0.25),
-        ({"type": "disk", "transform": [{"scale": 0.5}]}, math.pi * 0.25),
-        ({"type": "cube", "transform": [{"scale": 0.5}]}, 1.0),
-        ({"type": "sphere", "transform": [{"scale": [0.5, 0.7, 0.3]}]}, math.pi * 0.35),
-        ({"type": "cylinder", "radius": 0.4, "height": 1.5}, 1.2),
-        ({"type": "cone", "apex": [0, 0.7, 0], "height": -1.4, "slope": 0.5}, 0.98),
-    ],
+    few(
+        [
+            ({"type": "sphere", "radius": 0.5}, math.pi * 0.25),
+            ({"type": "disk", "transform": [{"scale": 0.5}]}, math.pi * 0.25),
+            ({"type": "cube", "transform": [{"scale": 0.5}]}, 1.0),
+            ({"type": "sphere", "transform": [{"scale": [0.5, 0.7, 0.3]}]}, math.pi * 0.35),
+            ({"type": "cylinder", "radius": 0.4, "height": 1.5}, 1.2),
+            ({"type": "cone", "apex": [0, 0.7, 0], "height": -1.4, "slope": 0.5}, 0.98),
+        ],
+        1,
+    ),
     ids=["sphere", "disk", "cube", "ellipsoid", "cylinder", "cone"],
 )
 def test_blockers_that_grow_under_the_sun(blocker: dict[str, Any], area: float) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 from torch import Tensor
 
 import torchpt
@@ -57,22 +58,25 @@ def test_a_white_sky_gives_the_albedo() -> None:
 
 @pytest.mark.parametrize(
     "material",
-    [
-        {"type": "roughconductor", "material": "Au", "roughness": 0.4},
-        {"type": "plastic", "diffuse_reflectance": 0.6},
-        {"type": "roughplastic", "alpha": 0.1, "nonlinear": True},
-        {"type": "nonmetal"},
-        {"type": "microfacet"},
-        {"type": "phong"},
-        {"type": "blinn_phong"},
-        {"type": "principled", "base_color": 0.6, "roughness": 0.3},
-        {"type": "principled", "base_color": [0.8, 0.5, 0.2], "roughness": 0.5, "metallic": 0.8, "spec_tint": 1.0},
-        {"type": "principled", "base_color": 1.0, "spec_trans": 1.0, "roughness": 0.1},
-        {"type": "dielectric"},
-        {"type": "thindielectric"},
-        {"type": "roughdielectric"},
-        {"type": "blend", "a": {"type": "diffuse"}, "b": {"type": "roughconductor"}, "weight": 0.3},
-    ],
+    few(
+        [
+            {"type": "roughconductor", "material": "Au", "roughness": 0.4},
+            {"type": "plastic", "diffuse_reflectance": 0.6},
+            {"type": "roughplastic", "alpha": 0.1, "nonlinear": True},
+            {"type": "nonmetal"},
+            {"type": "microfacet"},
+            {"type": "phong"},
+            {"type": "blinn_phong"},
+            {"type": "principled", "base_color": 0.6, "roughness": 0.3},
+            {"type": "principled", "base_color": [0.8, 0.5, 0.2], "roughness": 0.5, "metallic": 0.8, "spec_tint": 1.0},
+            {"type": "principled", "base_color": 1.0, "spec_trans": 1.0, "roughness": 0.1},
+            {"type": "dielectric"},
+            {"type": "thindielectric"},
+            {"type": "roughdielectric"},
+            {"type": "blend", "a": {"type": "diffuse"}, "b": {"type": "roughconductor"}, "weight": 0.3},
+        ],
+        4,
+    ),
     ids=lambda material: material["type"],
 )
 def test_models_under_a_white_sky(material: dict[str, Any]) -> None:
@@ -106,10 +110,13 @@ def test_a_model_without_a_rule_is_diffuse() -> None:
 
 @pytest.mark.parametrize(
     "material",
-    [
-        {"type": "diffuse", "reflectance": 0.7},
-        {"type": "roughconductor", "reflectance": [0.9, 0.6, 0.3], "roughness": 0.4},
-    ],
+    few(
+        [
+            {"type": "diffuse", "reflectance": 0.7},
+            {"type": "roughconductor", "reflectance": [0.9, 0.6, 0.3], "roughness": 0.4},
+        ],
+        1,
+    ),
     ids=["diffuse", "metal"],
 )
 def test_a_lone_convex_body_is_as_the_path_tracer_has_it(material: dict[str, Any], sky: dict[str, Any]) -> None:
@@ -154,7 +161,7 @@ def test_the_environment_is_cut_from_the_table() -> None:
     assert without_environment(alone) is None and without_environment(None) is None
 
 
-@pytest.mark.parametrize("kind", ["constant", "envmap"])
+@pytest.mark.parametrize("kind", few(["constant", "envmap"], 1))
 def test_gradients_flow_to_sky_and_material(kind: str, sky: dict[str, Any]) -> None:
     scene = ball({"type": "roughconductor", "reflectance": 0.6, "roughness": 0.5}, WHITE if kind == "constant" else sky)
     name = "lights.sky.radiance" if kind == "constant" else "lights.sky.texels"
@@ -174,7 +181,7 @@ def test_what_is_refused() -> None:
         torchpt.render(ball({"type": "diffuse"}, WHITE), integrator={"type": "ibl", "max_depth": 3}, spp=1)
 
 
-@pytest.mark.parametrize("directional", [False, True])
+@pytest.mark.parametrize("directional", few([False, True], 1))
 def test_a_light_tree_is_cut_likewise(directional: bool) -> None:
     lights: dict[str, Any] = {**WHITE, "a": {"type": "point", "position": [0, 2, 3], "intensity": 4.0}}
     lights["b"] = {"type": "point", "position": [3, 0, 2], "intensity": 6.0}

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 
 import pytest
 import torch
+from few import few
 from torch import Tensor
 
 import torchpt
@@ -73,7 +74,7 @@ def test_the_error_falls(scene: torchpt.Scene, rendering: Rendering) -> None:
 
 @needs_library
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (33, 17), (64, 40)])
-@pytest.mark.parametrize("level", [1e-30, 1e-9, 0.5, 1e4, 3e38])
+@pytest.mark.parametrize("level", few([1e-30, 1e-9, 0.5, 1e4, 3e38], 2))
 def test_a_constant_picture_stays_so(size: tuple[int, int], level: float) -> None:
     grey = torch.full((*size, 3), level)
     assert torch.allclose(torchpt.denoise(grey), grey, rtol=5e-3, atol=0)
@@ -92,6 +93,7 @@ def noise(seed: int, *size: int) -> Tensor:
 
 
 @needs_library
+@pytest.mark.slow
 def test_the_scale_of_radiance_and_the_number_of_threads_change_nothing() -> None:
     image, albedo, normal = noise(1, 37, 53), noise(2, 37, 53), 2 * noise(3, 37, 53) - 1
     before, threads = torchpt.denoise(image, albedo, normal), torch.get_num_threads()

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 
 import torchpt
 from torchpt.format.description import settings
@@ -91,7 +92,7 @@ def baked(texture: dict[str, Any], folder: Path) -> dict[str, Any]:
     return {"type": "image", "path": str(folder / "baked.exr"), "wrap": "clamp"}
 
 
-@pytest.mark.parametrize("slot", SLOTS)
+@pytest.mark.parametrize("slot", few(SLOTS, 3))
 def test_as_an_image_of_the_same_values(slot: str, tmp_path: Path):
     texture = {**NOISE, **SLOTS[slot]}
     loaded = torchpt.load(scene(slot, texture), "cpu")
@@ -105,7 +106,7 @@ def test_as_an_image_of_the_same_values(slot: str, tmp_path: Path):
     assert float((image - expected).abs().mean()) < 0.05 * float((image - flat).abs().mean())
 
 
-@pytest.mark.parametrize("slot", [slot for slot in SLOTS if slot != "displacement"])
+@pytest.mark.parametrize("slot", few([slot for slot in SLOTS if slot != "displacement"], 2))
 def test_compiled_is_eager(slot: str):
     """Nothing of it falls back to tensor operations, and bits do not depend on threads."""
     loaded = torchpt.load(scene(slot, {**NOISE, **SLOTS[slot]}), "cpu")
@@ -115,7 +116,7 @@ def test_compiled_is_eager(slot: str):
     assert torch.equal(made.image, taken(loaded, "on", threads=2).image)
 
 
-@pytest.mark.parametrize("slot", ["opacity", "emission"])
+@pytest.mark.parametrize("slot", few(["opacity", "emission"], 1))
 def test_images_and_others_side_by_side(slot: str, tmp_path: Path):
     """Each surface reads its own, by whichever table: as where all of them are images."""
     squares = {"type": "checkerboard", "color0": 0.9, "color1": 0.2, "scale": 2}

@@ -233,7 +233,7 @@ def test_a_layer_shows_the_ball(name, compiled):
         assert torch.allclose(layer, torch.tensor(values).expand_as(layer), atol=2e-3)
 
 
-@pytest.mark.parametrize("name", LAYER_ROWS)
+@pytest.mark.parametrize("name", few(LAYER_ROWS, 4))
 def test_a_layer_is_the_same_compiled_and_in_files(name, tmp_path: Path):
     scene = load(ROOM)
     eager, compiled = (layers_of(scene, name, mode, film={"aovs": [name], "filter": "box"}) for mode in (False, True))

@@ -73,7 +73,7 @@ SLOW = pytest.mark.slow
     ("albedo", "strategy", "compile"),
     [
         (0.99, "mis", "on"),
-        (0.99, "bsdf", "off"),
+        pytest.param(0.99, "bsdf", "off", marks=SLOW),
         pytest.param(0.999, "mis", "on", marks=SLOW),
         pytest.param(0.999, "bsdf", "on", marks=SLOW),
         pytest.param(0.99, "mis", "off", marks=SLOW),
@@ -93,7 +93,8 @@ def test_a_closed_room_of_high_albedo(albedo, strategy, compile):
 
 
 @pytest.mark.parametrize(
-    ("index", "compile"), [(1.0, "on"), (1.0, "off"), (1.5, "on"), pytest.param(1.5, "off", marks=SLOW)]
+    ("index", "compile"),
+    [(1.0, "on"), pytest.param(1.0, "off", marks=SLOW), (1.5, "on"), pytest.param(1.5, "off", marks=SLOW)],
 )
 def test_two_hundred_clear_panes(index, compile):
     count = 200

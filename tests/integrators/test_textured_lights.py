@@ -41,7 +41,7 @@ LAMPS: dict[str, dict[str, Any]] = {
 
 
 #: The others take the same paths with another shape's coordinates, which tests of shapes and of look-ups cover too.
-FAST = (("rectangle", "holes"), ("sphere", "whole"))
+FAST = (("rectangle", "holes"),)
 CASES = [
     pytest.param(kind, more, marks=() if (kind, more) in FAST else pytest.mark.slow)
     for kind in LAMPS

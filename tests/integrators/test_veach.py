@@ -63,6 +63,7 @@ def test_every_strategy_has_the_same_mean(veach, reference, shapes, strategy, sp
         assert (difference.abs() < 1.25 * z_limit(len(compared)) * error).all(), (name, difference / error)
 
 
+@pytest.mark.slow
 def test_mis_has_the_lowest_error(veach, reference, shapes):
     seen = shapes["all"][..., None]
     errors = {}

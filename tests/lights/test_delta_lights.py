@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 from trials import film_of, shoot, z_limit
 
 import torchpt
@@ -62,7 +63,7 @@ def test_a_lambert_floor_under_one_light(name):
     torch.testing.assert_close(seen(floor({name: LIGHTS[name]})), exact(name), rtol=2e-4, atol=0)
 
 
-@pytest.mark.parametrize("strategy", ["mis", "light"])
+@pytest.mark.parametrize("strategy", few(["mis", "light"], 1))
 def test_lights_add_up(strategy):
     lamp = {"type": "sphere", "center": [0, 3, 1], "radius": 0.1, "emission": 40}
     whole = floor({**LIGHTS, "sky": {"type": "constant", "radiance": 0.3}}, lamp=lamp)
@@ -144,7 +145,7 @@ def test_textures_of_other_lights_leave_them_alone():
 
 
 @pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
-@pytest.mark.parametrize("name", LIGHTS)
+@pytest.mark.parametrize("name", few(LIGHTS, 2))
 def test_gradients(name):
     """Of one light: among several the choice follows their power, and the samples would change."""
     scene = torchpt.load({**floor({name: LIGHTS[name]}), "film": {**film_of(2), "filter": "box"}}, "cpu")

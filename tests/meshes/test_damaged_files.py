@@ -233,6 +233,7 @@ for name in sys.argv[1:]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory in KiB is Linux's")
+@pytest.mark.slow
 def test_declared_sizes_cost_no_memory(tmp_path: Path) -> None:
     files = [str(file) for file in declared(tmp_path) if not file.name.startswith("whole")]
     done = subprocess.run(

@@ -304,6 +304,7 @@ def test_in_data_parallel_training(renderer, tmp_path):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's own, while it compiles
 @pytest.mark.filterwarnings("ignore:The .grad attribute")  # torch 2.13's, at any break that such a tensor crosses
+@pytest.mark.slow
 def test_in_compiled_code(renderer):
     torch.compiler.reset()
     expected = copy.deepcopy(renderer)
