@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
+
 __all__ = [
     "AssetError",
     "EdgeWarning",
@@ -14,6 +17,7 @@ __all__ = [
     "SceneError",
     "ShortageError",
     "TorchptError",
+    "warn_caller",
 ]
 
 
@@ -123,3 +127,11 @@ class EdgeWarning(UserWarning):
 
 class EnergyWarning(UserWarning):
     """Energy may not be kept: a material that may reflect more than it receives, refracting shapes that touch."""
+
+
+def warn_caller(message: str, category: type[Warning]) -> None:
+    """Warn at the line that called this package, be it through torch (``nn.Module``, a data loader)."""
+    frame, level = sys._getframe(), 1
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("torchpt", "torch"):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import warnings
 from collections.abc import Callable, Collection, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from torchpt import adjoint as adjoints
 from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape, without_gradient
-from torchpt.errors import EdgeWarning, SceneError
+from torchpt.errors import EdgeWarning, SceneError, warn_caller
 from torchpt.format.description import settings as complete
 from torchpt.forward import Rendering, limited_threads, render_scene
 from torchpt.graphs import known
@@ -292,7 +291,7 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         _warn_of_edges(scene, settings, backward["edges"] == 0)
     for name in without_gradient(scene, wanted):
         said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"
-        warnings.warn(said, EdgeWarning, stacklevel=5)
+        warn_caller(said, EdgeWarning)
     names = (*wanted, *(name for name in params if name not in wanted))
     made: list[Rendering] = []
     taken: list[int] = []
@@ -369,4 +368,4 @@ def _warn_of_edges(scene: Scene, settings: Settings, every: bool) -> None:
         if not missing:
             return
         edges = f"some edges: {'; '.join(missing)}"
-    warnings.warn(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning, stacklevel=6)
+    warn_caller(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning)

@@ -138,7 +138,7 @@ class Render(Valued):
             "auto",
             names=("auto", "on", "off"),
             booleans={True: "on", False: "off"},
-            doc="auto: always on a CPU, on CUDA where it repays",
+            doc="whether stages run as kernels; auto: in float32 on a CPU, else as tensor operations",
         ),
         "threads": Whole(
             "auto",

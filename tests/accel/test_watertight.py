@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 from accel_reference import geometry, rays, search, soup, sphere_mesh, triangles
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from torchpt.accel import KINDS, build
+from torchpt.accel.bounds import primitive_bounds
+from torchpt.accel.tables import prepare
 
 BACKENDS = [k for k in KINDS if k != "auto"]
 INF = float("inf")
@@ -57,11 +59,36 @@ def test_no_ray_escapes_a_room_of_rectangles(kind):
     assert ((o + t * d).abs().amax(0) - 1).abs().max() < 1e-5
 
 
-def _same(a, b):
-    """Same primitives and parameters bit for bit, distances to an ulp."""
-    assert torch.equal(a[1], b[1])
-    torch.testing.assert_close(a[0], b[0], rtol=2.4e-7, atol=0)
-    assert torch.equal(a[2], b[2]) and torch.equal(a[3], b[3])
+def _same(g, o, d, numba, plain):
+    """Same primitives and parameters bit for bit, distances to an ulp, but for rays (almost) within the plane of what they hit.
+
+    There distances, and whether a ray crosses at all, are quotients and signs of rounding errors. The trees differ in which
+    boxes keep these from mattering: by tensor operations that of the primitive alone, in the wide tree that of its leaf.
+    """
+    same = (numba[1] == plain[1]) & (numba[2] == plain[2]) & (numba[3] == plain[3])
+    same &= ((numba[0] - plain[0]).abs() <= 2.4e-7 * plain[0]) | (numba[0] == plain[0])
+    k = (~same).nonzero()[:, 0]
+    t, other, o, d = numba[0][k].double(), plain[0][k].double(), o[:, k].double(), d[:, k].double()
+    # The plain hit is nearer than the box of its primitive: the wide tree moves it to where the ray enters the leaf.
+    enters, _, error = _edge_on(g, plain[1][k].long(), o, d, other)
+    moved = (t > other) & (t <= enters * (1 + 2.0**-16)) & (t - other <= error)
+    # The wide tree's primitive is in the plane of the ray and beside it: the plain search stays out of its box.
+    enters, leaves, error = _edge_on(g, numba[1][k].long(), o, d, t)
+    beside = (t < other) & (enters > leaves) & (error >= t)
+    assert (moved | beside).all()
+
+
+def _edge_on(g, prim, o, d, t):
+    """Distances at which rays enter and leave the boxes of what they hit, and how far off its planes' distances may be."""
+    prim, missed = prim.clamp(min=0), prim < 0
+    n, c = prepare(g).rows64.T[:3, prim], prepare(g).rows64.T[3, prim]
+    terms = (n * o).abs().sum(0) + c.abs() + t * (n * d).abs().sum(0)
+    low, high = ((box[:, prim].double() - o) / d for box in primitive_bounds(g))
+    still = d == 0
+    enters = torch.where(still, -INF, torch.minimum(low, high)).amax(0)
+    leaves = torch.where(still, INF, torch.maximum(low, high)).amin(0)
+    error = 2.0**-21 * terms / (n * d).sum(0).abs()  # 8 roundings
+    return enters, leaves, error.masked_fill(missed, -INF)
 
 
 def _slivers(seed):
@@ -87,7 +114,7 @@ def test_numba_is_torch_bit_for_bit(make, seed):
     t_max[::5] = 2.0
     a, b = build(g, "numba"), build(g, "torch")
     hits = a.intersect(o, d, t_max)
-    _same(hits, b.intersect(o, d, t_max))
+    _same(g, o, d, hits, b.intersect(o, d, t_max))
     assert torch.equal(a.occluded(o, d, t_max), hits[1] >= 0)
     assert torch.equal(b.occluded(o, d, t_max), hits[1] >= 0)
 
@@ -99,6 +126,9 @@ def test_numba_is_torch_bit_for_bit(make, seed):
     scale=st.sampled_from([1e-6, 1.0, 1e6]),
     grid=st.booleans(),
 )
+@example(
+    seed=8674, counts=(7, 0, 6, 12), scale=1e-6, grid=True
+)  # ray 81 lies in the plane of triangle 6, and meets a corner
 def test_numba_is_torch_on_any_soup(seed, counts, scale, grid):
     g = soup(seed, counts)
     p = [x.numpy().T * scale for x in (g.p0, g.p1, g.p2)]
@@ -108,7 +138,7 @@ def test_numba_is_torch_on_any_soup(seed, counts, scale, grid):
         o, d = (o * 2).round() / 2, (d * 2).round() / 2
     g = geometry(*p, counts)
     hits = build(g, "numba").intersect(o * scale, d, t_max)
-    _same(hits, build(g, "torch").intersect(o * scale, d, t_max))
+    _same(g, o * scale, d, hits, build(g, "torch").intersect(o * scale, d, t_max))
     assert not torch.isnan(torch.stack([hits[0], hits[2], hits[3]])).any()
 
 

@@ -446,13 +446,3 @@ def test_shapes():
     a, b = turned[:, :, 0].T * 7, turned[:, :, 1].T * 0.1
     lights = solid_angle.table_of([RECTANGLE] * 100, a, a, b)
     assert lights is not None and bool((lights[:, 0] == RECTANGLE).all())
-
-
-def test_a_compiled_graph_calls_the_kernel():
-    lights, row, x, u = _scatter(333, torch.float32)
-    sampled = torch.compile(solid_angle.sample, fullgraph=True, dynamic=True, backend="eager")
-    found = torch.compile(solid_angle.angles, fullgraph=True, dynamic=True, backend="eager")
-    for a, b in zip(sampled(lights, row, x, u), solid_angle.sample(lights, row, x, u), strict=True):
-        assert torch.equal(a, b)
-    assert torch.equal(found(lights, row, x), solid_angle.angles(lights, row, x))
-    assert torch.equal(found(lights[:1], None, x), solid_angle.angles(lights[:1], None, x))

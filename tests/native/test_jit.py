@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import os
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -203,3 +205,13 @@ def test_files_that_did_not_change_are_not_read(tmp_path, monkeypatch):
     assert code_of_folder(tmp_path / "package") == first
     code_of_folder.cache_clear()
     cache._folder.cache_clear()
+
+
+def test_numba_without_its_compiler_is_told_in_a_line(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "torchpt", "render", "scene=cornell_box", "render.spp=1", "render.accel=numba"]
+    words += ["film.width=4", "film.height=4", f"out={tmp_path / 'box.png'}"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    assert done.returncode == 2 and not list(tmp_path.iterdir())
+    said = done.stderr.strip().splitlines()
+    assert len(said) == 1 and "NUMBA_DISABLE_JIT is set" in said[0]

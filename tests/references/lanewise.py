@@ -22,12 +22,12 @@ from torch import Tensor
 import torchpt
 from torchpt.format.description import settings
 from torchpt.forward import kernels_of, make_wave
-from torchpt.integrators.compiled import Stages
 from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.loop.rows import HIT, Memory
 from torchpt.integrators.path import partition
 from torchpt.integrators.search import Search
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported

@@ -17,11 +17,12 @@ from trials import film_of
 
 import torchpt
 from torchpt.bsdfs import Parameters
+from torchpt.errors import SceneError
 from torchpt.format.description import settings
 from torchpt.forward import say_once
-from torchpt.integrators.compiled import Stages
 from torchpt.integrators.loop import programs
 from torchpt.integrators.loop.kernels import Kernels
+from torchpt.integrators.stage_runner import Stages
 from torchpt.lanes import engine
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.warps import cosine_hemisphere
@@ -261,7 +262,7 @@ def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
         return kept(self, model, *args)
 
     capsys.readouterr()
-    monkeypatch.setattr("torchpt.integrators.compiled.Stages.bounce", noted)
+    monkeypatch.setattr("torchpt.integrators.stage_runner.Stages.bounce", noted)
     found = rendered(scene, render={"spp": 4})
     models = scene.world(torch.float32)[0].materials.models
     (own,) = [k for k, model in enumerate(models) if model.name == "odd"]
@@ -344,10 +345,13 @@ def test_a_stage_that_turns_out_not_to_compile_renders_all_eagerly(monkeypatch, 
     monkeypatch.setattr(Kernels, "emit", refuses)
     monkeypatch.setattr(Kernels, "retire", refuses)
     for _ in range(2):
-        found = rendered(scene)
+        found = rendered(scene, render={"compile": "auto"})
         assert torch.equal(found.image, eager.image) and found.rays == eager.rays
         assert found.eager == ("all stages: the operator nothing_of_the_kind",)
     assert capsys.readouterr().err.count("nothing_of_the_kind") == 1
+    said = r"^render.compile: expected auto or off \(no kernel can be made of the operator nothing_of_the_kind\), got 'on'$"
+    with pytest.raises(SceneError, match=said):
+        rendered(scene, render={"compile": "on"})
 
 
 def test_a_parameter_changed_in_place_reaches_the_tables():

@@ -37,12 +37,27 @@ def beside(gap: float, material: str = "glass", scale: float = 1.0, up: float = 
     return {"type": "cube", "material": material, "transform": transform}
 
 
+def on_top(kind: str, gap: float = 0.0, out: float = 0.0, material: str = "glass", **more: Any) -> dict[str, Any]:
+    """A cylinder or cone of radius .5 on the upper face."""
+    at = [{"translate": [out, 1.0 + gap, out]}]
+    own = {"center": [0, 0.5, 0], "radius": 0.5} if kind == "cylinder" else {"apex": [0, 1, 0], "slope": 0.5}
+    return {"type": kind, **own, "material": material, "transform": at, **more}
+
+
 @pytest.mark.parametrize("turn", [0.0, 33.0])
 @pytest.mark.parametrize("far", [0.0, 1e5])
 @pytest.mark.parametrize(
     "other",
-    [beside(0.0), beside(0.0, "frosted"), beside(0.0, scale=0.3, up=0.4), beside(0.0, up=1.99)],
-    ids=["face on face", "of another material", "a small one", "by a sliver"],
+    [
+        beside(0.0),
+        beside(0.0, "frosted"),
+        beside(0.0, scale=0.3, up=0.4),
+        beside(0.0, up=1.99),
+        on_top("cylinder"),
+        on_top("cone", out=1.3),
+        {"type": "disk", "material": "glass", "transform": [{"translate": [0.0, 1.5, 1.0]}]},
+    ],
+    ids=["face on face", "of another material", "a small one", "by a sliver", "a cylinder", "a cone", "a disk"],
 )
 def test_two_glass_boxes_that_touch_are_told_of(other, far, turn):
     given = scene(other, turn)
@@ -75,8 +90,15 @@ def test_meshes_and_instances_that_touch_are_told_of():
         beside(0.0, "pane"),
         beside(0.0, up=2.0),
         {"type": "sphere", "center": [2, 0, 0], "radius": 1.0, "material": "glass"},
+        on_top("cylinder", gap=1e-3),
+        on_top("cylinder", out=1.36),  # its cap passes the corner by .009
+        on_top("cylinder", capped=False),
+        on_top("cylinder", material="wall"),
     ],
-    ids=["a gap", "overlapping", "opaque", "a thin pane", "an edge in common", "a sphere"],
+    ids=[
+        *("a gap", "overlapping", "opaque", "a thin pane", "an edge in common", "a sphere"),
+        *("a cylinder above", "a cylinder past the corner", "an open cylinder", "an opaque cylinder"),
+    ],
 )
 def test_others_are_not(other):
     if "transform" not in other:

@@ -148,6 +148,10 @@ def test_a_failure_is_told_by_the_exit_code(
         (["accel=fast"], "accel: expected one of auto, numba, torch, brute, got 'fast'"),
         (["dtype=float16"], "dtype: expected one of float32, float64"),
         (["device=tpu"], "device: expected cpu, cuda or cuda:N"),
+        (
+            ["compile=[auto,on]", "dtype=float64"],
+            "compile: expected auto or off (there are no kernels for float64 on cpu)",
+        ),
         (["film.width=3"], "film: settings are of a scene"),
         (["scene=nowhere"], "scene: expected one of"),
         (["paint"], "paint: expected one of quick="),

@@ -18,7 +18,6 @@ from torch import Tensor
 from torchpt.accel.base import Accel, Array, Hits, closer
 from torchpt.accel.tables import extent, inverses, prepare, tolerances
 from torchpt.errors import SceneError
-from torchpt.native.operators import hits_like, operator
 from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
@@ -64,18 +63,37 @@ class Brute(Accel):
         self.counts = list(geometry.counts)
         self.extent = size
         self.threads = threads
-        self.arrays = _arrays(self.table, self.spheres, self.quadrics, self.counts, self.extent)
+        self.arrays = (
+            *(x.numpy() for x in (self.table, self.spheres, self.quadrics)),
+            *self.counts[:3],
+            np.float32(size),
+        )
         self.build_seconds = time.perf_counter() - start
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(
-            o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, thread_count(self.threads)
-        )
+        from torchpt.accel import kernels_brute as kernels
+
+        t, u, v = (torch.empty_like(t_max) for _ in range(3))
+        prim = torch.empty_like(t_max, dtype=torch.int32)
+        self._launch(kernels.intersect, kernels.intersect_parallel, o, d, t_max, t, prim, u, v)
+        return t, prim, u, v
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(
-            o, d, t_max, self.table, self.spheres, self.quadrics, self.counts, self.extent, thread_count(self.threads)
-        )
+        from torchpt.accel import kernels_brute as kernels
+
+        blocked = torch.empty_like(t_max, dtype=torch.bool)
+        self._launch(kernels.occluded, kernels.occluded_parallel, o, d, t_max, blocked)
+        return blocked
+
+    def _launch(self, serial: Any, parallel: Any, o: Tensor, d: Tensor, t_max: Tensor, *results: Tensor) -> None:
+        """Run a kernel on rays, over as many threads as repay."""
+        from torchpt.accel import kernels_brute as kernels
+        from torchpt.native.jit import launch
+
+        rays = (x.contiguous().numpy() for x in (o, d, t_max))
+        args = (*rays, *self.arrays, *(x.numpy() for x in results))
+        blocks = -(-t_max.shape[0] // kernels.BLOCK)
+        launch(serial, parallel, blocks, thread_count(self.threads), _GRAIN, args)
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
@@ -107,74 +125,3 @@ class Brute(Accel):
             "bytes": self.table.nbytes + self.spheres.nbytes + self.quadrics.nbytes,
             "build_seconds": self.build_seconds,
         }
-
-
-@operator("torchpt::brute_intersect", lambda o, d, t_max, *scene: hits_like(t_max))
-def _intersect(
-    o: Tensor,
-    d: Tensor,
-    t_max: Tensor,
-    table: Tensor,
-    spheres: Tensor,
-    quadrics: Tensor,
-    counts: list[int],
-    extent: float,
-    threads: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    from torchpt.accel import kernels_brute as kernels
-    from torchpt.native.jit import launch
-
-    t, prim, u, v = (torch.empty_like(t_max) for _ in range(4))
-    prim = torch.empty_like(t_max, dtype=torch.int32)
-    args = _arguments(o, d, t_max, table, spheres, quadrics, counts, extent)
-    blocks = -(-t_max.shape[0] // kernels.BLOCK)
-    launch(
-        kernels.intersect,
-        kernels.intersect_parallel,
-        blocks,
-        threads,
-        _GRAIN,
-        (*args, t.numpy(), prim.numpy(), u.numpy(), v.numpy()),
-    )
-    return t, prim, u, v
-
-
-@operator("torchpt::brute_occluded", lambda o, d, t_max, *scene: torch.empty_like(t_max, dtype=torch.bool))
-def _occluded(
-    o: Tensor,
-    d: Tensor,
-    t_max: Tensor,
-    table: Tensor,
-    spheres: Tensor,
-    quadrics: Tensor,
-    counts: list[int],
-    extent: float,
-    threads: int,
-) -> Tensor:
-    from torchpt.accel import kernels_brute as kernels
-    from torchpt.native.jit import launch
-
-    blocked = torch.empty_like(t_max, dtype=torch.bool)
-    args = _arguments(o, d, t_max, table, spheres, quadrics, counts, extent)
-    blocks = -(-t_max.shape[0] // kernels.BLOCK)
-    launch(kernels.occluded, kernels.occluded_parallel, blocks, threads, _GRAIN, (*args, blocked.numpy()))
-    return blocked
-
-
-def _arguments(
-    o: Tensor,
-    d: Tensor,
-    t_max: Tensor,
-    table: Tensor,
-    spheres: Tensor,
-    quadrics: Tensor,
-    counts: list[int],
-    extent: float,
-) -> tuple:
-    rays = (x.contiguous().numpy() for x in (o, d, t_max))
-    return (*rays, *_arrays(table, spheres, quadrics, counts, extent))
-
-
-def _arrays(table: Tensor, spheres: Tensor, quadrics: Tensor, counts: list[int], extent: float) -> tuple:
-    """What the kernels take of the primitives."""
-    return table.numpy(), spheres.numpy(), quadrics.numpy(), *counts[:3], np.float32(extent)

@@ -13,7 +13,6 @@ from torchpt.accel.base import Accel, Hits
 from torchpt.accel.bounds import primitive_bounds, surface
 from torchpt.accel.radix import Tree, build_tree
 from torchpt.accel.tables import inverses, prepare
-from torchpt.native.operators import hits_like, operator
 from torchpt.records import Geometry
 
 __all__ = ["Lbvh"]
@@ -44,11 +43,14 @@ class Lbvh(Accel):
     def _tensors(self) -> list[Tensor]:
         return [self.corners, self.rows, self.quadrics, self.tree.children, self.tree.boxes, self.tree.order]
 
+    def _nodes(self) -> traverse.Nodes:
+        return traverse.Nodes(self._tensors(), self.counts, self.tree.depth)
+
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
+        return traverse.intersect(o, d, t_max, self._nodes())
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
+        return traverse.occluded(o, d, t_max, self._nodes())
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`."""
@@ -72,18 +74,3 @@ def sah_cost(tree: Tree) -> float:
     area = torch.stack([surface(boxes[0:3], boxes[3:6]), surface(boxes[6:9], boxes[9:12])])
     low, high = torch.minimum(boxes[0:3, :1], boxes[6:9, :1]), torch.maximum(boxes[3:6, :1], boxes[9:12, :1])
     return float(1 + area.sum() / surface(low, high).clamp(min=torch.finfo(torch.float64).tiny))
-
-
-@operator("torchpt::lbvh_intersect", lambda o, d, t_max, *scene: hits_like(t_max))
-def _intersect(
-    o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return traverse.intersect(o, d, t_max, traverse.Nodes(tensors, counts, depth))
-
-
-@operator(
-    "torchpt::lbvh_occluded",
-    lambda o, d, t_max, *scene: torch.empty_like(t_max, dtype=torch.bool),
-)
-def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> Tensor:
-    return traverse.occluded(o, d, t_max, traverse.Nodes(tensors, counts, depth))

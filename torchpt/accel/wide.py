@@ -16,7 +16,6 @@ from torchpt.accel.blocks import Others, aligned, lines_of, mesh_tree, room_of, 
 from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.topology import Topology
 from torchpt.native.jit import compiled, launch
-from torchpt.native.operators import hits_like, operator
 from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
@@ -68,10 +67,19 @@ class Wide(Accel):
         return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return _intersect(o, d, t_max, self.tensors, thread_count(self.threads))
+        t, u, v = (torch.empty_like(t_max) for _ in range(3))
+        prim = torch.empty_like(t_max, dtype=torch.int32)
+        rays = (x.contiguous().numpy() for x in (o, d, t_max))
+        args = (*rays, *self.arrays, *(x.numpy() for x in (t, prim, u, v)))
+        launch(kernels.nearest, kernels.nearest_parallel, t_max.shape[0], thread_count(self.threads), _GRAIN, args)
+        return t, prim, u, v
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return _occluded(o, d, t_max, self.tensors, thread_count(self.threads))
+        out = torch.empty_like(t_max, dtype=torch.int32)
+        rays = (x.contiguous().numpy() for x in (o, d, t_max))
+        args = (*rays, *self.arrays, _ALL_OPAQUE, out.numpy())
+        launch(kernels.blocked, kernels.blocked_parallel, t_max.shape[0], thread_count(self.threads), _GRAIN, args)
+        return out != 0
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
@@ -106,24 +114,3 @@ def _arrays(tensors: list[Tensor]) -> tuple[np.ndarray, ...]:
     """The kernels' arguments: the tree as float32 and as int32, then the others."""
     tree, *rest = (x.numpy() for x in tensors)
     return tree, tree.view(np.int32), *rest
-
-
-@operator("torchpt::wide_intersect", lambda o, d, t_max, *scene: hits_like(t_max))
-def _intersect(
-    o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], threads: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    t, u, v = (torch.empty_like(t_max) for _ in range(3))
-    prim = torch.empty_like(t_max, dtype=torch.int32)
-    rays = (x.contiguous().numpy() for x in (o, d, t_max))
-    args = (*rays, *_arrays(tensors), *(x.numpy() for x in (t, prim, u, v)))
-    launch(kernels.nearest, kernels.nearest_parallel, t_max.shape[0], threads, _GRAIN, args)
-    return t, prim, u, v
-
-
-@operator("torchpt::wide_occluded", lambda o, d, t_max, *scene: torch.empty_like(t_max, dtype=torch.bool))
-def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], threads: int) -> Tensor:
-    out = torch.empty_like(t_max, dtype=torch.int32)
-    rays = (x.contiguous().numpy() for x in (o, d, t_max))
-    args = (*rays, *_arrays(tensors), _ALL_OPAQUE, out.numpy())
-    launch(kernels.blocked, kernels.blocked_parallel, t_max.shape[0], threads, _GRAIN, args)
-    return out != 0

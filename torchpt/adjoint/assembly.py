@@ -17,7 +17,7 @@ from torchpt.core.tree import leaves, map_leaves
 from torchpt.forward.schedule import Span
 from torchpt.forward.wave import make_wave
 from torchpt.forward.waves import Waves
-from torchpt.integrators.compiled import Stages
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.wave import Wave
 from torchpt.ranks import Group, blocks
 from torchpt.scene import Scene

@@ -21,10 +21,10 @@ from torchpt.forward.budget import Budget
 from torchpt.forward.schedule import Span
 from torchpt.forward.waves import Waves
 from torchpt.integrators import joint
-from torchpt.integrators.compiled import Stages
 from torchpt.integrators.joint import Behind
 from torchpt.integrators.path import ENDLESS, Ends, partition, slides, trace
 from torchpt.integrators.search import Search
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.tally import Tally
 from torchpt.math.gathers import gathered_by
 from torchpt.math.vectors import take

@@ -159,6 +159,8 @@ def _benches(wishes: Wishes) -> dict[str, Bench]:
     if not (device in ("cpu", "cuda") or (device.startswith("cuda:") and device[5:].isdigit())):
         raise SceneError("device", device, "cpu, cuda or cuda:N")
     device_of(device)
+    if "on" in wishes.list("compile", "auto") and (device, dtype) != ("cpu", "float32"):
+        raise SceneError("compile", "on", f"auto or off (there are no kernels for {dtype} on {device})")
     return {
         f"accel {accel}, compile {compiled}, {dtype} on {device}": Bench(device, accel, compiled, getattr(torch, dtype))
         for accel, compiled in product(wishes.list("accel", "auto"), wishes.list("compile", "auto"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import torch
+from torch import Tensor
 
 from torchpt.edges.sets import known
 from torchpt.integrators.path import PathIntegrator
@@ -26,7 +27,7 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
     built, camera = scene.built, scene.description.camera.kind
     if camera.lens:
         yield "those that a lens blurs"
-    elif scene.camera(settings.film, scene.params, torch.float64).film_of(torch.zeros(3, 1).double()) is None:
+    elif scene.camera(settings.film, scene.params, torch.float64).film_of(_point(scene.device)) is None:
         yield f"those that a camera of kind {camera.name} sees"
     materials = [owner.material for owner in (*built.parts, *built.copies)]
     if any(part.model.delta for material in materials for part in material.all()):
@@ -42,6 +43,11 @@ def _found(scene: Scene, settings: Settings) -> Iterator[str]:
         yield "the rims of spots that do not fade out"
     if not isinstance(settings.integrator, PathIntegrator):
         yield f"edges of shadows where the integrator is {settings.integrator.name}"
+
+
+def _point(device: torch.device) -> Tensor:
+    """Any point ``(3, 1)``: whether a camera has a film for points does not depend on it."""
+    return torch.zeros(3, 1, dtype=torch.float64, device=device)
 
 
 def without_gradient(scene: Scene, wanted: Iterable[str]) -> list[str]:

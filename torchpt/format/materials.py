@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 from torchpt.bsdfs import KINDS, Bsdf
 from torchpt.bsdfs.base import made
 from torchpt.bsdfs.specs import Inner
-from torchpt.errors import EnergyWarning, NotBuiltError, SceneError
+from torchpt.errors import EnergyWarning, NotBuiltError, SceneError, warn_caller
 from torchpt.format.textures import TextureInput, check_texture, texture_of
 from torchpt.spec import REQUIRED, Refused, Spec, parameters_of, spec_of
 from torchpt.spec.declared import Described, described, values_of
@@ -178,7 +177,7 @@ def check_material(
         raise SceneError(f"{key}.two_sided", material["two_sided"], expected, file)
     if problem := material.kind.energy(material.values):
         where = f"{file}: {key}" if file else key
-        warnings.warn(f"{where}: {problem}", EnergyWarning, stacklevel=2)
+        warn_caller(f"{where}: {problem}", EnergyWarning)
 
 
 def _check_blend(

@@ -8,9 +8,7 @@ from weakref import WeakKeyDictionary
 
 from torchpt.cameras import Camera
 from torchpt.integrators.base import Integrator
-from torchpt.integrators.compiled import CompiledStages
 from torchpt.integrators.loop.kernels import Kernels
-from torchpt.integrators.stages import Plan
 from torchpt.records import World
 from torchpt.scene import Scene
 
@@ -26,7 +24,6 @@ class Kept:
 
     Attributes:
         kernels: of its latest render by the compiled loop.
-        stages: compiled by torch, by what was asked of them.
         first: the integrator and the world that this was made of, and what happens at first surfaces.
         dark: a world, and the same without lights.
         camera: the latest one on a film, with what it was made of.
@@ -34,7 +31,6 @@ class Kept:
     """
 
     kernels: Kernels | None = None
-    stages: dict[Plan, CompiledStages] = field(default_factory=dict)
     first: tuple[Integrator, World, FirstSurface] | None = None
     dark: tuple[World, World] | None = None
     camera: tuple[Any, Camera] | None = None

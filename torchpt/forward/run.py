@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchpt.errors import LostRankError, OutputError, RenderError
+from torchpt.errors import LostRankError, OutputError, RenderError, SceneError
 from torchpt.film import Film
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.budget import check_memory
@@ -66,6 +66,7 @@ class Run:
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
         meter, limit = Meter(self.device), settings.render.max_memory
         before = 0 if limit is None else meter.peak()
+        compiled = looped(settings, self.device, dtype)
         with needing(lambda: f"a scene of {scene.told}"):
             self.wave = make_wave(scene, settings, params, dtype, like=like)
         built = before if limit is None else meter.peak()
@@ -83,7 +84,6 @@ class Run:
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.keeper.check(settings.render.resume)
-        compiled = looped(self.wave, settings, self.device)
         self.loop = loop_of(scene, self.wave, self.eager, threads) if compiled else None
         how = "eager" if self.loop is None else "compiled"
         rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
@@ -173,7 +173,13 @@ class Run:
             self._eagerly(error)
 
     def _eagerly(self, error: Unsupported) -> None:
-        """All samples, once more, by tensor operations."""
+        """All samples, once more, by tensor operations.
+
+        Raises:
+            SceneError: kernels alone were asked for.
+        """
+        if self.settings.render.compile == "on":
+            raise SceneError("render.compile", "on", f"auto or off (no kernel can be made of {error})")
         self.eager.append(f"all stages: {error}")
         say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
         self.loop = None

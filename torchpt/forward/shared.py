@@ -6,7 +6,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import replace
 
 from torchpt.core.tree import leaves
-from torchpt.integrators.compiled import Stages
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.wave import Wave
 
 __all__ = ["ROOM", "alike", "common", "room_of", "shared_wave"]
@@ -23,11 +23,11 @@ def room_of(wave: Wave) -> int:
 def common(wave: Wave, room: int) -> Hashable | None:
     """What scenes must have in common to share a wave with this one, of so much :func:`room_of`; None where no other may.
 
-    Textures that average over footprints want to know of one camera. Compiled stages have the scene's tensors in them, and
-    split-sum shading has the scene's environment in advance. What models of a caller's own hold may change from scene to scene.
+    Textures that average over footprints want to know of one camera. Split-sum shading has the scene's environment in advance.
+    What models of a caller's own hold may change from scene to scene.
     """
     world = wave.stages.world
-    own = wave.first is not None or wave.stages.pixel is not None or wave.stages.compiled
+    own = wave.first is not None or wave.stages.pixel is not None
     if own or room > ROOM // 2 or any(True for model in world.materials.models for _ in model.weights()):
         return None
     from torchpt.union import form_of
@@ -41,9 +41,7 @@ def alike(one: Wave, other: Wave) -> bool:
         return False
     if one.stages.world is not other.stages.world:
         return True
-    # Compiled stages repeat lanes, which would count for one camera.
-    plain = one.stages.pixel is None and not one.stages.compiled and not other.stages.compiled
-    return plain and one.accel is other.accel
+    return one.stages.pixel is None and one.accel is other.accel
 
 
 def shared_wave(waves: Sequence[Wave]) -> tuple[Wave, list[int] | None]:

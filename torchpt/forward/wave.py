@@ -1,4 +1,4 @@
-"""What all waves of a render share, and how they run: as tensor operations, compiled by torch, or as the compiled loop."""
+"""What all waves of a render share, and how they run: as tensor operations, or as the compiled loop."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.cameras import Camera
+from torchpt.errors import SceneError
 from torchpt.film import Filter
 from torchpt.forward.kept import kept
 from torchpt.forward.schedule import streams_of
@@ -18,10 +19,9 @@ from torchpt.forward.waves import say_once
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
-from torchpt.integrators.compiled import CompiledStages, Stages
 from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.loop.schedule import Loop
-from torchpt.integrators.stages import Plan
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.wave import Wave
 from torchpt.records import World
 from torchpt.samplers import ADAPTIVE, Points, Sampler
@@ -35,10 +35,6 @@ if TYPE_CHECKING:
     from torchpt.integrators.layer import SurfaceLayer
 
 __all__ = ["kernels_of", "loop_facts", "loop_of", "looped", "make_wave", "rebound", "surface_layers"]
-
-#: From this many camera paths a BSDF model on ``compile: auto`` compiles: a cold start takes a minute each, and saves a
-#: quarter of the rest.
-COMPILE_REPAYS = 200_000_000
 
 
 def make_wave(
@@ -73,7 +69,7 @@ def make_wave(
     plan = integrator.plan(points, dtype, tape, attached)
     camera = _camera(scene, settings, params, dtype)
     return Wave(
-        stages=_stages(scene, settings, plan, world, _pixel_of(world, camera), own),
+        stages=Stages(plan, world, _pixel_of(world, camera)),
         integrator=integrator,
         accel=accel,
         camera=camera,
@@ -166,36 +162,24 @@ def _pixel_of(world: World, camera: Camera) -> Tensor | None:
     return camera.pixel() if world.textures.filtered else None
 
 
-def _stages(scene: Scene, settings: Settings, plan: Plan, world: World, pixel: Tensor | None, own: bool) -> Stages:
-    """Eager stages; on CUDA compiled ones, which are kept with the scene unless the world is not the scene's ``own``."""
-    mode = settings.render.compile
-    if mode == "auto":
-        _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
-        work = width * height * settings.render.spp
-        mode = (
-            "on"
-            if own
-            and work >= COMPILE_REPAYS * len(world.materials.models)  # each has graphs of its own
-            and plan.dtype == torch.float32
-            and not scene.own_models  # code of the user's own may hold what cannot be compiled
-            else "off"
-        )
-    if scene.device.type == "cpu" or mode == "off" or plan.tape or torch.is_grad_enabled():
-        return Stages(plan, world, pixel)
-    if not own:
-        return CompiledStages(plan, world, pixel)
-    made = kept(scene).stages
-    if plan not in made or made[plan].world is not world:
-        made[plan] = CompiledStages(plan, world)
-    return made[plan].through(pixel)
+def looped(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool:
+    """Return True where a render runs as kernels, False where it runs as tensor operations.
 
-
-def looped(wave: Wave, settings: Settings, device: torch.device) -> bool:
-    """Whether a render takes the compiled loop: on a CPU, in float32, and without a tape."""
-    plan = wave.stages.plan
-    if not wave.integrator.looped or device.type != "cpu" or settings.render.compile == "off":
+    Raises:
+        SceneError: ``render.compile`` is ``on`` where there are no kernels.
+    """
+    if settings.render.compile == "off":
         return False
-    return plan.dtype == torch.float32 and not plan.tape
+    missing = ""
+    if device.type != "cpu":
+        missing = f"kernels run on a CPU; this scene is on {device}"
+    elif dtype != torch.float32:
+        missing = f"kernels compute in float32; this render is in {str(dtype).removeprefix('torch.')}"
+    elif not settings.integrator.looped:
+        missing = f"there are no kernels for the integrator {settings.integrator.name}"
+    if missing and settings.render.compile == "on":
+        raise SceneError("render.compile", "on", f"auto or off ({missing})")
+    return not missing
 
 
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
@@ -218,9 +202,9 @@ def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kerne
 def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
     """How a render of the scene would run: as the compiled loop, and how that searches, or as tensor operations."""
     with torch.no_grad():
+        if not looped(settings, scene.device, torch.float32):
+            return {"stages": "eager, by tensor operations"}
         wave = make_wave(scene, settings, None, torch.float32)
-        if not looped(wave, settings, scene.device):
-            return {"stages": "compiled by torch" if wave.stages.compiled else "eager, by tensor operations"}
         kernels = kernels_of(scene, wave)
     search = "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else wave.accel.name
     names = [str(model) for model in wave.stages.world.materials.models]

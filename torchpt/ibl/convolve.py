@@ -153,7 +153,7 @@ class _Rule:
     """How a result of ``height x width`` is made of the texels of a pyramid and of suns, by a lobe."""
 
     pyramid: Pyramid
-    suns: Tensor  # (3, K) float64 directions
+    suns: Tensor  # (3, K) float64 directions, on the host
     height: int
     width: int
     lobe: Lobe
@@ -290,7 +290,8 @@ def _parted(map: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
         points: each texel's hat becomes ``(2 points - 1)^2`` suns; 0: none at all.
 
     Returns:
-        The rest ``(H, W, 3)``, directions of suns ``(3, K)`` float64 and their light ``(K, 3)``, radiance by solid angle.
+        The rest ``(H, W, 3)``, directions of suns ``(3, K)`` float64 on the host, and their light ``(K, 3)``, radiance by solid
+        angle.
     """
     height, width, _ = map.shape
     each = max(2 * points - 1, 0) ** 2
@@ -298,7 +299,7 @@ def _parted(map: Tensor, points: int) -> tuple[Tensor, Tensor, Tensor]:
     flat = map.reshape(-1, 3)
     brightest = torch.topk(flat.detach().amax(1), count) if count else None
     if brightest is None:
-        return map, map.new_zeros(3, 1, dtype=torch.float64), map.new_zeros(1, 3)
+        return map, torch.zeros(3, 1, dtype=torch.float64), map.new_zeros(1, 3)
     excess = (flat[brightest.indices] - brightest.values[-1]).clamp_min(0.0)
     rest = flat.index_add(0, brightest.indices, -excess).view_as(map)
     # The lattice of each hat: offsets in texels, and shares of its solid angle.

@@ -25,7 +25,7 @@ class Pyramid:
         texels: ``(T, 3)``.
         heights: rows of the levels 0..A-1.
         widths: columns of the levels 0..B-1.
-        first: ``(A, B)`` int64: where level ``(a, b)`` begins.
+        first: ``(A, B)`` int64 on the host: where level ``(a, b)`` begins.
     """
 
     texels: Tensor
@@ -46,7 +46,7 @@ class Pyramid:
                 parts.append(_means(lower, columns, False).transpose(0, 1).reshape(-1, 3))
                 first.append(end)
                 end += rows * columns
-        places = torch.tensor(first, dtype=torch.int64, device=map.device).view(len(heights), len(widths))
+        places = torch.tensor(first, dtype=torch.int64).view(len(heights), len(widths))
         return Pyramid(torch.cat(parts), heights, widths, places)
 
 

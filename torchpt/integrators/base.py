@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from torchpt.accel import Accel
     from torchpt.accel.forest import Forest
-    from torchpt.integrators.compiled import Stages
     from torchpt.integrators.first_surface import FirstSurface
+    from torchpt.integrators.stage_runner import Stages
     from torchpt.integrators.tally import Tally
     from torchpt.records import PathState, World
     from torchpt.samplers import Points

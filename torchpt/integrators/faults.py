@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from torchpt.core.tree import leaves
-from torchpt.integrators.compiled import Stages
 from torchpt.integrators.first_surface import FirstSurface
 from torchpt.integrators.lost import Place
 from torchpt.integrators.plan import Plan
 from torchpt.integrators.recorder import Bounced, Left, Met, Record, Recorder, Shone
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.wave import Wave
 from torchpt.records import Hit, PathState, Shadow, World
 from torchpt.samplers import Streams

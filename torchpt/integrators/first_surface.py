@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchpt.accel import Accel
 from torchpt.integrators.base import Integrator
-from torchpt.integrators.compiled import Stages
 from torchpt.integrators.path import gather_light, partition
 from torchpt.integrators.search import Search
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.stages import Plan
 from torchpt.integrators.tally import Tally
 from torchpt.records import Hit, PathState, Shadow, World, rows

@@ -16,9 +16,9 @@ from torch import Tensor
 from torchpt import lights
 from torchpt.accel import Accel
 from torchpt.integrators.base import Integrator, Limits
-from torchpt.integrators.compiled import Stages
 from torchpt.integrators.plan import Plan
 from torchpt.integrators.search import Search
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.tally import Tally
 from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, joined

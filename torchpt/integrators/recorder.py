@@ -1,8 +1,8 @@
 """Eager stages that keep what each of them was given and what it made of it.
 
-A recorder takes the place of :class:`~torchpt.integrators.compiled.Stages` in a wave, and the integrators run as ever. It hands
-on what the stages themselves return; what they do not return (which light, the density of a direction) it asks again of the
-same pure functions, which give the same numbers.
+A recorder takes the place of :class:`~torchpt.integrators.stage_runner.Stages` in a wave, and the integrators run as ever. It
+hands on what the stages themselves return; what they do not return (which light, the density of a direction) it asks again of
+the same pure functions, which give the same numbers.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from torch import Tensor
 from torchpt import lights
 from torchpt.cameras import Camera
 from torchpt.film import Filter
-from torchpt.integrators.compiled import Stages
 from torchpt.integrators.light_sampling import held_back, light_radiance, light_wish, sample_light
 from torchpt.integrators.roulette import chance_of
 from torchpt.integrators.scattering import Drawn, carry_on, draw
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.stages import shining
 from torchpt.integrators.surfaces import Surface, surface_at
 from torchpt.math.mis import power_heuristic

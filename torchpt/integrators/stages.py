@@ -39,7 +39,7 @@ def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, k
     ones = torch.ones_like(d)
     forever = torch.full((n,), math.inf, dtype=plan.dtype, device=d.device)
     lane = torch.arange(n, device=d.device)
-    # No two tensors of a state share memory: a compiled stage would take that for a fact.
+    # No two tensors of a state share memory: `radiance` is added to in place.
     return PathState(o.expand(3, n).clone(), d, forever, ones, torch.zeros_like(d), forever.clone(), lane, key)
 
 

@@ -13,9 +13,9 @@ from torchpt.accel import Accel
 from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.base import Integrator, Limits
-from torchpt.integrators.compiled import Stages
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.search import Search
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.tally import Tally
 from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, Streams, salts
@@ -32,7 +32,7 @@ class Wave:
     """What a render fixes for all of its waves.
 
     Attributes:
-        stages: the stages bound to the scene, eager or compiled.
+        stages: the stages bound to the scene.
         integrator: what makes radiance of camera rays.
         accel: the search.
         camera: on the whole film.

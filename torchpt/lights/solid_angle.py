@@ -27,7 +27,6 @@ from torchpt.lanes.tracing import tracing
 from torchpt.math.angles import azimuth
 from torchpt.math.vectors import cross, dot
 from torchpt.math.warps import uniform_triangle
-from torchpt.native.operators import operator
 
 __all__ = [
     "LEAST",
@@ -112,7 +111,9 @@ def sample(
         are 0 the point was drawn by area. Rows of other shapes keep ``u``.
     """
     if x.device.type == "cpu" and not tracing():
-        return _sample_on_cpu(table, row, x, u)
+        from torchpt.lights import kernels_solid
+
+        return kernels_solid.sample(table, row, x, u)
     return tensor_sample(table, row, x, u, shapes)
 
 
@@ -122,7 +123,9 @@ def angles(table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] =
     From behind a light fills the same angle; it is the caller who knows which side emits.
     """
     if x.device.type == "cpu" and not tracing():
-        return _angles_on_cpu(table, row, x)
+        from torchpt.lights import kernels_solid
+
+        return kernels_solid.angles(table, row, x)
     return tensor_angles(table, row, x, shapes)
 
 
@@ -140,23 +143,6 @@ def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
     seen = value > 0
     solid = angle * torch.where(seen, by_area / torch.where(seen, value, 1.0), 0.0)
     return torch.where(angle > 0, solid, by_area)
-
-
-@operator(
-    "torchpt::solid_angle_sample",
-    lambda table, row, x, u: (x.new_empty(2, x.shape[1], dtype=u.dtype), x.new_empty(x.shape[1])),
-)
-def _sample_on_cpu(table: Tensor, row: Tensor | None, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    from torchpt.lights import kernels_solid
-
-    return kernels_solid.sample(table, row, x, u)
-
-
-@operator("torchpt::solid_angles", lambda table, row, x: x.new_empty(x.shape[1]))
-def _angles_on_cpu(table: Tensor, row: Tensor | None, x: Tensor) -> Tensor:
-    from torchpt.lights import kernels_solid
-
-    return kernels_solid.angles(table, row, x)
 
 
 @torch.no_grad()

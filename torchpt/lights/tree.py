@@ -25,7 +25,6 @@ from torch import Tensor
 
 from torchpt.lanes.tracing import tracing
 from torchpt.math.vectors import take
-from torchpt.native.operators import operator
 
 __all__ = ["LightTree", "build", "fine", "joined", "probability", "sample"]
 
@@ -147,7 +146,9 @@ def sample(
     """
     x, n = x.detach(), None if n is None else n.detach()
     if x.device.type == "cpu" and not tracing():
-        return _sample_on_cpu(*_parts(tree), x, n, u, _root_of(tree, of))
+        from torchpt.lights import kernels_tree
+
+        return kernels_tree.sample(_parts(tree), x, n, u, _root_of(tree, of))
     row, p, rest = _walk(tree, x, n, u, None, _root_of(tree, of))
     assert rest is not None
     return row, p, rest
@@ -159,7 +160,9 @@ def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None, of: T
     if tree.first is not None and of is not None:
         row = row + take(tree.first, of)
     if x.device.type == "cpu" and not tracing():
-        return _probability_on_cpu(*_parts(tree), row, x, n, _root_of(tree, of))
+        from torchpt.lights import kernels_tree
+
+        return kernels_tree.probability(_parts(tree), row, x, n, _root_of(tree, of))
     return _walk(tree, x, n, None, row, _root_of(tree, of))[1]
 
 
@@ -170,50 +173,6 @@ def _root_of(tree: LightTree, of: Tensor | None) -> Tensor | None:
 
 def _parts(tree: LightTree) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     return tree.nodes, tree.child, tree.full, tree.trail, tree.depth
-
-
-@operator(
-    "torchpt::light_tree_sample",
-    lambda nodes, child, full, trail, depth, x, n, u, root: (
-        torch.empty_like(u, dtype=torch.int64),
-        torch.empty_like(u, dtype=x.dtype),
-        torch.empty_like(u),
-    ),
-)
-def _sample_on_cpu(
-    nodes: Tensor,
-    child: Tensor,
-    full: Tensor,
-    trail: Tensor,
-    depth: Tensor,
-    x: Tensor,
-    n: Tensor | None,
-    u: Tensor,
-    root: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    from torchpt.lights import kernels_tree
-
-    return kernels_tree.sample((nodes, child, full, trail, depth), x, n, u, root)
-
-
-@operator(
-    "torchpt::light_tree_probability",
-    lambda nodes, child, full, trail, depth, row, x, n, root: torch.empty_like(row, dtype=x.dtype),
-)
-def _probability_on_cpu(
-    nodes: Tensor,
-    child: Tensor,
-    full: Tensor,
-    trail: Tensor,
-    depth: Tensor,
-    row: Tensor,
-    x: Tensor,
-    n: Tensor | None,
-    root: Tensor | None,
-) -> Tensor:
-    from torchpt.lights import kernels_tree
-
-    return kernels_tree.probability((nodes, child, full, trail, depth), row, x, n, root)
 
 
 # The tensor form: what other devices run, and the kernels' reference.

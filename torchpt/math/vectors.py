@@ -69,10 +69,7 @@ def take(table: Tensor, index: Tensor | None) -> Tensor:
     """
     if index is None:
         return table
-    if torch.compiler.is_compiling():
-        # Known not to be negative, an index needs no code for counting from the end.
-        index = index.clamp_min(0)
-    elif table.requires_grad and (gathers := gatherer()) is not None and torch.is_grad_enabled():
+    if table.requires_grad and (gathers := gatherer()) is not None and torch.is_grad_enabled():
         taken = gathers.take(table, index)
         if taken is not None:
             return taken

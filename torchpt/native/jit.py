@@ -23,9 +23,13 @@ from numba.core import serialize
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 
+from torchpt.errors import RenderError
 from torchpt.native import cache
 from torchpt.native.content import code_of_function
 from torchpt.native.memory import MARGIN, room_for
+
+if getattr(numba_config, "DISABLE_JIT", 0):
+    raise RenderError("NUMBA_DISABLE_JIT is set, and kernels are machine code that Python cannot run: unset it")
 
 __all__ = ["compiled", "jit", "launch", "parallel_allowed", "part"]
 

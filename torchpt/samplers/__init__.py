@@ -138,8 +138,7 @@ class Draws:
 
     def _by_kernel(self) -> bool:
         """Whether numbers come from a CPU kernel: compiled stages have the tensor form inside."""
-        eager = self._key.device.type == "cpu" and not tracing() and not torch.compiler.is_compiling()
-        return eager and self._points.kernels() is not None
+        return self._key.device.type == "cpu" and not tracing() and self._points.kernels() is not None
 
     def _drawn(self, rows: int, dimension: Dimension, further: bool = False) -> Tensor:
         from torchpt.samplers import kernels

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 
@@ -11,7 +12,6 @@ from torchpt.bsdfs import Bsdf
 from torchpt.format.description import Source, read_description, settings
 from torchpt.format.tensors import Tensors
 from torchpt.native.modes import lasting
-from torchpt.native.operators import outside_graphs
 from torchpt.scene.devices import device_of
 from torchpt.scene.scene import Scene
 from torchpt.scene.traced import corners_in, traced, widened
@@ -19,7 +19,6 @@ from torchpt.scene.traced import corners_in, traced, widened
 __all__ = ["load"]
 
 
-@outside_graphs
 def load(
     source: Source,
     device: str | torch.device | None = None,
@@ -41,6 +40,13 @@ def load(
         AssetError: a file that it names is missing or malformed.
         RenderError: the device is not there.
     """
+    if torch.compiler.is_compiling():  # not before: this imports the compiler
+        outside: Any = torch.compiler.disable(_load)
+        return outside(source, device, bsdfs)
+    return _load(source, device, bsdfs)
+
+
+def _load(source: Source, device: str | torch.device | None, bsdfs: Mapping[str, Bsdf] | None) -> Scene:
     start = time.perf_counter()
     tensors = Tensors()
     description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpt.errors import EnergyWarning
+from torchpt.errors import EnergyWarning, warn_caller
 from torchpt.scene.parts import Copy, Part
 
 __all__ = ["warn_of_touching"]
@@ -26,6 +26,8 @@ PAIRS = 2_000_000
 FACE = 100
 #: The corners of a rectangle in its own space.
 _SQUARE = np.array([[[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]])
+#: Corners on the rim of a disk in its own space: between two of them the rim is .0012 radii away.
+_RIM = np.array([[[math.cos(angle), math.sin(angle), 0.0] for angle in np.arange(64) * math.tau / 64]])
 
 
 @dataclass(frozen=True)
@@ -60,11 +62,10 @@ def warn_of_touching(parts: Sequence[Part], copies: Sequence[Copy], file: str | 
         if _overlap(scaled[i].corners, scaled[j].corners):
             told.add(pair)
             where = f"{file}: {pair[0]}" if file else pair[0]
-            warnings.warn(
+            warn_caller(
                 f"{where}: refracts and lies on {pair[1]}, which refracts too: rays meet one of the two surfaces only, and "
                 "energy is not kept there; leave a gap between them",
                 EnergyWarning,
-                stacklevel=2,
             )
 
 
@@ -83,6 +84,8 @@ def _faces(name: str, part: Part, pose: Array) -> Iterator[_Faces]:
     """Those of a part under a pose, where it has flat ones."""
     if part.kind == "rectangle":
         yield _Faces(name, _moved(_SQUARE, pose))
+    elif part.kind == "disk":  # caps of cylinders and cones too
+        yield _Faces(name, _moved(_RIM, pose))
     elif part.vertices is not None and part.faces is not None:
         yield _Faces(name, _moved(part.vertices[part.faces], pose))
 
@@ -93,7 +96,8 @@ def _moved(corners: Array, pose: Array) -> Array:
 
 def _planes(corners: Array) -> Array:
     """Unit normals and distances ``(F, 4)``; both sides of a plane are the same."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    a, b, c = (corners[:, k * corners.shape[1] // 3] for k in range(3))  # of many corners, those that lie well apart
+    normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
     normals = normals / np.where(lengths > 0.0, lengths, 1.0)[:, None]
     largest = np.take_along_axis(normals, np.abs(normals).argmax(1)[:, None], 1)

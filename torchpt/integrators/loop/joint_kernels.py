@@ -8,10 +8,10 @@ from typing import Any
 
 from torch import Tensor
 
-from torchpt.integrators.compiled import Stages
 from torchpt.integrators.loop import joint
 from torchpt.integrators.loop.kernels import Kernel, Kernels
 from torchpt.integrators.loop.rows import Rows
+from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
 
