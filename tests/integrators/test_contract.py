@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import pytest
 import torch
+from few import few
 from few_lanes import few_lanes
 
 import torchpt
