@@ -37,13 +37,12 @@ def test_import_is_quick_and_light() -> None:
 
 
 def test_the_public_names_load_on_use() -> None:
-    found, _ = loaded("import torchpt, torchpt.cli\nfor name in torchpt.__all__: getattr(torchpt, name)")
+    found, _ = loaded(
+        "import torchpt, torchpt.cli, torchpt.rendering\n"
+        "for name in torchpt.__all__: getattr(torchpt, name)\n"
+        "from torchpt import render; assert callable(torchpt.render) and torchpt.render is render"
+    )
     assert found == "[]"
-
-
-def test_render_is_the_function_whatever_is_imported() -> None:
-    code = "import torchpt.rendering; from torchpt import render; assert callable(torchpt.render) and torchpt.render is render"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_unknown_names() -> None:

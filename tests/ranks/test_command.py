@@ -86,7 +86,8 @@ def _wait_for(path: Path, started: Command) -> None:
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [2, 20])
+@pytest.mark.slow
 def test_the_bits_after_kills(box: torchpt.Scene, kills: int, tmp_path: Path) -> None:
     """Whichever rank is killed and whenever: the others end soon, with one line; and what is resumed ends as if unharmed."""
     chance, spp = random.Random(kills), 1200 * kills + 1500
@@ -129,6 +130,7 @@ def torchrun(size: int, words: list[str], folder: Path, *options: str) -> subpro
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)  # fmt: skip
 
 
+@pytest.mark.slow
 def test_torchrun(box: torchpt.Scene, tmp_path: Path) -> None:
     """By the real launcher, with an override that Hydra composes."""
     work = torchrun(2, [*WORDS, "render.spp=4", "out=a.exr", "integrator=direct"], tmp_path)

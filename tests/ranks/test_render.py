@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from few import few
 from forks import in_ranks
 
 import torchpt
@@ -58,7 +59,7 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[name], b[name]) for name in a)
 
 
-@pytest.mark.parametrize("size", [2, 3])
+@pytest.mark.parametrize("size", few([2, 3], 1))
 def test_the_bits_of_one_process(box: torchpt.Scene, broken: torchpt.Scene, size: int, tmp_path: Path) -> None:
     """Picture, layers, error, counts and what is not finite, however the render ends."""
 
@@ -284,6 +285,7 @@ sys.setswitchinterval(100.0)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.slow
 def test_a_process_that_lost_a_rank_ends_well(tmp_path: Path) -> None:
     found = subprocess.run(
         [sys.executable, "-c", LEFT_ALONE, str(tmp_path / "store")], capture_output=True, text=True, timeout=100.0

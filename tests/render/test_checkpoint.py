@@ -482,7 +482,8 @@ def killed(folder: Path, kills: int, spp: int) -> tuple[int, int]:
     return done, after
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [2, 200])
+@pytest.mark.slow
 def test_the_bits_after_kills(kills: int, tmp_path: Path) -> None:
     """At random times; no file is lost, and none of those that were being written comes to be taken for whole."""
     spp = 300 * kills + 500

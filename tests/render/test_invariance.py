@@ -193,7 +193,8 @@ def scene_of(tmp_path) -> Callable[[str], torchpt.Scene]:
 
 def slow(name: str, mode: str) -> list[pytest.MarkDecorator]:
     """Where kernels take long to compile, or one of a kind is left that shows the same."""
-    rows = ("many lights", "textures and normal maps", "strategy light", "some materials")
+    rows = ("many lights", "textures and normal maps", "strategy light", "some materials", "preview", "environment map",
+            "searched by a tree", "parallel projection", "lens of six blades", "filter mitchell")  # fmt: skip
     others = name.startswith(("sampler ", "filter ", "strategy ")) and name not in ("sampler sobol", "filter mitchell")
     eager = ("every kind of primitive", "opacity", "textures and normal maps", "many lights", "layers")
     return [pytest.mark.slow] * (others or (name in rows if mode == "compiled" else name not in eager))

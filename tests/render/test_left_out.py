@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 from features import FEATURES, Feature, kernels, with_feature
+from few import few
 from showcase import MATERIALS, showcase
 from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
@@ -139,7 +140,7 @@ def test_kernels_hold_nothing_of_what_is_not_there(name, plain):
         assert made.state.count > without.state.count
 
 
-@pytest.mark.parametrize("name", FEATURES)
+@pytest.mark.parametrize("name", few(FEATURES, 8))
 def test_kernels_are_the_same_after_it_was_there_and_is_gone(name, plain):
     """Traced anew, not from the cache: the machine code's name is made of the IR."""
     kernels(with_feature(name))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from few import few
 from lanewise import ALLOWED, arena, compare, loaded, prepared, run_bounce, waves
 from showcase import MATERIALS, showcase
 from significance import t_limit
@@ -227,7 +228,7 @@ def paired(
     return worst / t_limit(comparisons, seeds - 1)
 
 
-@pytest.mark.parametrize("name", ["cornell_transmissive", "env_teapot", "ibl_row"])
+@pytest.mark.parametrize("name", few(["cornell_transmissive", "env_teapot", "ibl_row"], 2))
 def test_pictures(name):
     assert paired(scene_of(name), {}, 16, 4) <= 1.0
 
@@ -337,7 +338,7 @@ def test_a_clamp_takes_the_same_light():
 # -- a lane's place
 
 
-@pytest.mark.parametrize("name", ["cornell_box", "showcase"])
+@pytest.mark.parametrize("name", few(["cornell_box", "showcase"], 2))
 def test_the_same_rays_in_another_order(name):
     """Bit for bit: nothing of a lane hangs on its neighbours in a vector, a packet or a list."""
     scene = loaded(showcase("lattice", "glass", "gold", "patches") if name == "showcase" else name)
@@ -370,7 +371,7 @@ def _same(a: torch.Tensor, b: torch.Tensor) -> bool:
     return torch.equal(a.view(torch.int32), b.view(torch.int32)) if a.is_floating_point() else torch.equal(a, b)
 
 
-@pytest.mark.parametrize("name", ["cornell_box", "showcase", "env_teapot"])
+@pytest.mark.parametrize("name", few(["cornell_box", "showcase", "env_teapot"], 2))
 def test_searches_do_not_depend_on_the_packet(name):
     scene = loaded(showcase("lattice", "glass", "gold")) if name == "showcase" else scene_of(name)
     wave, _ = prepared(scene, {"film": film_of(32), "render": {"spp": 4}})

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from few import few
 from few_lanes import few_lanes
 from showcase import showcase
 from trials import film_of
@@ -64,7 +65,7 @@ def broken(monkeypatch) -> set[tuple[int, int]]:
     return chosen
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", few([1, 2], 1))
 def test_samples_that_are_not_finite_are_black_and_counted(broken, threads):
     scene = torchpt.load("cornell_box", "cpu")
     film = {**film_of(24, 20), "filter": "box"}
@@ -77,7 +78,7 @@ def test_samples_that_are_not_finite_are_black_and_counted(broken, threads):
     assert set(differs) <= {0, 7, 479, 100} and len(differs) >= 2  # a black sample may be black anyway
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", few([1, 2], 1))
 def test_strict_names_pixel_and_sample(broken, threads):
     scene = torchpt.load("cornell_box", "cpu")
     film = {**film_of(40, 30), "crop": [5, 3, 24, 20]}
@@ -101,7 +102,7 @@ def test_paths_without_end_are_counted(monkeypatch):
 # -- ends
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", few([1, 2], 1))
 def test_progress_may_end_it_early(threads):
     scene = torchpt.load("cornell_box", "cpu")
     film = {**film_of(64), "filter": "box"}
@@ -195,6 +196,7 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 
 @pytest.mark.skipif(not hasattr(torch, "get_num_threads") or sys.platform == "win32", reason="needs fork")
+@pytest.mark.slow
 def test_after_a_fork():
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", FORK], capture_output=True, text=True, timeout=120)
     assert done.stdout.split() == ["0"], done.stderr

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 
 import torchpt
 from torchpt.errors import SceneError
@@ -74,7 +75,7 @@ def plain() -> dict[str, Rendering]:
 
 
 @pytest.mark.parametrize("compile", ["on", "off"])
-@pytest.mark.parametrize("scale", [1e-30, 1e-18, 1e-10, 1e10, 1e15, 1e18, 1e20, 1e37])
+@pytest.mark.parametrize("scale", few([1e-30, 1e-18, 1e-10, 1e10, 1e15, 1e18, 1e20, 1e37], 3))
 @pytest.mark.parametrize("lamp", ["rectangle", "sphere"])
 def test_size_does_not_matter(plain, lamp, scale, compile):
     assert_same(shoot(room(scale, lamp), compile), plain[lamp])
@@ -82,7 +83,7 @@ def test_size_does_not_matter(plain, lamp, scale, compile):
 
 @pytest.mark.parametrize("compile", ["on", "off"])
 @pytest.mark.parametrize("scale", [1e-15, 1e18])
-@pytest.mark.parametrize("lamp", ["sheared", "disk", "triangle", "ellipsoid", "cylinder"])
+@pytest.mark.parametrize("lamp", few(["sheared", "disk", "triangle", "ellipsoid", "cylinder"], 2))
 def test_nor_does_it_for_other_lamps(plain, lamp, scale, compile):
     assert_same(shoot(room(scale, lamp), compile), plain[lamp])
 
@@ -148,7 +149,7 @@ def deltas(scale: float) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("compile", ["on", "off"])
-@pytest.mark.parametrize("scale", [1e-18, 1e18])
+@pytest.mark.parametrize("scale", few([1e-18, 1e18], 1))
 @pytest.mark.parametrize("scene", [many, copies, bumps, lens, parallel, deltas])
 def test_nor_for_what_else_has_a_length(scene, scale, compile):
     assert_same(shoot(scene(scale), compile), shoot(scene(1.0)))

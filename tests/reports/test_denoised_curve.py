@@ -103,6 +103,7 @@ def test_a_second_curve_stands_beside_each_and_changes_nothing_of_it(folder: Pat
 
 
 @there
+@pytest.mark.slow
 def test_what_is_denoised_is_the_run_to_the_bit_and_seconds_hold_all_of_it(folder: Path) -> None:
     from torchpt.images.denoiser import denoise
 

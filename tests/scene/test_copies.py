@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 from torch import Tensor
 
 import torchpt
@@ -119,7 +120,7 @@ def test_moving_to_where_it_is_does_nothing():
         scene.to("cuda:99")
 
 
-@pytest.mark.parametrize("how", ["pickle", "deepcopy", "torch.save"])
+@pytest.mark.parametrize("how", few(["pickle", "deepcopy", "torch.save"], 1))
 def test_models_of_ones_own_are_copied_with_it(how):
     grey = Grey()
     own = {**SCENE, "materials": {**SCENE["materials"], "red": {"type": "grey"}}}

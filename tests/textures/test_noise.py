@@ -151,6 +151,7 @@ def test_it_is_smooth():
         assert float(_read(uv, None, torch.float64, True, octaves=1).diff().abs().max()) < 1e-8
 
 
+@pytest.mark.slow
 def test_octaves_fade_one_after_another():
     """What a footprint leaves of each is what the mean over it leaves, by least squares."""
     uv, parts = points(20_000, 100.0), (torch.arange(10, dtype=torch.float64) + 0.5) / 10 - 0.5
