@@ -9,6 +9,8 @@ import pytest
 import yaml
 
 from torchpt.cli import GROUPS, main
+from torchpt.commands import render
+from torchpt.commands.render import Job
 from torchpt.files import configs
 from torchpt.settings import TYPED
 from torchpt.spec import not_built, parameters_of
@@ -83,6 +85,37 @@ def test_types_are_chosen_by_file_or_by_key(
 ) -> None:
     assert main(["render", "scene=s.yaml", *words]) == 0
     assert [settings.integrator.name for settings in renderer.settings] == kinds
+
+
+@pytest.mark.parametrize(
+    ("words", "overrides"),
+    [
+        ([], {}),
+        (["film.width=16", "film.exposure=-1"], {"film": {"width": 16, "exposure": -1}}),
+        (["render.seed=1e3", "film.gamma=-0.0"], {"render": {"seed": 1000.0}, "film": {"gamma": -0.0}}),
+        (["film.aovs=[albedo,normal]", "film.crop=[0,1,-2,3.5]"],
+         {"film": {"aovs": ["albedo", "normal"], "crop": [0, 1, -2, 3.5]}}),
+        (["film.filter=box"], {"film": {"filter": "box"}}),
+        (["film.filter.radius=NULL", "film.filter.type=null"], {"film": {}}),
+        (["integrator.clamp=null"], {"integrator": {"clamp": None}}),
+        (["integrator.strict=TRUE", "sampler.adaptive=False"],
+         {"integrator": {"strict": True}, "sampler": {"adaptive": False}}),
+        (["render.compile=off", "integrator.strategy=yes"], {"render": {"compile": "off"}, "integrator": {"strategy": "yes"}}),
+        (["render.preview=a=b.png", "film.tonemap='a, b'"], {"render": {"preview": "a=b.png"}, "film": {"tonemap": "a, b"}}),
+    ],
+)  # fmt: skip
+def test_words_become_settings_of_their_types(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], overrides: dict
+) -> None:
+    jobs: list[Job] = []
+    monkeypatch.setattr(render, "render", lambda job, interrupt: jobs.append(job) or 0)
+    assert main(["render", "scene=s.yaml", "out=a.png", *words]) == 0
+    found, wanted = (  # by text: 1 is not 1.0, nor 0.0 -0.0
+        {(group, key): repr(value) for group, block in each.items() for key, value in block.items()}
+        for each in (jobs[0].overrides, overrides)
+    )
+    assert found == wanted
+    assert (jobs[0].scene, jobs[0].outs, jobs[0].number) == ("s.yaml", ("a.png",), None)
 
 
 def test_no_litter_even_in_a_folder_that_cannot_be_written(folder: Path, renderer: Renderer, tmp_path: Path) -> None:
