@@ -22,7 +22,7 @@ def loaded(code: str) -> tuple[str, float]:
 #: What a small render to a PNG file has no use for.
 NEEDLESS = (
     *(name for name in HEAVY if name not in ("hydra", "omegaconf")),
-    *("networkx", "pandas", "rich", "scipy", "sympy", "triton"),
+    *("networkx", "pandas", "pydantic", "rich", "scipy", "sympy", "triton"),
     *("torch._dynamo", "torch._inductor", "torch.onnx", "torch.utils.tensorboard"),
     "PIL.TiffImagePlugin",
     *(f"torchpt.meshes.{name}" for name in ("gltf", "obj", "ply", "stl")),
