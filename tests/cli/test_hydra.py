@@ -151,6 +151,19 @@ def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.startswith("torchpt 0.")
 
 
+def test_info_says_that_no_render_could_run_in_so_little_memory(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", "scene=s.yaml", "render.max_memory=1", "--json"]) == 0
+    captured = capsys.readouterr()
+    memory = json.loads(captured.out)["memory"]
+    assert memory["enough"] is False and memory["refused"].startswith("render.max_memory: expected at least ")
+    assert captured.err == f"torchpt: warning: no render could run: {memory['refused']}\n"
+    assert main(["info", "scene=s.yaml", "render.max_memory=32GB", "render.checkpoint=there/is/none.ckpt"]) == 0
+    captured = capsys.readouterr()
+    assert "memory:\n  enough: yes" in captured.out and captured.err == ""
+
+
 def test_info(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", "scene=s.yaml"]) == 0
     plain = capsys.readouterr()
