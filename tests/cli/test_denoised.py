@@ -109,12 +109,15 @@ def test_without_the_package_nothing_is_rendered(
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["out=[a.png,a.denoised.png]"], "a.denoised.png: is where the denoised picture of a.png goes"),
-        (["out=a.png", "render.preview=a.denoised.png"], "a.denoised.png: is where the denoised picture of a.png goes"),
+        (["out=[a.png,a.denoised.png]"], "film.denoise: expected another file than 'a.denoised.png' of out"),
+        (
+            ["out=a.png", "render.preview=a.denoised.png"],
+            "film.denoise: expected another file than 'a.denoised.png' of render.preview",
+        ),
         (["integrator=aov", "film.aovs=[depth]"], "film.denoise: expected false where integrator is aov"),
         (["film.denoise=maybe"], "film.denoise: expected true or false"),
     ],
-)
+)  # fmt: skip
 def test_bad_input(
     folder: Path, renderer: Renderer, halved: list[Any], capsys: pytest.CaptureFixture[str], words: list[str], says: str
 ) -> None:

@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from torchpt.cli import main
+from torchpt.errors import OutputError
+from torchpt.forward import files as files_module
 from torchpt.images import read_header, read_image, read_layers
 from torchpt.images.colour import TONEMAPS
 
@@ -187,6 +189,30 @@ def test_a_failed_write_does_not_cost_the_other_pictures(
     assert main(["render", "scene=s.yaml", "out=[sub/a.png,b.png]"]) == 2
     captured = capsys.readouterr()
     assert files(folder) == {"b.png"} and len(captured.err.splitlines()) == 1 and "sub/a.png" in captured.err
+
+
+def test_every_picture_that_is_saved_elsewhere_is_named(
+    folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("full", "home"):
+        (folder / name).mkdir()
+    monkeypatch.setenv("HOME", str(folder / "home"))
+    write = files_module.write_rendered
+
+    def refused(path: str | os.PathLike[str], *rest: Any) -> None:
+        if Path(path).parent.name == "full" and Path(path).suffix == ".exr":
+            raise OutputError(path, "cannot be written (No space left on device)")
+        write(path, *rest)
+
+    monkeypatch.setattr(files_module, "write_rendered", refused)
+    assert main(["render", "scene=s.yaml", "out=[full/a.png,full/b.exr,full/c.exr]"]) == 2
+    captured = capsys.readouterr()
+    said = captured.err.splitlines()
+    assert len(said) == 1 and captured.out == ""
+    saved = sorted((folder / "home").iterdir())
+    assert [path.name[:2] for path in saved] == ["b-", "c-"] and all(str(path) in said[0] for path in saved)
+    assert said[0].count("No space left on device") == 2 and "full/b.exr" in said[0] and "full/c.exr" in said[0]
+    assert [path.name for path in (folder / "full").iterdir()] == ["a.png"]
 
 
 def test_multirun_numbers_the_pictures(folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ import secrets
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from torchpt.commands.progress import Bar
 from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
 
-__all__ = ["Job", "described", "knowing", "numbered", "plain", "render"]
+__all__ = ["Job", "check_distinct", "described", "knowing", "numbered", "plain", "render"]
 
 
 @dataclass(frozen=True)
@@ -75,15 +75,22 @@ def render(job: Job, interrupt: Interrupt) -> int:
         outs = _outputs(job, wishes)
         preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
         previews = _preview_files(preview) if preview else []
-        denoised = denoised_files(wishes, outs, previews)
+        denoised = denoised_files(wishes, outs)
+        kept = wishes.render.checkpoint and numbered(str(Path(wishes.render.checkpoint).expanduser()), job.number)
+        check_distinct(
+            [
+                *(("out", path) for path in outs),
+                *(("render.preview", path) for path in previews),
+                *((("render.checkpoint", kept),) if kept else ()),
+                *(("film.denoise", path) for path in denoised),
+            ]
+        )
         for path in (*outs, *previews, *denoised) if first else ():
             check_writable(path)
-        if wishes.render.checkpoint is not None:
-            wishes = replace(
-                wishes, render=wishes.render.but(checkpoint=numbered(wishes.render.checkpoint, job.number))
-            )
+        if kept is not None:
+            wishes = replace(wishes, render=wishes.render.but(checkpoint=kept))
             if first:
-                Keeper(wishes.render.checkpoint).check(wishes.render.resume)
+                Keeper(kept).check(wishes.render.resume)
         scene = Scene(description, device_of(wishes.render.device))
     scene.load_seconds = time.perf_counter() - start
     if preview and first:
@@ -159,6 +166,25 @@ def _outputs(job: Job, wishes: Any) -> list[str]:
     return [numbered(path, job.number) for path in outs]
 
 
+def check_distinct(files: Sequence[tuple[str, str]]) -> None:
+    """Refuse two files to write that are one, however their paths are spelled.
+
+    Args:
+        files: key and path of each.
+
+    Raises:
+        SceneError: names the later one's key and path, and the file that it would replace.
+    """
+    seen: dict[str, tuple[str, str]] = {}
+    for key, path in files:
+        with suppress(OSError, ValueError):  # of a path that cannot be, which is told where it is tried
+            place = os.path.normcase(os.path.realpath(path))
+            if place in seen:
+                other, before = seen[place]
+                raise SceneError(key, path, f"another file than {before!r} of {other}")
+            seen[place] = key, path
+
+
 def _is_exr(path: str) -> bool:
     return Path(path).suffix.lower() == ".exr"
 
@@ -174,7 +200,7 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: An
     from torchpt.forward.denoising import denoise_rendering
     from torchpt.forward.files import write_denoised, write_rendered
 
-    failed: TorchptError | None = None
+    failed: list[TorchptError] = []
     facts: dict[str, Any] = {}
     for path in paths:
         try:
@@ -183,19 +209,21 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: An
             elsewhere = _written_elsewhere(path, rendering, wishes)
             if elsewhere is not None:
                 error = OutputError(path, f"{error.problem}; the picture is in {elsewhere}")
-            failed = failed or error
+            failed.append(error)
     try:
         if denoised:  # only now: what was rendered is safe
             facts = {"denoised": _names(denoised), "denoise_seconds": round(denoise_rendering(rendering, wishes), 4)}
+            for path in denoised:
+                try:
+                    write_denoised(path, rendering, wishes.film)
+                except OutputError as error:
+                    failed.append(error)
     except RenderError as error:
-        raise failed or error from None
-    for path in denoised:
-        try:
-            write_denoised(path, rendering, wishes.film)
-        except OutputError as error:
-            failed = failed or error
-    if failed is not None:
-        raise failed
+        failed.append(error)
+    if len(failed) > 1:
+        raise TorchptError("; ".join(map(str, failed)))
+    if failed:
+        raise failed[0]
     return facts
 
 
