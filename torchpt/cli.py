@@ -63,7 +63,7 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
 
   integrator=NAME, sampler=NAME, ... take a group's file from configs/: integrator=direct sampler=independent
   --multirun, -m      one render for every combination: sampler=sobol,independent render.spp=16,64 scene=a,b out=x.exr
-                      writes x_0.exr, x_1.exr, ...
+                      writes x_0.exr, x_1.exr, ...; stderr and the summaries say which job has which settings
   --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
 
   torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/ranks.md)
@@ -233,11 +233,13 @@ class _Task:
         assert isinstance(composed, dict)
         number = hydra.job.num if hydra.mode == RunMode.MULTIRUN else None
         scene = self.scenes[composed.pop("scene_number", 0)]
-        overrides = _given(composed, list(hydra.overrides.task))
+        words = list(hydra.overrides.task)
+        overrides = _given(composed, words)
+        words = [f"scene={scene}" if word.startswith("+scene_number=") else word for word in words]
         for key, path in self.paths.items():
             group, _, name = key.partition(".")
             overrides.setdefault(group, {})[name] = path
-        return Job(scene, overrides, tuple(self.outs), number)
+        return Job(scene, overrides, tuple(self.outs), number, () if number is None else tuple(words))
 
 
 def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, Any]]:

@@ -151,6 +151,15 @@ def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out.startswith("torchpt 0.")
 
 
+def test_jobs_of_a_sweep_of_info_are_told_apart(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", "-m", "scene=s.yaml", "integrator=path,direct", "film.width=4", "--json"]) == 0
+    captured = capsys.readouterr()
+    facts = [json.loads(line) for line in captured.out.splitlines()]
+    words = [[f"integrator={name}", "film.width=4"] for name in ("path", "direct")]
+    assert [(one["job"], one["overrides"]) for one in facts] == list(enumerate(words))
+    assert captured.err.splitlines() == [f"torchpt: job {n}: {' '.join(each)}" for n, each in enumerate(words)]
+
+
 def test_info_says_that_no_render_could_run_in_so_little_memory(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

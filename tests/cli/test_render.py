@@ -33,7 +33,7 @@ def test_the_last_line_is_json(folder: Path, renderer: Renderer, capsys: pytest.
     captured = capsys.readouterr()
     facts = json.loads(captured.out.splitlines()[-1])
     assert facts.pop("load_seconds") >= 0
-    assert facts == {
+    assert facts == {  # no job of a sweep
         "out": "a.exr",
         "spp": 4,
         "seconds": 1.5,
@@ -223,8 +223,14 @@ def test_multirun_numbers_the_pictures(folder: Path, renderer: Renderer, capsys:
     made |= {f"p_{n}.{layer}.exr" for n in range(4) for layer in ("albedo", "normal")}
     assert files(folder) == made | {"t, u.yaml"}
     assert [(s.film.width, s.render.spp) for s in renderer.settings] == [(8, 1), (8, 2), (4, 1), (4, 2)]
-    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    captured = capsys.readouterr()
+    lines = [json.loads(line) for line in captured.out.splitlines() if line.startswith("{")]
     assert [line["out"][0] for line in lines] == [f"a b_{n}.exr" for n in range(4)]
+    words = [[f"scene={scene}", f"render.spp={spp}"] for scene in ("s.yaml", "t, u.yaml") for spp in (1, 2)]
+    assert [(line["job"], line["overrides"]) for line in lines] == list(enumerate(words))
+    assert captured.err.splitlines() == [
+        f"torchpt: job {n}: {' '.join(each)} -> a b_{n}.exr, c=1_{n}.png" for n, each in enumerate(words)
+    ]
 
 
 def test_multirun_stops_at_a_signal(folder: Path, renderer: Renderer) -> None:

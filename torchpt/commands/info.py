@@ -10,7 +10,7 @@ from typing import Any
 
 from torchpt.commands import collector
 from torchpt.commands.interrupt import Interrupt
-from torchpt.commands.notices import notices
+from torchpt.commands.notices import notices, which_job
 from torchpt.commands.render import Job, described, knowing, plain
 from torchpt.commands.streams import speaking
 from torchpt.errors import TorchptError
@@ -35,8 +35,10 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
         scene = Scene(description, device_of(wishes.render.device))
         facts = scene.info(wishes)
         facts["built"]["loop"] = loop_facts(scene, wishes)
+        facts = {**job.facts(), **facts}
         if wishes.render.max_memory is not None:
             facts["memory"] = _memory(scene, wishes)
+    which_job(job)
     interrupt.check()
     if "refused" in facts.get("memory", ()):
         print(f"torchpt: warning: no render could run: {facts['memory']['refused']}", file=sys.stderr)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from torchpt import __version__
 from torchpt.commands import collector
 from torchpt.commands.interrupt import Interrupt, Interrupted
-from torchpt.commands.notices import notices
+from torchpt.commands.notices import notices, which_job
 from torchpt.commands.progress import Bar
 from torchpt.commands.render import Job, check_distinct, described, knowing, numbered, plain
 from torchpt.commands.streams import speaking
@@ -168,12 +168,14 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
         frames = Frames(Path(f"{outs[0]}.frames"), _facts(scene, wishes, turn))
         before = frames.count(turn.frames)
     load_seconds = time.perf_counter() - start
+    which_job(job, outs)
     interrupt.check()
     interrupt.deferred = True
     totals = _render(job, scene, turn, frames, interrupt)
     ready = frames.count(turn.frames)
     facts: dict[str, Any] = {
         "out": outs[0] if len(outs) == 1 else outs,
+        **job.facts(),
         "frames": turn.frames,
         "rendered": ready - before,
     }

@@ -18,7 +18,7 @@ from typing import Any
 from torchpt.commands import collector, ranked
 from torchpt.commands.denoised import denoised_files
 from torchpt.commands.interrupt import Interrupt, Interrupted
-from torchpt.commands.notices import not_finite, notices
+from torchpt.commands.notices import not_finite, notices, which_job
 from torchpt.commands.progress import Bar
 from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
@@ -35,12 +35,18 @@ class Job:
         overrides: block (``film integrator sampler render``) to the keys given on the command line.
         outs: pictures to write; ``<scene>.png`` in the current folder where empty.
         number: of the job in a sweep, which enters the file names; None outside one.
+        words: what the command line says of this job of a sweep, ``key=value`` each.
     """
 
     scene: str
     overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
     outs: tuple[str, ...] = ()
     number: int | None = None
+    words: tuple[str, ...] = ()
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a summary says of a job of a sweep; nothing outside one."""
+        return {} if self.number is None else {"job": self.number, "overrides": list(self.words)}
 
 
 def numbered(path: str, number: int | None) -> str:
@@ -93,6 +99,8 @@ def render(job: Job, interrupt: Interrupt) -> int:
                 Keeper(kept).check(wishes.render.resume)
         scene = Scene(description, device_of(wishes.render.device))
     scene.load_seconds = time.perf_counter() - start
+    if first:
+        which_job(job, outs)
     if preview and first:
         hits = first_hit(scene, wishes)
         for path, name in zip(previews, ("albedo", "normal"), strict=False):
@@ -113,7 +121,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     if not first:
         return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)
-    summary = {"out": _names(outs), **facts, **rendering.summary()}
+    summary = {"out": _names(outs), **job.facts(), **facts, **rendering.summary()}
     if not rendering.complete:
         summary["complete"] = False
     not_finite(summary)
