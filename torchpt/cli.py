@@ -68,7 +68,8 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
 
   torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/ranks.md)
 
-The last line on stdout is a summary in JSON. Samples that are not finite count as black, and stderr says why.
+A sentence on stdout says what came of it; the last line is a summary in JSON. Samples that are not finite count as
+black, and stderr says why.
 Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the partial picture saved.
 """
 HELP_INFO = """\

@@ -9,7 +9,7 @@ import secrets
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,7 +23,7 @@ from torchpt.commands.progress import Bar
 from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
 
-__all__ = ["Job", "check_distinct", "described", "knowing", "numbered", "plain", "render"]
+__all__ = ["Job", "check_distinct", "described", "knowing", "numbered", "plain", "render", "sentence"]
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,10 @@ def render(job: Job, interrupt: Interrupt) -> int:
     if not rendering.complete:
         summary["complete"] = False
     not_finite(summary)
-    with speaking():  # the last line on stdout
-        print(json.dumps(plain(summary), allow_nan=False))
+    summary = plain(summary, digits=6)
+    height, width = rendering.image.shape[:2]
+    with speaking():  # in one piece, as jobs of a sweep may share stdout; the last line is the summary
+        print(f"{sentence(summary, width, height)}\n{json.dumps(summary, allow_nan=False)}")
     if interrupt.signum is None:
         return 0
     again = "" if wishes.render.checkpoint is None else "; render.resume=true goes on"
@@ -261,14 +263,49 @@ def _names(paths: list[str]) -> str | list[str]:
     return paths[0] if len(paths) == 1 else paths
 
 
-def plain(value: Any) -> Any:
-    """JSON knows neither NaN nor tensors."""
+def sentence(facts: Mapping[str, Any], width: int, height: int) -> str:
+    """Return the summary of a render in a sentence for people.
+
+    Args:
+        facts: the summary, as JSON has it.
+        width: of the picture in pixels.
+        height: of the picture in pixels.
+    """
+    out, spp = facts["out"], facts["spp"]
+    text = f"{out if isinstance(out, str) else ', '.join(out)}: {width} x {height} pixels, "
+    text += f"{spp} sample{'' if spp == 1 else 's'} a pixel, {_brief(facts['seconds'])} s"
+    if facts.get("relmse") is not None:
+        text += f"; relative error {_percent(facts['relmse'])} %"
+        if facts.get("relmse_interval") is not None:
+            low, high = map(_percent, facts["relmse_interval"])
+            text += f" ({low} to {high} %)"
+        if facts.get("heavy_tailed"):
+            text += ", most of it in few pixels"
+    if not facts.get("complete", True):
+        text += "; stopped early"
+    elif "stopped_by" in facts:
+        text += f"; ended by render.{facts['stopped_by']}"
+    return text
+
+
+def _percent(relmse: float) -> str:
+    """Return the relative error in percent, the root of relMSE."""
+    return _brief(100.0 * math.sqrt(max(relmse, 0.0)))
+
+
+def _brief(value: float) -> str:
+    """Return two digits, or all before the point."""
+    return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
+
+
+def plain(value: Any, digits: int = 17) -> Any:
+    """Return a value as JSON has it, which knows neither NaN nor tensors; floats to so many significant digits."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): plain(item, digits) for key, item in value.items()}
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return plain(value.tolist(), digits)
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+        return [plain(item, digits) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
     return value
