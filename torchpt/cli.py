@@ -10,7 +10,8 @@ from __future__ import annotations
 import os
 import re
 import sys
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -296,12 +297,12 @@ def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
         arguments.turn,
         arguments.debug,
     )
-    _check_grammar(arguments.overrides)
     words = [*arguments.options, *arguments.overrides]
+    single = not arguments.multirun and not any("hydra" in word for word in words)
     with sweep_folder() if arguments.multirun else nullcontext() as folder:
         if folder is not None:
             words.append(f"hydra.sweep.dir={_quoted(folder)}")
-        with hydra_process(words):
+        with hydra_process(words), _composed_once() if single else nullcontext():
             try:
                 hydra.main(version_base="1.3", config_path=str(_configs()), config_name="config")(task)()
             except SystemExit as end:
@@ -311,11 +312,26 @@ def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
             except Exception as error:
                 if _came_from_job(error):
                     raise
+                _check_grammar(arguments.overrides)
                 raise UsageError(_one_line(error, arguments.overrides)) from error
             finally:
                 GlobalHydra.instance().clear()
     interrupt.check()
     return 0
+
+
+@contextmanager
+def _composed_once() -> Iterator[None]:
+    """Context in which Hydra is told that this is no sweep: to find out it composes all settings once more."""
+    from hydra._internal.hydra import Hydra
+    from hydra.types import RunMode
+
+    before = Hydra.get_mode
+    Hydra.get_mode = lambda *_, **__: RunMode.RUN
+    try:
+        yield
+    finally:
+        Hydra.get_mode = before
 
 
 def _check_grammar(words: list[str]) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.hydra import Hydra
 
 from torchpt.cli import GROUPS, main
 from torchpt.commands import render
@@ -116,6 +118,28 @@ def test_words_become_settings_of_their_types(
     )
     assert found == wanted
     assert (jobs[0].scene, jobs[0].outs, jobs[0].number) == ("s.yaml", ("a.png",), None)
+
+
+@pytest.mark.parametrize(
+    ("words", "composed", "files"),
+    [
+        (["render.spp=1"], 1, {"s.png"}),
+        (["hydra.mode=RUN"], 2, {"s.png"}),
+        (["hydra.mode=MULTIRUN", "render.spp=1,2"], 6, {"s_0.png", "s_1.png"}),
+    ],
+)
+def test_a_single_job_is_composed_once(
+    folder: Path, renderer: Renderer, monkeypatch: pytest.MonkeyPatch, words: list[str], composed: int, files: set[str]
+) -> None:
+    calls: list[object] = []
+    load = ConfigLoaderImpl.load_configuration
+    monkeypatch.setattr(
+        ConfigLoaderImpl, "load_configuration", lambda *given, **named: calls.append(0) or load(*given, **named)
+    )
+    before = Hydra.get_mode
+    assert main(["render", "scene=s.yaml", *words]) == 0
+    assert len(calls) == composed and Hydra.get_mode is before
+    assert set(os.listdir(folder)) - {"s.yaml"} == files
 
 
 def test_no_litter_even_in_a_folder_that_cannot_be_written(folder: Path, renderer: Renderer, tmp_path: Path) -> None:
