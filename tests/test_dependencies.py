@@ -88,8 +88,7 @@ def test_the_launcher_of_sweeps_is_tested() -> None:
 
 
 def test_everything_imported_is_asked_for() -> None:
-    own = {"torchpt", "hydra_plugins"}  # the latter is only looked for
-    everything = modules(PROJECT["dependencies"]) | own | {"omegaconf", "pydantic_core", "flip_evaluator"}
+    everything = modules(PROJECT["dependencies"]) | {"torchpt", "omegaconf", "flip_evaluator"}
     optional = set().union(*(modules(EXTRAS[extra]) for extra in FEATURES))
     at_once = {name for name, now in USED if now} - set(sys.stdlib_module_names)
     later = {name for name, _ in USED} - set(sys.stdlib_module_names)

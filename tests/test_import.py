@@ -21,10 +21,10 @@ def loaded(code: str) -> tuple[str, float]:
 
 #: What a small render to a PNG file has no use for.
 NEEDLESS = (
-    *HEAVY,
-    *("antlr4", "networkx", "pandas", "rich", "scipy", "sympy", "triton"),
+    *(name for name in HEAVY if name not in ("hydra", "omegaconf")),
+    *("networkx", "pandas", "pydantic", "rich", "scipy", "sympy", "triton"),
     *("torch._dynamo", "torch._inductor", "torch.onnx", "torch.utils.tensorboard"),
-    *("hydra_plugins", "hydra._internal.core_plugins", "PIL.TiffImagePlugin", "logging.config"),
+    "PIL.TiffImagePlugin",
     *(f"torchpt.meshes.{name}" for name in ("gltf", "obj", "ply", "stl")),
     "torchpt.ranks.launch",
 )

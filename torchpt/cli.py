@@ -1,9 +1,8 @@
 """The command line: words to a Hydra composition, to jobs, to an exit code. The only file that imports Hydra.
 
 Hydra composes the *run* settings (groups ``film integrator sampler render``), sweeps over them (``--multirun``), shows
-them (``--cfg job``) and launches the jobs; the plain words of a single job do without it (`torchpt.commands.plain_words`),
-with the same outcome. Scenes and file names stay outside (`torchpt.commands.arguments`). Whatever
-is wrong with the input ends as one line on stderr and exit code 2.
+them (``--cfg job``) and launches the jobs. Scenes and file names stay outside (`torchpt.commands.arguments`). Whatever is
+wrong with the input ends as one line on stderr and exit code 2.
 """
 
 from __future__ import annotations
@@ -11,8 +10,8 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +26,6 @@ from torchpt.commands.converge import converge
 from torchpt.commands.hydra_process import hydra_process
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.orbit import HELP as HELP_ORBIT
-from torchpt.commands.plain_words import compose_plainly
 from torchpt.commands.streams import ready, speaking
 from torchpt.commands.stress import HELP as HELP_STRESS
 from torchpt.commands.stress import stress
@@ -66,12 +64,13 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
 
   integrator=NAME, sampler=NAME, ... take a group's file from configs/: integrator=direct sampler=independent
   --multirun, -m      one render for every combination: sampler=sobol,independent render.spp=16,64 scene=a,b out=x.exr
-                      writes x_0.exr, x_1.exr, ...
+                      writes x_0.exr, x_1.exr, ...; stderr and the summaries say which job has which settings
   --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
 
   torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/ranks.md)
 
-The last line on stdout is a summary in JSON. Samples that are not finite count as black, and stderr says why.
+A sentence on stdout says what came of it; the last line is a summary in JSON. Samples that are not finite count as
+black, and stderr says why.
 Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the partial picture saved.
 """
 HELP_INFO = """\
@@ -186,17 +185,13 @@ class _Task:
 
     def __call__(self, cfg: DictConfig) -> int:
         """Do one job. Where it does not end well it ends this process, or, in a launcher's own, lets jobs beside it finish."""
-        code = self._ended(lambda: self._of_hydra(cfg))
+        code = self._run(cfg)
         if code:
             raise SystemExit(code) if os.getpid() == self.process else JobFailedError(code)
         return code
 
-    def plainly(self, composed: dict[str, Any], words: list[str]) -> int:
-        """Do the one job of a composition that did not need Hydra; returns the exit code."""
-        return self._ended(lambda: self._job(composed, words, None))
-
-    def _ended(self, make_job: Callable[[], Job]) -> int:
-        """Make and do a job; returns the exit code."""
+    def _run(self, cfg: DictConfig) -> int:
+        """Run the job of a composed configuration and return the exit code."""
         from torchpt.commands.debug import Wish, debug
         from torchpt.commands.info import info
         from torchpt.commands.orbit import Turn, orbit
@@ -204,7 +199,7 @@ class _Task:
 
         with Interrupt() as interrupt:
             try:
-                job = make_job()
+                job = self._job(cfg)
                 if self.command == "orbit":
                     return orbit(job, Turn.read(self.turn), interrupt)
                 if self.debug:
@@ -219,11 +214,18 @@ class _Task:
             except Exception as error:
                 return _out_of_memory(error)
 
-    def _of_hydra(self, cfg: DictConfig) -> Job:
+    def _job(self, cfg: DictConfig) -> Job:
+        """Return the job of a composed configuration.
+
+        Raises:
+            UsageError: a value that cannot be resolved, a block that does not exist.
+        """
         from hydra.core.hydra_config import HydraConfig
         from hydra.types import RunMode
         from omegaconf import OmegaConf
         from omegaconf.errors import OmegaConfBaseException
+
+        from torchpt.commands.render import Job
 
         hydra = HydraConfig.get()
         try:
@@ -232,17 +234,14 @@ class _Task:
             raise UsageError(f"{error.full_key or 'settings'}: {_first_line(error)}") from error
         assert isinstance(composed, dict)
         number = hydra.job.num if hydra.mode == RunMode.MULTIRUN else None
-        return self._job(composed, list(hydra.overrides.task), number)
-
-    def _job(self, composed: dict[Any, Any], words: list[str], number: int | None) -> Job:
-        from torchpt.commands.render import Job
-
         scene = self.scenes[composed.pop("scene_number", 0)]
+        words = list(hydra.overrides.task)
         overrides = _given(composed, words)
+        words = [f"scene={scene}" if word.startswith("+scene_number=") else word for word in words]
         for key, path in self.paths.items():
             group, _, name = key.partition(".")
             overrides.setdefault(group, {})[name] = path
-        return Job(scene, overrides, tuple(self.outs), number)
+        return Job(scene, overrides, tuple(self.outs), number, () if number is None else tuple(words))
 
 
 def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, Any]]:
@@ -285,7 +284,10 @@ def _refuse_targets(value: Any, where: str) -> None:
 
 
 def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
-    """Compose plain words here and hand all others over to Hydra; returns the exit code."""
+    """Hand the words over to Hydra, which calls a task with each composition; returns the exit code."""
+    import hydra
+    from hydra.core.global_hydra import GlobalHydra
+
     task = _Task(
         arguments.command,
         arguments.scenes,
@@ -295,19 +297,12 @@ def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
         arguments.turn,
         arguments.debug,
     )
-    if not arguments.options and not arguments.multirun:
-        composed = compose_plainly(arguments.overrides, _configs())
-        if composed is not None:
-            return task.plainly(composed, arguments.overrides)
-    import hydra
-    from hydra.core.global_hydra import GlobalHydra
-
-    _check_grammar(arguments.overrides)
     words = [*arguments.options, *arguments.overrides]
+    single = not arguments.multirun and not any("hydra" in word for word in words)
     with sweep_folder() if arguments.multirun else nullcontext() as folder:
         if folder is not None:
             words.append(f"hydra.sweep.dir={_quoted(folder)}")
-        with hydra_process(words):
+        with hydra_process(words), _composed_once() if single else nullcontext():
             try:
                 hydra.main(version_base="1.3", config_path=str(_configs()), config_name="config")(task)()
             except SystemExit as end:
@@ -317,11 +312,26 @@ def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
             except Exception as error:
                 if _came_from_job(error):
                     raise
+                _check_grammar(arguments.overrides)
                 raise UsageError(_one_line(error, arguments.overrides)) from error
             finally:
                 GlobalHydra.instance().clear()
     interrupt.check()
     return 0
+
+
+@contextmanager
+def _composed_once() -> Iterator[None]:
+    """Context in which Hydra is told that this is no sweep: to find out it composes all settings once more."""
+    from hydra._internal.hydra import Hydra
+    from hydra.types import RunMode
+
+    before = Hydra.get_mode
+    Hydra.get_mode = lambda *_, **__: RunMode.RUN
+    try:
+        yield
+    finally:
+        Hydra.get_mode = before
 
 
 def _check_grammar(words: list[str]) -> None:

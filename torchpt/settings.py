@@ -24,6 +24,8 @@ __all__ = ["BLOCKS", "FILTERS", "INTEGRATORS", "RECORDS", "SAMPLERS", "TYPED", "
 BLOCKS = ("film", "integrator", "sampler", "render")
 MAX_SIDE = 65_536
 MAX_PIXELS = 2**28
+#: The largest `render.seed`.
+MOST_SEED = 2**63 - 1
 
 
 #: What has a type: the kinds it may be of, and the one it is of where nothing is said.
@@ -131,7 +133,7 @@ class Render(Valued):
 
     parameters: ClassVar = {
         "spp": Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take"),
-        "seed": Whole(0, high=2**63 - 1, doc="the same seed gives the same picture"),
+        "seed": Whole(0, high=MOST_SEED, doc="the same seed gives the same picture"),
         "device": Other("auto", reader=_device, words="auto, cpu, cuda or cuda:N", doc="auto: CUDA where there is one"),
         "accel": Choice("auto", names=("auto", "torch", "numba", "brute"), doc="the search structure"),
         "compile": Choice(

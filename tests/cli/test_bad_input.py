@@ -59,7 +59,22 @@ CASES = [
     (["render", S, "out=a"], "needs an ending"),
     (["render", S, "out=nowhere/a.png"], "there is no folder"),
     (["render", S, "out=[a.png,nowhere/b.png]"], "there is no folder"),
-    (["render", S, "out=[a.png,a.png]"], "out: a name is given twice"),
+    (["render", S, "out=[a.png,a.png]"], "out: expected another file than 'a.png' of out, got 'a.png'"),
+    (["render", S, "out=[a.png,b.png,./folder.png/../a.png]"], "out: expected another file than 'a.png' of out"),
+    (["render", S, "out=[a.png,linked/a.png]"], "out: expected another file than 'a.png' of out, got 'linked/a.png'"),
+    (["render", S, "out=y.exr", "render.checkpoint=y.exr"],
+     "render.checkpoint: expected another file than 'y.exr' of out, got 'y.exr'"),
+    (["render", S, "out=y.exr", "render.checkpoint=linked/y.exr"], "render.checkpoint: expected another file than 'y.exr'"),
+    (["render", "-m", S, "render.spp=1,2", "out=y.exr", "render.checkpoint=./y.exr"],
+     "render.checkpoint: expected another file than 'y_0.exr' of out, got 'y_0.exr'"),
+    (["render", S, "out=a.png", "render.preview=./a.png"], "render.preview: expected another file than 'a.png' of out"),
+    (["render", S, "out=p.normal.png", "render.preview=p.png"],
+     "render.preview: expected another file than 'p.normal.png' of out, got 'p.normal.png'"),
+    (["render", S, "out=a.png", "render.preview=p.exr", "render.checkpoint=p.albedo.exr"],
+     "render.checkpoint: expected another file than 'p.albedo.exr' of render.preview"),
+    (["orbit", S, "out=[a.gif,linked/a.gif]"], "out: expected another file than 'a.gif' of out, got 'linked/a.gif'"),
+    (["orbit", S, "frames=2", "render.seed=9223372036854775807"],
+     "render.seed: expected a whole number 0..9223372036854775806 where frames=2"),
     (["render", S, "out=[a.png,,b.png]"], "out: expected names between commas"),
     (["render", S, "out=[]"], "out: expected names between commas"),
     (["render", S, "out=folder.png"], "is a folder"),
@@ -74,7 +89,7 @@ CASES = [
     (["info", S, "out=a.png"], "out: `torchpt info` writes no picture"),
     (["info", "scene=nowhere"], "cornell_box"),
     (["info", S, "film.widht=3"], "film.widht: unknown key"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("words", "says"), CASES, ids=[" ".join(words) or "nothing" for words, _ in CASES])
@@ -84,6 +99,7 @@ def test_bad_input(
     (folder / "target.yaml").write_text("camera: {type: perspective, _target_: os.system}\n")
     (folder / "broken.yaml").write_text("camera: [\n")
     (folder / "folder.png").mkdir()
+    (folder / "linked").symlink_to(folder)
     before = sorted(os.listdir(folder))
     assert main(words) == 2
     captured = capfd.readouterr()

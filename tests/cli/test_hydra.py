@@ -7,8 +7,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.hydra import Hydra
 
 from torchpt.cli import GROUPS, main
+from torchpt.commands import render
+from torchpt.commands.render import Job
 from torchpt.files import configs
 from torchpt.settings import TYPED
 from torchpt.spec import not_built, parameters_of
@@ -85,6 +89,59 @@ def test_types_are_chosen_by_file_or_by_key(
     assert [settings.integrator.name for settings in renderer.settings] == kinds
 
 
+@pytest.mark.parametrize(
+    ("words", "overrides"),
+    [
+        ([], {}),
+        (["film.width=16", "film.exposure=-1"], {"film": {"width": 16, "exposure": -1}}),
+        (["render.seed=1e3", "film.gamma=-0.0"], {"render": {"seed": 1000.0}, "film": {"gamma": -0.0}}),
+        (["film.aovs=[albedo,normal]", "film.crop=[0,1,-2,3.5]"],
+         {"film": {"aovs": ["albedo", "normal"], "crop": [0, 1, -2, 3.5]}}),
+        (["film.filter=box"], {"film": {"filter": "box"}}),
+        (["film.filter.radius=NULL", "film.filter.type=null"], {"film": {}}),
+        (["integrator.clamp=null"], {"integrator": {"clamp": None}}),
+        (["integrator.strict=TRUE", "sampler.adaptive=False"],
+         {"integrator": {"strict": True}, "sampler": {"adaptive": False}}),
+        (["render.compile=off", "integrator.strategy=yes"], {"render": {"compile": "off"}, "integrator": {"strategy": "yes"}}),
+        (["render.preview=a=b.png", "film.tonemap='a, b'"], {"render": {"preview": "a=b.png"}, "film": {"tonemap": "a, b"}}),
+    ],
+)  # fmt: skip
+def test_words_become_settings_of_their_types(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], overrides: dict
+) -> None:
+    jobs: list[Job] = []
+    monkeypatch.setattr(render, "render", lambda job, interrupt: jobs.append(job) or 0)
+    assert main(["render", "scene=s.yaml", "out=a.png", *words]) == 0
+    found, wanted = (  # by text: 1 is not 1.0, nor 0.0 -0.0
+        {(group, key): repr(value) for group, block in each.items() for key, value in block.items()}
+        for each in (jobs[0].overrides, overrides)
+    )
+    assert found == wanted
+    assert (jobs[0].scene, jobs[0].outs, jobs[0].number) == ("s.yaml", ("a.png",), None)
+
+
+@pytest.mark.parametrize(
+    ("words", "composed", "files"),
+    [
+        (["render.spp=1"], 1, {"s.png"}),
+        (["hydra.mode=RUN"], 2, {"s.png"}),
+        (["hydra.mode=MULTIRUN", "render.spp=1,2"], 6, {"s_0.png", "s_1.png"}),
+    ],
+)
+def test_a_single_job_is_composed_once(
+    folder: Path, renderer: Renderer, monkeypatch: pytest.MonkeyPatch, words: list[str], composed: int, files: set[str]
+) -> None:
+    calls: list[object] = []
+    load = ConfigLoaderImpl.load_configuration
+    monkeypatch.setattr(
+        ConfigLoaderImpl, "load_configuration", lambda *given, **named: calls.append(0) or load(*given, **named)
+    )
+    before = Hydra.get_mode
+    assert main(["render", "scene=s.yaml", *words]) == 0
+    assert len(calls) == composed and Hydra.get_mode is before
+    assert set(os.listdir(folder)) - {"s.yaml"} == files
+
+
 def test_no_litter_even_in_a_folder_that_cannot_be_written(folder: Path, renderer: Renderer, tmp_path: Path) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
@@ -116,6 +173,28 @@ def test_help(capsys: pytest.CaptureFixture[str]) -> None:
         assert max(map(len, captured.out.splitlines())) <= 150
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("torchpt 0.")
+
+
+def test_jobs_of_a_sweep_of_info_are_told_apart(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", "-m", "scene=s.yaml", "integrator=path,direct", "film.width=4", "--json"]) == 0
+    captured = capsys.readouterr()
+    facts = [json.loads(line) for line in captured.out.splitlines()]
+    words = [[f"integrator={name}", "film.width=4"] for name in ("path", "direct")]
+    assert [(one["job"], one["overrides"]) for one in facts] == list(enumerate(words))
+    assert captured.err.splitlines() == [f"torchpt: job {n}: {' '.join(each)}" for n, each in enumerate(words)]
+
+
+def test_info_says_that_no_render_could_run_in_so_little_memory(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", "scene=s.yaml", "render.max_memory=1", "--json"]) == 0
+    captured = capsys.readouterr()
+    memory = json.loads(captured.out)["memory"]
+    assert memory["enough"] is False and memory["refused"].startswith("render.max_memory: expected at least ")
+    assert captured.err == f"torchpt: warning: no render could run: {memory['refused']}\n"
+    assert main(["info", "scene=s.yaml", "render.max_memory=32GB", "render.checkpoint=there/is/none.ckpt"]) == 0
+    captured = capsys.readouterr()
+    assert "memory:\n  enough: yes" in captured.out and captured.err == ""
 
 
 def test_info(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -38,7 +38,13 @@ def sweep(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 def test_jobs_of_several_processes_write_what_jobs_of_one_do(tmp_path: Path) -> None:
     done = sweep(tmp_path, "render.spp=1,2", "sampler=sobol,independent", "out=x.exr")
     assert done.returncode == 0, done.stderr
-    assert {json.loads(line)["out"] for line in done.stdout.splitlines()} == {f"x_{k}.exr" for k in range(4)}
+    lines = done.stdout.splitlines()  # a sentence and a summary each
+    facts = [json.loads(line) for line in lines[1::2]]
+    assert [line.partition(": ")[0] for line in lines[::2]] == [fact["out"] for fact in facts]
+    assert {fact["out"]: fact["job"] for fact in facts} == {f"x_{k}.exr": k for k in range(4)}
+    assert all(
+        f"torchpt: job {fact['job']}: {' '.join(fact['overrides'])} -> {fact['out']}" in done.stderr for fact in facts
+    )
     scene = torchpt.load("cornell_box", device="cpu")
     film = {"width": 24, "height": 16}
     for number, (spp, sampler) in enumerate((spp, name) for spp in (1, 2) for name in ("sobol", "independent")):

@@ -648,6 +648,11 @@ def test_a_model_of_the_callers_own() -> None:
     assert found.model is OWN["mine"]
 
 
+@pytest.mark.parametrize("name", ["copy", "json", "values", "model_fields"])
+def test_a_parameter_may_have_any_name(name: str) -> None:
+    assert slot({"mine": with_parameters({name: 0.5})}, type="mine", **{name: 2}).values[name] == 2.0
+
+
 def test_models_of_their_own_stay_apart() -> None:
     plain: Any = Tinted()
     materials = read({"m": {"type": "one"}, "n": {"type": "two"}}, {"one": plain, "two": Tinted(clear=True)}).materials
@@ -698,7 +703,7 @@ MODELS_BAD: dict[str, tuple[Any, str, str]] = {
     "a pair": ({"mine": with_parameters({"x": (1, 2)})}, "bsdfs.mine.parameters.x", "a finite number, or three"),
     "a common key": ({"mine": with_parameters({"opacity": 1})}, "bsdfs.mine.parameters.opacity", "another name"),
     "a later key": ({"mine": with_parameters({"bump_map": 1})}, "bsdfs.mine.parameters.bump_map", "another name"),
-    "a taken name": ({"mine": with_parameters({"copy": 1})}, "bsdfs.mine.parameters.copy", "another name"),
+    "the type": ({"mine": with_parameters({"type": 1})}, "bsdfs.mine.parameters.type", "another name"),
     "a default out of range": (
         {"mine": with_parameters({"x": Scalar(2.0, high=1.0)})},
         "bsdfs.mine.parameters.x",

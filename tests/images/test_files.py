@@ -2,8 +2,11 @@ from __future__ import annotations
 
 import os
 import struct
+import subprocess
+import sys
 import zlib
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -186,6 +189,49 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
                 write_image(path, picture())
         assert path.read_text() == "old"
     assert sorted(os.listdir(tmp_path)) == ["a.exr", "a.png"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of files are of Unix")
+@pytest.mark.parametrize("ending", [".exr", ".hdr", ".png", ".ppm"])
+def test_the_systems_reason_is_told_where_a_file_may_not_grow(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"a{ending}"
+    path.write_text("old")
+    text = f"""
+import resource, torch
+from torchpt.images import write_image
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+try:
+    write_image({str(path)!r}, torch.rand(100, 100, 3, generator=torch.Generator().manual_seed(1)))
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
+    assert done.stdout == f"OutputError {path}: cannot be written (File too large)\n", done.stderr
+    assert [file.name for file in tmp_path.iterdir()] == [path.name] and path.read_text() == "old"
+
+
+def test_an_encoders_own_error_names_no_hidden_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import OpenImageIO
+
+    class Broken:
+        def open(self, name: str, spec: Any) -> bool:
+            self.said = f"cannot encode {name}"
+            return True
+
+        def write_image(self, pixels: Any) -> bool:
+            return False
+
+        def close(self) -> bool:
+            return True
+
+        def geterror(self) -> str:
+            return self.said
+
+    monkeypatch.setattr(OpenImageIO.ImageOutput, "create", lambda _: Broken())
+    with pytest.raises(OutputError) as caught:
+        write_image(tmp_path / "a.exr", picture())
+    assert str(caught.value) == f"{tmp_path}/a.exr: cannot be written (cannot encode the file)"
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("ending", [".exr", ".hdr", ".png", ".jpg", ".ppm"])

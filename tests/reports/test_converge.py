@@ -13,8 +13,9 @@ import pytest
 import torch
 
 from torchpt.cli import main
+from torchpt.commands import progress
 from torchpt.images import write_image
-from torchpt.reports import measure
+from torchpt.reports import measure, report
 from torchpt.reports.measure import seed_of
 
 SCENE = """\
@@ -142,6 +143,77 @@ def test_a_finished_study_renders_nothing_and_a_larger_one_what_is_new(
     fresh = [seed_of(0, "run", 5, number) for number in range(3)]
     assert sorted(seed for spp, seed in renders.seen if spp == 5) == sorted(2 * fresh)
     assert len(renders.seen) == 2 * 6, "a run that is thrown away goes before each"
+
+
+def test_another_study_has_a_folder_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("s.yaml").write_text(SCENE)
+    renders = Renders(monkeypatch)
+
+    def write(study: Any, measured: Any, folder: Path) -> list[Any]:
+        (folder / "report.html").write_text(f"{study.variants} {study.asked}")
+        return []
+
+    monkeypatch.setattr(report, "write_report", write)
+    words = ["scene=s.yaml", "spp=[1,2]", "seeds=2", "reference.spp=4", "reference.seeds=2", "render.compile=off"]
+    words += ["metrics=mse", "film.width=8", "film.height=6"]
+
+    def study(*more: str) -> tuple[str, str, int]:
+        """Return the folder, what stderr says, and how many renders it took."""
+        before = len(renders.seen)
+        assert main(["converge", *words, *more]) == 0
+        said = capfd.readouterr()
+        return str(Path(json.loads(said.out.splitlines()[-1])["out"]).parent), said.err, len(renders.seen) - before
+
+    def pages() -> dict[str, str]:
+        return {path.parent.name: path.read_text() for path in Path().glob("*/report.html")}
+
+    assert study("sampler=sobol")[:2] == ("s_converge", "")
+    first = pages()
+    moved = "torchpt: s_converge holds another study; this one is in {} (out= names another folder)\n"
+    assert study("sampler=independent")[:2] == ("s_converge_2", moved.format("s_converge_2"))
+    assert study("sampler=sobol", "integrator.max_depth=2")[:2] == ("s_converge_3", moved.format("s_converge_3"))
+    assert {**pages(), **first} == pages()
+    # The same study again, and one that only grew or is shown otherwise.
+    assert study("sampler=sobol") == ("s_converge", "", 0)
+    assert study("sampler=independent") == ("s_converge_2", moved.format("s_converge_2"), 0)
+    assert study("sampler=sobol", "title=Again", "target=1") == ("s_converge", "", 0)
+    words[1:3] = ["spp=[1,2,3]", "seeds=3"]
+    assert study("sampler=sobol")[:2] == ("s_converge", "")
+    words[1:3] = ["spp=[1,2]", "seeds=2"]
+    assert study("sampler=sobol")[0] == "s_converge_4", "its report would say less"
+    # A folder that was asked for is taken, with a word.
+    said = "torchpt: s_converge_2 holds the report of another study, which this one's replaces; its runs stay\n"
+    assert study("sampler=sobol", "out=s_converge_2")[:2] == ("s_converge_2", said)
+
+
+def test_progress_is_told_in_lines_where_no_terminal_shows_a_bar(
+    there: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    words = ["scene=s.yaml", "spp=[1,2]", "seeds=2", "reference=theirs.exr", "render.compile=off", "metrics=mse"]
+    assert main(["converge", *words, "out=told"]) == 0
+    lines = capfd.readouterr().err.splitlines()
+    found = [re.fullmatch(r"torchpt: told: (\d+) % of 1\.15k samples after \d+ s", line) for line in lines]
+    parts = [int(match[1]) for match in found if match]
+    assert len(parts) == len(lines)
+    assert parts == sorted(parts) and parts[-1] == 100 and len(set(parts)) > 3
+
+
+def test_print_keeps_things_whole_and_small() -> None:
+    text = (Path(measure.__file__).parent / "report.html").read_text()
+    style = text.partition("<style>")[2].partition("</style>")[0]
+    printed = re.search(r"@media print \{(.*?)\n\}", style, re.DOTALL)
+    assert printed is not None
+    rules: dict[str, str] = {}
+    for selectors, body in re.findall(r"([^{}]+)\{([^{}]*)\}", printed[1]):
+        for selector in selectors.split(","):
+            rules[selector.strip()] = rules.get(selector.strip(), "") + body
+    for selector in ("figure", "tr", ".plots img", ".wide", ".headline", ".note"):
+        assert rules[selector].split() == ["break-inside:", "avoid;"], selector
+    assert not any("font-weight" in body for body in rules.values())
 
 
 def test_a_signal_keeps_what_is_done(

@@ -224,6 +224,4 @@ def _names(key: str, value: str | None) -> list[str]:
         names.pop()  # what the pattern finds at the very end
     if not all(names):
         raise UsageError(f"{key}: expected names between commas, got {value!r}")
-    if key == "out" and len(set(names)) < len(names):
-        raise UsageError(f"out: a name is given twice in {value!r}")
     return names

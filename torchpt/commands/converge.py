@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,11 @@ from torchpt.errors import OutputError, SceneError
 
 __all__ = ["HELP", "converge", "raw_study"]
 
+#: What a folder says that it is of.
+_STUDY = "study.json"
+#: Keys by which the report shows the same runs otherwise.
+_SHOWN = ("title", "metrics", "target", "extra")
+
 HELP = """\
 torchpt converge scene=NAME|[A,B] [out=FOLDER] [key=value|key=[a,b] ...]
 torchpt converge study=NAME|FILE.yaml [key=value ...]
@@ -26,7 +32,8 @@ torchpt converge study=NAME|FILE.yaml [key=value ...]
   without set-up, compared with a reference. A list makes an axis of the grid: sampler=[independent,sobol].
   scene=      a file ending in .yaml, or a scene that ships, or a list of them:
 {scenes}
-  out=        the folder of report.html, report.json, plots/ and runs/; SCENE_converge where nothing is said
+  out=        the folder of report.html, report.json, plots/ and runs/; where nothing is said SCENE_converge, or, where
+              that holds another study, SCENE_converge_2, ...
   study=      a YAML file with the same keys, or a study that ships (samplers); words of the command line win over it
   spp=        samples a pixel of each step                                                   [4,16,64,256]
   seeds=      independent runs of each step                                                  5
@@ -99,7 +106,7 @@ def converge(words: Mapping[str, str], interrupt: Interrupt) -> int:
     from torchpt.reports.analysis import check_files
     from torchpt.reports.measure import Stopped, measure, prepare
     from torchpt.reports.report import plain, write_report
-    from torchpt.reports.store import Store
+    from torchpt.reports.store import Store, write_whole
     from torchpt.reports.study import study_of
 
     collector.resume()
@@ -107,15 +114,17 @@ def converge(words: Mapping[str, str], interrupt: Interrupt) -> int:
     raw, file = raw_study({key: text for key, text in words.items() if key != "out"})
     with notices():
         study = study_of(raw, file)
-        folder = Path(words["out"]).expanduser() if "out" in words else Path(f"{_stem(study.scenes, file)}_converge")
-        if folder.exists() and not folder.is_dir():
-            raise OutputError(folder, "is a file; expected a folder")
+        told = _told(raw, study.asked)
+        folder, note = _folder(words.get("out"), f"{_stem(study.scenes, file)}_converge", told)
         prepared = prepare(study)
         check_files(study, prepared)
         store = Store(folder / "runs")
+        write_whole(folder / _STUDY, json.dumps(told, indent=1).encode())
+    if note:
+        print(f"torchpt: {note}", file=sys.stderr)
     interrupt.check()
     interrupt.deferred = True
-    with Bar(folder.name) as bar:
+    with Bar(folder.name, lines=True) as bar:
 
         def on_progress(done: int, total: int, rays: int, seconds: float) -> bool:
             bar.update(done, total, rays, seconds)
@@ -155,6 +164,55 @@ def converge(words: Mapping[str, str], interrupt: Interrupt) -> int:
     with speaking():
         print(json.dumps(plain(facts), allow_nan=False))
     return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
+
+
+def _folder(out: str | None, name: str, told: dict[str, Any]) -> tuple[Path, str]:
+    """Return the folder of a study, and what is to be said of it: where it holds another study, that.
+
+    Args:
+        out: the folder that was asked for.
+        name: where none was; ``NAME_2``, ``NAME_3``, ... where those before hold other studies.
+        told: of :func:`_told`.
+
+    Raises:
+        OutputError: a file is there.
+    """
+    first = Path(name if out is None else out).expanduser()
+    if first.exists() and not first.is_dir():
+        raise OutputError(first, "is a file; expected a folder")
+    if not _holds_another(first, told):
+        return first, ""
+    if out is not None:
+        return first, f"{first} holds the report of another study, which this one's replaces; its runs stay"
+    later = (first.with_name(f"{first.name}_{number}") for number in count(2))
+    folder = next(path for path in later if not _holds_another(path, told))
+    return folder, f"{first} holds another study; this one is in {folder} (out= names another folder)"
+
+
+def _holds_another(folder: Path, told: dict[str, Any]) -> bool:
+    """Return whether a folder holds what this study would write over; one that only grew by runs is the same study."""
+    note = folder / _STUDY
+    if not note.exists():
+        return (folder / "report.html").exists() or (folder.exists() and not folder.is_dir())
+    try:
+        known = json.loads(note.read_text(encoding="utf-8"))
+        grown = set(known["spp"]) <= set(told["spp"]) and known["seeds"] <= told["seeds"]
+    except (OSError, ValueError, KeyError, TypeError):  # somebody else's file
+        return True
+    return {**known, "spp": 0, "seeds": 0} != {**told, "spp": 0, "seeds": 0} or not grown
+
+
+def _told(raw: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all that the runs of a study depend on, as JSON has it.
+
+    Args:
+        raw: its keys as written.
+        asked: its own keys as read, see :class:`torchpt.reports.study.Study`.
+    """
+    from torchpt.reports.report import plain
+
+    told = {key: value for key, value in raw.items() if key not in _SHOWN}
+    return json.loads(json.dumps(plain({**told, "spp": asked["spp"], "seeds": asked["seeds"]}), sort_keys=True))
 
 
 def _stem(scenes: tuple[str, ...], file: str | None) -> str:

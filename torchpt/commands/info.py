@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from torchpt.commands import collector
 from torchpt.commands.interrupt import Interrupt
-from torchpt.commands.notices import notices
-from torchpt.commands.render import Job, described, plain
+from torchpt.commands.notices import notices, which_job
+from torchpt.commands.render import Job, described, knowing, plain
 from torchpt.commands.streams import speaking
+from torchpt.errors import TorchptError
 
 __all__ = ["info", "lines"]
 
@@ -33,7 +35,13 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
         scene = Scene(description, device_of(wishes.render.device))
         facts = scene.info(wishes)
         facts["built"]["loop"] = loop_facts(scene, wishes)
+        facts = {**job.facts(), **facts}
+        if wishes.render.max_memory is not None:
+            facts["memory"] = _memory(scene, wishes)
+    which_job(job)
     interrupt.check()
+    if "refused" in facts.get("memory", ()):
+        print(f"torchpt: warning: no render could run: {facts['memory']['refused']}", file=sys.stderr)
     with speaking():
         if as_json:
             print(json.dumps(plain(facts), allow_nan=False))
@@ -46,6 +54,22 @@ def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
             for key, value in lines(facts):
                 Console().print(Text(key, style="bold") + Text(value), soft_wrap=True)
     return 0
+
+
+def _memory(scene: Any, wishes: Any) -> dict[str, Any]:
+    """Return whether ``render.max_memory`` is enough for a render, and what a render would say where it is not."""
+    import torch
+
+    from torchpt.forward import Run
+
+    wishes = knowing(wishes)  # as `torchpt render`
+    wishes = replace(wishes, render=wishes.render.but(checkpoint=None, resume=False))
+    try:
+        with torch.no_grad():
+            Run(scene, wishes, None, torch.float32)
+    except TorchptError as error:
+        return {"enough": False, "refused": str(error)}
+    return {"enough": True}
 
 
 def lines(facts: dict[str, Any], depth: int = 0) -> Iterator[tuple[str, str]]:

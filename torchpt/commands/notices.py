@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from torchpt.errors import EnergyWarning
 
-__all__ = ["not_finite", "notices"]
+if TYPE_CHECKING:
+    from torchpt.commands.render import Job
+
+__all__ = ["not_finite", "notices", "which_job"]
 
 
 @contextmanager
@@ -38,6 +41,13 @@ def notices() -> Iterator[None]:
         yield
     for text in dict.fromkeys(lines):
         print(text, file=sys.stderr)
+
+
+def which_job(job: Job, outs: Sequence[str] = ()) -> None:
+    """Say on stderr which files are of which settings: of a job of a sweep its number, overrides and pictures."""
+    if job.number is not None:
+        files = f" -> {', '.join(outs)}" if outs else ""
+        print(f"torchpt: job {job.number}: {' '.join(job.words)}{files}", file=sys.stderr)
 
 
 def not_finite(facts: Mapping[str, Any]) -> None:

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any
 from torchpt import __version__
 from torchpt.commands import collector
 from torchpt.commands.interrupt import Interrupt, Interrupted
-from torchpt.commands.notices import notices
+from torchpt.commands.notices import notices, which_job
 from torchpt.commands.progress import Bar
-from torchpt.commands.render import Job, described, knowing, numbered, plain
+from torchpt.commands.render import Job, check_distinct, described, knowing, numbered, plain
 from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, SceneError
 
@@ -140,6 +140,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     from torchpt.images.movie import check_movie, write_movie
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
+    from torchpt.settings import MOST_SEED
 
     collector.resume()
     start = time.perf_counter()
@@ -156,19 +157,25 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
                 if key == "denoise":
                     what = "false: torchpt orbit writes frames as rendered (denoised one by one they flicker)"
                 raise SceneError(f"{group}.{key}", job.overrides[group][key], what)
+        if wishes.render.seed > (last := MOST_SEED - turn.frames + 1):
+            expected = f"a whole number 0..{last} where frames={turn.frames} (frame k has the seed render.seed + k)"
+            raise SceneError("render.seed", wishes.render.seed, expected)
         outs = _outputs(job)
+        check_distinct([("out", path) for path in outs])
         for path in outs:
             check_movie(path, turn.fps)
         scene = Scene(description, device_of(wishes.render.device))
         frames = Frames(Path(f"{outs[0]}.frames"), _facts(scene, wishes, turn))
         before = frames.count(turn.frames)
     load_seconds = time.perf_counter() - start
+    which_job(job, outs)
     interrupt.check()
     interrupt.deferred = True
     totals = _render(job, scene, turn, frames, interrupt)
     ready = frames.count(turn.frames)
     facts: dict[str, Any] = {
         "out": outs[0] if len(outs) == 1 else outs,
+        **job.facts(),
         "frames": turn.frames,
         "rendered": ready - before,
     }

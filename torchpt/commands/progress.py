@@ -1,14 +1,18 @@
-"""The bar of a long render: samples, rays a second, time left. On stderr, and only where that is a terminal."""
+"""The bar of a long render: samples, rays a second, time left. On stderr; where that is no terminal lines, if any."""
 
 from __future__ import annotations
 
 import sys
+import time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 __all__ = ["Bar"]
+
+#: Seconds between two lines.
+EVERY = 10.0
 
 
 def _short(count: float) -> str:
@@ -20,10 +24,16 @@ def _short(count: float) -> str:
 
 
 class Bar:
-    """A progress bar, or nothing at all where stderr is no terminal."""
+    """A progress bar; where stderr is no terminal nothing at all.
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    Args:
+        name: what is rendered.
+        lines: whether there is a line every ten seconds where stderr is no terminal, as of work of many minutes.
+    """
+
+    def __init__(self, name: str, lines: bool = False) -> None:
+        self.name, self.lines = name, lines
+        self.begun = self.told = time.monotonic()
         self._progress: Progress | None = None
         self._task: TaskID | None = None
 
@@ -53,6 +63,13 @@ class Bar:
     def update(self, done: int, total: int, rays: int, seconds: float) -> None:
         """Show so many of so many camera samples, so many rays in so many seconds."""
         if self._progress is None or self._task is None:
+            now = time.monotonic()
+            if self.lines and now - self.told >= EVERY:
+                self.told = now
+                part, passed = 100 * done // max(total, 1), now - self.begun
+                print(
+                    f"torchpt: {self.name}: {part} % of {_short(total)} samples after {passed:.0f} s", file=sys.stderr
+                )
             return
         rate = rays / seconds if seconds > 0 else 0.0
         work = f"{_short(done)}/{_short(total)} samples, {_short(rate)} rays/s"

@@ -9,7 +9,7 @@ import secrets
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,12 +18,12 @@ from typing import Any
 from torchpt.commands import collector, ranked
 from torchpt.commands.denoised import denoised_files
 from torchpt.commands.interrupt import Interrupt, Interrupted
-from torchpt.commands.notices import not_finite, notices
+from torchpt.commands.notices import not_finite, notices, which_job
 from torchpt.commands.progress import Bar
 from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
 
-__all__ = ["Job", "described", "knowing", "numbered", "plain", "render"]
+__all__ = ["Job", "check_distinct", "described", "knowing", "numbered", "plain", "render", "sentence"]
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,18 @@ class Job:
         overrides: block (``film integrator sampler render``) to the keys given on the command line.
         outs: pictures to write; ``<scene>.png`` in the current folder where empty.
         number: of the job in a sweep, which enters the file names; None outside one.
+        words: what the command line says of this job of a sweep, ``key=value`` each.
     """
 
     scene: str
     overrides: dict[str, dict[str, Any]] = field(default_factory=dict)
     outs: tuple[str, ...] = ()
     number: int | None = None
+    words: tuple[str, ...] = ()
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a summary says of a job of a sweep; nothing outside one."""
+        return {} if self.number is None else {"job": self.number, "overrides": list(self.words)}
 
 
 def numbered(path: str, number: int | None) -> str:
@@ -75,17 +81,26 @@ def render(job: Job, interrupt: Interrupt) -> int:
         outs = _outputs(job, wishes)
         preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
         previews = _preview_files(preview) if preview else []
-        denoised = denoised_files(wishes, outs, previews)
+        denoised = denoised_files(wishes, outs)
+        kept = wishes.render.checkpoint and numbered(str(Path(wishes.render.checkpoint).expanduser()), job.number)
+        check_distinct(
+            [
+                *(("out", path) for path in outs),
+                *(("render.preview", path) for path in previews),
+                *((("render.checkpoint", kept),) if kept else ()),
+                *(("film.denoise", path) for path in denoised),
+            ]
+        )
         for path in (*outs, *previews, *denoised) if first else ():
             check_writable(path)
-        if wishes.render.checkpoint is not None:
-            wishes = replace(
-                wishes, render=wishes.render.but(checkpoint=numbered(wishes.render.checkpoint, job.number))
-            )
+        if kept is not None:
+            wishes = replace(wishes, render=wishes.render.but(checkpoint=kept))
             if first:
-                Keeper(wishes.render.checkpoint).check(wishes.render.resume)
+                Keeper(kept).check(wishes.render.resume)
         scene = Scene(description, device_of(wishes.render.device))
     scene.load_seconds = time.perf_counter() - start
+    if first:
+        which_job(job, outs)
     if preview and first:
         hits = first_hit(scene, wishes)
         for path, name in zip(previews, ("albedo", "normal"), strict=False):
@@ -106,12 +121,14 @@ def render(job: Job, interrupt: Interrupt) -> int:
     if not first:
         return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)
-    summary = {"out": _names(outs), **facts, **rendering.summary()}
+    summary = {"out": _names(outs), **job.facts(), **facts, **rendering.summary()}
     if not rendering.complete:
         summary["complete"] = False
     not_finite(summary)
-    with speaking():  # the last line on stdout
-        print(json.dumps(plain(summary), allow_nan=False))
+    summary = plain(summary, digits=6)
+    height, width = rendering.image.shape[:2]
+    with speaking():  # in one piece, as jobs of a sweep may share stdout; the last line is the summary
+        print(f"{sentence(summary, width, height)}\n{json.dumps(summary, allow_nan=False)}")
     if interrupt.signum is None:
         return 0
     again = "" if wishes.render.checkpoint is None else "; render.resume=true goes on"
@@ -159,6 +176,25 @@ def _outputs(job: Job, wishes: Any) -> list[str]:
     return [numbered(path, job.number) for path in outs]
 
 
+def check_distinct(files: Sequence[tuple[str, str]]) -> None:
+    """Refuse two files to write that are one, however their paths are spelled.
+
+    Args:
+        files: key and path of each.
+
+    Raises:
+        SceneError: names the later one's key and path, and the file that it would replace.
+    """
+    seen: dict[str, tuple[str, str]] = {}
+    for key, path in files:
+        with suppress(OSError, ValueError):  # of a path that cannot be, which is told where it is tried
+            place = os.path.normcase(os.path.realpath(path))
+            if place in seen:
+                other, before = seen[place]
+                raise SceneError(key, path, f"another file than {before!r} of {other}")
+            seen[place] = key, path
+
+
 def _is_exr(path: str) -> bool:
     return Path(path).suffix.lower() == ".exr"
 
@@ -174,7 +210,7 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: An
     from torchpt.forward.denoising import denoise_rendering
     from torchpt.forward.files import write_denoised, write_rendered
 
-    failed: TorchptError | None = None
+    failed: list[TorchptError] = []
     facts: dict[str, Any] = {}
     for path in paths:
         try:
@@ -183,19 +219,21 @@ def _write_all(paths: list[str], denoised: list[str], rendering: Any, wishes: An
             elsewhere = _written_elsewhere(path, rendering, wishes)
             if elsewhere is not None:
                 error = OutputError(path, f"{error.problem}; the picture is in {elsewhere}")
-            failed = failed or error
+            failed.append(error)
     try:
         if denoised:  # only now: what was rendered is safe
             facts = {"denoised": _names(denoised), "denoise_seconds": round(denoise_rendering(rendering, wishes), 4)}
+            for path in denoised:
+                try:
+                    write_denoised(path, rendering, wishes.film)
+                except OutputError as error:
+                    failed.append(error)
     except RenderError as error:
-        raise failed or error from None
-    for path in denoised:
-        try:
-            write_denoised(path, rendering, wishes.film)
-        except OutputError as error:
-            failed = failed or error
-    if failed is not None:
-        raise failed
+        failed.append(error)
+    if len(failed) > 1:
+        raise TorchptError("; ".join(map(str, failed)))
+    if failed:
+        raise failed[0]
     return facts
 
 
@@ -225,14 +263,49 @@ def _names(paths: list[str]) -> str | list[str]:
     return paths[0] if len(paths) == 1 else paths
 
 
-def plain(value: Any) -> Any:
-    """JSON knows neither NaN nor tensors."""
+def sentence(facts: Mapping[str, Any], width: int, height: int) -> str:
+    """Return the summary of a render in a sentence for people.
+
+    Args:
+        facts: the summary, as JSON has it.
+        width: of the picture in pixels.
+        height: of the picture in pixels.
+    """
+    out, spp = facts["out"], facts["spp"]
+    text = f"{out if isinstance(out, str) else ', '.join(out)}: {width} x {height} pixels, "
+    text += f"{spp} sample{'' if spp == 1 else 's'} a pixel, {_brief(facts['seconds'])} s"
+    if facts.get("relmse") is not None:
+        text += f"; relative error {_percent(facts['relmse'])} %"
+        if facts.get("relmse_interval") is not None:
+            low, high = map(_percent, facts["relmse_interval"])
+            text += f" ({low} to {high} %)"
+        if facts.get("heavy_tailed"):
+            text += ", most of it in few pixels"
+    if not facts.get("complete", True):
+        text += "; stopped early"
+    elif "stopped_by" in facts:
+        text += f"; ended by render.{facts['stopped_by']}"
+    return text
+
+
+def _percent(relmse: float) -> str:
+    """Return the relative error in percent, the root of relMSE."""
+    return _brief(100.0 * math.sqrt(max(relmse, 0.0)))
+
+
+def _brief(value: float) -> str:
+    """Return two digits, or all before the point."""
+    return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
+
+
+def plain(value: Any, digits: int = 17) -> Any:
+    """Return a value as JSON has it, which knows neither NaN nor tensors; floats to so many significant digits."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): plain(item, digits) for key, item in value.items()}
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return plain(value.tolist(), digits)
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+        return [plain(item, digits) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
     return value

@@ -13,7 +13,6 @@ from torchpt.errors import EnergyWarning, NotBuiltError, SceneError, warn_caller
 from torchpt.format.textures import TextureInput, check_texture, texture_of
 from torchpt.spec import REQUIRED, Refused, Spec, parameters_of, spec_of
 from torchpt.spec.declared import Described, described, values_of
-from torchpt.spec.validate import Model
 
 __all__ = [
     "MAX_BLENDS", "POINTS", "Kind", "check_material", "inner_of", "material_types", "model_of", "plain_material",
@@ -65,7 +64,7 @@ def _check_own(model: Bsdf, key: str) -> None:
         at = f"{key}.parameters.{parameter}"
         if not isinstance(parameter, str) or not parameter.isidentifier() or parameter.startswith("_"):
             raise SceneError(f"{key}.parameters", parameter, "names made of letters, digits and underscores")
-        if parameter == "type" or parameter in Bsdf.parameters or hasattr(Model, parameter):
+        if parameter == "type" or parameter in Bsdf.parameters:
             raise SceneError(at, value, f"another name ({parameter} is taken)")
         try:
             spec = spec_of(value)

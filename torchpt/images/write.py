@@ -176,11 +176,26 @@ def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str], fact
         spec.attribute("compression", "zip")
         put_header(spec, facts)
     encoder = oiio.ImageOutput.create("picture" + temporary.suffix)
-    if encoder is None or not encoder.open(str(temporary), spec):
-        raise OSError(encoder.geterror() if encoder else oiio.geterror())
-    written = encoder.write_image(np.ascontiguousarray(pixels))
+    if encoder is None:
+        raise OSError(oiio.geterror())
+    opened = encoder.open(str(temporary), spec)
+    written = opened and encoder.write_image(np.ascontiguousarray(pixels))
     if not (encoder.close() and written):
-        raise OSError(encoder.geterror() or "the encoder failed")
+        _try_bytes(temporary, pixels.nbytes + 64 * height + 2**16)
+        said = encoder.geterror() or "the encoder failed"
+        raise OSError(said.replace(str(temporary), "the file"))
+
+
+def _try_bytes(path: Path, size: int) -> None:
+    """Write as many zeros as an encoder may have wanted to write: it failed and does not tell the system's reason.
+
+    Raises:
+        OSError: the system's: the disk is full, the file may not grow, its folder is gone.
+    """
+    block = bytes(min(size, 2**20))
+    with open(path, "wb") as file:
+        for _ in range(-(-size // len(block))):
+            file.write(block)
 
 
 def _encode_integer(temporary: Path, levels: np.ndarray) -> None:

@@ -5,18 +5,16 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache, partial
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import create_model
 
 from torchpt.core.tree import UNPRINTED
 from torchpt.errors import NotBuiltError, SceneError
 from torchpt.spec import REQUIRED, Block, Map, Refused, Spec, not_built, parameters_of
 from torchpt.spec.memo import Memo
 from torchpt.spec.reading import within
-from torchpt.spec.validate import Check, Model, check_keys, construct, dotted, refuse_not_built, refused
+from torchpt.spec.validate import check_keys, dotted, refuse_not_built, refused
 
 __all__ = ["Described", "described", "refuse_foreign", "values_of"]
 
@@ -130,8 +128,18 @@ def values_of(
     """
     specs = parameters_of(kind)
     given = {name: value for name, value in raw.items() if value is not None}
-    made = construct(_model(_key(kind), texture), given, key, file, words or getattr(kind, "name", "") or kind.__name__)
-    values = {name: getattr(made, name) for name in specs}
+    check_keys(given, specs, key, words or getattr(kind, "name", "") or kind.__name__, file)
+    values: dict[str, Any] = {}
+    for name, spec in specs.items():
+        if name in given:
+            try:
+                values[name] = _read_value(spec, given[name], texture)
+            except Refused as error:
+                raise refused(error, dotted(key, name), given[name], file) from None
+        elif spec.default is REQUIRED:
+            raise SceneError(dotted(key, name), None, "a value (this key is required)", file)
+        else:
+            values[name] = None if callable(spec.default) else spec.default
     for name, spec in specs.items():
         if name not in given and callable(spec.default):
             values[name] = spec.default(values)
@@ -168,49 +176,22 @@ def refuse_foreign(what: str, table: Mapping[str, Any], raw: Any, default: str, 
             raise SceneError(dotted(what, key), value, expected, file)
 
 
-class _key:
-    """A kind as a key of the cache below: by identity, as instances of a user's own need not hash."""
+def _read_value(spec: Spec, value: Any, texture: ReadTexture | None) -> Any:
+    """Return the value of a parameter, or the texture that stands in its place.
 
-    def __init__(self, kind: Any) -> None:
-        self.kind = kind
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _key) and self.kind is other.kind
-
-    def __hash__(self) -> int:
-        return id(self.kind)
-
-
-@lru_cache(maxsize=256)
-def _model(key: _key, texture: ReadTexture | None) -> type[Model]:
-    """The pydantic model of a kind's parameters."""
-    fields: dict[str, Any] = {
-        name: (Annotated[Any, Check(_reader(spec, texture))], _default(spec))
-        for name, spec in parameters_of(key.kind).items()
-    }
-    return create_model("Parameters", __base__=Model, **fields)
-
-
-def _default(spec: Spec) -> Any:
-    if spec.default is REQUIRED:
-        return ...
-    return None if callable(spec.default) else spec.default
-
-
-def _reader(spec: Spec, texture: ReadTexture | None) -> Callable[[Any], Any]:
+    Raises:
+        Refused: it is not accepted.
+    """
     if isinstance(spec, Block):
-        return partial(_block, spec, texture)
-    if not spec.texture or texture is None:
-        return spec.read
-
-    def read(value: Any) -> Any:
+        return _block(spec, texture, value)
+    if spec.texture and texture is not None:
         if isinstance(value, str) and isinstance(spec, Map):
             value = {"texture": value}
         elif isinstance(value, np.ndarray) and value.ndim > 1:
             value = {"type": "image", "data": value}
-        return texture(value, spec) if isinstance(value, Mapping) else spec.read(value)
-
-    return read
+        if isinstance(value, Mapping):
+            return texture(value, spec)
+    return spec.read(value)
 
 
 def _block(spec: Block, texture: ReadTexture | None, value: Any) -> Described | None:
