@@ -31,7 +31,9 @@ class Described:
 
     kind: Any
     values: dict[str, Any]
-    given: frozenset[str] = field(default=frozenset(), metadata=UNPRINTED)  # a default that is stated is no other one
+    given: frozenset[str] = field(
+        default=frozenset(), repr=False, metadata=UNPRINTED
+    )  # a default that is stated is no other one
 
     @property
     def name(self) -> str:
