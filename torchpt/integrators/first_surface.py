@@ -80,7 +80,7 @@ class FirstSurfaceIntegrator(Integrator):
         search = Search(accel, world, plan.sampler, plan.dtype)
         slide = plan.attached or plan.dtype == torch.float64
         hit = search.nearest(state, 1)
-        tally.searched(state.lane)
+        tally.rays += len(state.lane)
         stages.met(1, state, hit)
         ends, groups = partition(world, hit)
         gather_light(stages, state, hit, ends, slide)
@@ -89,7 +89,7 @@ class FirstSurfaceIntegrator(Integrator):
             here, met = rows(state, index), rows(hit, index)
             radiance, shadow = first.shade(plan, world, model, here, met, salt, stages.pixel, slide)
             if shadow is not None:
-                tally.searched(here.lane)
+                tally.rays += len(here.lane)
                 radiance = torch.addcmul(radiance, shadow.radiance, search.clear(shadow))
             state.radiance.scatter_add_(1, index.expand(3, -1), radiance)
         return state.radiance

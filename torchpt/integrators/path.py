@@ -75,7 +75,7 @@ def trace(
 
     last = limits.max_depth if limits.max_depth >= 0 else ENDLESS
     while n and depth <= last:
-        tally.searched(state.lane)
+        tally.rays += len(state.lane)
         if hit is None:
             hit = search.nearest(state, depth)
         if stages.met(depth, state, hit):
@@ -88,7 +88,7 @@ def trace(
             for _, index in groups:
                 retire(index)
                 if limits.max_depth < 0:
-                    tally.cut(state.lane, index)
+                    tally.truncated += len(index)
         if depth == last or not groups:
             break
         salt = salts(depth, state.lane.device)
@@ -99,7 +99,7 @@ def trace(
                 model, limits.roulette(depth), slide, following, state, hit, index, salt
             )
             if shadow is not None:
-                tally.searched(state.lane, index)
+                tally.rays += len(index)
                 clear = search.clear(shadow)
                 stages.cleared(clear)
                 after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
