@@ -12,7 +12,6 @@ __all__ = [
     "OutputError",
     "RenderError",
     "SceneError",
-    "ShortageError",
     "TorchptError",
 ]
 
@@ -96,10 +95,6 @@ class OutputError(TorchptError):
 
 class RenderError(TorchptError):
     """A render that could not be carried out as asked (device, compiler, strict mode)."""
-
-
-class ShortageError(RenderError):
-    """There is not enough memory."""
 
 
 class LostRankError(RenderError):

@@ -78,7 +78,7 @@ def sah_cost(tree: Tree) -> float:
 def _intersect(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return traverse.intersect(o, d, t_max, traverse.Nodes(tensors, counts, depth))
+    return traverse.intersect(o, d, t_max, tensors, counts, depth)
 
 
 @operator(
@@ -86,4 +86,4 @@ def _intersect(
     lambda o, d, t_max, *scene: torch.empty_like(t_max, dtype=torch.bool),
 )
 def _occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> Tensor:
-    return traverse.occluded(o, d, t_max, traverse.Nodes(tensors, counts, depth))
+    return traverse.occluded(o, d, t_max, tensors, counts, depth)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,9 +16,6 @@ from torchpt.integrators.stages import Plan
 from torchpt.integrators.tally import Tally
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import salts
-
-if TYPE_CHECKING:
-    from torchpt.accel.forest import Forest
 
 __all__ = ["FirstSurface", "FirstSurfaceIntegrator"]
 
@@ -72,9 +68,7 @@ class FirstSurfaceIntegrator(Integrator):
 
     looped = True
 
-    def radiance(
-        self, stages: Stages, accel: Accel | Forest, state: PathState, first: FirstSurface, tally: Tally
-    ) -> Tensor:
+    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: FirstSurface, tally: Tally) -> Tensor:
         """See :class:`Integrator`."""
         plan, world = stages.plan, stages.world
         search = Search(accel, world, plan.sampler, plan.dtype)

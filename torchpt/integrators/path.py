@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -24,9 +23,6 @@ from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, joined
 from torchpt.samplers import salts
 
-if TYPE_CHECKING:
-    from torchpt.accel.forest import Forest
-
 __all__ = ["ENDLESS", "Limits", "PathIntegrator", "gather_light", "partition", "slides", "trace"]
 
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
@@ -39,7 +35,7 @@ class PathIntegrator(Integrator):
 
     looped = True
 
-    def radiance(self, stages: Stages, accel: Accel | Forest, state: PathState, first: None, tally: Tally) -> Tensor:
+    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: None, tally: Tally) -> Tensor:
         """See :class:`Integrator`."""
         return trace(stages, self.limits, accel, state, tally)
 
@@ -47,7 +43,7 @@ class PathIntegrator(Integrator):
 def trace(
     stages: Stages,
     limits: Limits,
-    accel: Accel | Forest,
+    accel: Accel,
     state: PathState,
     tally: Tally,
     lanes: int | None = None,
