@@ -153,8 +153,6 @@ class Lights:
         Tensor | None
     )  # (K, 14) float64, see torchpt.lights.solid_angle.table_of; None without triangles and rectangles
     shapes: tuple[int, ...]  # codes of the shapes in `solid`; static
-    #: (S,) int64 the first row of each scene, in a world of several; None: there is one
-    first: Tensor | None = None
 
 
 @dataclass(frozen=True)
