@@ -29,7 +29,7 @@ def intersect(
 
 
 def occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> Tensor:
-    """Whether anything is hit."""
+    """Return True where a ray hits anything; arguments as for :func:`intersect`."""
     blocked = torch.zeros_like(t_max, dtype=torch.bool)
     for lanes in _live(o, d, t_max):
         hit, _ = _Wave(o, d, t_max, lanes, tensors, counts, depth).run(any_hit=True)

@@ -89,7 +89,7 @@ def _beside(crew: Together[Entry]) -> Iterator[None]:
 
 @contextmanager
 def _blamed(entry: Entry) -> Iterator[None]:
-    """Errors within are told to an entry."""
+    """Tell an entry of the errors within."""
     try:
         yield
     except Exception as error:

@@ -1,4 +1,4 @@
-"""What waves did, counted."""
+"""Counts of what waves trace."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["Tally"]
 
 @dataclass
 class Tally:
-    """What waves did.
+    """Counts of rays and paths.
 
     Attributes:
         rays: that were searched for, those of shadows too.
