@@ -131,11 +131,11 @@ FAULTS = (
     # -- lights
     Fault(
         "environment_chance_of_first",
-        "math/distributions.py",
+        "lights/choice.py",
         "lights math",
-        "Discrete.chance_of_last",
-        "self.pmf[-1]",
-        "self.pmf[0]",
+        "environment",
+        "chosen.pmf[-1]",
+        "chosen.pmf[0]",
         "a scene with an environment and other lights: MIS weighs rays that escape by the chance of another light",
     ),
     Fault(

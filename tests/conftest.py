@@ -26,22 +26,6 @@ def _little_to_collect() -> None:
     gc.freeze()
 
 
-@pytest.fixture
-def waves(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """Of how many renders and of how many scenes each wave of tensor operations was that renders shared."""
-    from torchpt.forward import crowd
-
-    found, take = [], crowd.take
-
-    def watched(works):
-        pieces = take(works)  # what fails is no wave
-        found.append((len(works), len({id(work.wave.stages.world) for work in works})))
-        return pieces
-
-    monkeypatch.setattr(crowd, "take", watched)
-    return found
-
-
 def pytest_sessionfinish() -> None:
     """What ends with the process is to be collected then."""
     gc.unfreeze()

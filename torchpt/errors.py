@@ -15,7 +15,6 @@ __all__ = [
     "OutputError",
     "RenderError",
     "SceneError",
-    "ShortageError",
     "TorchptError",
     "warn_caller",
 ]
@@ -100,10 +99,6 @@ class OutputError(TorchptError):
 
 class RenderError(TorchptError):
     """A render that could not be carried out as asked (device, compiler, strict mode)."""
-
-
-class ShortageError(RenderError):
-    """There is not enough memory."""
 
 
 class LostRankError(RenderError):

@@ -7,7 +7,7 @@ Directions (pbrt): ``wo`` points toward the previous vertex, ``wi`` toward the n
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from torchpt.core.tree import map_leaves
 from torchpt.math.vectors import take
@@ -153,17 +153,11 @@ class Lights:
         Tensor | None
     )  # (K, 14) float64, see torchpt.lights.solid_angle.table_of; None without triangles and rectangles
     shapes: tuple[int, ...]  # codes of the shapes in `solid`; static
-    #: (S,) int64 the first row of each scene, in a world of several (torchpt.union); None: there is one
-    first: Tensor | None = None
 
 
 @dataclass(frozen=True)
 class LaneGeometry:
     """Where surfaces lie, as the lanes gather it: P primitives, and I copies (see :class:`Copies`)."""
-
-    counted: ClassVar = (
-        "counts",
-    )  # of what is static, here and below: what worlds that are joined need not have alike
 
     kinds: tuple[type[Primitive], ...]  # those that there are, in the order of KINDS; static
     counts: tuple[int, int, int, int, int]  # as in Geometry; static: lanes read `ends`
@@ -332,7 +326,6 @@ class Shadow:
     d: Tensor  # (3, N)
     t_max: Tensor  # (N,) in units of |d|; 0 where the light brings nothing
     radiance: Tensor  # (3, N)
-    scene: Tensor | None = None  # (N,) as of the paths
 
 
 @dataclass(frozen=True)
@@ -352,7 +345,6 @@ class PathState:
     #: same everywhere.
     p: Tensor | None = None
     n: Tensor | None = None
-    scene: Tensor | None = None  # (N,) int64 which scene of several; None: there is one
 
 
 T = TypeVar("T")

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import torch
 
-from torchpt.errors import ShortageError, TorchptError
+from torchpt.errors import RenderError, TorchptError
 from torchpt.native.memory import Meter, after_import, mb
 
 __all__ = ["needing", "ran_out"]
@@ -48,7 +48,7 @@ def needing(what: str | Callable[[], str]) -> Iterator[None]:
     """Context that says in a line what it was for that there is not enough memory: a text, or what makes one.
 
     Raises:
-        ShortageError: there is not.
+        RenderError: there is not.
     """
     try:
         yield
@@ -59,4 +59,4 @@ def needing(what: str | Callable[[], str]) -> Iterator[None]:
         return
     held = Meter(torch.device("cpu")).now() - after_import()
     told = what if isinstance(what, str) else what()
-    raise ShortageError(f"not enough memory for {told}, with {mb(max(held, 0))} held already")
+    raise RenderError(f"not enough memory for {told}, with {mb(max(held, 0))} held already")

@@ -248,18 +248,3 @@ def test_a_lane_without_a_place_draws_some_light():
 def test_two_numbers_are_one_of_48_bits():
     u = tree.fine(torch.tensor([[0.5, 1 - 2**-24], [0.25, 1 - 2**-24]]))
     assert u.tolist() == [0.5 + 2**-26, 1 - 2**-48]
-
-
-@pytest.mark.parametrize("tensors", (True, False), ids=("tensors", "kernel"))
-def test_several_trees_are_each_its_own(monkeypatch, tensors):
-    if tensors:  # as on CUDA
-        monkeypatch.setattr(tree, "tracing", lambda: True)
-    built = [tree.build(**emitters(case)) for case in ("nine", "one", "some dark", "lopsided")]
-    every, of = tree.joined(built), torch.randint(len(built), (4000,), generator=G)
-    (x, n), u = points(4000), tree.fine(uniform(2, 4000))
-    found = *tree.sample(every, x, n, u, of), tree.probability(every, tree.sample(every, x, n, u, of)[0], x, n, of)
-    for number, own in enumerate(built):
-        mine = of == number
-        row, p, rest = tree.sample(own, x[:, mine], n[:, mine], u[mine])
-        expected = row, p, rest, tree.probability(own, row, x[:, mine], n[:, mine])
-        assert all(torch.equal(a[mine], b) for a, b in zip(found, expected, strict=True))

@@ -13,7 +13,8 @@ import torch
 import torchpt
 from torchpt import accel
 from torchpt.errors import RenderError, SceneError
-from torchpt.forward import Run
+from torchpt.forward import Run, run
+from torchpt.integrators import path
 from torchpt.integrators.loop import chunk, programs
 from torchpt.integrators.loop import kernels as loop_kernels
 from torchpt.scene import scene as scenes_room
@@ -209,6 +210,108 @@ def test_layers():
     assert repr(batch) == "Renderings(2 x 2 x 16 x 24 x 3; layers: depth, albedo, variance)"
 
 
+# -- by tensor operations: one picture after another
+
+FACTS = ("rays", "paths", "spp", "truncated_paths", "nonfinite_samples", "clamped", "stopped_by", "complete")
+#: The last one looks past everything.
+VIEWS = [*BLOCKS, {"type": "perspective", "origin": [0, 1, 4], "target": [0, 1, 9]}]
+
+
+@pytest.mark.parametrize(
+    "wishes",
+    (
+        {},
+        {"film": {"aovs": ["depth", "albedo", "variance"], "filter": "mitchell", "crop": [4, 2, 14, 10]}},
+        {"integrator": {"type": "path", "light_choice": "tree", "clamp": 0.4}, "dtype": torch.float64},
+        {"integrator": "ibl"},
+        {"integrator": "aov", "film": {"aovs": ["normal", "object_id"]}},
+    ),
+    ids=str,
+)
+def test_pictures_by_tensor_operations(wishes):
+    scenes, wishes = [room(0.2), tetrahedron()], {"compile": "off", "full": True, **wishes}
+    seeds = [[3, 1, 4, 1], [5, 9, 2, 6]]
+    batch = torchpt.render_batch(scenes, VIEWS, seed=seeds, **wishes)
+    for s, scene in enumerate(scenes):
+        for c, block in enumerate(VIEWS):
+            alone, own = torchpt.render(scene.seen_by(block), seed=seeds[s][c], **wishes), batch[s, c]
+            assert torch.equal(own.image, alone.image) and own.layers.keys() == alone.layers.keys()
+            assert all(torch.equal(own.layers[name], alone.layers[name]) for name in own.layers)
+            assert [getattr(own, fact) for fact in FACTS] == [getattr(alone, fact) for fact in FACTS]
+            assert own.rays > 0
+
+
+def test_views_and_parameters_of_the_camera():
+    scene, angles = room(), torch.tensor([30.0, 40.0])
+    for compiled in ("off", "on"):
+        views = torchpt.render_batch([scene.seen_by(block) for block in BLOCKS], compile=compiled)
+        for block, picture in zip(BLOCKS, views, strict=True):
+            assert torch.equal(picture[0], torchpt.render(scene.seen_by(block), compile=compiled))
+        zoomed = torchpt.render_batch(scene, params={"camera.fov": angles}, compile=compiled)
+        for angle, picture in zip(angles, zoomed, strict=True):
+            assert torch.equal(picture[0], torchpt.render(scene, params={"camera.fov": angle}, compile=compiled))
+
+
+def test_textures_that_average_over_the_footprints_of_each_camera():
+    floor = {"type": "image", "data": torch.rand(8, 8, 3), "filter": "trilinear"}
+    scene = room(materials={"grey": {"type": "diffuse", "reflectance": floor}})
+    cameras = [BLOCKS[0], {**BLOCKS[0], "fov": 4}]
+    batch = torchpt.render_batch(scene, cameras, compile="off")
+    for picture, block in zip(batch[0], cameras, strict=True):
+        assert torch.equal(picture, torchpt.render(scene.seen_by(block), compile="off"))
+
+
+def test_pictures_with_and_without_kernels():
+    scenes = [room(0.1 * k, render={"spp": 3, "threads": 1, "compile": way}) for k, way in enumerate(("on", "off") * 2)]
+    for scene, picture in zip(scenes, torchpt.render_batch(scenes), strict=True):
+        assert torch.equal(picture[0], torchpt.render(scene))
+
+
+def test_paths_that_are_cut_are_counted_by_picture(monkeypatch):
+    monkeypatch.setattr(path, "ENDLESS", 4)
+    scene, wishes = room(), {"integrator": {"type": "path", "max_depth": -1, "rr_depth": 99}, "compile": "off"}
+    batch = torchpt.render_batch(scene, VIEWS, full=True, **wishes)
+    found = [batch[0, c].truncated_paths for c in range(4)]
+    alone = [torchpt.render(scene.seen_by(block), full=True, **wishes).truncated_paths for block in VIEWS]
+    assert found == alone and len(set(found)) > 2
+
+
+def test_scenes_by_tensor_operations_are_rendered_before_the_next_is_loaded():
+    told = []
+
+    def scenes():
+        for k in range(3):
+            told.append(f"load {k}")
+            yield room(0.1 * k)
+
+    torchpt.render_batch(scenes(), BLOCKS[:2], compile="off", on_progress=lambda done, total: told.append(done))
+    assert told == ["load 0", 1, 2, "load 1", 3, 4, "load 2", 5, 6]
+
+
+def test_memory_that_runs_out_by_tensor_operations(monkeypatch):
+    scenes = [room(0.2), room(0.3)]
+    expected = torchpt.render_batch(scenes, compile="off")
+    plain, taken = run.take, []
+
+    def limited(wave, plate, light, span):
+        if span[1] * span[3] > 500:
+            raise MemoryError
+        taken.append(span)
+        return plain(wave, plate, light, span)
+
+    monkeypatch.setattr(run, "take", limited)
+    assert torch.equal(torchpt.render_batch(scenes, compile="off"), expected) and len(taken) > 4
+
+
+def test_samples_that_are_not_finite_are_those_of_their_picture():
+    scenes = [tetrahedron(), tetrahedron(0.5), tetrahedron(0.7)]
+    scenes[1].params["lights.sky.radiance"].fill_(float("nan"))
+    scenes[1].check_own = lambda: None  # which refuses that
+    for compiled in ("off", "on"):
+        batch = torchpt.render_batch(scenes, compile=compiled, full=True)
+        assert [batch[s, 0].nonfinite_samples > 0 for s in range(3)] == [False, True, False]
+
+
 # -- gradients
 
 
@@ -385,19 +488,35 @@ def test_no_scenes_and_films_of_other_sizes():
         torchpt.render_batch([room(), room(film={"width": 8, "height": 8})])
 
 
-@pytest.mark.parametrize("threads", (1, 2))
-def test_an_error_names_its_scene(threads):
+@pytest.mark.parametrize(("threads", "compiled"), ((1, "auto"), (2, "auto"), (1, "off")))
+def test_an_error_names_its_scene(threads, compiled):
     bad = room()
     bad.params["shapes.lamp.emission"].fill_(float("nan"))
     bad.check_own = lambda: None  # which refuses that
     scenes = [room(), room(0.1), bad, room(0.2)]
-    wish = {"integrator": {"type": "path", "strict": True}, "threads": threads}
+    wish = {"integrator": {"type": "path", "strict": True}, "threads": threads, "compile": compiled}
     with pytest.raises(RenderError, match=r"^scenes\[2\]: integrator\.strict: sample"):
         torchpt.render_batch(scenes, **wish)
     moved = room()
     moved.params["shapes.ball.to_world"][0, 3] = float("inf")
     with pytest.raises(SceneError, match=r"^scenes\[1\]\.params\.shapes\.ball\.to_world: expected numbers finite"):
-        torchpt.render_batch([room(), moved], threads=threads)
+        torchpt.render_batch([room(), moved], threads=threads, compile=compiled)
+
+
+@pytest.mark.parametrize("compiled", ("auto", "off"))
+def test_an_error_names_its_parameters(monkeypatch, compiled):
+    scene, took = room(), Run.took
+
+    def failing(self, share):
+        if float(self.wave.camera.to_world[0, 3]) > 1.5:
+            raise RenderError("broken")
+        return took(self, share)
+
+    monkeypatch.setattr(Run, "took", failing)
+    given = poses(scene, 3)
+    given[2, 0, 3] = 2.0
+    with pytest.raises(RenderError, match=r"^params\[2\]: broken"):
+        torchpt.render_batch(scene, params={"camera.to_world": given}, compile=compiled)
 
 
 @pytest.mark.parametrize(("key", "value"), [("aovs", ["depth"]), ("denoise", True)])

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.records import Geometry
 
-__all__ = ["Accel", "Array", "Hits", "as_rays", "closer"]
+__all__ = ["Accel", "Array", "Hits", "closer"]
 
 #: A numpy array, float32 or int32.
 Array = np.ndarray[Any, Any]
@@ -36,12 +36,12 @@ class Accel(ABC):
     @torch.no_grad()
     def intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
         """The nearest hit of each ray: ``t, prim, u, v``, each ``(N,)``."""
-        return self._intersect(*as_rays(o, d, t_max))
+        return self._intersect(*_rays(o, d, t_max))
 
     @torch.no_grad()
     def occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
         """Whether anything lies in the open interval ``(0, t_max)``: ``(N,)`` bool."""
-        return self._occluded(*as_rays(o, d, t_max))
+        return self._occluded(*_rays(o, d, t_max))
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """The nearest hits of the first ``count`` rays of arrays, for loops outside of torch.
@@ -111,6 +111,5 @@ def closer(out: Array, non_opaque: Array | None) -> None:
         np.left_shift(out, 1, out=out)
 
 
-def as_rays(o: Tensor, d: Tensor, t_max: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rays as searches take them: float32, detached, contiguous."""
+def _rays(o: Tensor, d: Tensor, t_max: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return tuple(x.detach().to(torch.float32).contiguous() for x in (o, d, t_max))  # type: ignore[return-value]

@@ -43,14 +43,11 @@ class Lbvh(Accel):
     def _tensors(self) -> list[Tensor]:
         return [self.corners, self.rows, self.quadrics, self.tree.children, self.tree.boxes, self.tree.order]
 
-    def _nodes(self) -> traverse.Nodes:
-        return traverse.Nodes(self._tensors(), self.counts, self.tree.depth)
-
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        return traverse.intersect(o, d, t_max, self._nodes())
+        return traverse.intersect(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
 
     def _occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        return traverse.occluded(o, d, t_max, self._nodes())
+        return traverse.occluded(o, d, t_max, self._tensors(), self.counts, self.tree.depth)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`."""

@@ -2,57 +2,37 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from torchpt.accel.leaf import Rays, distances, prepare_rays
 
-__all__ = ["NONE", "Nodes", "intersect", "occluded"]
+__all__ = ["intersect", "occluded"]
 
 #: Lanes that travel together; bounds memory to some 100 MB.
 CHUNK = 1 << 18
-#: No node.
-NONE = 1 << 30
+_DONE = 1 << 30
 #: Boxes are enlarged by 16 ulps of the distance: the slabs' own error is 3 (Ize, "Robust BVH Ray Traversal", 2013).
 _SLACK = 1.0 + 2.0**-20
 
 
-class Nodes(NamedTuple):
-    """What rays travel through: one tree, or several one after another.
-
-    Attributes:
-        tensors: as :class:`torchpt.accel.lbvh.Lbvh` has them.
-        counts: primitives of each kind.
-        depth: of the deepest tree.
-    """
-
-    tensors: list[Tensor]
-    counts: list[int]
-    depth: int
-
-
 def intersect(
-    o: Tensor, d: Tensor, t_max: Tensor, nodes: Nodes, root: Tensor | None = None
+    o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Nearest hits.
-
-    ``root (N,)`` int64: the node that each ray begins at, :data:`NONE` where it meets nothing; None: node 0.
-    """
+    """Nearest hits; arguments as :class:`torchpt.accel.lbvh.Lbvh` holds them."""
     t, prim = torch.full_like(t_max, torch.inf), torch.full_like(t_max, -1, dtype=torch.int32)
     u, v = torch.zeros_like(t_max), torch.zeros_like(t_max)
     for lanes in _live(o, d, t_max):
-        hit, found = _Wave(o, d, t_max, lanes, nodes, root).run(any_hit=False)
+        hit, found = _Wave(o, d, t_max, lanes, tensors, counts, depth).run(any_hit=False)
         t[hit], prim[hit], u[hit], v[hit] = found[0], found[1].int(), found[2], found[3]
     return t, prim, u, v
 
 
-def occluded(o: Tensor, d: Tensor, t_max: Tensor, nodes: Nodes, root: Tensor | None = None) -> Tensor:
-    """Whether anything is hit; see :func:`intersect`."""
+def occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int) -> Tensor:
+    """Return True where a ray hits anything; arguments as for :func:`intersect`."""
     blocked = torch.zeros_like(t_max, dtype=torch.bool)
     for lanes in _live(o, d, t_max):
-        hit, _ = _Wave(o, d, t_max, lanes, nodes, root).run(any_hit=True)
+        hit, _ = _Wave(o, d, t_max, lanes, tensors, counts, depth).run(any_hit=True)
         blocked[hit] = True
     return blocked
 
@@ -66,24 +46,26 @@ def _live(o: Tensor, d: Tensor, t_max: Tensor) -> list[Tensor]:
 class _Wave:
     """The state of the lanes that still travel, and the hits of those that do not."""
 
-    def __init__(self, o: Tensor, d: Tensor, t_max: Tensor, lanes: Tensor, nodes: Nodes, root: Tensor | None) -> None:
-        self.corners, self.rows, self.quadrics, self.children, self.boxes, self.order = nodes.tensors
-        self.counts = nodes.counts
+    def __init__(
+        self, o: Tensor, d: Tensor, t_max: Tensor, lanes: Tensor, tensors: list[Tensor], counts: list[int], depth: int
+    ) -> None:
+        self.corners, self.rows, self.quadrics, self.children, self.boxes, self.order = tensors
+        self.counts = counts
         self.lanes = lanes
         self.rays = prepare_rays(o[:, lanes], d[:, lanes])
         self.t = t_max[lanes].clone()
         self.prim = torch.full_like(lanes, -1)
         self.u, self.v = torch.zeros_like(self.t), torch.zeros_like(self.t)
-        self.node = torch.full_like(lanes, 0 if self.children.shape[1] else NONE) if root is None else root[lanes]
+        self.node = torch.full_like(lanes, 0 if self.children.shape[1] else _DONE)
         self.top = torch.zeros_like(lanes)  # entries on the stack
-        self.stack = torch.full((nodes.depth + 1, len(lanes)), NONE, dtype=torch.int32, device=lanes.device)
+        self.stack = torch.full((depth + 1, len(lanes)), _DONE, dtype=torch.int32, device=lanes.device)
         self.finished: list[tuple[Tensor, ...]] = []
 
     def run(self, any_hit: bool) -> tuple[Tensor, list[Tensor]]:
         """Travels to the end: places of the rays that hit, and their ``t, prim, u, v``."""
         step = 0
         while True:
-            inner = torch.nonzero((self.node >= 0) & (self.node < NONE))[:, 0]
+            inner = torch.nonzero((self.node >= 0) & (self.node < _DONE))[:, 0]
             leaf = torch.nonzero(self.node < 0)[:, 0]
             live = inner.numel() + leaf.numel()
             if live == 0:
@@ -106,7 +88,7 @@ class _Wave:
 
     def _compact(self) -> None:
         """Puts finished lanes aside."""
-        done = self.node == NONE
+        done = self.node == _DONE
         self._retire(done)
         keep = torch.nonzero(~done)[:, 0]
         self.rays = self.rays.take(keep)
@@ -146,7 +128,7 @@ class _Wave:
         self.t[won], self.prim[won], self.u[won], self.v[won] = t[better], prim[better], u[better], v[better]
         self.node[lanes] = self._pop(lanes)
         if any_hit:
-            self.node[won] = NONE
+            self.node[won] = _DONE
 
 
 def _slabs(ray: Rays, box: Tensor, t_max: Tensor) -> tuple[Tensor, Tensor]:

@@ -58,13 +58,12 @@ class Renderings:
 
 @dataclass(frozen=True)
 class _Picture:
-    """One picture of a batch: where it belongs, its name in errors, what is asked for; the last one of its world or not."""
+    """One picture of a batch: where it belongs, its name in errors, what is asked for."""
 
     scene: int
     camera: int
     name: str
     order: Order
-    last: bool
 
 
 Pictures = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
@@ -94,9 +93,8 @@ def render_batch(
 
     Picture ``[s, c]`` is to the bit ``torchpt.render(scenes[s].seen_by(cameras[c]), params=..., seed=...)``. Threads share one
     list of work over all pictures, and what is next is made ready while they trace. Worlds, search structures and kernels are
-    made once for all cameras of a scene. By tensor operations (on CUDA above all) pictures of a scene share waves, and those of
-    scenes of one form. One after another are rendered all that a time or an error ends, in bounded memory, or by several
-    ``ranks`` (which share each picture's pixels).
+    made once for all cameras of a scene. Pictures by tensor operations (as on CUDA) are rendered one after another; so are all
+    that a time or an error ends, in bounded memory, or by several ``ranks`` (which share each picture's pixels).
 
     Args:
         scenes: from :func:`torchpt.load`: a sequence, or an iterator that loads them (while others are rendered), of any kinds,
@@ -195,8 +193,7 @@ def _pictures(
                 for key, value in asked.items():
                     if value != like[key]:
                         raise SceneError(f"film.{key}", value, f"{like[key]}, as of the first picture")
-            moves = not several or any(not key.startswith("camera.") for key in order.params)
-            yield _Picture(s, c, name, order, moves and c == len(cameras) - 1)
+            yield _Picture(s, c, name, order)
 
 
 def _ordered(
@@ -254,7 +251,7 @@ def _entries(
             with named(picture.name, None):
                 raise error
 
-        return Entry(order.scene.device, make, done, failed, picture.last)
+        return Entry(order.scene.device, make, done, failed)
 
     return map(entry, pictures)
 

@@ -2,16 +2,15 @@
 
 ``wave`` makes what all waves of a render share, ``stopping`` says how many samples are next, ``waves`` cuts them into pieces as
 large as memory lets them be (``budget``), ``piece`` computes one, ``run`` adds them up, ``twice`` samples pilots and
-``adaptive`` sends samples where they say, ``many`` renders several at once (``crowd``: by waves that they share), ``kept`` is
-what renders of a scene leave for the next one.
+``adaptive`` sends samples where they say, ``many`` renders several at once, ``kept`` is what renders of a scene leave
+for the next one.
 """
 
 from __future__ import annotations
 
-from torchpt.forward.crowd import Entry
 from torchpt.forward.entry import render_scene
 from torchpt.forward.kept import Kept, kept
-from torchpt.forward.many import render_many
+from torchpt.forward.many import Entry, render_many
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.run import Run
 from torchpt.forward.schedule import BYTES_PER_LANE, budget_of

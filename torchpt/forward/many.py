@@ -1,24 +1,19 @@
-"""Several renders at once: their samples are one work list, and what is next is made ready while threads trace.
-
-By tensor operations, as on CUDA, pictures of several cameras and scenes share their waves.
-"""
+"""Several renders at once: their samples are one work list, and what is next is made ready while threads trace."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
 
 import torch
 
-from torchpt.errors import ShortageError
-from torchpt.forward.crowd import Crowd, Entry, blamed
+from torchpt.forward.result import Rendering
+from torchpt.forward.run import Run
 from torchpt.integrators.loop.together import Job, Together
-from torchpt.integrators.plate import Plate
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.threads import one_thread
-from torchpt.native.memory import let_go
 from torchpt.native.modes import undisturbed
-from torchpt.shortage import ran_out
 
 __all__ = ["Entry", "render_many"]
 
@@ -26,12 +21,30 @@ __all__ = ["Entry", "render_many"]
 AHEAD = 2
 
 
+@dataclass
+class Entry:
+    """A render of several.
+
+    Attributes:
+        device: where it is rendered.
+        make: makes it ready for a number of threads; called when it is soon to begin.
+        done: told of the rendering.
+        failed: told of an error instead, which it may raise as another one.
+        run: once it is ready.
+    """
+
+    device: torch.device
+    make: Callable[[int], Run]
+    done: Callable[[Rendering], None]
+    failed: Callable[[BaseException], None]
+    run: Run = field(init=False)
+
+
 def render_many(entries: Iterable[Entry], tasks: int) -> None:
     """Render them, each to the very bits that it has alone.
 
-    Of renders which nothing but their number of samples ends, those that the compiled loop takes share threads and a work list,
-    and those by tensor operations (on CUDA above all) share waves, where they follow each other and are
-    :func:`torchpt.forward.shared.alike`. Others are rendered one after another: to a time or an error, in bounded memory.
+    Renders that the compiled loop takes, and that nothing but their number of samples ends, share threads and a work list.
+    Others are rendered one after another: by tensor operations (as on CUDA), to a time or an error, in bounded memory.
 
     Args:
         entries: what is to be rendered; taken one by one.
@@ -40,7 +53,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
     Raises:
         Exception: what an entry's ``failed`` raises; the others are given up then.
     """
-    crew, crowd = Together[Entry](torch.get_num_threads()), Crowd()
+    crew = Together[Entry](torch.get_num_threads())
     waiting = iter(entries)
     try:
         while True:
@@ -48,44 +61,23 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 entry = next(waiting, None)
             if entry is None:
                 break
-            spans = _ready(entry, crew, crowd)
+            with undisturbed(entry.device), _blamed(entry), _beside(crew):
+                entry.run = entry.make(crew.threads)
+                spans = entry.run.at_once()
             if spans is None:
                 _drain(crew, 0)
-                crowd.add(entry)
+                with undisturbed(entry.device), _blamed(entry):
+                    entry.done(entry.run.go(None))
+                del entry.run
                 continue
-            crowd.settle()
-            with blamed(entry):
+            with _blamed(entry):
                 loop = entry.run.loop
                 assert loop is not None
                 crew.add(Job(entry, loop, loop.blocks(spans, tasks)))
             _drain(crew, AHEAD * crew.threads * tasks)
         _drain(crew, 0)
-        crowd.settle()
     finally:
         crew.close()
-
-
-def _ready(entry: Entry, crew: Together[Entry], crowd: Crowd) -> list[tuple[Plate, int, int]] | None:
-    """Make a render ready; its samples, where the compiled loop takes all of them at once.
-
-    Where memory runs out, those that wait are done first.
-    """
-
-    def ready() -> list[tuple[Plate, int, int]] | None:
-        with undisturbed(entry.device), _beside(crew):
-            entry.run = entry.make(crew.threads)
-            return entry.run.at_once()
-
-    with blamed(entry):
-        try:
-            return ready()
-        except Exception as error:
-            if not crowd or not (isinstance(error, ShortageError) or ran_out(error)):
-                raise
-    crowd.settle()
-    let_go()
-    with blamed(entry):
-        return ready()
 
 
 @contextmanager
@@ -93,6 +85,16 @@ def _beside(crew: Together[Entry]) -> Iterator[None]:
     """While all cores trace, tensor operations of this thread are its own: a team would wait for a core, and spin meanwhile."""
     with one_thread() if crew.pending else nullcontext():
         yield
+
+
+@contextmanager
+def _blamed(entry: Entry) -> Iterator[None]:
+    """Tell an entry of the errors within."""
+    try:
+        yield
+    except Exception as error:
+        entry.failed(error)
+        raise
 
 
 def _drain(crew: Together[Entry], most: int) -> None:
@@ -105,7 +107,7 @@ def _drain(crew: Together[Entry], most: int) -> None:
             continue
         job, share = found
         entry = job.owner
-        with undisturbed(entry.device), blamed(entry), _beside(crew):
+        with undisturbed(entry.device), _blamed(entry), _beside(crew):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
                 job.loop.halt()

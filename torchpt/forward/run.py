@@ -18,7 +18,7 @@ from torchpt.forward.causes import told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.need import loaded, need_of, shape_of
 from torchpt.forward.picture import final, rendering_of
-from torchpt.forward.piece import Work, take
+from torchpt.forward.piece import take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.resume import check_samples, check_whole
 from torchpt.forward.room import check_room
@@ -139,15 +139,11 @@ class Run:
 
         None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
         """
-        if self.loop is None or not self.only_counts():
+        ends = self.keeps or self.stop.open or self.twice is not None or self.split is not None
+        if self.loop is None or ends or self.settings.render.max_memory is not None:
             return None
         self.begun = time.perf_counter()
         return [(self.picture, 0, self.settings.render.spp)]
-
-    def only_counts(self) -> bool:
-        """Whether nothing but their number ends its samples, and memory is not bounded."""
-        open_ended = self.keeps or self.stop.open or self.twice is not None
-        return not open_ended and self.split is None and self.settings.render.max_memory is None
 
     def completed(self, rest: list[Block]) -> Rendering:
         """The picture of samples that were taken at once, but for the blocks for which there was no memory."""
@@ -382,7 +378,7 @@ class Run:
 
     def _piece(self, plate: Plate, span: Span) -> None:
         """A piece by tensor operations: all of it, or nothing where it raises."""
-        (piece,) = take([Work(self.wave, plate, self.light, span)])
+        piece = take(self.wave, plate, self.light, span)
         self._count(piece.lost)
         piece.write()
         self.tally.rays += piece.tally.rays

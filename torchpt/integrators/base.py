@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchpt.accel import Accel
-    from torchpt.accel.forest import Forest
     from torchpt.integrators.first_surface import FirstSurface
     from torchpt.integrators.stage_runner import Stages
     from torchpt.integrators.tally import Tally
@@ -105,12 +104,12 @@ class Integrator(Valued):
         """What happens at first surfaces, made once a scene and differentiable in its world; None where paths go on."""
         return None
 
-    def radiance(self, stages: Stages, accel: Accel | Forest, state: PathState, first: Any, tally: Tally) -> Tensor:
+    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: Any, tally: Tally) -> Tensor:
         """What camera rays bring.
 
         Args:
             stages: bound to the scene.
-            accel: the search; a forest where lanes are in several scenes (``state.scene``).
+            accel: the search.
             state: camera rays, ``state.radiance`` zero; N lanes.
             first: of :meth:`first`.
             tally: counts what it takes.

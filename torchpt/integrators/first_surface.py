@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,9 +16,6 @@ from torchpt.integrators.stages import Plan
 from torchpt.integrators.tally import Tally
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import salts
-
-if TYPE_CHECKING:
-    from torchpt.accel.forest import Forest
 
 __all__ = ["FirstSurface", "FirstSurfaceIntegrator"]
 
@@ -72,15 +68,13 @@ class FirstSurfaceIntegrator(Integrator):
 
     looped = True
 
-    def radiance(
-        self, stages: Stages, accel: Accel | Forest, state: PathState, first: FirstSurface, tally: Tally
-    ) -> Tensor:
+    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: FirstSurface, tally: Tally) -> Tensor:
         """See :class:`Integrator`."""
         plan, world = stages.plan, stages.world
         search = Search(accel, world, plan.sampler, plan.dtype)
         slide = plan.attached or plan.dtype == torch.float64
         hit = search.nearest(state, 1)
-        tally.searched(state.lane)
+        tally.rays += len(state.lane)
         stages.met(1, state, hit)
         ends, groups = partition(world, hit)
         gather_light(stages, state, hit, ends, slide)
@@ -89,7 +83,7 @@ class FirstSurfaceIntegrator(Integrator):
             here, met = rows(state, index), rows(hit, index)
             radiance, shadow = first.shade(plan, world, model, here, met, salt, stages.pixel, slide)
             if shadow is not None:
-                tally.searched(here.lane)
+                tally.rays += len(here.lane)
                 radiance = torch.addcmul(radiance, shadow.radiance, search.clear(shadow))
             state.radiance.scatter_add_(1, index.expand(3, -1), radiance)
         return state.radiance

@@ -53,7 +53,7 @@ def shade(
         reflected = kind.eval(surface.parameters, surface.wo, wi)
     weight = held_back(weight, world, model, at, surface, light.wi, wi)
     radiance = state.throughput * reflected * light_radiance(world, light) * weight
-    return surface, _shadow_ray(plan, world, state, at, light, radiance, weight)
+    return surface, _shadow_ray(plan, world, at, light, radiance, weight)
 
 
 def held_back(
@@ -85,7 +85,7 @@ def sample_light(
     """A point on the lights for each surface point."""
     assert world.lights is not None
     x, which, numbers, n = light_wish(plan, world, model, state, at, surface, salts)
-    return lights.sample(world.lights, x, which, numbers, OFFSET, n, plan.strategy == "mis", state.scene)
+    return lights.sample(world.lights, x, which, numbers, OFFSET, n, plan.strategy == "mis")
 
 
 def light_wish(
@@ -120,13 +120,7 @@ def light_radiance(world: World, light: LightSample) -> Tensor:
 
 
 def _shadow_ray(
-    plan: Plan,
-    world: World,
-    state: PathState,
-    at: Interaction,
-    light: LightSample,
-    radiance: Tensor,
-    weight: Tensor,
+    plan: Plan, world: World, at: Interaction, light: LightSample, radiance: Tensor, weight: Tensor
 ) -> Shadow:
     """The ray to a point on a light that brings ``radiance``; of length 0 where that is none.
 
@@ -139,7 +133,7 @@ def _shadow_ray(
     if light.distant is not None:
         d = torch.where(light.distant, light.wi, d)
         t_max = torch.where(light.distant & lit, math.inf, t_max)
-    return Shadow(o, d, t_max, radiance, state.scene)
+    return Shadow(o, d, t_max, radiance)
 
 
 def leaning(world: World, model: int) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -24,9 +23,6 @@ from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, World, joined
 from torchpt.samplers import salts
 
-if TYPE_CHECKING:
-    from torchpt.accel.forest import Forest
-
 __all__ = ["ENDLESS", "Limits", "PathIntegrator", "gather_light", "partition", "slides", "trace"]
 
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
@@ -39,7 +35,7 @@ class PathIntegrator(Integrator):
 
     looped = True
 
-    def radiance(self, stages: Stages, accel: Accel | Forest, state: PathState, first: None, tally: Tally) -> Tensor:
+    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: None, tally: Tally) -> Tensor:
         """See :class:`Integrator`."""
         return trace(stages, self.limits, accel, state, tally)
 
@@ -47,7 +43,7 @@ class PathIntegrator(Integrator):
 def trace(
     stages: Stages,
     limits: Limits,
-    accel: Accel | Forest,
+    accel: Accel,
     state: PathState,
     tally: Tally,
     lanes: int | None = None,
@@ -75,7 +71,7 @@ def trace(
 
     last = limits.max_depth if limits.max_depth >= 0 else ENDLESS
     while n and depth <= last:
-        tally.searched(state.lane)
+        tally.rays += len(state.lane)
         if hit is None:
             hit = search.nearest(state, depth)
         if stages.met(depth, state, hit):
@@ -88,7 +84,7 @@ def trace(
             for _, index in groups:
                 retire(index)
                 if limits.max_depth < 0:
-                    tally.cut(state.lane, index)
+                    tally.truncated += len(index)
         if depth == last or not groups:
             break
         salt = salts(depth, state.lane.device)
@@ -99,7 +95,7 @@ def trace(
                 model, limits.roulette(depth), slide, following, state, hit, index, salt
             )
             if shadow is not None:
-                tally.searched(state.lane, index)
+                tally.rays += len(index)
                 clear = search.clear(shadow)
                 stages.cleared(clear)
                 after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))

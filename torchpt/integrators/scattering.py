@@ -178,7 +178,6 @@ def next_ray(
         lane=state.lane,
         key=state.key,
         eta=onward.eta,
-        scene=state.scene,
     )
     if state.p is None:
         return leaving

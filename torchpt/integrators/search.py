@@ -6,8 +6,6 @@ straight to the search.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
@@ -18,9 +16,6 @@ from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow, World, rows
 from torchpt.samplers import Dimension, Draws, Points, salts
 from torchpt.shapes import interact, offset_origin
-
-if TYPE_CHECKING:
-    from torchpt.accel.forest import Forest
 
 __all__ = ["PASSES", "Search", "beyond", "opacity_at"]
 
@@ -53,39 +48,29 @@ class Search:
     """The search of one wave.
 
     Args:
-        accel: finds the nearest hit; of several scenes, whose lanes carry them, a forest.
+        accel: finds the nearest hit.
         world: the scene's tensors.
         sampler: where numbers come from.
         dtype: of the lanes.
     """
 
-    def __init__(self, accel: Accel | Forest, world: World, sampler: Points, dtype: torch.dtype) -> None:
+    def __init__(self, accel: Accel, world: World, sampler: Points, dtype: torch.dtype) -> None:
         self._accel, self._world, self._sampler, self._dtype = accel, world, sampler, dtype
 
     def nearest(self, state: PathState, depth: int) -> Hit:
         """Where the rays of ``state`` meet a surface, at path vertex ``depth``."""
-        hit = self._trace(state.o, state.d, state.t_max, state.scene)
+        hit = self._trace(state.o, state.d, state.t_max)
         return hit if self._world.materials.opacity is None else self._stopped(state, hit, depth)
 
     def clear(self, shadow: Shadow) -> Tensor:
         """How much of the light gets through ``(N,)``: 0 or 1 where all surfaces are opaque."""
         if self._world.materials.opacity is None:
-            return (~self._blocked(shadow)).to(self._dtype)
+            return (~self._accel.occluded(shadow.o, shadow.d, shadow.t_max)).to(self._dtype)
         return self._transmittance(shadow)
 
-    def _trace(self, o: Tensor, d: Tensor, t_max: Tensor, scene: Tensor | None) -> Hit:
-        if isinstance(self._accel, Accel):
-            t, prim, u, v = self._accel.intersect(o, d, t_max)
-        else:
-            assert scene is not None
-            t, prim, u, v = self._accel.intersect(o, d, t_max, scene)
+    def _trace(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
+        t, prim, u, v = self._accel.intersect(o, d, t_max)
         return Hit(t.to(self._dtype), prim.to(torch.int64), u.to(self._dtype), v.to(self._dtype))
-
-    def _blocked(self, shadow: Shadow) -> Tensor:
-        if isinstance(self._accel, Accel):
-            return self._accel.occluded(shadow.o, shadow.d, shadow.t_max)
-        assert shadow.scene is not None
-        return self._accel.occluded(shadow.o, shadow.d, shadow.t_max, shadow.scene)
 
     @torch.no_grad()
     def _beyond(self, o: Tensor, d: Tensor, hit: Hit) -> Tensor:
@@ -108,8 +93,7 @@ class Search:
             passed = Hit(take(t, lanes), take(prim, lanes), take(u, lanes), take(v, lanes))
             o, d = take(state.o.detach(), lanes), take(state.d.detach(), lanes)
             o = self._beyond(o, d, passed)
-            scene = None if state.scene is None else take(state.scene, lanes)
-            behind = self._trace(o, d, take(state.t_max, lanes), scene)
+            behind = self._trace(o, d, take(state.t_max, lanes))
             # Distances are counted from where the ray began; the step over the surface is below their rounding.
             t, prim = t.index_copy(0, lanes, behind.t + passed.t), prim.index_copy(0, lanes, behind.prim)
             u, v = u.index_copy(0, lanes, behind.u), v.index_copy(0, lanes, behind.v)
@@ -121,15 +105,14 @@ class Search:
     def _transmittance(self, shadow: Shadow) -> Tensor:
         """The product of ``1 - opacity`` over all surfaces between the ends of the rays."""
         clear = torch.ones_like(shadow.t_max)
-        o, d, t_max, scene = shadow.o.detach(), shadow.d.detach(), shadow.t_max, shadow.scene
+        o, d, t_max = shadow.o.detach(), shadow.d.detach(), shadow.t_max
         lanes = torch.arange(len(t_max), device=t_max.device)
         while len(lanes):
-            hit = self._trace(o, d, t_max, scene)
+            hit = self._trace(o, d, t_max)
             opacity = opacity_at(self._world, o, d, hit, 0.0)
             clear = clear.index_copy(0, lanes, take(clear, lanes) * (1.0 - opacity))
             on = ((hit.prim >= 0) & (opacity.detach() < 1)).nonzero().squeeze(1)
             passed, o, d = rows(hit, on), take(o, on), take(d, on)
-            scene = None if scene is None else take(scene, on)
             lanes, t_max = take(lanes, on), (take(t_max, on) - passed.t).clamp_min(0.0)
             if len(lanes):
                 o = self._beyond(o, d, passed)

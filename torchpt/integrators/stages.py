@@ -56,8 +56,7 @@ def shining(world: World, state: PathState, hit: Hit, index: Tensor | None, slid
     at = interact(world, o, d, rows(hit, index), slide)
     # Where lights are chosen by place the density is that at the vertex itself, which is not quite where the ray begins.
     x = o if state.p is None else take(state.p, index)
-    n = None if state.n is None else take(state.n, index)
-    radiance, pdf = lights.emitted(world.lights, x, at, d, n, _scenes(state, index))
+    radiance, pdf = lights.emitted(world.lights, x, at, d, None if state.n is None else take(state.n, index))
     if world.textures.emission is not None:
         radiance = radiance * emission_map(world, at)
     return radiance, pdf
@@ -66,12 +65,8 @@ def shining(world: World, state: PathState, hit: Hit, index: Tensor | None, slid
 def escape(world: World, state: PathState, hit: Hit, index: Tensor | None) -> Tensor:
     """Radiance ``(3, n)`` that the paths at ``index`` (None: all) gather from the environment they escape to."""
     assert world.lights is not None
-    radiance, pdf = lights.environment(world.lights, take(state.d, index), _scenes(state, index))
+    radiance, pdf = lights.environment(world.lights, take(state.d, index))
     return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
-
-
-def _scenes(state: PathState, index: Tensor | None) -> Tensor | None:
-    return None if state.scene is None else take(state.scene, index)
 
 
 def _arrived(state: PathState, hit: Hit, index: Tensor | None) -> Tensor:

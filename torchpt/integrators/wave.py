@@ -21,7 +21,6 @@ from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, Streams, salts
 
 if TYPE_CHECKING:
-    from torchpt.accel.forest import Forest
     from torchpt.integrators.first_surface import FirstSurface
 
 __all__ = ["Wave", "camera_state"]
@@ -41,8 +40,6 @@ class Wave:
         crop: ``(x, y, width, height)`` of the picture on the film.
         centre: ``(3,)`` float64, see Space.shift.
         first: what happens at first surfaces; None where paths go on.
-        forest: what is searched instead of ``accel`` where lanes are in several scenes (:mod:`torchpt.union`), whose world the
-            stages have; what is of one camera or one sampler here then has no say.
     """
 
     stages: Stages
@@ -54,7 +51,6 @@ class Wave:
     crop: tuple[int, int, int, int]
     centre: Tensor
     first: FirstSurface | None = None
-    forest: Forest | None = None
 
     @property
     def limits(self) -> Limits | None:
@@ -97,7 +93,7 @@ class Wave:
     def brought(self, state: PathState, tally: Tally | None = None) -> Tensor:
         """Radiance ``(3, N)`` that camera rays bring, weighted by the filter; ``tally`` counts what it takes."""
         tally = Tally() if tally is None else tally
-        radiance = self.integrator.radiance(self.stages, self.forest or self.accel, state, self.first, tally)
+        radiance = self.integrator.radiance(self.stages, self.accel, state, self.first, tally)
         return radiance * self.weight(state) if self.filter.signed else radiance
 
     def weight(self, state: PathState) -> Tensor:
@@ -124,7 +120,7 @@ class Wave:
         from torchpt.integrators import aov
 
         plan, world = self.stages.plan, self.stages.world
-        search = Search(self.forest or self.accel, world, plan.sampler, plan.dtype)
+        search = Search(self.accel, world, plan.sampler, plan.dtype)
         found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel, slide)
         return aov.weighted(found, self.weight(state)) if self.filter.signed else found
 

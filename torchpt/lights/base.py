@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -232,16 +232,6 @@ class Environment(Light):
     @classmethod
     def arriving(cls, around: Any, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
         """Radiance ``(3, N)`` from unit directions ``d (3, N)``, and the density ``(N,)`` with which they are drawn."""
-        raise NotImplementedError
-
-    @classmethod
-    def joined(cls, arounds: Sequence[Any]) -> Any:
-        """What those of several scenes come to, all of one form; for :meth:`of`."""
-        raise NotImplementedError
-
-    @classmethod
-    def of(cls, around: Any, scene: Tensor) -> Any:
-        """Of what was :meth:`joined`, what the functions are given for lanes of scenes ``(N,)``."""
         raise NotImplementedError
 
     @classmethod

@@ -6,7 +6,6 @@ to rays that meet a light by chance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 
 import torch
@@ -20,18 +19,7 @@ from torchpt.math.threads import sum_all
 from torchpt.math.vectors import take
 from torchpt.records import Lights
 
-__all__ = [
-    "MANY",
-    "WAYS",
-    "ByTree",
-    "choice_of",
-    "draw",
-    "environment",
-    "joined",
-    "local",
-    "probability",
-    "without_last",
-]
+__all__ = ["MANY", "WAYS", "ByTree", "choice_of", "draw", "environment", "local", "probability", "without_last"]
 
 #: Ways to choose: all lights alike, by power, by the tree, or by power below MANY lights that lie somewhere, by the tree from
 #: there on.
@@ -50,7 +38,7 @@ class ByTree:
     tree: LightTree
     beside: Discrete | None  # over the tree and the rows after its own; None where there are none
     even: Discrete | None  # over the rows of the tree; None where all draws are the tree's own
-    share: Tensor  # () float64, of the draws of a row of the tree that are taken from `even`; of several choices (S,)
+    share: Tensor  # () float64, of the draws of a row of the tree that are taken from `even`
 
 
 def choice_of(lights: Lights, power: Tensor, boxes: tuple[Tensor, Tensor], way: str) -> Discrete | ByTree | None:
@@ -86,24 +74,7 @@ def local(lights: Lights | None) -> bool:
     return lights is not None and isinstance(lights.choice, ByTree)
 
 
-def joined(choices: Sequence[Discrete | ByTree | None]) -> Discrete | ByTree | None:
-    """The choices of several tables, all of one form (:func:`torchpt.union.form_of`), of which each lane has its own."""
-    plain, trees = [c for c in choices if isinstance(c, Discrete)], [c for c in choices if isinstance(c, ByTree)]
-    if not trees:
-        return Discrete.joined(plain) if plain else None
-    beside = [c.beside for c in trees if c.beside is not None]
-    even = [c.even for c in trees if c.even is not None]
-    return ByTree(
-        tree.joined([c.tree for c in trees]),
-        Discrete.joined(beside) if beside else None,
-        Discrete.joined(even) if even else None,
-        torch.stack([c.share for c in trees]),
-    )
-
-
-def draw(
-    choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None, of: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
+def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Rows ``(N,)``, their probabilities ``(N,)``, and what the choice leaves of ``u``: ``(N,)`` float64 in [0, 1].
 
     The rest is uniform whatever was chosen. Who goes on with it keeps the stratification of light and place together.
@@ -113,68 +84,67 @@ def draw(
         u: ``(N,)`` float64 in [0, 1) of 48 bits, see :func:`torchpt.lights.tree.fine`.
         x: reference points ``(3, N)``.
         n: normals ``(3, N)`` as :func:`torchpt.lights.tree.sample` takes them, or None.
-        of: here and below, which of several :func:`joined` choices each lane has ``(N,)``; rows are those of its own table.
     """
     if isinstance(choice, Discrete):
-        row, rest = choice.draw(u, of)
-        return row, choice.chance(row, of), rest
+        row, rest = _by_power(choice, u)
+        return row, take(choice.pmf, row), rest
     if choice.beside is None:
-        return _near(choice, u, x, n, of)
-    beside, first = choice.beside, _lanes(choice.tree.count, of)
-    outcome, left = beside.draw(u, of)
-    row, p, rest = _near(choice, left, x, n, of)
+        return _near(choice, u, x, n)
+    beside, first = choice.beside, choice.tree.count
+    outcome, left = _by_power(beside, u)
+    row, p, rest = _near(choice, left, x, n)
     near = outcome == 0
     rest = torch.where(near, rest, left)
-    p = torch.where(near, p, 1.0) * beside.chance(outcome, of)
+    p = torch.where(near, p, 1.0) * take(beside.pmf, outcome)
     return torch.where(near, row, outcome + (first - 1)), p, rest
 
 
-def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None, of: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """:func:`draw` among the rows of the tree."""
     if choice.even is None:
-        return tree.sample(choice.tree, x, n, u, of)
-    share = _lanes(choice.share, of)
+        return tree.sample(choice.tree, x, n, u)
+    share = choice.share
     apart = u < share
-    row, _, rest = tree.sample(choice.tree, x, n, ((u - share) / (1.0 - share)).clamp_min(0.0), of)
-    other, left = choice.even.draw((u / share).clamp_max(1.0 - 2.0**-53), of)
+    row, _, rest = tree.sample(choice.tree, x, n, ((u - share) / (1.0 - share)).clamp_min(0.0))
+    other, left = _by_power(choice.even, (u / share).clamp_max(1.0 - 2.0**-53))
     row, rest = torch.where(apart, other, row), torch.where(apart, left, rest)
-    return row, _chance(choice, row, x, n, of), rest
+    return row, _chance(choice, row, x, n), rest
 
 
-def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None, of: Tensor | None) -> Tensor:
+def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """:func:`probability` among the rows of the tree."""
-    p = tree.probability(choice.tree, row, x, n, of)
+    p = tree.probability(choice.tree, row, x, n)
     if choice.even is None:
         return p
-    share = _lanes(choice.share.to(p.dtype), of)
-    return p * (1.0 - share) + choice.even.chance(row, of) * share
+    share = choice.share.to(p.dtype)
+    return p * (1.0 - share) + take(choice.even.pmf, row) * share
 
 
-def _lanes(value: Tensor, of: Tensor | None) -> Tensor:
-    """A number ``()`` of the only choice; of several ``(S,)`` those of the lanes."""
-    return value if of is None else take(value, of)
+def _by_power(choice: Discrete, u: Tensor) -> tuple[Tensor, Tensor]:
+    row = choice.sample(u)
+    low = torch.where(row > 0, take(choice.cdf, (row - 1).clamp_min(0)), 0.0)
+    width = take(choice.cdf, row) - low
+    return row, ((u - low) / torch.where(width > 0, width, 1.0)).clamp(0.0, 1.0)
 
 
-def probability(
-    choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | None, of: Tensor | None = None
-) -> Tensor:
+def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """``(N,)`` with which :func:`draw` gives ``row (N,)`` at ``x, n``."""
     if isinstance(choice, Discrete):
-        return choice.chance(row, of)
+        return take(choice.pmf, row)
     if choice.beside is None:
-        return _chance(choice, row, x, n, of)
-    first = _lanes(choice.tree.count, of)
-    p = _chance(choice, torch.minimum(row, first - 1), x, n, of)
-    return torch.where(row < first, p, 1.0) * choice.beside.chance((row - (first - 1)).clamp_min(0), of)
+        return _chance(choice, row, x, n)
+    first = choice.tree.count
+    p = _chance(choice, torch.minimum(row, first - 1), x, n)
+    return torch.where(row < first, p, 1.0) * take(choice.beside.pmf, (row - (first - 1)).clamp_min(0))
 
 
-def environment(choice: Discrete | ByTree | None, of: Tensor | None = None) -> Tensor | float:
+def environment(choice: Discrete | ByTree | None) -> Tensor | float:
     """The probability of the last row, which is the environment's where there is one."""
     if choice is None:
         return 1.0
     chosen = choice if isinstance(choice, Discrete) else choice.beside
     assert chosen is not None
-    return chosen.chance_of_last(of)
+    return chosen.pmf[-1]
 
 
 def without_last(choice: Discrete | ByTree) -> Discrete | ByTree:

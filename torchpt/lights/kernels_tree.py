@@ -89,7 +89,7 @@ def _total(weight, full):
 
 
 @jit()
-def _sample(first, last, x, n, turns, u, tree, root, unit, out_row, out_probability, out_rest):
+def _sample(first, last, x, n, turns, u, tree, unit, out_row, out_probability, out_rest):
     nodes, child, full, _, _ = tree
     weight = np.empty(WIDTH, np.float32)
     nx, ny, nz = _ZERO, _ZERO, _ZERO
@@ -97,7 +97,7 @@ def _sample(first, last, x, n, turns, u, tree, root, unit, out_row, out_probabil
         if turns:
             nx, ny, nz = n[0, i], n[1, i], n[2, i]
         turned = (nx != _ZERO) | (ny != _ZERO) | (nz != _ZERO)
-        node, left, p = root[i] if len(root) else np.int64(0), u[i], 1.0
+        node, left, p = np.int64(0), u[i], 1.0
         while node >= 0:
             _weigh(nodes, node, x[0, i], x[1, i], x[2, i], nx, ny, nz, turned, weight, unit)
             total = _total(weight, full[node])
@@ -117,7 +117,7 @@ def _sample(first, last, x, n, turns, u, tree, root, unit, out_row, out_probabil
 
 
 @jit()
-def _probability(first, last, x, n, turns, row, tree, root, unit, out):
+def _probability(first, last, x, n, turns, row, tree, unit, out):
     nodes, child, full, trail, depth = tree
     weight = np.empty(WIDTH, np.float32)
     nx, ny, nz = _ZERO, _ZERO, _ZERO
@@ -126,7 +126,7 @@ def _probability(first, last, x, n, turns, row, tree, root, unit, out):
             nx, ny, nz = n[0, i], n[1, i], n[2, i]
         turned = (nx != _ZERO) | (ny != _ZERO) | (nz != _ZERO)
         way, steps = trail[row[i]], depth[row[i]]
-        node, p = root[i] if len(root) else np.int64(0), 1.0 if steps > 0 else 0.0
+        node, p = np.int64(0), 1.0 if steps > 0 else 0.0
         for _ in range(steps):
             _weigh(nodes, node, x[0, i], x[1, i], x[2, i], nx, ny, nz, turned, weight, unit)
             total = _total(weight, full[node])
@@ -138,27 +138,27 @@ def _probability(first, last, x, n, turns, row, tree, root, unit, out):
 
 
 @jit()
-def _sample_blocks(first, last, x, n, turns, u, tree, root, unit, row, probability, rest):
-    _sample(first * BLOCK, min(last * BLOCK, len(u)), x, n, turns, u, tree, root, unit, row, probability, rest)
+def _sample_blocks(first, last, x, n, turns, u, tree, unit, row, probability, rest):
+    _sample(first * BLOCK, min(last * BLOCK, len(u)), x, n, turns, u, tree, unit, row, probability, rest)
 
 
 @jit(parallel=True)
-def _sample_parallel(chunks, items, x, n, turns, u, tree, root, unit, row, probability, rest):
+def _sample_parallel(chunks, items, x, n, turns, u, tree, unit, row, probability, rest):
     for c in nb.prange(chunks):
         a, b = items * c // chunks, items * (c + 1) // chunks
-        _sample_blocks(a, b, x, n, turns, u, tree, root, unit, row, probability, rest)
+        _sample_blocks(a, b, x, n, turns, u, tree, unit, row, probability, rest)
 
 
 @jit()
-def _probability_blocks(first, last, x, n, turns, row, tree, root, unit, out):
-    _probability(first * BLOCK, min(last * BLOCK, len(row)), x, n, turns, row, tree, root, unit, out)
+def _probability_blocks(first, last, x, n, turns, row, tree, unit, out):
+    _probability(first * BLOCK, min(last * BLOCK, len(row)), x, n, turns, row, tree, unit, out)
 
 
 @jit(parallel=True)
-def _probability_parallel(chunks, items, x, n, turns, row, tree, root, unit, out):
+def _probability_parallel(chunks, items, x, n, turns, row, tree, unit, out):
     for c in nb.prange(chunks):
         a, b = items * c // chunks, items * (c + 1) // chunks
-        _probability_blocks(a, b, x, n, turns, row, tree, root, unit, out)
+        _probability_blocks(a, b, x, n, turns, row, tree, unit, out)
 
 
 def _numpy(tensor: Tensor) -> Any:
@@ -175,33 +175,21 @@ def _arrays(tree: tuple[Tensor, ...]) -> tuple[Any, ...]:
     return _numpy(nodes).reshape(-1), _numpy(child).reshape(-1), _numpy(full), _numpy(trail), _numpy(depth)
 
 
-def _roots(root: Tensor | None) -> Any:
-    """Where lanes begin; of no length where all begin at node 0."""
-    return np.zeros(0, np.int64) if root is None else _numpy(root)
-
-
-def sample(
-    tree: tuple[Tensor, ...], x: Tensor, n: Tensor | None, u: Tensor, root: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows, their probabilities in the dtype of ``x``, and what is left of ``u``: :func:`torchpt.lights.tree.sample`.
-
-    ``root (N,)`` int64: the node that each lane begins at; None: node 0.
-    """
+def sample(tree: tuple[Tensor, ...], x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows, their probabilities in the dtype of ``x``, and what is left of ``u``: :func:`torchpt.lights.tree.sample`."""
     row, found = torch.empty(len(u), dtype=torch.int64), torch.empty(len(u), dtype=x.dtype)
     rest = torch.empty(len(u), dtype=torch.float64)
     if len(u):
         out = row.numpy(), found.numpy(), rest.numpy()
-        arguments = (*_place(x, n), _numpy(u.double()), _arrays(tree), _roots(root), 1, *out)
+        arguments = (*_place(x, n), _numpy(u.double()), _arrays(tree), 1, *out)
         launch(_sample_blocks, _sample_parallel, -(-len(u) // BLOCK), thread_count(None), 4, arguments)
     return row, found, rest
 
 
-def probability(
-    tree: tuple[Tensor, ...], row: Tensor, x: Tensor, n: Tensor | None, root: Tensor | None = None
-) -> Tensor:
-    """Probabilities ``(N,)`` of rows; see :func:`torchpt.lights.tree.probability`, and :func:`sample` for ``root``."""
+def probability(tree: tuple[Tensor, ...], row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
+    """Probabilities ``(N,)`` of rows; see :func:`torchpt.lights.tree.probability`."""
     found = torch.empty(len(row), dtype=x.dtype)
     if len(row):
-        arguments = (*_place(x, n), _numpy(row), _arrays(tree), _roots(root), 1, found.numpy())
+        arguments = (*_place(x, n), _numpy(row), _arrays(tree), 1, found.numpy())
         launch(_probability_blocks, _probability_parallel, -(-len(row) // BLOCK), thread_count(None), 4, arguments)
     return found

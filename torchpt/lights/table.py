@@ -9,7 +9,6 @@ gathered.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,7 +48,6 @@ def sample(
     offset: float,
     n: Tensor | None = None,
     mis: bool = True,
-    scene: Tensor | None = None,
 ) -> LightSample:
     """A point on the lights, seen from ``x (3, N)``.
 
@@ -63,20 +61,13 @@ def sample(
         n: normals ``(3, N)`` of surfaces that nothing lights from behind, zero for others; None: no such surface. Asked for
             where the choice is local, see :func:`torchpt.lights.choice.local`.
         mis: whether BSDF sampling shares the work: an environment map then leaves it the dim directions.
-        scene: where the table is that of several scenes, which one each lane has ``(N,)``.
     """
-    assert (lights.first is None) == (scene is None)
     row: Tensor | None = None
     probability: Tensor | float = 1.0
     if lights.choice is not None and which is not None:
-        row, probability, rest = choice.draw(lights.choice, which, x, n, scene)
+        row, probability, rest = choice.draw(lights.choice, which, x, n)
         u = torch.stack((rest.to(u.dtype).clamp_max(1.0 - 2.0**-24), u[1]))
-    if lights.first is not None and scene is not None:
-        first = take(lights.first, scene)
-        row = first if row is None else first + row
     at, number = taken(lights, row), _numbers(lights, row)
-    if scene is not None and lights.environment is not None:
-        at = replace(at, environment=_around(lights, scene))
     surfaces = _surfaces(lights)
     drawn = _on_surfaces(lights, at, row, number, x, u, offset, probability) if surfaces else None
     bare: Tensor | None = None
@@ -95,8 +86,7 @@ def sample(
 
 
 def chosen(lights: Lights, which: Tensor | None, x: Tensor, n: Tensor | None) -> Tensor:
-    """Rows ``(N,)`` of the lights that :func:`sample` draws; of one scene."""
-    assert lights.first is None
+    """Rows ``(N,)`` of the lights that :func:`sample` draws."""
     if lights.choice is None or which is None:
         return torch.zeros(x.shape[1], dtype=torch.int64, device=x.device)
     return choice.draw(lights.choice, which, x, n)[0]
@@ -184,9 +174,7 @@ def _textured(
     return Interaction(p, normal, normal, None, None, prim, prim, None, place[0], place[1], own)
 
 
-def emitted(
-    lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None, scene: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """What emitters that were hit send back along ``wi``.
 
     Args:
@@ -195,12 +183,11 @@ def emitted(
         at: points on emissive primitives.
         wi: unit directions from ``x`` to them ``(3, N)``.
         n: normals ``(3, N)`` where they came from, as :func:`sample` was given them.
-        scene: as of :func:`sample`.
 
     Returns:
         Radiance ``(3, N)``, zero from behind, and the density ``(N,)`` with which :func:`sample` would have drawn ``wi``.
     """
-    assert lights.row_of_prim is not None and (lights.first is None) == (scene is None)
+    assert lights.row_of_prim is not None
     row = take(lights.row_of_prim, at.slot) if len(lights.area) > 1 else None
     table = taken(lights, row)
     with torch.no_grad():
@@ -211,9 +198,7 @@ def emitted(
         facing = dot(wi, at.ng) < 0
         pdf = safe_reciprocal(inverse)
         if lights.choice is not None and row is not None:
-            if lights.first is not None and scene is not None:
-                row = row - take(lights.first, scene)
-            pdf = pdf * choice.probability(lights.choice, row, x, n, scene)
+            pdf = pdf * choice.probability(lights.choice, row, x, n)
         pdf = torch.where(facing, pdf, 0.0)
     return torch.where(facing, table.radiance, 0.0), pdf
 
@@ -225,19 +210,10 @@ def _environment(lights: Lights) -> type[Environment]:
     return kind
 
 
-def _around(lights: Lights, scene: Tensor | None) -> Any:
-    """What the environment's functions are given; of several scenes' what the lanes have."""
-    assert (lights.first is None) == (scene is None)
-    return lights.environment if scene is None else _environment(lights).of(lights.environment, scene)
-
-
-def environment(lights: Lights, d: Tensor, scene: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS.
-
-    ``scene``: as of :func:`sample`.
-    """
-    radiance, pdf = _environment(lights).arriving(_around(lights, scene), d, mis=True)
-    return radiance, pdf * choice.environment(lights.choice, scene)
+def environment(lights: Lights, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Radiance ``(3, N)`` that escaped rays find, and the density ``(N,)`` with which :func:`sample` draws them for MIS."""
+    radiance, pdf = _environment(lights).arriving(lights.environment, d, mis=True)
+    return radiance, pdf * choice.environment(lights.choice)
 
 
 def surroundings(lights: Lights | None) -> Surroundings | None:

@@ -3,7 +3,6 @@
     build(low, high, axis, cos_o, cos_e, intensity) -> LightTree
     sample(tree, x, n, u) -> row, probability
     probability(tree, row, x, n) -> probability
-    joined(trees) -> several trees as one, of which each lane has its own
 
 After Conty Estevez and Kulla, "Importance Sampling of Many Lights with Adaptive Tree Splitting" (2018), with the bounds of
 Pharr, Jakob, Humphreys, *Physically Based Rendering*, 4th ed., section 12.6.3. A node has eight children rather than two: they
@@ -15,18 +14,14 @@ children share evenly, so that every draw has a probability, and the probabiliti
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchpt.lanes.tracing import tracing
-from torchpt.math.vectors import take
 
-__all__ = ["LightTree", "build", "fine", "joined", "probability", "sample"]
+__all__ = ["LightTree", "build", "fine", "probability", "sample"]
 
 #: Lights dimmer than all together by this factor are taken for that bright: they stay in the range of float32.
 _DIMMEST = 1e-30
@@ -34,13 +29,7 @@ _DIMMEST = 1e-30
 
 @dataclass(frozen=True)
 class LightTree:
-    """A tree over K lights; see :mod:`torchpt.lights.kernels_tree` for what its nodes hold.
-
-    Several trees may lie one after another (:func:`joined`): then ``count`` is ``(S,)``, and rows count from the first of a
-    lane's own tree.
-    """
-
-    counted: ClassVar = ("levels",)  # see LaneGeometry
+    """A tree over K lights; see :mod:`torchpt.lights.kernels_tree` for what its nodes hold."""
 
     nodes: Tensor  # (M, F, 8) float32
     child: Tensor  # (M, 8) int32: a node, or ~row
@@ -49,8 +38,6 @@ class LightTree:
     depth: Tensor  # (K,) int32 how many steps; 0 where a light is left out, since it does not shine
     count: Tensor  # () int64 K
     levels: int  # the largest of `depth`
-    root: Tensor | None = None  # (S,) int64 the first node of each of several trees; None: there is one
-    first: Tensor | None = None  # (S,) int64 the first row of each in `trail` and `depth`; likewise
 
 
 def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor, intensity: Tensor) -> LightTree:
@@ -99,26 +86,6 @@ def build(low: Tensor, high: Tensor, axis: Tensor, cos_o: Tensor, cos_e: Tensor,
     return LightTree(*parts, count=number, levels=int(depth.max()))
 
 
-def joined(trees: Sequence[LightTree]) -> LightTree:
-    """Several trees, of which each lane has its own."""
-    device = trees[0].count.device
-    sizes, counts = [len(tree.full) for tree in trees], [len(tree.trail) for tree in trees]
-    roots, first = [0, *accumulate(sizes)][:-1], [0, *accumulate(counts)][:-1]
-    # Of what is no light a child is a node; none of them is the root, so that zeros stay the sign of an empty place.
-    moved = [torch.where(t.child > 0, t.child + root, t.child) for t, root in zip(trees, roots, strict=True)]
-    return LightTree(
-        nodes=torch.cat([tree.nodes for tree in trees]),
-        child=torch.cat(moved),
-        full=torch.cat([tree.full for tree in trees]),
-        trail=torch.cat([tree.trail for tree in trees]),
-        depth=torch.cat([tree.depth for tree in trees]),
-        count=torch.stack([tree.count for tree in trees]),
-        levels=max(tree.levels for tree in trees),
-        root=torch.tensor(roots, device=device),
-        first=torch.tensor(first, device=device),
-    )
-
-
 def fine(u: Tensor) -> Tensor:
     """``(2, N)`` in [0, 1) as ``(N,)`` float64: the second continues the digits of the first.
 
@@ -127,9 +94,7 @@ def fine(u: Tensor) -> Tensor:
     return torch.add(u[0].double(), u[1].double(), alpha=2.0**-24)
 
 
-def sample(
-    tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor, of: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
+def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Draws lights for points.
 
     Args:
@@ -138,7 +103,6 @@ def sample(
         n: unit normals ``(3, N)`` of surfaces that nothing lights from behind; zero where light comes from both sides. None:
             such everywhere.
         u: ``(N,)`` in [0, 1), float64, see :func:`fine`.
-        of: which of several trees each lane has ``(N,)``.
 
     Returns:
         Rows ``(N,)`` int64, the probabilities ``(N,)`` with which they were drawn, always positive, and what is left of ``u``:
@@ -148,27 +112,20 @@ def sample(
     if x.device.type == "cpu" and not tracing():
         from torchpt.lights import kernels_tree
 
-        return kernels_tree.sample(_parts(tree), x, n, u, _root_of(tree, of))
-    row, p, rest = _walk(tree, x, n, u, None, _root_of(tree, of))
+        return kernels_tree.sample(_parts(tree), x, n, u)
+    row, p, rest = _walk(tree, x, n, u, None)
     assert rest is not None
     return row, p, rest
 
 
-def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None, of: Tensor | None = None) -> Tensor:
+def probability(tree: LightTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
     """``(N,)`` with which :func:`sample` draws ``row (N,)`` at ``x, n``."""
     x, n = x.detach(), None if n is None else n.detach()
-    if tree.first is not None and of is not None:
-        row = row + take(tree.first, of)
     if x.device.type == "cpu" and not tracing():
         from torchpt.lights import kernels_tree
 
-        return kernels_tree.probability(_parts(tree), row, x, n, _root_of(tree, of))
-    return _walk(tree, x, n, None, row, _root_of(tree, of))[1]
-
-
-def _root_of(tree: LightTree, of: Tensor | None) -> Tensor | None:
-    """The nodes that lanes begin at ``(N,)``; None: node 0."""
-    return None if tree.root is None or of is None else take(tree.root, of)
+        return kernels_tree.probability(_parts(tree), row, x, n)
+    return _walk(tree, x, n, None, row)[1]
 
 
 def _parts(tree: LightTree) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -213,10 +170,10 @@ def _root(a: Tensor) -> Tensor:
 
 
 def _walk(
-    tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor | None, row: Tensor | None, root: Tensor | None = None
+    tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor | None, row: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Ways through the tree, by ``u`` or to ``row``: where they end, their probabilities, and what is left of ``u``."""
-    node = torch.zeros(x.shape[1], dtype=torch.int64, device=x.device) if root is None else root
+    node = torch.zeros(x.shape[1], dtype=torch.int64, device=x.device)
     p = torch.ones(x.shape[1], dtype=torch.float64, device=x.device)
     places = torch.arange(tree.child.shape[1], device=x.device)
     way = None if row is None else tree.trail[row]

@@ -138,17 +138,6 @@ class Atlas(Table):
         assert point.uv is not None
         return slope(self, nodes, point.uv, point.footprint)
 
-    @classmethod
-    def joined(cls, tables: Sequence[Atlas]) -> Atlas:
-        """See :class:`Table`."""
-        places, begin = [], 0
-        for table in tables:
-            first = table.places[:1] + begin
-            places.append(torch.cat((first, table.places[1:])))
-            begin += len(table.texels)
-        texels, maps = torch.cat([t.texels for t in tables]), torch.cat([t.maps for t in tables], 1)
-        return replace(tables[0], texels=texels, places=torch.cat(places, 1), maps=maps)
-
 
 def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch.dtype, device: torch.device) -> Atlas:
     """The atlas of ``nodes``, in their order; differentiable in the images.

@@ -102,11 +102,6 @@ class Table:
         """Derivatives ``(N,)`` of number-valued nodes with respect to ``u`` and ``v``."""
         raise NotImplementedError
 
-    @classmethod
-    def joined(cls, tables: Sequence[Any]) -> Table:
-        """Tables of several scenes as one, the nodes of each after those before; all of one form, and none filters."""
-        raise NotImplementedError
-
 
 class Node:
     """One way of reading a texture: a frozen dataclass, static, equal where the same is read alike.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -160,8 +160,6 @@ class ComputedTable(Table):
         factor: ``(M,)`` of the values; None where it is 1.
     """
 
-    counted: ClassVar = ("rows",)  # see LaneGeometry
-
     texture: Computed
     rows: int
     values: dict[str, Tensor]
@@ -210,19 +208,3 @@ class ComputedTable(Table):
             return across, along
         maps = take(self.transform, nodes)
         return across * maps[0] + along * maps[3], across * maps[1] + along * maps[4]
-
-    @classmethod
-    def joined(cls, tables: Sequence[ComputedTable]) -> ComputedTable:
-        """See :class:`Table`."""
-
-        def column(name: str) -> Tensor | None:
-            values = [getattr(table, name) for table in tables]
-            return None if values[0] is None else torch.cat(values, -1)
-
-        return replace(
-            tables[0],
-            rows=sum(table.rows for table in tables),
-            values={key: torch.cat([table.values[key] for table in tables], -1) for key in tables[0].values},
-            transform=column("transform"),
-            factor=column("factor"),
-        )

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
-from torchpt.math.vectors import take
 from torchpt.math.warps import uniform_sphere
 from torchpt.records import Lights, LightSample
 from torchpt.spec import Color
@@ -42,18 +40,7 @@ class Constant(Environment):
     @classmethod
     def arriving(cls, around: Tensor, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
         """See :class:`Environment`."""
-        radiance = around if around.dim() > 1 else around[:, None]
-        return radiance.expand_as(d), torch.full_like(d[0], 1.0 / _INVERSE_PDF)
-
-    @classmethod
-    def joined(cls, arounds: Sequence[Tensor]) -> Tensor:
-        """See :class:`Environment`: ``(3, S)``."""
-        return torch.stack(list(arounds), 1)
-
-    @classmethod
-    def of(cls, around: Tensor, scene: Tensor) -> Tensor:
-        """See :class:`Environment`: ``(3, N)``."""
-        return take(around, scene)
+        return around[:, None].expand_as(d), torch.full_like(d[0], 1.0 / _INVERSE_PDF)
 
     @classmethod
     def surroundings(cls, around: Tensor) -> Surroundings:

@@ -21,7 +21,7 @@ less than a tenth of its light above the mean, spread over more than a tenth of 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -30,7 +30,6 @@ import torch
 from torch import Tensor
 
 from torchpt.images.given import TEXELS, check_source, texels_of
-from torchpt.lights import several_maps
 from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.math.angles import azimuth
 from torchpt.math.distributions import Cells, invert_linear
@@ -81,12 +80,7 @@ class EnvironmentMap:
         mean: ``()`` mean luminance over the sphere, ``scale`` left out; detached.
         plain: the density by luminance.
         compensated: the density for MIS; None where it is ``plain``.
-        starts: ``(3, N)`` int64 where lanes have the maps of several scenes (:mod:`torchpt.lights.several_maps`): where
-            their own begin in ``texels``, ``halves``, ``steps``. Then ``size``, ``turn``, ``scale`` and the densities'
-            numbers are the lanes' too, and ``mean`` says nothing. None: there is one map.
     """
-
-    counted: ClassVar = ("height", "width")  # see LaneGeometry
 
     texels: Tensor
     height: int
@@ -99,7 +93,6 @@ class EnvironmentMap:
     mean: Tensor
     plain: Grid
     compensated: Grid | None
-    starts: Tensor | None = None
 
     def grid(self, mis: bool) -> Grid:
         """The density in use: for MIS with BSDF sampling, or alone."""
@@ -184,8 +177,7 @@ class _Place(NamedTuple):
 
 def _place(map: EnvironmentMap, d: Tensor) -> _Place:
     """The cells of unit directions ``(3, N)`` of the world."""
-    turn = map.turn if map.turn.dim() > 2 else map.turn[..., None]
-    local = [dot(turn[k], d) for k in range(3)]
+    local = [dot(map.turn[k][:, None], d) for k in range(3)]
     square = torch.addcmul(local[0] * local[0], local[2], local[2])
     radius = square.clamp_min(torch.finfo(d.dtype).tiny).sqrt()
     # Not by acos, which near the poles knows an angle only to a square root of the rounding.
@@ -207,8 +199,6 @@ def _corners(map: EnvironmentMap, row: Tensor, column: Tensor) -> _Corners:
     width = map.size[1]
     right = torch.where(column == width - 1, 0, column + 1)
     first = row * width
-    if map.starts is not None:
-        first = first + map.starts[0]
     return (
         take(map.texels, first + column),
         take(map.texels, first + right),
@@ -233,8 +223,7 @@ def _density(map: EnvironmentMap, grid: Grid, at: _Place, corners: _Corners) -> 
     step = math.pi / (map.size[0] - 1).to(at.y.dtype)
     y = at.y.detach()
     # A difference of cosines as a product, which does not cancel.
-    place = at.row if map.starts is None else at.row + map.starts[2]
-    down = torch.sin((0.5 * step) * y) * torch.sin(step * (at.row + 0.5 * y)) * take(map.steps, place)
+    down = torch.sin((0.5 * step) * y) * torch.sin(step * (at.row + 0.5 * y)) * take(map.steps, at.row)
     return _mix(_values(grid, corners), at.x.detach(), down.clamp_max(1.0)) * grid.factor
 
 
@@ -277,8 +266,7 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
         down = invert_linear(rest[1], a + b, c + d)
         x = invert_linear(rest[0], a + (c - a) * down, b + (d - b) * down)
         density = _mix((a, b, c, d), x, down) * grid.factor
-        place = row if map.starts is None else row + map.starts[1]
-        above, below = take(map.halves, place), take(map.halves, place + 1)
+        above, below = take(map.halves, row), take(map.halves, row + 1)
         half = above + (below - above) * down
         tall, wide = map.size[0].to(u.dtype), map.size[1].to(u.dtype)
         phi = (x + (column + 0.5)) * (2.0 * math.pi / wide)
@@ -352,16 +340,6 @@ class Envmap(Environment):
     def arriving(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
         """See :class:`Environment`."""
         return environment(around, d, mis)
-
-    @classmethod
-    def joined(cls, arounds: Sequence[EnvironmentMap]) -> EnvironmentMap:
-        """See :class:`Environment`."""
-        return several_maps.joined(arounds)
-
-    @classmethod
-    def of(cls, around: EnvironmentMap, scene: Tensor) -> EnvironmentMap:
-        """See :class:`Environment`."""
-        return several_maps.of(around, scene)
 
     @classmethod
     def surroundings(cls, around: EnvironmentMap) -> Surroundings:

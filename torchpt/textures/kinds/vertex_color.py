@@ -45,10 +45,6 @@ class _Table(Table):
             return point.colors
         return point.colors[self.channel] if self.channel >= 0 else luminance(point.colors)
 
-    @classmethod
-    def joined(cls, tables: Sequence[_Table]) -> _Table:
-        return tables[0]
-
 
 class VertexColor(Texture):
     """The colours of a mesh's vertices, taken as linear; white on surfaces that have none."""
