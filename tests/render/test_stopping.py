@@ -125,7 +125,7 @@ def test_no_error_in_doubt_ends_a_render(box, monkeypatch, doubt):
     """Pilots alone are certain of it; the picture, once suspects were looked at again, is not."""
     told = {
         "heavy": (KnownError(0.01, (0.009, 0.011), True), ""),
-        "null": (None, "a reason"),
+        "null": (KnownError(0.01, (0.009, 0.011), False), "a reason"),
         "wide": (KnownError(0.01, (0.002, 0.05), False), ""),
     }
     monkeypatch.setattr("torchpt.forward.run.known_of", lambda *_: told[doubt])

@@ -130,7 +130,18 @@ def test_dark_pixels_count_where_they_show_what_reflects():
     assert dark(0.1) == dark(0.1, on_black) == dark(0.1, on_sky) == Unlit("", 0.0)
     assert dark(0.1, *on_floor, on_black, on_sky) == Unlit("", 10 / 3072)
     assert dark(0.001, *on_floor).reason == "no sample met any light in 0.33 % of the picture"  # more than is known
-    assert dark(0.1, *[(x, y) for y in (40, 41, 42, 43) for x, _ in on_floor]).reason.endswith("1.3 % of the picture")
+    half = [(x, y) for y in range(40, 48) for x in range(20, 40)]
+    assert dark(0.2, *half) == Unlit("no sample met any light in 5.2 % of the picture", 160 / 3072)
+
+
+def test_the_far_side_of_a_ball_that_is_alone_is_known_to_be_black():
+    ball = {"type": "sphere", "center": [0, 1, 0], "radius": 1.5}
+    lamp = {"type": "sphere", "center": [9, 4, 0], "radius": 0.5, "emission": 50}
+    scene = {"camera": CAMERA, "film": film_of(24, 18), "shapes": {"ball": ball, "lamp": lamp}}
+    alone = shot(torchpt.load(scene, device="cpu"))
+    assert alone.relmse is not None and alone.relmse_unknown == ""
+    scene["shapes"] |= {"moon": {"type": "sphere", "center": [-9, 1, 0], "radius": 0.5}}
+    assert shot(torchpt.load(scene, device="cpu"), integrator={"type": "path", "max_depth": 3}).relmse is None
 
 
 def test_few_dark_pixels_widen_the_interval(monkeypatch):
@@ -151,7 +162,7 @@ def test_rare_light_never_ends_a_render(compile):
     scene = room(bulb=BULB, lamp=lamp)
     for seed in range(6 if compile == "on" else 1):
         found = shot(scene, target_error=0.05, spp=64, seed=seed, compile=compile)
-        assert (found.spp, found.stopped_by, found.relmse) == (64, "spp", None)
+        assert (found.spp, found.stopped_by, found.relmse, found.heavy_tailed) == (64, "spp", None, True)
 
 
 def test_python_warns_and_the_command_line_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

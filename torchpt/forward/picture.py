@@ -81,8 +81,8 @@ def rendering_of(run: Run) -> Rendering:
         nonfinite_samples=run.lost.count,
         truncated_paths=run.tally.truncated,
         clamped=clamped,
-        relmse=None if known is None else known.relmse,
-        relmse_interval=None if known is None else known.interval,
+        relmse=None if known is None or unknown else known.relmse,
+        relmse_interval=None if known is None or unknown else known.interval,
         relmse_unknown=unknown,
         heavy_tailed=known is not None and known.heavy_tailed,
         stopped_by=run.stop.reason,
@@ -96,7 +96,7 @@ def rendering_of(run: Run) -> Rendering:
 
 
 def known_of(run: Run, picture: Tensor) -> tuple[KnownError | None, str]:
-    """Return the picture's own error, or why that is not known; "" too where nobody asked for it."""
+    """Return what the samples tell of the picture's own error, None where nobody asked, and why that is not known, or ""."""
     film = run.picture.film
     if run.twice is not None:
         known = run.twice.known(film, picture)
@@ -107,7 +107,7 @@ def known_of(run: Run, picture: Tensor) -> tuple[KnownError | None, str]:
         return known, ""
     lacks = unlit(run.scene, run.wave, run.geometry, picture, known.relmse)
     if lacks.reason:
-        return None, lacks.reason
+        return known, lacks.reason
     if known.interval is not None:
         low, high = known.interval
         known = replace(known, interval=(low, high + lacks.dark))

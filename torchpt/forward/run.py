@@ -370,8 +370,8 @@ class Run:
         """The relMSE that the picture itself holds possible, once suspects were looked at again; it takes some samples."""
         assert self.twice is not None
         self._look_again()
-        known, _ = known_of(self, self.twice.picture(self.picture.film))
-        return math.inf if self.ended else _most(known)
+        known, unknown = known_of(self, self.twice.picture(self.picture.film))
+        return math.inf if self.ended or unknown else _most(known)
 
     def geometry(self) -> Geometry:
         """The primitives as the search sees them."""

@@ -15,21 +15,24 @@ from torch import Tensor
 
 from torchpt.accel import Accel
 from torchpt.accel.bounds import primitive_bounds
-from torchpt.integrators.path import PathIntegrator
+from torchpt.integrators.path import PathIntegrator, partition
+from torchpt.integrators.search import Search
 from torchpt.integrators.wave import Wave
 from torchpt.math.frames import Frame
-from torchpt.records import Geometry, Lights
+from torchpt.math.vectors import dot
+from torchpt.records import Geometry, Lights, PathState, rows
 from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
+from torchpt.shapes import interact, offset_origin
 
 __all__ = ["Unlit", "unlit"]
 
 #: Share of the picture that may be dark for the rest to tell the error.
-DARK = 0.01
+DARK = 0.05
 #: Dark pixels of which one camera ray each is asked whether it meets anything that reflects.
 ASKED = 1000
-#: Rays from a light that are asked what they meet first.
-RAYS = 512
+#: Rays from a light that are asked what they meet first; and from each dark pixel's surface, what is in sight.
+RAYS, SIGHTS = 512, 8
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,37 @@ def _dark(search: _Search, black: Tensor) -> float:
         reflects = wave.seen(("albedo",), state)["albedo"].abs().amax(0) > 0
     except NotImplementedError:  # a model of the caller's own without an albedo
         reflects = wave.seen(("object_id",), state)["object_id"][0] > 0
+    if not bool(reflects.any()) or not _in_sight(wave, rows(state, reflects.nonzero()[:, 0])):
+        return 0.0
     return float(reflects.double().mean()) * count / len(black)
+
+
+def _in_sight(wave: Wave, state: PathState) -> bool:
+    """Whether anything can be seen from the surfaces that camera rays meet, or light passes them.
+
+    Else, as behind a single ball in the sun, no path goes on, and what the lights were asked for is all there is.
+    """
+    world, plan = wave.stages.world, wave.stages.plan
+    hit = Search(wave.accel, world, plan.sampler, plan.dtype).nearest(state, 1)
+    for model, _ in partition(world, hit)[1]:
+        if world.materials.models[model].transmits:
+            return True
+    at = interact(world, state.o, state.d, hit)
+    near = torch.where(dot(at.ng, state.d) < 0.0, 1.0, -1.0) * at.ng
+    for k in range(SIGHTS):
+        d = _sphere(torch.arange(len(hit.t), device=near.device) * SIGHTS + k, len(hit.t) * SIGHTS).to(near.dtype)
+        d = torch.where(dot(d, near) < 0.0, -d, d)
+        prim = wave.accel.intersect(offset_origin(world, at, d), d, torch.full_like(hit.t, math.inf))[1]
+        if bool((prim >= 0).any()):
+            return True
+    return False
+
+
+def _sphere(k: Tensor, count: int) -> Tensor:
+    """Directions ``(3, n)`` number ``k (n,)`` of ``count`` on a Fibonacci lattice, float64."""
+    turn, height = math.pi * (3.0 - math.sqrt(5.0)) * k.double(), 1.0 - (2.0 * k.double() + 1.0) / count
+    radius = (1.0 - height.square()).sqrt()
+    return torch.stack((radius * turn.cos(), radius * turn.sin(), height))
 
 
 def _deltas(lights: Lights) -> list[tuple[int, str]]:
@@ -168,12 +201,10 @@ def _rays(search: _Search, lights: Lights, row: int, kind: str) -> tuple[Tensor,
         aside = share.sqrt() * (turn.cos() * frame.s + turn.sin() * frame.t)
         o, d = 0.5 * (low + high) + reach * (aside - 2.0 * axis), axis.expand(3, RAYS)
     else:
-        if kind == "point":
-            axis, cone = torch.tensor([[0.0], [0.0], [1.0]], dtype=torch.float64, device=axis.device), 2.0
-        else:
-            cone = 1.0 - math.cos(float(lights.e1[0, row]))
-        height, frame = 1.0 - cone * share, Frame.about(axis)
-        radius = (1.0 - height.square()).clamp_min(0.0).sqrt()
-        d = radius * (turn.cos() * frame.s + turn.sin() * frame.t) + height * frame.n
+        d = _sphere(k, RAYS)
+        if kind == "spot":
+            height, frame = 1.0 - (1.0 - math.cos(float(lights.e1[0, row]))) * share, Frame.about(axis)
+            radius = (1.0 - height.square()).clamp_min(0.0).sqrt()
+            d = radius * (turn.cos() * frame.s + turn.sin() * frame.t) + height * frame.n
         o = lights.p0[:, row : row + 1].double().expand(3, RAYS)
     return o.float().contiguous(), d.float().contiguous()
