@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,12 +16,13 @@ from torch import Tensor
 
 from torchpt.accel import Accel
 from torchpt.accel.bounds import primitive_bounds
+from torchpt.integrators.aov import values
 from torchpt.integrators.path import PathIntegrator, partition
 from torchpt.integrators.search import Search
-from torchpt.integrators.wave import Wave
+from torchpt.integrators.wave import Wave, camera_state
 from torchpt.math.frames import Frame
-from torchpt.math.vectors import dot
-from torchpt.records import Geometry, Lights, PathState, rows
+from torchpt.math.vectors import dot, take
+from torchpt.records import Geometry, Hit, Lights, PathState, rows
 from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
 from torchpt.shapes import interact, offset_origin
@@ -30,7 +32,7 @@ __all__ = ["Unlit", "unlit"]
 #: Share of the picture that may be dark for the rest to tell the error.
 DARK = 0.05
 #: Dark pixels of which one camera ray each is asked whether it meets anything that reflects.
-ASKED = 1000
+ASKED = 256
 #: Rays from a light that are asked what they meet first; and from each dark pixel's surface, what is in sight.
 RAYS, SIGHTS = 512, 8
 
@@ -110,24 +112,44 @@ def _dark(search: _Search, black: Tensor) -> float:
     asked = places[torch.linspace(0, count - 1, min(count, ASKED), dtype=torch.float64).round().long()].to(
         wave.centre.device
     )
-    x0, y0, width, _ = wave.crop
-    state = wave.rays_of(asked % width + x0, asked // width + y0, torch.zeros_like(asked))
-    try:
-        reflects = wave.seen(("albedo",), state)["albedo"].abs().amax(0) > 0
-    except NotImplementedError:  # a model of the caller's own without an albedo
-        reflects = wave.seen(("object_id",), state)["object_id"][0] > 0
-    if not bool(reflects.any()) or not _in_sight(wave, rows(state, reflects.nonzero()[:, 0])):
+    state, plan, world = _through(wave, asked), wave.stages.plan, wave.stages.world
+    hit = Search(wave.accel, world, plan.sampler, plan.dtype).nearest(state, 1)
+    reflects = hit.prim >= 0
+    with suppress(NotImplementedError):  # a model of the caller's own without an albedo
+        reflects = _albedo(wave, state, hit).abs().amax(0) > 0
+    on = reflects.nonzero()[:, 0]
+    if not len(on) or not _in_sight(wave, rows(state, on), rows(hit, on)):
         return 0.0
     return float(reflects.double().mean()) * count / len(black)
 
 
-def _in_sight(wave: Wave, state: PathState) -> bool:
+def _through(wave: Wave, places: Tensor) -> PathState:
+    """Rays from the middle of the lens through the middles of pixels ``places (n,)`` of the picture."""
+    x0, y0, width, _ = wave.crop
+    x, y = places % width + x0, places // width + y0
+    dtype, camera = wave.stages.plan.dtype, wave.camera
+    lens = torch.full((2, len(places)), 0.5, dtype=dtype, device=places.device) if camera.lens else None
+    o, d = camera.rays(x.to(dtype) + 0.5, y.to(dtype) + 0.5, lens)
+    key = wave.sampler.key(y * camera.resolution[0] + x, torch.zeros_like(places))  # for surfaces of some opacity
+    return camera_state(o.expand_as(d), d, key)
+
+
+def _albedo(wave: Wave, state: PathState, hit: Hit) -> Tensor:
+    """The albedo ``(3, n)`` of the surfaces that rays meet; 0 where they miss."""
+    found, plan, world = torch.zeros_like(state.d), wave.stages.plan, wave.stages.world
+    for model, index in partition(world, hit)[1]:
+        met, o, d = rows(hit, index), take(state.o, index), take(state.d, index)
+        here = values(("albedo",), world, model, o, d, met, wave.centre, plan.dtype, wave.stages.pixel)
+        found.scatter_(1, index.expand(3, -1), here["albedo"])
+    return found
+
+
+def _in_sight(wave: Wave, state: PathState, hit: Hit) -> bool:
     """Whether anything can be seen from the surfaces that camera rays meet, or light passes them.
 
     Else, as behind a single ball in the sun, no path goes on, and what the lights were asked for is all there is.
     """
-    world, plan = wave.stages.world, wave.stages.plan
-    hit = Search(wave.accel, world, plan.sampler, plan.dtype).nearest(state, 1)
+    world = wave.stages.world
     for model, _ in partition(world, hit)[1]:
         if world.materials.models[model].transmits:
             return True
