@@ -253,9 +253,9 @@ def test_no_bias(box, way, seeds):
     is off by no more than the sum over ``k`` of ``sqrt(P(k))`` times its standard deviation (Cauchy and Schwarz). Of adaptive
     renders pilots' own values are not asked either.
     """
-    side = 8
+    side = 8 if way == "adaptive" else 12  # of fewer than eight pilots no error is told
     sampler = {"type": "sobol", "adaptive": way == "adaptive"}
-    wishes: dict[str, Any] = {"spp": 64} if way == "adaptive" else {"spp": 64, "target_error": 0.006}
+    wishes: dict[str, Any] = {"spp": 64} if way == "adaptive" else {"spp": 64, "target_error": 0.01}
     sums, squares, counts = (torch.zeros(2, side * side, 3, dtype=torch.float64) for _ in range(3))
     ended: dict[int, int] = {}
     for seed in range(seeds):
@@ -279,7 +279,7 @@ def test_no_bias(box, way, seeds):
         enough = counts[1] > 5  # of few values the spread is little known
         assert float(z[1][enough].square().mean()) < (1.6 if seeds > 1000 else 3.0)
     else:
-        assert len(ended) >= 4 and 2 <= min(ended) and max(ended) <= 64
+        assert len(ended) >= 4 and min(ended) >= 16 and max(ended) <= 64
         deviation = torch.sqrt(((squares / counts.clamp_min(1)) - found.square()).clamp_min(0.0))[0].mean()
         bound = float(deviation) * sum((number / seeds) ** 0.5 for number in ended.values())
         assert abs(float((found[1] - mean)[counts[1] > 5].mean())) < bound
