@@ -215,7 +215,7 @@ def rendered(order: Order, made: list[Rendering] | None = None) -> Rendering:
     if settings.film.denoise:
         denoise_rendering(rendering, settings)
     if rendering.relmse_unknown:
-        warnings.warn(f"the picture's error is not known: {rendering.relmse_unknown}", NoLightWarning, stacklevel=3)
+        warn_caller(f"the picture's error is not known: {rendering.relmse_unknown}", NoLightWarning)
     return rendering
 
 

@@ -134,6 +134,7 @@ def test_no_error_in_doubt_ends_a_render(box, monkeypatch, doubt):
     monkeypatch.undo()
     plain = shot(box, spp=40, pilots=True)
     assert torch.equal(plain.image, found.image) and plain.relmse == found.relmse
+    assert (plain.rays, plain.paths) == (found.rays, found.paths)  # a look that led to nothing leaves no trace
 
 
 def test_kernels_take_none_of_the_time(monkeypatch):

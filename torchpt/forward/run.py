@@ -46,6 +46,9 @@ from torchpt.shortage import needing
 
 __all__ = ["Run"]
 
+#: A last round of adaptive sampling of less than this part of the samples is not kept: the checkpoint before serves any spp.
+SMALL_ROUND = 8
+
 
 def _most(known: KnownError | None) -> float:
     """The upper end of an interval; infinite where there is none that is to be trusted."""
@@ -121,6 +124,7 @@ class Run:
         self.picture = Plate(film, layers, streams)
         self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
         self.tally, self.done, self.left, self.taken, self.ended = Tally(), 0, 0, 0, False
+        self._keeps_no_more = False  # what follows is done again by whoever goes on
         self.cut = False  # whether a round of adaptive sampling was shortened
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
         bounded = self.keeps or self.split is not None  # a rank that is gone is noticed after a pass
@@ -256,12 +260,15 @@ class Run:
         while self.stop.going(mean):
             wish = min(2.0 * mean, float(self.settings.render.spp)) - mean
             more = self.stop.affordable(wish)
-            last = more == wish and mean + more >= self.settings.render.spp
+            last = more == wish and more < mean and mean + more >= self.settings.render.spp
             spans = shares.spans(self.picture, self.twice, mean + more, last)
             if not spans:  # a sample of one block's pixels is more than what is left
                 self.stop.reason = "spp" if more == wish else "time_limit"
                 break
-            self.cut |= last or more < mean
+            if last and SMALL_ROUND * more < mean and not self.cut:  # quickly done again, and then for any spp
+                self._keep(last=True)
+                self._keeps_no_more = True
+            self.cut |= more < mean
             whole = self._take(spans)
             self._join()
             shares.put_back()
@@ -281,7 +288,7 @@ class Run:
 
     def _keep(self, last: bool = False) -> None:
         """Write a checkpoint where it is time for one."""
-        if not self.keeps:
+        if not self.keeps or self._keeps_no_more:
             return
         due = self.keeper is not None and (last or self.keeper.due())
         if due if self.split is None else self.split.due(due):
@@ -354,6 +361,8 @@ class Run:
             error = self._certain()
             if self.split is not None:
                 _, error = self.split.decide(seconds, error)
+            if (error is None or error > target) and not self.ended:
+                self._forget_look()
         self.stop.told(mean, seconds, error)
 
     def _join(self) -> None:
@@ -372,6 +381,14 @@ class Run:
         self._look_again()
         known, unknown = known_of(self, self.twice.picture(self.picture.film))
         return math.inf if self.ended or unknown else _most(known)
+
+    def _forget_look(self) -> None:
+        """Count as if no pixel had been looked at again: the picture gets more samples, and will be then."""
+        assert self.twice is not None
+        counts, self.light = self._unlooked
+        self.done, self.tally = counts["done"], Tally(counts["rays"], counts["truncated"])
+        self.lost = Lost.read(counts["lost"])
+        self.twice.third, self.twice.looked = None, None
 
     def geometry(self) -> Geometry:
         """The primitives as the search sees them."""
