@@ -23,9 +23,9 @@ def main(device: str) -> None:
                 complete = settings(scene.description, wish)
                 render_scene(scene, complete)  # warm
                 done = render_scene(scene, complete)
-                rate = 1e-6 / done.seconds
+                rate = 1e-6 / done.render_seconds
                 print(
-                    f"{name} {side}^2 x {spp} compile={mode}: {done.seconds:.2f} s, {done.paths * rate:.2f} Mpaths/s, "
+                    f"{name} {side}^2 x {spp} compile={mode}: {done.render_seconds:.2f} s, {done.paths * rate:.2f} Mpaths/s, "
                     f"{done.rays * rate:.1f} Mrays/s, mean {float(done.image.mean()):.5f}, relmse {done.relmse:.2e}",
                     flush=True,
                 )

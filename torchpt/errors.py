@@ -10,6 +10,7 @@ __all__ = [
     "EdgeWarning",
     "EnergyWarning",
     "LostRankError",
+    "NoLightWarning",
     "NotBuiltError",
     "OtherRankError",
     "OutputError",
@@ -122,6 +123,10 @@ class EdgeWarning(UserWarning):
 
 class EnergyWarning(UserWarning):
     """Energy may not be kept: a material that may reflect more than it receives, refracting shapes that touch."""
+
+
+class NoLightWarning(UserWarning):
+    """A picture, or part of it, lacks light that no sample met, so that its error is not known."""
 
 
 def warn_caller(message: str, category: type[Warning]) -> None:

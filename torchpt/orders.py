@@ -13,11 +13,12 @@ from torch import Tensor
 
 from torchpt import adjoint as adjoints
 from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape, without_gradient
-from torchpt.errors import EdgeWarning, SceneError, warn_caller
+from torchpt.errors import EdgeWarning, NoLightWarning, SceneError, warn_caller
 from torchpt.format.description import settings as complete
-from torchpt.forward import Rendering, limited_threads, render_scene
+from torchpt.forward import Rendering, render_scene
+from torchpt.forward.denoising import denoise_rendering
 from torchpt.graphs import known
-from torchpt.images.denoiser import check_denoiser, denoise
+from torchpt.images.denoiser import check_denoiser
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators import LAYERS
 from torchpt.integrators.layer import SurfaceLayer
@@ -212,8 +213,9 @@ def rendered(order: Order, made: list[Rendering] | None = None) -> Rendering:
     else:
         rendering = render({})
     if settings.film.denoise:
-        with limited_threads(settings.render.threads):
-            rendering.denoised = denoise(rendering.image.detach(), **rendering.guides)
+        denoise_rendering(rendering, settings)
+    if rendering.relmse_unknown:
+        warn_caller(f"the picture's error is not known: {rendering.relmse_unknown}", NoLightWarning)
     return rendering
 
 

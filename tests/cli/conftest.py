@@ -27,6 +27,7 @@ class Rendering:
     done: int
     total: int
     denoised: torch.Tensor | None = None
+    write_seconds: float = 0.0
 
     @property
     def complete(self) -> bool:

@@ -82,7 +82,8 @@ def test_numbers_of_the_summary_have_six_digits() -> None:
 
 def test_the_summary_and_the_header_tell_the_error(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lamp = "shapes: {lamp: {type: sphere, center: [2, 2, -2], radius: 0.5, emission: 5}, "
-    (folder / "s.yaml").write_text(SCENE.replace("shapes: {", lamp))
+    sky = "lights: {sky: {type: constant, radiance: 0.1}}\n"
+    (folder / "s.yaml").write_text(SCENE.replace("shapes: {", lamp) + sky)
     assert main(["render", "scene=s.yaml", "out=a.exr", "film.width=48", "film.height=32"]) == 0
     facts, header = summary(capsys), read_header("a.exr")
     found = (facts["relmse"], *facts["relmse_interval"])

@@ -40,6 +40,20 @@ def test_numbers_are_doubled_within_what_there_is():
     assert float(ratio[aims == 4 * have].mean()) > float(ratio[aims == have].mean())
 
 
+def test_the_last_round_leaves_nothing_over():
+    g = torch.Generator().manual_seed(3)
+    pixels = torch.full((100,), 16)
+    pixels[7::10], pixels[9] = 12, 3  # at the film's edge
+    for spp in (20.0, 33.0, 61.5, 64.0):
+        error = (3 * torch.randn(100, generator=g, dtype=torch.float64)).exp()
+        have = 16 << torch.randint(0, 2, (100,), generator=g)
+        if float((have * pixels).sum()) > spp * float(pixels.sum()):
+            continue
+        aims = shared_out(error, have, pixels, min(spp, 2.0 * float(have.double().mean())), last=True)
+        total = min(spp, 2.0 * float(have.double().mean())) * float(pixels.sum())
+        assert (aims >= have).all() and 0.0 <= total - float((aims * pixels).sum()) < 16.0
+
+
 def test_bad_estimates_do_no_harm():
     error = torch.full((100,), -1.0).double()
     assert (shared_out(error, counts(32), PIXELS, 64.0) == 64).all()

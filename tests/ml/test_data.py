@@ -167,7 +167,7 @@ def test_items_of_a_scene_are_of_one_type_whatever_its_poses_are():
 
 
 def test_wishes_of_a_scene_for_files_are_left_out(monkeypatch):
-    monkeypatch.setattr("torchpt.orders.denoise", lambda *_, **__: pytest.fail("nobody sees it"))
+    monkeypatch.setattr("torchpt.images.denoiser.denoise", lambda *_, **__: pytest.fail("nobody sees it"))
     scene = torchpt.load({**room(0), "film": {**FILM, "denoise": True, "aovs": ["normal"]}}, "cpu")
     item = RenderDataset(lambda _: scene, 1, spp=1, layers=["depth"])[0]
     assert "depth" in item and "normal" not in item

@@ -56,7 +56,7 @@ def halved(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
         return 0.5 * image
 
     monkeypatch.setattr(torchpt.orders, "check_denoiser", lambda: None)
-    monkeypatch.setattr(torchpt.orders, "denoise", half)
+    monkeypatch.setattr("torchpt.images.denoiser.denoise", half)
     return seen
 
 

@@ -13,7 +13,7 @@ from torchpt.errors import EnergyWarning
 if TYPE_CHECKING:
     from torchpt.commands.render import Job
 
-__all__ = ["not_finite", "notices", "which_job"]
+__all__ = ["not_finite", "notices", "unknown_error", "which_job"]
 
 
 @contextmanager
@@ -65,3 +65,13 @@ def not_finite(facts: Mapping[str, Any]) -> None:
         f"{facts['nonfinite_first']}; debug.pixel=[x,y] debug.sample=k prints a path",
         file=sys.stderr,
     )
+
+
+def unknown_error(facts: Mapping[str, Any]) -> None:
+    """Say on stderr why a picture's error is not known; nothing where it is, or where nobody asked.
+
+    Args:
+        facts: of :meth:`torchpt.Rendering.summary`.
+    """
+    if facts.get("relmse_unknown"):
+        print(f"torchpt: warning: the picture's error is not known: {facts['relmse_unknown']}", file=sys.stderr)

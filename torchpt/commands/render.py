@@ -18,7 +18,7 @@ from typing import Any
 from torchpt.commands import collector, ranked
 from torchpt.commands.denoised import denoised_files
 from torchpt.commands.interrupt import Interrupt, Interrupted
-from torchpt.commands.notices import not_finite, notices, which_job
+from torchpt.commands.notices import not_finite, notices, unknown_error, which_job
 from torchpt.commands.progress import Bar
 from torchpt.commands.streams import speaking
 from torchpt.errors import OutputError, RenderError, SceneError, TorchptError
@@ -125,6 +125,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     if not rendering.complete:
         summary["complete"] = False
     not_finite(summary)
+    unknown_error(summary)
     summary = plain(summary, digits=6)
     height, width = rendering.image.shape[:2]
     with speaking():  # in one piece, as jobs of a sweep may share stdout; the last line is the summary

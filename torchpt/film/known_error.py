@@ -12,8 +12,8 @@ two values do not tell r. So some pixels are looked at again, by several more st
 - *doubtful pilots*: those whose two values differ most, for the r that theirs is divided by.
 
 The interval is that of the mean over pilots, symmetric in its logarithm, as errors are squares and lean to the right. It is
-called heavy-tailed where one pilot has a large part of the variance, or suspects most of the error: then the interval is not to
-be trusted.
+called heavy-tailed, and is not to be trusted, where suspects have most of the error, where the standard error is half of the
+estimate, or where the largest errors of pilots have a tail too heavy for a mean (:mod:`torchpt.film.tail`).
 """
 
 from __future__ import annotations
@@ -26,12 +26,15 @@ from torch import Tensor
 
 from torchpt.film.pilots import Pilots
 from torchpt.film.sums import RELMSE_FLOOR
+from torchpt.film.tail import FEWEST as TAIL
+from torchpt.film.tail import heavy_tail
 from torchpt.math.threads import sum_all
 
 __all__ = [
     "STREAMS",
     "Again",
     "KnownError",
+    "again_counts",
     "around",
     "error_at",
     "error_by_pilots",
@@ -42,10 +45,8 @@ __all__ = [
 
 #: Pilots from which on an interval is given.
 FEWEST = 8
-#: Share of the variance that one pilot may have before the interval is called heavy-tailed.
-HEAVY = 0.2
-#: Part of the error that suspects may have before it is called so too.
-FEW = 0.5
+#: Part of the error that suspects may have, and that its standard error may be, before the interval is called heavy-tailed.
+FEW, VAGUE = 0.5, 0.5
 #: One of so many pixels is a suspect, one of so many pilots doubtful.
 SUSPECTS, DOUBTFUL = 1024, 64
 #: Streams that they are looked at again by.
@@ -109,11 +110,14 @@ def error_by_pilots(pilots: Pilots, a: Tensor, b: Tensor) -> Tensor:
     return error_at(a, b, around(grid, known)[at]).mean(1)
 
 
-def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> float:
+def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> KnownError:
     """By the pilots alone, so that no other pixel has a say: the relMSE that decisions are made by."""
     share = error_by_pilots(pilots, a, b) * _first_part(a, b, spare)
     pixels = float(sum_all(pilots.weight))
-    return float(sum_all(share * pilots.weight)) / pixels * (1.0 - 0.5 * len(pilots) / pixels if counted else 1.0)
+    part = 1.0 - 0.5 * len(pilots) / pixels if counted else 1.0
+    mean = float(sum_all(share * pilots.weight)) / pixels
+    parts = pilots.weight / pixels * (share - mean) * part
+    return _with_interval(mean * part, parts, 0.0, False, share)
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,11 @@ class Again:
     spare: Tensor
 
 
+def again_counts(pixels: int, pilots: int) -> tuple[int, int]:
+    """Return how many suspects and how many doubtful pilots are looked at again, at most."""
+    return max(pixels // SUSPECTS, 1), max(pilots // DOUBTFUL, 4)
+
+
 def to_look_at(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Which pixels are to be looked at again: suspects, and doubtful pilots; places ``(m,)`` on the picture.
 
@@ -146,7 +155,7 @@ def to_look_at(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[T
     rest = ~torch.isin(pilots.places, suspects)
     low = torch.minimum(a, b).clamp_min(0.0)
     doubt = ((a - b).square() / (low.square() + RELMSE_FLOOR)).mean(1) * rest
-    count = min(max(len(pilots) // DOUBTFUL, 4), int(rest.sum()))
+    count = min(again_counts(len(rest), len(pilots))[1], int(rest.sum()))
     return suspects, pilots.places[doubt.topk(count).indices.sort().values]
 
 
@@ -161,7 +170,7 @@ def _suspects(picture: Tensor) -> Tensor:
             brighter += padded[dy : dy + height, dx : dx + width] > bright
     few = (brighter.reshape(-1) <= 1).nonzero()[:, 0]
     standing = _standing_out(picture.reshape(-1, picture.shape[2])[few], _neighbours(picture, few))
-    count = max(bright.numel() // SUSPECTS, 1)
+    count, _ = again_counts(bright.numel(), 0)
     return few[standing.topk(min(count, len(few))).indices].sort().values
 
 
@@ -211,7 +220,7 @@ def known_error(
     mean = float(sum_all(weight * share))
     parts = weight * (share - mean) * part
     total = sure / pixels + mean * part
-    return _with_interval(total, parts, unsure / pixels**2, sure / pixels > FEW * total)
+    return _with_interval(total, parts, unsure / pixels**2, sure / pixels > FEW * total, share)
 
 
 def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
@@ -258,7 +267,7 @@ def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
     return float(sum_all(share.mean(1))), float(sum_all((slope * spare.sqrt()).mean(1).square()))
 
 
-def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool) -> KnownError:
+def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool, share: Tensor) -> KnownError:
     """The estimate with its interval.
 
     Args:
@@ -266,15 +275,16 @@ def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool) -> Know
         parts: the pilots' deviations, whose sum of squares is their variance.
         unsure: variance from suspects.
         few: whether suspects carry most of the error.
+        share: the pilots' errors.
     """
     count = len(parts)
     if not mean > 0.0 or not math.isfinite(mean):
         return KnownError(mean, (0.0, 0.0) if mean == 0.0 and count >= FEWEST else None, not math.isfinite(mean))
     if count < FEWEST:
         return KnownError(mean, None, True)
-    total = float(sum_all(parts.square())) + unsure
-    heavy = few or (total > 0.0 and float(parts.square().max()) > HEAVY * total)
-    factor = math.exp(min(_quantile(count - 1) * math.sqrt(total) / mean, 300.0))
+    deviation = math.sqrt(float(sum_all(parts.square())) + unsure)
+    heavy = few or deviation > VAGUE * mean or (count >= TAIL and heavy_tail(share))
+    factor = math.exp(min(_quantile(count - 1) * deviation / mean, 300.0))
     return KnownError(mean, (mean / factor, mean * factor), heavy)
 
 

@@ -67,14 +67,18 @@ def _smoothed(values: Tensor, known: Tensor, own: bool = True) -> Tensor:
     return torch.where(weight > 0, total / weight.clamp_min(1e-30), mean)
 
 
-def shared_out(error: Tensor, counts: Tensor, pixels: Tensor, mean: float) -> Tensor:
+def shared_out(error: Tensor, counts: Tensor, pixels: Tensor, mean: float, last: bool = False) -> Tensor:
     """Samples a pixel that blocks are to have ``(B,)`` int64: those they have, twice or four times as many.
+
+    In the ``last`` round what cannot double any more is filled up by halves, quarters, ... of what blocks have, so that less is
+    left over than a sample of the smallest block's pixels.
 
     Args:
         error: relative variance of the pixels of each block ``(B,)`` float64, at its present number of samples.
         counts: that number ``(B,)`` int64.
         pixels: of each block ``(B,)``.
         mean: samples a pixel over the picture that there are to be, at most.
+        last: whether no round follows.
     """
     positive = error.clamp_min(0.0)
     floor = FLOOR * sum_all(positive * pixels) / sum_all(pixels.double())
@@ -99,4 +103,24 @@ def shared_out(error: Tensor, counts: Tensor, pixels: Tensor, mean: float) -> Te
     spent = ((aims * pixels)[order]).cumsum(0)
     left = total - float((aims * pixels).sum())
     aims[order[spent <= left]] *= 2
-    return aims
+    return _filled_up(aims, wanted * have, pixels, total) if last else aims
+
+
+def _filled_up(aims: Tensor, wanted: Tensor, pixels: Tensor, total: float) -> Tensor:
+    """Numbers of samples ``(B,)`` that come to ``total`` over all pixels, as nearly as whole samples of blocks do.
+
+    Args:
+        aims: to begin with.
+        wanted: what blocks would have if that need not be whole: those that are furthest below it come first.
+        pixels: of each block.
+        total: samples in all.
+    """
+    order, halvings = (wanted / aims).argsort(descending=True, stable=True), 0
+    while True:
+        halvings += 1
+        more = (aims >> halvings).clamp_min(1)
+        spent = (more * pixels)[order].cumsum(0)
+        fits = order[spent <= total - float((aims * pixels).sum())]
+        aims[fits] += more[fits]
+        if not len(fits) and int(more.max()) == 1:
+            return aims

@@ -38,11 +38,14 @@ class Shares:
         self.pixels = torch.bincount(self.block, minlength=rows * columns)
         self._parts: list[tuple[Film, Tensor, Film]] = []
 
-    def spans(self, picture: Plate, twice: Twice, mean: float) -> list[tuple[Plate, int, int]]:
-        """What is to be sampled for the picture to have ``mean`` samples a pixel: plates of pixels with as many samples."""
+    def spans(self, picture: Plate, twice: Twice, mean: float, last: bool) -> list[tuple[Plate, int, int]]:
+        """What is to be sampled for the picture to have ``mean`` samples a pixel: plates of pixels with as many samples.
+
+        ``last``: whether no round follows, see :func:`torchpt.film.sharing.shared_out`.
+        """
         device = picture.film.sums.device
         counts = self._of_blocks(picture.film.counts.cpu())
-        aims = shared_out(self._errors(twice), counts, self.pixels, mean)
+        aims = shared_out(self._errors(twice), counts, self.pixels, mean, last)
         spans: list[tuple[Plate, int, int]] = []
         if self._agreed is not None:
             aims = self._agreed(aims)

@@ -20,5 +20,6 @@ def denoise_rendering(rendering: Rendering, settings: Settings) -> float:
     """
     start = time.perf_counter()
     with limited_threads(settings.render.threads):
-        rendering.denoised = denoiser.denoise(rendering.image, **rendering.guides)
-    return time.perf_counter() - start
+        rendering.denoised = denoiser.denoise(rendering.image.detach(), **rendering.guides)
+    rendering.denoise_seconds = time.perf_counter() - start
+    return rendering.denoise_seconds

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torchpt.files import as_path
 from torchpt.images import write_image
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from torchpt.forward.result import Rendering
     from torchpt.settings import Film
 
@@ -27,15 +30,8 @@ def write_rendered(path: str | PathLike[str], rendering: Rendering, film: Film) 
     Raises:
         OutputError: an ending that is not written, or a place that cannot be written.
     """
-    write_image(
-        path,
-        rendering.image,
-        rendering.layers if as_path(path).suffix.lower() == ".exr" else None,
-        exposure=film.exposure,
-        tonemap=film.tonemap,
-        gamma=film.gamma,
-        header=rendering.header(),
-    )
+    layers = rendering.layers if as_path(path).suffix.lower() == ".exr" else None
+    _write(path, rendering, film, rendering.image, layers=layers, header=rendering.header())
 
 
 def write_denoised(path: str | PathLike[str], rendering: Rendering, film: Film) -> None:
@@ -46,11 +42,11 @@ def write_denoised(path: str | PathLike[str], rendering: Rendering, film: Film) 
     """
     assert rendering.denoised is not None
     facts = {name: value for name, value in rendering.header().items() if not name.startswith(("relmse", "heavy"))}
-    write_image(
-        path,
-        rendering.denoised,
-        exposure=film.exposure,
-        tonemap=film.tonemap,
-        gamma=film.gamma,
-        header={**facts, "denoised": 1},
-    )
+    _write(path, rendering, film, rendering.denoised, header={**facts, "denoised": 1})
+
+
+def _write(path: str | PathLike[str], rendering: Rendering, film: Film, image: Tensor, **more: Any) -> None:
+    """Write a picture of a rendering, and count the seconds that it took."""
+    start = time.perf_counter()
+    write_image(path, image, exposure=film.exposure, tonemap=film.tonemap, gamma=film.gamma, **more)
+    rendering.write_seconds += time.perf_counter() - start

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 from torchpt.film import KnownError
 from torchpt.forward.causes import causes_of
 from torchpt.forward.result import Rendering
+from torchpt.forward.unlit import unlit
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.native.memory import Meter, let_go, mb
@@ -19,7 +20,7 @@ from torchpt.shortage import needing, ran_out
 if TYPE_CHECKING:
     from torchpt.forward.run import Run
 
-__all__ = ["final", "rendering_of"]
+__all__ = ["final", "known_of", "rendering_of"]
 
 
 def final(run: Run) -> Rendering:
@@ -50,10 +51,10 @@ def rendering_of(run: Run) -> Rendering:
     """The picture so far; where ranks share a render, what their films hold was joined before."""
     radiant, film = run.integrator.light, run.picture.film
     layers = _layers(run)
-    known = None
+    known, unknown = None, ""
     if radiant:
         values = film.mean() if run.twice is None else run.twice.picture(film)
-        image, known = values.to(run.dtype), _known(run, values)
+        image, (known, unknown) = values.to(run.dtype), known_of(run, values)
     else:
         shown = layers[next(iter(run.seen))]
         blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
@@ -63,26 +64,26 @@ def rendering_of(run: Run) -> Rendering:
         before, after = run.light.tolist()
         clamped = 1.0 - after / before if before > 0 else 0.0
     counts = (film if radiant else next(iter(run.picture.layers.values()))).counts
-    compile_seconds = 0.0 if run.loop is None else run.loop.kernels.seconds
     names = run.settings.film.aovs or run.integrator.layers
     meter = Meter(run.device)
     return Rendering(
         image=image,
         layers={name: layers[name] for name in names},
         guides={name: layers[name] for name in GUIDES} if run.settings.film.denoise else {},
-        spp=int(counts.sum()) // len(counts),
-        seconds=time.perf_counter() - run.start,
+        spp=round(float(counts.double().mean())) if run.settings.adaptive else int(counts.sum()) // len(counts),
         load_seconds=run.load_seconds,
         build_seconds=run.build_seconds,
-        compile_seconds=compile_seconds,
+        compile_seconds=run.compile_seconds(),
         render_seconds=run.seconds_of_sampling(),
+        write_seconds=run.write_seconds(),
         paths=run.done,
         rays=run.tally.rays,
         nonfinite_samples=run.lost.count,
         truncated_paths=run.tally.truncated,
         clamped=clamped,
-        relmse=None if known is None else known.relmse,
-        relmse_interval=None if known is None else known.interval,
+        relmse=None if known is None or unknown else known.relmse,
+        relmse_interval=None if known is None or unknown else known.interval,
+        relmse_unknown=unknown,
         heavy_tailed=known is not None and known.heavy_tailed,
         stopped_by=run.stop.reason,
         complete=bool(run.stop.reason) and not run.ended,
@@ -94,13 +95,23 @@ def rendering_of(run: Run) -> Rendering:
     )
 
 
-def _known(run: Run, picture: Tensor) -> KnownError | None:
-    """The picture's own error."""
+def known_of(run: Run, picture: Tensor) -> tuple[KnownError | None, str]:
+    """Return what the samples tell of the picture's own error, None where nobody asked, and why that is not known, or ""."""
     film = run.picture.film
     if run.twice is not None:
-        return run.twice.known(film, picture)
-    relmse = film.relmse()
-    return None if relmse is None else KnownError(relmse, None, False)
+        known = run.twice.known(film, picture)
+    else:
+        relmse = film.relmse()
+        known = None if relmse is None else KnownError(relmse, None, False)
+    if known is None or not run.done:
+        return known, ""
+    lacks = unlit(run.scene, run.wave, run.geometry, picture, known.relmse)
+    if lacks.reason:
+        return known, lacks.reason
+    if known.interval is not None:
+        low, high = known.interval
+        known = replace(known, interval=(low, high + lacks.dark))
+    return known, ""
 
 
 def _layers(run: Run) -> dict[str, Tensor]:

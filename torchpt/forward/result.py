@@ -28,11 +28,12 @@ class Rendering:
             without ``film.denoise``.
         denoised: the picture without its noise ``(H, W, 3)``; None where nobody denoised it. No number here is about it.
         spp: samples a pixel that the picture holds.
-        seconds: wall time, loading apart.
         load_seconds: for reading the scene and its files; 0 where nobody took the time.
-        build_seconds: of ``seconds``, for the world and its search structure.
-        compile_seconds: of it, for compiling.
-        render_seconds: of it, for sampling.
+        build_seconds: for the world and its search structure.
+        compile_seconds: for kernels: compiled, or loaded from disk.
+        render_seconds: for sampling, and for what the picture knows of its error; with those before a checkpoint.
+        denoise_seconds: for the denoised picture.
+        write_seconds: for files: checkpoints, and the pictures of ``torchpt render``.
         paths: camera samples traced.
         rays: rays traced, shadow rays included.
         nonfinite_samples: samples that were NaN or infinite, and counted as black.
@@ -41,8 +42,9 @@ class Rendering:
         nonfinite_first: which sample was the first of them, and what of it stopped being finite; "" where there is none.
         truncated_paths: paths ended by the cap on endless depth.
         clamped: fraction of the light that ``integrator.clamp`` took away; None where it is off.
-        relmse: the picture's estimate of its own relMSE; None where it has no pilots.
+        relmse: the picture's estimate of its own relMSE; None where it has no pilots, or where light is missing.
         relmse_interval: of 95 % for it; None where there are too few pilots.
+        relmse_unknown: which light is missing, so that no error is known; "" where none is, or where there are no pilots.
         heavy_tailed: whether few pixels carry the error, so that the interval is not to be trusted.
         stopped_by: the rule that ended it: spp, time_limit or target_error; "" where it was ended from outside.
         complete: whether a rule ended it.
@@ -58,11 +60,12 @@ class Rendering:
     guides: dict[str, Tensor] = field(default_factory=dict)
     denoised: Tensor | None = None
     spp: int = 0
-    seconds: float = 0.0
     load_seconds: float = 0.0
     build_seconds: float = 0.0
     compile_seconds: float = 0.0
     render_seconds: float = 0.0
+    denoise_seconds: float = 0.0
+    write_seconds: float = 0.0
     paths: int = 0
     rays: int = 0
     nonfinite_samples: int = 0
@@ -72,6 +75,7 @@ class Rendering:
     clamped: float | None = None
     relmse: float | None = None
     relmse_interval: tuple[float, float] | None = None
+    relmse_unknown: str = ""
     heavy_tailed: bool = False
     stopped_by: str = ""
     complete: bool = True
@@ -82,9 +86,23 @@ class Rendering:
     settings: Settings | None = None
 
     @property
+    def seconds(self) -> float:
+        """What it took, from reading the scene to writing the picture: the sum of the six above."""
+        prepared = self.load_seconds + self.build_seconds + self.compile_seconds
+        return prepared + self.render_seconds + self.denoise_seconds + self.write_seconds
+
+    @property
     def variance(self) -> Tensor | None:
         """The variance of each pixel ``(H, W, 3)``; None where ``film.aovs`` does not ask for it."""
         return self.layers.get("variance")
+
+    @property
+    def _open(self) -> bool:
+        """Whether anything but ``render.spp`` has a say in how many samples a pixel gets."""
+        if self.settings is None:
+            return False
+        render = self.settings.render
+        return self.settings.adaptive or render.time_limit is not None or render.target_error is not None
 
     def __getitem__(self, name: str) -> Tensor:
         """The picture (``rgb``) or a layer, by name.
@@ -197,6 +215,11 @@ class Rendering:
             "build_seconds": round(self.build_seconds, 4),
             "compile_seconds": round(self.compile_seconds, 4),
             "render_seconds": round(self.render_seconds, 4),
+            **{
+                name: round(value, 4)
+                for name, value in (("denoise_seconds", self.denoise_seconds), ("write_seconds", self.write_seconds))
+                if value
+            },
             "seconds": round(self.seconds, 4),
             "paths_per_second": round(self.paths / max(self.render_seconds, 1e-9)),
             "rays": self.rays,
@@ -205,6 +228,8 @@ class Rendering:
             "relmse": self.relmse,
             "relmse_interval": None if self.relmse_interval is None else list(self.relmse_interval),
         }
+        if self.relmse_unknown:
+            facts["relmse_unknown"] = self.relmse_unknown
         facts["peak_memory"] = self.peak_memory
         if self.lanes is not None:
             facts["lanes"] = self.lanes
@@ -213,7 +238,7 @@ class Rendering:
             facts["nonfinite_first"] = self.nonfinite_first
         if self.heavy_tailed:
             facts["heavy_tailed"] = True
-        if self.stopped_by not in ("", "spp"):
+        if self.stopped_by and (self.stopped_by != "spp" or self._open):
             facts["stopped_by"] = self.stopped_by
         if self.truncated_paths:
             facts["truncated_paths"] = self.truncated_paths

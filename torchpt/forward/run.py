@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpt.errors import LostRankError, OutputError, RenderError, SceneError
-from torchpt.film import Film
+from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
 from torchpt.forward.budget import check_memory
 from torchpt.forward.causes import told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
 from torchpt.forward.need import loaded, need_of, shape_of
-from torchpt.forward.picture import final, rendering_of
+from torchpt.forward.picture import final, known_of, rendering_of
 from torchpt.forward.piece import take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.resume import check_samples, check_whole
@@ -28,19 +30,29 @@ from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
 from torchpt.forward.wave import loop_of, looped, make_wave, surface_layers
 from torchpt.forward.waves import Waves, say_once
-from torchpt.integrators.loop.schedule import Block, Share
+from torchpt.integrators.loop.schedule import Block, Loop, Share
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
+from torchpt.native import compile_time
 from torchpt.native.memory import Meter, mb
 from torchpt.ranks import Group
+from torchpt.records import Geometry
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 from torchpt.shortage import needing
 
 __all__ = ["Run"]
+
+#: A last round of adaptive sampling of less than this part of the samples is not kept: the checkpoint before serves any spp.
+SMALL_ROUND = 8
+
+
+def _most(known: KnownError | None) -> float:
+    """The upper end of an interval; infinite where there is none that is to be trusted."""
+    return math.inf if known is None or known.interval is None or known.heavy_tailed else known.interval[1]
 
 
 class Run:
@@ -60,6 +72,9 @@ class Run:
         threads: int | None = None,
     ) -> None:
         self.start = time.perf_counter()
+        self._numba = compile_time.seconds()
+        self._kernels = 0.0  # seconds of kernels that were given up
+        self.loop: Loop | None = None
         self.split = None if group is None or group.size == 1 else Split(group)
         self.shared: tuple[int, int] = 0, 1  # samples before this pass, and how many ranks take it
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
@@ -70,9 +85,8 @@ class Run:
         with needing(lambda: f"a scene of {scene.told}"):
             self.wave = make_wave(scene, settings, params, dtype, like=like)
         built = before if limit is None else meter.peak()
-        self.build_seconds = time.perf_counter() - self.start
         _, _, self.width, self.height = self.wave.crop
-        self.dtype = dtype
+        self.params, self.dtype = params, dtype
         self.integrator = settings.integrator
         self.seen = surface_layers(settings)
         self.on_progress: Callable[[Progress], bool | None] | None = None
@@ -96,6 +110,8 @@ class Run:
                 self.loop.threads, self.loop.lanes = shape_of(left, self.loop.threads, rows, self.loop.lanes)
         with needing(lambda: f"films of {self.width} x {self.height} pixels, which take {mb(self.need.films)}"):
             self._begin()
+        self._compiled = self.compile_seconds()
+        self.build_seconds = time.perf_counter() - self.start - self._compiled
 
     def _begin(self) -> None:
         """Nothing is sampled yet."""
@@ -108,13 +124,17 @@ class Run:
         self.picture = Plate(film, layers, streams)
         self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
         self.tally, self.done, self.left, self.taken, self.ended = Tally(), 0, 0, 0, False
+        self._keeps_no_more = False  # what follows is done again by whoever goes on
         self.cut = False  # whether a round of adaptive sampling was shortened
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
         bounded = self.keeps or self.split is not None  # a rank that is gone is noticed after a pass
         self.stop = Stop(self.settings.render, streams.count, EVERY if bounded else None)
+        if self.twice is not None:
+            self.stop.after = self.twice.looks(self.width * self.height)
         if self.split is not None:
             self.split.begin()
         self.lost = Lost()
+        self._unlooked: tuple[dict[str, Any], Tensor] = {}, torch.empty(0)  # counted before pixels were looked at again
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.waves: Waves | None = None  # of tensor operations
         self.begun: float | None = None
@@ -178,6 +198,8 @@ class Run:
             raise SceneError("render.compile", "on", f"auto or off (no kernel can be made of {error})")
         self.eager.append(f"all stages: {error}")
         say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
+        assert self.loop is not None
+        self._kernels += self.loop.kernels.seconds
         self.loop = None
         self._begin()
         self._complete()
@@ -189,10 +211,18 @@ class Run:
         self._resume()
         self._sample()
         self._join()
-        if self.twice is not None and not self.ended:
-            again = self.twice.look_again(self.picture.film, None if self.split is None else self.split.places)
-            if not self._take(again):
-                self.twice.third = None
+        if not self.ended:
+            self._look_again()
+
+    def _look_again(self) -> None:
+        """Sample what it takes to know the picture's error better, unless that was done with as many samples."""
+        if self.twice is None or self.twice.looked == self._mean():
+            return
+        self._unlooked = self._counted()
+        again = self.twice.look_again(self.picture.film, None if self.split is None else self.split.places)
+        if not self._take(again):
+            self.twice.third = None
+        self._join()
 
     def _sample(self) -> None:
         """Pass by pass, until a rule says that it is enough."""
@@ -222,21 +252,25 @@ class Run:
         assert self.twice is not None
         self._join()
         shares = Shares(self.twice.pilots, self.picture.film, None if self.split is None else self.split.places)
-        mean = float(self.picture.film.counts.double().mean())
+        mean = self._mean()
         while self.stop.going(mean):
             wish = min(2.0 * mean, float(self.settings.render.spp)) - mean
             more = self.stop.affordable(wish)
-            spans = shares.spans(self.picture, self.twice, mean + more)
-            if not spans:  # no block's samples can be doubled within what is left
+            last = more == wish and more < mean and mean + more >= self.settings.render.spp
+            spans = shares.spans(self.picture, self.twice, mean + more, last)
+            if not spans:  # a sample of one block's pixels is more than what is left
                 self.stop.reason = "spp" if more == wish else "time_limit"
                 break
+            if last and SMALL_ROUND * more < mean and not self.cut:  # quickly done again, and then for any spp
+                self._keep(last=True)
+                self._keeps_no_more = True
             self.cut |= more < mean
             whole = self._take(spans)
             self._join()
             shares.put_back()
             if not whole:
                 break
-            mean = float(self.picture.film.counts.double().mean())
+            mean = self._mean()
             self._reached(mean, self.seconds_of_sampling())
             self._keep()
 
@@ -250,7 +284,7 @@ class Run:
 
     def _keep(self, last: bool = False) -> None:
         """Write a checkpoint where it is time for one."""
-        if not self.keeps:
+        if not self.keeps or self._keeps_no_more:
             return
         due = self.keeper is not None and (last or self.keeper.due())
         if due if self.split is None else self.split.due(due):
@@ -269,17 +303,20 @@ class Run:
 
     def _state(self) -> State:
         """Where the render is."""
-        facts = {
-            "taken": self.taken,
-            "done": self.done,
-            "rays": self.tally.rays,
-            "truncated": self.tally.truncated,
-            "seconds": self.seconds_of_sampling(),
-            "cut": int(self.cut),
-            "lost": self.lost.plain(),
-        }
+        looked = self.twice is not None and self.twice.looked == self._mean()  # whoever goes on looks once more
+        counted, light = self._unlooked if looked else self._counted()
+        facts = {"taken": self.taken, "seconds": self.seconds_of_sampling(), "cut": int(self.cut), **counted}
         arrays = {f"{name}.{key}": value for name, film in self.films().items() for key, value in film.state().items()}
-        return State(facts, arrays | {"light": self.light})
+        return State(facts, arrays | {"light": light})
+
+    def _counted(self) -> tuple[dict[str, Any], Tensor]:
+        """What is counted beside the films, by name, and the light before and after the clamp."""
+        counts = {"done": self.done, "rays": self.tally.rays, "truncated": self.tally.truncated}
+        return {**counts, "lost": self.lost.plain()}, self.light.clone()
+
+    def _mean(self) -> float:
+        """Samples a pixel that the picture holds."""
+        return float(self.picture.film.counts.double().mean())
 
     def _resume(self) -> None:
         """Go on from the checkpoint, where that is wished and there is one."""
@@ -298,7 +335,7 @@ class Run:
         self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
         self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
         self.cut = bool(state.facts["cut"])
-        mean = float(self.picture.film.counts.double().mean()) if self._adapts() else self.taken
+        mean = self._mean() if self._adapts() else self.taken
         self._reached(mean, self.before)
 
     def _kept(self, keeper: Keeper) -> State | None:
@@ -312,9 +349,16 @@ class Run:
         """Tell the rules what was reached; where ranks share a render, as the first one sees it."""
         if self.settings.render.target_error is not None:
             self._join()
-        error = self._decisive()
+        error = self._by_pilots() if self.stop.asks(mean, self._adapts()) else None
         if self.split is not None:
             seconds, error = self.split.decide(seconds, error)
+        target = self.settings.render.target_error
+        if error is not None and target is not None and error <= target:
+            error = self._certain()
+            if self.split is not None:
+                _, error = self.split.decide(seconds, error)
+            if (error is None or error > target) and not self.ended:
+                self._forget_look()
         self.stop.told(mean, seconds, error)
 
     def _join(self) -> None:
@@ -322,19 +366,46 @@ class Run:
         if self.split is not None:
             self.split.join()
 
-    def _decisive(self) -> float | None:
-        """RelMSE as pilots alone tell it, where the render may end by it."""
-        if self.twice is None or self.settings.render.target_error is None:
-            return None
-        return self.twice.alone(self.picture.film)
+    def _by_pilots(self) -> float:
+        """The relMSE that pilots alone hold possible: the upper end of its interval."""
+        assert self.twice is not None
+        return _most(self.twice.alone(self.picture.film))
+
+    def _certain(self) -> float:
+        """The relMSE that the picture itself holds possible, once suspects were looked at again; it takes some samples."""
+        assert self.twice is not None
+        self._look_again()
+        known, unknown = known_of(self, self.twice.picture(self.picture.film))
+        return math.inf if self.ended or unknown else _most(known)
+
+    def _forget_look(self) -> None:
+        """Count as if no pixel had been looked at again: the picture gets more samples, and will be then."""
+        assert self.twice is not None
+        counts, self.light = self._unlooked
+        self.done, self.tally = counts["done"], Tally(counts["rays"], counts["truncated"])
+        self.lost = Lost.read(counts["lost"])
+        self.twice.third, self.twice.looked = None, None
+
+    def geometry(self) -> Geometry:
+        """The primitives as the search sees them."""
+        moved = {name: value for name, value in (self.params or {}).items() if not name.startswith("camera.")}
+        return self.scene.world(torch.float32, moved)[1]
 
     def seconds_of_sampling(self) -> float:
-        """Since the first sample, without what was spent on kernels."""
+        """Since the first sample, without what was spent on kernels and checkpoints."""
         if self.begun is None:
             return 0.0
+        made = self.compile_seconds() - self._compiled
+        return self.before + max(time.perf_counter() - self.begun - made - self.write_seconds(), 0.0)
+
+    def compile_seconds(self) -> float:
+        """Since the start, for kernels: those of stages, and numba's of searches, also where a first call makes them."""
         made = 0.0 if self.loop is None else self.loop.kernels.seconds
-        kept = 0.0 if self.keeper is None else self.keeper.seconds
-        return self.before + max(time.perf_counter() - self.begun - made - kept, 0.0)
+        return self._kernels + made + compile_time.seconds() - self._numba
+
+    def write_seconds(self) -> float:
+        """For checkpoints."""
+        return 0.0 if self.keeper is None else self.keeper.seconds
 
     # -- how they are taken
 

@@ -3,6 +3,9 @@
 Where only ``render.spp`` ends it, passes double if somebody looks at the picture in between. Else they are blocks of 16
 samples, after a start that doubles, and shorter where a block would take more time than is left, or is more than a quarter of
 the samples there are: every pass begins at a multiple of its own length, so that sequences stay balanced.
+
+An error is asked for at four numbers of samples an octave, from 16 on: each time it may lie below the target by chance.
+A pass before a time limit is let to take twice as long as the last ones foretell, as other work on the machine may slow it.
 """
 
 from __future__ import annotations
@@ -17,7 +20,11 @@ __all__ = ["Stop"]
 #: What of ``render.time_limit`` may be left over or exceeded.
 SLACK = 0.03
 #: Samples from which on an error may end a render: of fewer it is little more than a guess.
-FEWEST = 4
+FEWEST = 16
+#: How many times longer than foretold a pass may take for the time limit to hold; of a single sample, which cannot be cut.
+SLOWER, SLOWER_ONE = 2.0, 1.25
+#: What is left of the difference to a quicker pass, from one pass to the next.
+FADING = 0.75
 
 
 @dataclass
@@ -29,6 +36,7 @@ class Stop:
         streams: that share the samples of a pixel.
         longest: seconds that a pass may take where only ``render.spp`` ends it; None: it does not matter.
         watched: whether something looks at the picture between passes; else they are as long as they may be.
+        after: what comes after the last sample, as a share of the samples there are: pixels that are looked at again.
         reason: the rule that ended it; "" as long as it goes on.
         share: of the work that is done, 0..1, by the rule that is nearest to its end.
     """
@@ -37,9 +45,10 @@ class Stop:
     streams: int = 1
     longest: float | None = None
     watched: bool = True
+    after: float = 0.0
     reason: str = ""
     share: float = 0.0
-    _pace: float | None = field(default=None, repr=False)  # seconds a sample of every pixel, in the last pass
+    _pace: float | None = field(default=None, repr=False)  # seconds a sample of every pixel, in the last passes
     _last: tuple[float, float] = field(default=(0.0, 0.0), repr=False)
 
     @property
@@ -47,16 +56,27 @@ class Stop:
         """Whether something else than the number of samples may end it."""
         return self.render.time_limit is not None or self.render.target_error is not None
 
+    def asks(self, taken: float, adaptive: bool = False) -> bool:
+        """Whether an error may end the render at so many samples a pixel; adaptive rounds are few, so each may."""
+        if self.render.target_error is None or taken < FEWEST:
+            return False
+        whole = int(taken)
+        return adaptive or (whole == taken and whole % (1 << max(whole.bit_length() - 3, 0)) == 0)
+
     def told(self, taken: float, seconds: float, error: float | None) -> None:
-        """What was reached after a pass: samples a pixel, seconds of sampling, and relMSE where it is asked for."""
+        """What was reached after a pass: samples a pixel, seconds of sampling, and relMSE where it is asked for.
+
+        An ``error`` at or below the target ends the render: who tells it must be certain of it.
+        """
         before, since = self._last
         if taken > before and seconds > since:
-            self._pace = (seconds - since) / (taken - before)
+            pace = (seconds - since) / (taken - before)
+            self._pace = pace if self._pace is None else max(pace, FADING * self._pace + (1.0 - FADING) * pace)
         self._last = taken, seconds
         done = {"spp": taken / self.render.spp}
         if self.render.time_limit is not None:
-            done["time_limit"] = seconds / self.render.time_limit
-        if self.render.target_error is not None and error is not None and taken >= FEWEST:
+            done["time_limit"] = 1.0 - self.time_left() / self.render.time_limit
+        if self.render.target_error is not None and error is not None:
             done["target_error"] = self.render.target_error / error if error > 0.0 else 1.0
         self.share = min(max(done.values()), 1.0)
         for rule, share in done.items():
@@ -83,25 +103,31 @@ class Stop:
             while size > max(taken // 4, 1):
                 size //= 2
         if self.render.time_limit is not None and self._pace is not None:
-            while size > 1 and self._pace * size > self.time_left() + SLACK * self.render.time_limit:
+            seconds = self.time_left() + SLACK * self.render.time_limit
+            while size > 1 and SLOWER * self._pace * size > seconds:
                 size //= 2
-            if self._pace * size > self.time_left() + SLACK * self.render.time_limit:
+            if SLOWER_ONE * self._pace * size > seconds:
                 self.reason = "time_limit"
                 return 0
         return min(size, left)
 
     def going(self, mean: float) -> bool:
-        """Whether adaptive sampling goes on, at so many samples a pixel; it never comes to a whole number of them."""
-        if not self.reason and mean >= self.render.spp - 0.5 * BLOCK:
+        """Whether adaptive sampling goes on, at so many samples a pixel."""
+        if not self.reason and mean >= self.render.spp:
             self.reason = "spp"
         if not self.reason and self.affordable(1.0) < 1.0:
             self.reason = "time_limit"
         return not self.reason
 
     def time_left(self) -> float:
-        """Seconds that ``render.time_limit`` leaves."""
-        return float("inf") if self.render.time_limit is None else self.render.time_limit - self._last[1]
+        """Seconds that ``render.time_limit`` leaves, but for what comes after the last sample."""
+        if self.render.time_limit is None:
+            return float("inf")
+        taken, seconds = self._last
+        return self.render.time_limit - seconds - self.after * taken * (self._pace or 0.0)
 
     def affordable(self, more: float) -> float:
         """Of ``more`` samples a pixel those for which there is time."""
-        return more if self._pace is None or self._pace <= 0.0 else min(more, max(self.time_left(), 0.0) / self._pace)
+        if self._pace is None or self._pace <= 0.0:
+            return more
+        return min(more, max(self.time_left(), 0.0) / (SLOWER * self._pace))

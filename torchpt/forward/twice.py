@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.film import Film, KnownError, Pilots, pilots_of
-from torchpt.film.known_error import STREAMS, Again, known_error, pilots_alone, to_look_at
+from torchpt.film.known_error import STREAMS, Again, again_counts, known_error, pilots_alone, to_look_at
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.wave import Wave
 from torchpt.samplers import Streams
@@ -30,12 +30,14 @@ class Twice:
         plate: sums of their second values.
         counted: whether these are part of the picture.
         third: what was looked at again, and how many of those pixels are suspects.
+        looked: samples a pixel that the picture had then; None: nothing was looked at yet.
     """
 
     pilots: Pilots
     plate: Plate
     counted: bool
     third: tuple[Plate, int] | None = None
+    looked: float | None = None
 
     def picture(self, film: Film) -> Tensor:
         """The picture ``(H, W, 3)`` in float64."""
@@ -68,8 +70,12 @@ class Twice:
         first = self._first(film)
         return known_error(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
 
+    def looks(self, pixels: int) -> float:
+        """Return what looking again takes, as a share of the samples of a picture of so many pixels."""
+        return STREAMS * sum(again_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
+
     def look_again(self, film: Film, agreed: Callable[[Tensor], Tensor] | None = None) -> list[tuple[Plate, int, int]]:
-        """What is to be sampled for the picture to know its error better, once it is finished.
+        """What is to be sampled for the picture to know its error better, once it is finished or may be.
 
         ``agreed`` makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
         """
@@ -83,10 +89,11 @@ class Twice:
         streams = Streams(self.plate.streams.first + self.plate.streams.count, STREAMS)
         plate = Plate(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
         self.third = plate, len(suspects)
-        samples = round(float(film.counts.double().mean()))
+        self.looked = float(film.counts.double().mean())
+        samples = round(self.looked)
         return [(plate, 0, STREAMS * samples)]
 
-    def alone(self, film: Film) -> float | None:
+    def alone(self, film: Film) -> KnownError | None:
         """RelMSE as the pilots alone tell it."""
         if not len(self.pilots):
             return None

@@ -22,9 +22,10 @@ from numba.core import config as numba_config
 from numba.core import serialize
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
+from numba.core.event import Event, Listener, register
 
 from torchpt.errors import RenderError
-from torchpt.native import cache
+from torchpt.native import cache, compile_time
 from torchpt.native.content import code_of_function
 from torchpt.native.memory import MARGIN, room_for
 
@@ -52,6 +53,20 @@ def _after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
+
+
+class _Compiling(Listener):
+    """Tells :mod:`torchpt.native.compile_time` of every kernel, also of those that compile at their first call."""
+
+    def on_start(self, event: Event) -> None:
+        compile_time.begun()
+
+    def on_end(self, event: Event) -> None:
+        compile_time.ended()
+
+
+# Numba holds this lock while it compiles, and while it looks a kernel up on disk.
+register("numba:compiler_lock", _Compiling())
 
 
 def jit(**options: Any) -> Callable[[Callable], Any]:

@@ -60,10 +60,17 @@ class Names:
 
     def owner(self, slot: int) -> str:
         """The shape and material of a surface by its slot alone."""
-        copied = slot >= self._ends[-1]
-        owner: Part | Copy
-        owner = self._copies[slot - self._ends[-1]] if copied else self._parts[bisect_right(self._ends, slot) - 1]
+        owner = self._owner(slot)
         return f"shape {owner.shape}, material {owner.material.name.removeprefix('materials.')}"
+
+    def shape(self, slot: int) -> tuple[str, str]:
+        """Return the names of the shape and of the material's ``type`` of a surface, by its slot alone."""
+        owner = self._owner(slot)
+        return owner.shape, owner.material.model.name
+
+    def _owner(self, slot: int) -> Part | Copy:
+        copied = slot >= self._ends[-1]
+        return self._copies[slot - self._ends[-1]] if copied else self._parts[bisect_right(self._ends, slot) - 1]
 
     def light(self, row: int) -> str:
         """A row of the table of lights: the name of its shape, or of the light."""
