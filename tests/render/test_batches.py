@@ -228,6 +228,7 @@ VIEWS = [*BLOCKS, {"type": "perspective", "origin": [0, 1, 4], "target": [0, 1, 
     ),
     ids=str,
 )
+@pytest.mark.filterwarnings("ignore::torchpt.NoLightWarning")
 def test_pictures_by_tensor_operations(wishes):
     scenes, wishes = [room(0.2), tetrahedron()], {"compile": "off", "full": True, **wishes}
     seeds = [[3, 1, 4, 1], [5, 9, 2, 6]]
