@@ -36,6 +36,7 @@ def test_import_is_quick_and_light() -> None:
     assert found == "[]" and seconds < 2.0
 
 
+@pytest.mark.slow
 def test_the_public_names_load_on_use() -> None:
     found, _ = loaded(
         "import torchpt, torchpt.cli, torchpt.rendering\n"

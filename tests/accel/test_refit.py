@@ -227,7 +227,7 @@ def without(g, name):
     return number, Geometry(p[0], p[1], p[2], g.counts)
 
 
-@pytest.mark.parametrize("name", LOST)
+@pytest.mark.parametrize("name", few(LOST, 3))
 def test_what_loses_its_area_is_not_hit_and_may_return(name, whatever_it_costs):
     g = soup(3, (400, 20, 15, 15))
     p = torch.cat([(g.p0 * 4).round() / 4, (g.p1 * 4).round() / 4, (g.p2 * 4).round() / 4])  # so that lines are lines
@@ -418,6 +418,7 @@ def picture_and_gradient(scene, vertices, seed):
 
 
 @pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
+@pytest.mark.slow
 def test_an_optimization_refits_and_gives_the_pictures_of_fresh_scenes(builds):
     scene = torchpt.load(ball_in_light(), "cpu")
     vertices = scene.params["shapes.ball.vertices"].clone()

@@ -10,6 +10,7 @@ import pytest
 import torch
 from cases import Case
 from chi_square import Chart, SlopeChart, Tree, integrate
+from few import few
 from test_contract import EACH, Experiment, Setting
 from torch import Tensor
 
@@ -102,7 +103,7 @@ def test_the_chart_and_its_inverse(scale):
     torch.testing.assert_close(chart.directions(chart.places(w)), w)
 
 
-@pytest.mark.parametrize("eta", [None, 1.5, 1 / 1.5, 10.0])
+@pytest.mark.parametrize("eta", few([None, 1.5, 1 / 1.5, 10.0], 2))
 @pytest.mark.parametrize("z", [0.9, 1e-3, -0.5])
 def test_the_chart_of_slopes_and_its_inverse(z, eta):
     """Every direction on the side meant, or every one that a facet can refract to; its area adds up to theirs."""

@@ -418,7 +418,7 @@ def by_case() -> Iterator[Any]:
         name = str(setting.case) if setting.full else str(setting.case.model)
         groups.setdefault((name, setting.full), []).append(setting)
     for (name, full), group in groups.items():
-        yield pytest.param(group, marks=[pytest.mark.slow] if full else [], id=name)
+        yield pytest.param(group, marks=[pytest.mark.slow] if full or heavy(group[0].case.model) else [], id=name)
 
 
 @pytest.mark.parametrize("settings", list(by_case()))

@@ -99,8 +99,9 @@ def quick(command: str) -> bool:
 
 def marks(command: str) -> list[pytest.MarkDecorator]:
     """What a command needs: time, or a package that may not be there."""
+    long = any(word in command for word in ("converge", "stress", "--multirun")) or not quick(command)
     needs = pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed (extra `denoise`)")
-    return [pytest.mark.slow] * (not quick(command)) + [needs] * ("denoise=true" in command)
+    return [pytest.mark.slow] * long + [needs] * ("denoise=true" in command)
 
 
 TORCHPT = commands("torchpt")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from few import few
 from PIL import Image, ImageSequence
 from textured_quad import repeated, textured_quad
 
@@ -151,20 +152,23 @@ def test_what_a_mesh_file_says_of_its_texture_is_part_of_the_scene(
 
 @pytest.mark.parametrize(
     ("words", "said"),
-    [
-        (["frames=0"], "frames: expected a whole number 1.."),
-        (["frames=2.5"], "frames: expected a whole number 1.."),
-        (["degrees=much"], "degrees: expected an angle in degrees, got 'much'"),
-        (["fps=0"], "fps: expected a number above 0"),
-        (["fps=60"], "s.gif: .gif shows at most 50 frames a second, fps=60"),
-        (["keep=maybe"], "keep: expected true or false"),
-        (["frames=2"], "frames: given twice"),
-        (["out=a.png"], "a.png: cannot write the kind '.png'; accepted: .gif .mp4"),
-        (["out=no/a.gif"], "there is no folder"),
-        (["film.aovs=[albedo]"], "film.aovs: expected nothing"),
-        (["render.preview=p.png"], "render.preview: expected nothing"),
-        (["turn=3"], "turn: unknown key"),
-    ],
+    few(
+        [
+            (["frames=0"], "frames: expected a whole number 1.."),
+            (["frames=2.5"], "frames: expected a whole number 1.."),
+            (["degrees=much"], "degrees: expected an angle in degrees, got 'much'"),
+            (["fps=0"], "fps: expected a number above 0"),
+            (["fps=60"], "s.gif: .gif shows at most 50 frames a second, fps=60"),
+            (["keep=maybe"], "keep: expected true or false"),
+            (["frames=2"], "frames: given twice"),
+            (["out=a.png"], "a.png: cannot write the kind '.png'; accepted: .gif .mp4"),
+            (["out=no/a.gif"], "there is no folder"),
+            (["film.aovs=[albedo]"], "film.aovs: expected nothing"),
+            (["render.preview=p.png"], "render.preview: expected nothing"),
+            (["turn=3"], "turn: unknown key"),
+        ],
+        4,
+    ),
 )
 def test_bad_input_is_one_line(
     folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str], words: list[str], said: str

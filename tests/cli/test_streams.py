@@ -32,6 +32,7 @@ def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     "words",
     few([f"render {SMALL}", "info scene=cornell_box", "info scene=cornell_box --json", "--help", "render --help"], 1),
 )
+@pytest.mark.slow
 def test_a_reader_that_has_enough_is_no_error(words: str, tmp_path: Path) -> None:
     found = shell(f"{TORCHPT} {words} | head -c 5", tmp_path)
     assert found.returncode == 0 and "Traceback" not in found.stderr and "BrokenPipe" not in found.stderr
@@ -47,6 +48,7 @@ def test_a_reader_that_is_gone_already(tmp_path: Path) -> None:
 
 @needs_full
 @pytest.mark.parametrize("words", few([f"render {SMALL}", "info scene=cornell_box", "--version"], 1))
+@pytest.mark.slow
 def test_a_full_disk_behind_stdout_is_told(words: str, tmp_path: Path) -> None:
     found = shell(f"{TORCHPT} {words} > /dev/full", tmp_path)
     assert found.returncode == 2

@@ -78,6 +78,7 @@ def test_the_box_filter_fills_the_pixel():
 
 
 @pytest.mark.parametrize(("stddev", "radius"), [(0.5, 2.0), (0.5, 1.0), (1.0, 4.0), (0.3, 0.5)])
+@pytest.mark.slow
 def test_the_gaussian_has_the_moments_of_mitsubas(stddev, radius):
     """Density proportional to ``exp(-x^2 / 2 s^2) - exp(-r^2 / 2 s^2)`` on [-r, r]."""
     x = np.linspace(-radius, radius, 2_000_001)

@@ -95,6 +95,7 @@ def test_error_names_the_file(tmp_path: Path) -> None:
     assert str(caught.value) == f"{file}: shapes.s.radius: expected a finite number > 0, got -1"
 
 
+@pytest.mark.slow
 def test_a_thousand_shapes_and_a_large_inline_mesh_are_quick(tmp_path: Path) -> None:
     shapes = "".join(
         f"  s{i}: {{type: sphere, center: [{i}, 0, 0], transform: [{{scale: 2}}, {{translate: [0, 1, 2]}}]}}\n"

@@ -122,6 +122,7 @@ def test_directions_are_found_where_they_lie(d: tuple[float, float, float]) -> N
     assert torch.allclose(equirect.look_up(map, equirect.directions(64, 128).permute(1, 2, 0).float()), map, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradients_of_maps_are_their_differences() -> None:
     torch.manual_seed(0)
     map = suns().double()[::4, ::4].contiguous().requires_grad_()
@@ -173,6 +174,7 @@ def test_neighbouring_faces_meet() -> None:
     assert float((look_up_cube(cube, a) - look_up_cube(cube, b)).abs().max()) < 2e-3
 
 
+@pytest.mark.slow
 def test_table_against_an_integral_over_directions() -> None:
     """``f cos`` of ``roughconductor`` with Schlick's term at F0 = 0 and 1, over a lattice of directions."""
     table = torchpt.ibl.brdf_table(21)

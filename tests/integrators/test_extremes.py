@@ -92,6 +92,7 @@ def test_radiance_and_albedo_at_their_limits(radiance, albedo):
     torch.testing.assert_close(image, plain, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_closed_room_of_albedo_one_ends():
     image = shoot(room(1.0, 1.0), 2, integrator={"max_depth": -1}, film=film_of(8))
     assert torch.isfinite(image.image).all()

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from few import few
 from trials import film_of, shoot, spread, z_limit
 
 import torchpt
@@ -108,7 +109,7 @@ def moved(scale: float, offset: float) -> dict[str, Any]:
     return scene
 
 
-@pytest.mark.parametrize(("scale", "offset"), [(1.0, 1e6), (1e-4, 0.0), (1e6, 0.0), (1e-4, 100.0), (1e6, -1e9)])
+@pytest.mark.parametrize(("scale", "offset"), few([(1.0, 1e6), (1e-4, 0.0), (1e6, 0.0), (1e-4, 100.0), (1e6, -1e9)], 2))
 def test_place_and_size_do_not_matter(by_mis, cornell, scale, offset):
     scene = torchpt.load(moved(scale, offset), device="cpu")
     assert_same_mean(pictures(scene, 8, 32, 3000), by_mis)

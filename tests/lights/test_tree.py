@@ -176,6 +176,7 @@ def test_a_thousand_lights_bring_far_less_variance_than_power_alone():
     assert variance(p) < 0.1 * variance(power)
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_lights_of_which_one_is_a_million_times_brighter():
     count = 100_000
     lights = emitters("mixed", count)

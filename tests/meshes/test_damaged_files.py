@@ -242,6 +242,7 @@ def test_declared_sizes_cost_no_memory(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
 
 
+@pytest.mark.slow
 def test_long_lines_and_deep_nesting(tmp_path: Path) -> None:
     """Inputs on which a naive reader takes quadratic time or overflows its stack."""
     files = {

@@ -207,6 +207,7 @@ def test_files_that_did_not_change_are_not_read(tmp_path, monkeypatch):
     cache._folder.cache_clear()
 
 
+@pytest.mark.slow
 def test_numba_without_its_compiler_is_told_in_a_line(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "torchpt", "render", "scene=cornell_box", "render.spp=1", "render.accel=numba"]
     words += ["film.width=4", "film.height=4", f"out={tmp_path / 'box.png'}"]

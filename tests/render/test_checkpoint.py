@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from few import few
 from textured_quad import repeated, textured_quad
 from trials import film_of
 
@@ -86,7 +87,7 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", few(CASES, 4))
 def test_the_bits_of_a_render_that_nobody_stopped(case: str, box: torchpt.Scene, tmp_path: Path) -> None:
     whole, stopped = shot(box, **CASES[case]), []
     for number, part in enumerate((0.02, 0.3, 0.6, 0.97)):
@@ -100,6 +101,7 @@ def test_the_bits_of_a_render_that_nobody_stopped(case: str, box: torchpt.Scene,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0.ckpt", "1.ckpt", "2.ckpt", "3.ckpt"]
 
 
+@pytest.mark.slow
 def test_passes_are_short_enough_for_checkpoints(box: torchpt.Scene, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(checkpoint, "EVERY", 0.05)
     monkeypatch.setattr("torchpt.forward.run.EVERY", 0.05)
@@ -301,7 +303,7 @@ MORE: dict[str, tuple[int, int, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("case", MORE)
+@pytest.mark.parametrize("case", few(MORE, 5))
 def test_more_samples_later_are_the_bits_of_all_at_once(case: str, box: torchpt.Scene, tmp_path: Path) -> None:
     few, many, wishes = MORE[case]
     file = str(tmp_path / "a.ckpt")

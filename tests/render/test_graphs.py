@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 from torch import Tensor
 from torch._dynamo.exc import Unsupported
 from torch._dynamo.testing import CompileCounter
@@ -63,7 +64,7 @@ def gradient(step, scene: torchpt.Scene, seed: int = 1) -> tuple[Tensor, Tensor]
     return value.detach(), leaf.grad
 
 
-@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", few(["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)], 1))
 def test_one_graph_with_gradients_for_all_seeds(scene, backend):
     compiled = torch.compile(step, backend=backend, fullgraph=True)
     for seed in (1, 2, 3, 4):

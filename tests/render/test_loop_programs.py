@@ -354,6 +354,7 @@ def test_a_stage_that_turns_out_not_to_compile_renders_all_eagerly(monkeypatch, 
         rendered(scene, render={"compile": "on"})
 
 
+@pytest.mark.slow
 def test_a_parameter_changed_in_place_reaches_the_tables():
     scene = torchpt.load("env_teapot", device="cpu")
     keys = {"spp": 1, "film": {**film_of(8), "filter": "box"}}

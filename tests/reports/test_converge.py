@@ -125,6 +125,7 @@ def test_the_page_is_one_file_that_asks_for_nothing(folder: Path) -> None:
     assert plots == [f"s_{name}.{kind}" for name in ("measures", "seconds", "spp") for kind in ("png", "svg")]
 
 
+@pytest.mark.slow
 def test_a_finished_study_renders_nothing_and_a_larger_one_what_is_new(
     there: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -235,6 +236,7 @@ def test_a_signal_keeps_what_is_done(
         assert [s["errors"]["mse"] for s in one["steps"]] == [s["errors"]["mse"] for s in other["steps"]]
 
 
+@pytest.mark.slow
 def test_a_reference_from_a_file_is_exact(there: Path) -> None:
     words = [word for word in WORDS if not word.startswith(("reference", "out"))]
     assert main(["converge", *words, "reference=theirs.exr", "out=file", "metrics=[mse]", "target=[1,0.1]"]) == 0

@@ -126,6 +126,7 @@ def test_what_is_denoised_is_the_run_to_the_bit_and_seconds_hold_all_of_it(folde
 
 
 @there
+@pytest.mark.slow
 def test_the_page_and_the_plots_tell_them_apart(folder: Path) -> None:
     bare = re.sub(r'"data:[^"]*"', "", (folder / "study" / "report.html").read_text())
     for words in ("sobol, denoised", "○", "□", "Denoised pictures are guesses", "and of denoising"):

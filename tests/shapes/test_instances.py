@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 
 import torchpt
 from torchpt.errors import SceneError
@@ -54,7 +55,7 @@ def described(explicit: bool, **mesh: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("accel", ["torch", "numba"])
-@pytest.mark.parametrize("flat", [True, False])
+@pytest.mark.parametrize("flat", few([True, False], 1))
 def test_the_picture_is_that_of_explicit_copies(flat, accel):
     scenes = [torchpt.load(described(explicit, face_normals=flat), "cpu") for explicit in (False, True)]
     layers, more = (
