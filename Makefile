@@ -33,9 +33,9 @@ render: $(VENV)/run.stamp
 # Tests of ranks fork the process that they run in, so that it must not have worked for other tests before: one of their own, beside
 # the others, since it mostly waits.
 test: $(VENV)/dev.stamp
-	@$(PY) -m pytest -q -m "not slow and not long and not gpu" tests/ranks > .ranks.log 2>&1 & ranks=$$!; \
+	@log=$$(mktemp); $(PY) -m pytest -q -m "not slow and not long and not gpu" tests/ranks > $$log 2>&1 & ranks=$$!; \
 	$(PY) -m pytest -m "not slow and not long and not gpu" -n 2 --dist loadfile --ignore=tests/ranks $(ARGS); others=$$?; \
-	wait $$ranks; ranks=$$?; cat .ranks.log; rm -f .ranks.log; exit $$((others + ranks))
+	wait $$ranks; ranks=$$?; cat $$log; rm -f $$log; exit $$((others + ranks))
 
 test-quick: $(VENV)/dev.stamp
 	$(PY) -m pytest -q -m "not slow and not long and not gpu" -n 2 $(wildcard tests/*/test_contract.py) $(ARGS)

@@ -15,6 +15,9 @@ from torchpt.bsdfs.kinds.blinn_phong import BlinnPhong
 from torchpt.bsdfs.kinds.microfacet import Microfacet
 from torchpt.bsdfs.kinds.nonmetal import Nonmetal
 from torchpt.bsdfs.kinds.phong import Phong
+from torchpt.bsdfs.kinds.plastic import Plastic
+from torchpt.bsdfs.kinds.roughconductor import RoughConductor
+from torchpt.math.fresnel import fresnel_dielectric
 
 RED, GREY = (0.8, 0.5, 0.1), (0.2, 0.3, 0.4)
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -212,3 +215,39 @@ def test_the_mean_weight_has_the_derivative_of_the_albedo(model, values):
 
     slope, change = float(mean(1.0, True)), float(mean(1.05, False) - mean(0.95, False))
     assert slope == pytest.approx(change / (0.1 * float(exact(values)[name].reshape(-1)[0])), rel=0.05, abs=0.02)
+
+
+# -- coats and metals, by what is known of their energy
+
+
+@pytest.mark.parametrize("nonlinear", [False, True])
+@pytest.mark.parametrize("angle", [0.0, 60.0])
+def test_a_white_plastic_loses_nothing(angle, nonlinear):
+    """What leaves the base of a coat and is thrown back within it comes out in the end: coat and base reflect 1 together."""
+    model = Plastic(nonlinear)
+    values = {"diffuse_reflectance": WHITE, "specular_reflectance": WHITE, "int_ior": 1.5, "ext_ior": 1.0}
+    wi, weight = grid(200)
+    n = wi.shape[1]
+    slant = math.radians(angle)
+    wo = torch.tensor([math.sin(slant), 0.0, math.cos(slant)], dtype=torch.float64)[:, None]
+    base = (model.eval(lanes(model, values, n), wo.expand(3, n), wi) * weight).sum(1)
+    coat = fresnel_dielectric(wo[2], torch.tensor([1.5], dtype=torch.float64)).reflectance
+    assert (base + coat - 1).abs().max() < 1e-3
+
+
+def test_energy_that_facets_give_back_takes_the_metals_colour():
+    """A metal reflects ``F (1 + F0 g)`` where one of F = 1 reflects ``1 + g``, g = 1 / E - 1 (Turquin 2019, equation 16)."""
+    gold: dict[str, Any] = {"eta": (0.14, 0.4, 1.5), "k": (4.0, 2.4, 1.9), "alpha": 0.7}
+    mirror = {"eta": BLACK, "k": WHITE, "alpha": 0.7}
+    wo, wi = (w.double() for w in random_pairs(23, 500))
+    plain, whole = RoughConductor(), RoughConductor(energy_compensation=True)
+    single, single_white, both, both_white = (
+        model.eval(lanes(model, values, 500), wo, wi) for model in (plain, whole) for values in (gold, mirror)
+    )
+    lit = (single_white > 1e-4).all(0)
+    ratio = (both / both_white * single_white / single)[:, lit]
+    eta, k = (exact(gold)[name] for name in ("eta", "k"))
+    f0 = ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
+    g = (1 - ratio[2]) / (ratio[2] - f0[2])
+    assert lit.sum() > 100 and float(g.max()) > 0.05
+    torch.testing.assert_close(ratio, (1 + f0 * g) / (1 + g), rtol=1e-5, atol=0)

@@ -26,6 +26,7 @@ CASES = [
     "some dark",
     "one bright",
     "all dark",
+    "one way",
 ]
 SIZES = {"one": 1, "two": 2, "three": 3, "nine": 9, "lopsided": 3000}
 
@@ -58,10 +59,15 @@ def emitters(case: str, count: int | None = None) -> dict[str, Tensor]:
     elif case == "all dark":
         intensity = torch.zeros(count)
     cos_o = torch.where(uniform(count) < 0.5, -1.0, 1.0)
+    axis = unit(count)
+    if (
+        case == "one way"
+    ):  # the cone of a node is no wider than that of one light: half of them shine all around, by half a turn
+        axis, cos_o = axis[:, :1].expand(3, count), torch.where(cos_o < 0, -1e-3, 1.0)
     return {
         "low": centre - radius,
         "high": centre + radius,
-        "axis": unit(count),
+        "axis": axis,
         "cos_o": cos_o,
         "cos_e": torch.zeros(count),
         "intensity": intensity,

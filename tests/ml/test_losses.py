@@ -51,6 +51,18 @@ def test_two_equal_renders_are_the_plain_losses():
     assert float(losses.l1(a, b)) == pytest.approx(float((a - b).abs().mean()))
 
 
+def test_of_two_renders_each_has_its_share_of_the_loss():
+    """The product of both differences, so that noise of either enters once and both get a gradient."""
+    a, b, t = torch.rand(3, 5, 4, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    b.requires_grad_()
+    squared, relative = losses.unbiased_squared_error(a, b, t), losses.unbiased_relmse(a, b, t, scale=t)
+    torch.testing.assert_close(squared, ((a - t) * (b - t)).mean())
+    weight = 1 / (t.square() + 0.01)
+    torch.testing.assert_close(relative, ((a - t) * (b - t) * weight).mean())
+    (grad,) = torch.autograd.grad(relative, b)
+    torch.testing.assert_close(grad, (a - t) * weight / a.numel())
+
+
 def test_pictures_of_whole_numbers_are_refused():
     """Their differences would wrap around."""
     photo = torch.full((4, 4, 3), 200, dtype=torch.uint8)

@@ -34,6 +34,16 @@ def test_a_parameter_replaced_or_changed_in_place_takes_effect():
     assert value(scene) == pytest.approx(58)
 
 
+@pytest.mark.parametrize("change", [{"width": 6}, {"height": 6}, {"crop": [1, 0, 2, 3]}, {"filter": "tent"}], ids=str)
+def test_a_scene_remembers_no_other_film(change):
+    """A render leaves tables for the next one, which asks for another film."""
+    scene = torchpt.load({**LAMP, "camera": {**LAMP["camera"], "fov": 50}}, "cpu")
+    torchpt.render(scene, spp=2)
+    film = {**LAMP["film"], **change}
+    fresh = torchpt.render(torchpt.load({**LAMP, "camera": {**LAMP["camera"], "fov": 50}}, "cpu"), spp=2, film=film)
+    assert torch.equal(torchpt.render(scene, spp=2, film=film), fresh)
+
+
 @pytest.mark.parametrize("kind", ["rectangle", "disk"])
 @pytest.mark.parametrize(("scale", "expected"), [([1, 1, 1], 1), ([-1, 1, 1], 1), ([1, -1, 1], 1), ([1, 1, -1], 0)])
 def test_a_mirrored_flat_light_faces_where_its_normal_goes(kind, scale, expected):
