@@ -113,7 +113,6 @@ def test_by_tensor_operations():
     agree(room(COLOUR["plate"]), "materials.plate.reflectance", compile="off")
 
 
-@pytest.mark.slow
 def test_signed_filters_and_clamps():
     wish = {"film": {"filter": "mitchell"}, "integrator": {"type": "path", "clamp": 2.0, "max_depth": 5}}
     agree(room(COLOUR["plate"]), "materials.plate.reflectance", **wish)

@@ -146,3 +146,15 @@ def test_one_light_among_many_a_million_times_brighter():
     expected = 0.5 / torch.pi * 1e6 * 4e-4  # far enough to be a point: E = L A / d^2, to within its own size
     assert float(error[0]) < 2e-3 * expected
     assert float(mean[0]) == pytest.approx(expected, rel=1e-2)
+
+
+def test_the_layer_of_positions_is_of_the_world_though_lanes_count_from_elsewhere() -> None:
+    """A scene far from the origin is moved there to be rendered."""
+    place = [1e5, -2e5, 3e5]
+    wall = {"type": "rectangle", "transform": [{"scale": 4}, {"translate": place}]}
+    camera = {"origin": [place[0], place[1], place[2] + 5], "target": place, "fov": 30}
+    scene = torchpt.load({"camera": camera, "shapes": {"wall": wall}}, "cpu")
+    film = {"width": 8, "height": 8, "filter": "box", "aovs": ["position"]}
+    position = torchpt.render(scene, spp=4, film=film, integrator="aov", full=True)["position"]
+    assert float((position - torch.tensor(place)).abs().amax()) < 2.0
+    assert float((position[..., 2] - place[2]).abs().amax()) < 0.1

@@ -209,34 +209,3 @@ def test_a_camera_that_looks_nowhere_is_refused() -> None:
             SceneError, match=r"^camera.target: expected a point other than the origin \(to the 16 digits"
         ):
             load(camera={"origin": [10**17, 0, 0], "target": [target, 0, 0]})
-
-
-def test_the_layer_of_positions_is_of_the_world_though_lanes_count_from_elsewhere() -> None:
-    """A scene far from the origin is moved there to be rendered."""
-    place = [1e5, -2e5, 3e5]
-    wall = {"type": "rectangle", "transform": [{"scale": 4}, {"translate": place}]}
-    camera = {"origin": [place[0], place[1], place[2] + 5], "target": place, "fov": 30}
-    scene = torchpt.load({"camera": camera, "shapes": {"wall": wall}}, "cpu")
-    film = {"width": 8, "height": 8, "filter": "box", "aovs": ["position"]}
-    position = torchpt.render(scene, spp=4, film=film, integrator="aov", full=True)["position"]
-    assert float((position - torch.tensor(place)).abs().amax()) < 2.0
-    assert float((position[..., 2] - place[2]).abs().amax()) < 0.1
-
-
-def test_normals_of_a_mesh_turn_against_its_stretch() -> None:
-    """Those that a mesh brings along go by the inverse transpose: a plane stays one whose normal is at right angles to it."""
-    slope = torch.tensor([0.0, 1.0, 1.0]) / 2**0.5
-    mesh = {
-        "type": "mesh",
-        "vertices": [[-9, -3, 3], [9, -3, 3], [9, 3, -3], [-9, 3, -3]],
-        "faces": [[0, 1, 2], [0, 2, 3]],
-        "normals": [slope.tolist()] * 4,
-        "transform": [{"scale": [1, 1, 3]}],
-    }
-    scene = torchpt.load(
-        {"camera": {"origin": [0, 0, 50], "target": [0, 0, 0], "fov": 3}, "shapes": {"m": mesh}}, "cpu"
-    )
-    film = {"width": 4, "height": 4, "aovs": ["normal"]}
-    normal = torchpt.render(scene, spp=1, film=film, integrator="aov", full=True)["normal"]
-    expected = torch.tensor([0.0, 3.0, 1.0]) / 10**0.5
-    assert float((normal - expected).abs().amax()) < 1e-5

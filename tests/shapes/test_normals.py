@@ -12,6 +12,7 @@ import pytest
 import torch
 from cubes import unit_cube
 
+import torchpt
 from torchpt.meshes import load_mesh
 from torchpt.shapes.normals import smooth_normals
 
@@ -76,3 +77,22 @@ def _write(file: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
         *(f"3 {a} {b} {c}" for a, b, c in faces),
     ]
     file.write_text("\n".join(lines) + "\n")
+
+
+def test_normals_of_a_mesh_turn_against_its_stretch() -> None:
+    """Those that a mesh brings along go by the inverse transpose: a plane stays one whose normal is at right angles to it."""
+    slope = torch.tensor([0.0, 1.0, 1.0]) / 2**0.5
+    mesh = {
+        "type": "mesh",
+        "vertices": [[-9, -3, 3], [9, -3, 3], [9, 3, -3], [-9, 3, -3]],
+        "faces": [[0, 1, 2], [0, 2, 3]],
+        "normals": [slope.tolist()] * 4,
+        "transform": [{"scale": [1, 1, 3]}],
+    }
+    scene = torchpt.load(
+        {"camera": {"origin": [0, 0, 50], "target": [0, 0, 0], "fov": 3}, "shapes": {"m": mesh}}, "cpu"
+    )
+    film = {"width": 4, "height": 4, "aovs": ["normal"]}
+    normal = torchpt.render(scene, spp=1, film=film, integrator="aov", full=True)["normal"]
+    expected = torch.tensor([0.0, 3.0, 1.0]) / 10**0.5
+    assert float((normal - expected).abs().amax()) < 1e-5
