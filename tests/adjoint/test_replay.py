@@ -10,6 +10,8 @@ from gradient_rooms import gradient_of, room
 
 import torchpt
 from torchpt.adjoint import replay, sweep
+from torchpt.adjoint.samples import asked_of, counted
+from torchpt.format.description import settings
 from torchpt.integrators.loop import chunk
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
@@ -153,3 +155,17 @@ def test_gradcheck_of_texels(tmp_path):
         return torchpt.render(scene, params={NAME: texels}, spp=2, seed=3, seed_grad=3, dtype=torch.float64, **wish)
 
     assert torch.autograd.gradcheck(picture, (leaf,), eps=1e-5, atol=1e-6, fast_mode=True)
+
+
+def test_cotangents_of_samples_are_those_of_how_pixels_count_them():
+    """Samples below and above the clamp, of either sign, and one that is not finite: against autograd."""
+    samples = torch.randn(3, 8, 5, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    samples[1, 2, 3] = float("nan")
+    pixels = torch.randn(3, 5, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    scene = torchpt.load(room(PLATE), "cpu")
+    for clamp in (None, 0.7):
+        wishes = settings(scene.description, {"integrator": {"type": "path", "clamp": clamp}, "render": {"spp": 8}})
+        leaf = samples.clone().requires_grad_()
+        (counted(wishes, leaf).mean(1) * pixels).sum().backward()
+        assert leaf.grad is not None
+        torch.testing.assert_close(asked_of(wishes, samples, pixels), leaf.grad)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from trials import estimate, film_of, shoot
 
+import torchpt
 from torchpt.integrators import path
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0], "fov": 40}
