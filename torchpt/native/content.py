@@ -1,4 +1,4 @@
-"""Names of what code says: equal for equal code, whatever its file's time, its docstrings, its comments and its place.
+"""Digest code: equal for equal code, whatever its file's time, its docstrings, its comments and its place.
 
 Entries of the kernel cache are found by them: see :mod:`torchpt.native.cache`.
 """
