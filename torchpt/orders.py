@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any, TypedDict, Unpack
@@ -11,8 +11,6 @@ from typing import Any, TypedDict, Unpack
 import torch
 from torch import Tensor
 
-from torchpt import adjoint as adjoints
-from torchpt.edges import Asked, add_gradients, concerns, followed, left_out, on_tape, without_gradient
 from torchpt.errors import EdgeWarning, NoLightWarning, SceneError, warn_caller
 from torchpt.format.description import settings as complete
 from torchpt.forward import Rendering, render_scene
@@ -28,9 +26,12 @@ from torchpt.scene.editions import AFTER, check_unchanged
 from torchpt.scene.entry import as_scene
 from torchpt.scene.textured import renew, with_texels
 from torchpt.settings import Settings
-from torchpt.taped import in_batch, wants_gradients
+from torchpt.taped import in_batch, on_tape, wants_gradients
 
 __all__ = ["Common", "Order", "Wishes", "check_names", "ordered", "rendered"]
+
+#: How gradients are taken, the default first.
+ADJOINTS = ("replay", "autograd")
 
 
 class Common(TypedDict, total=False):
@@ -167,7 +168,7 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
     params = _given(scene, wishes.get("params"), full)
     textured = with_texels(scene, params)
     textured.check_own()
-    order = Order(scene, textured, settings, params, backward, dtype, adjoint or adjoints.KINDS[0], wishes.get("ranks"))
+    order = Order(scene, textured, settings, params, backward, dtype, adjoint or ADJOINTS[0], wishes.get("ranks"))
     return order.noted() if order.taped else order
 
 
@@ -248,8 +249,8 @@ def _check(
         raise SceneError("device", str(device), f"the scene's own device {scene.device}; load the scene on the other")
     if dtype not in (torch.float32, torch.float64):
         raise SceneError("dtype", dtype, "torch.float32 or torch.float64")
-    if adjoint not in (None, *adjoints.KINDS):
-        raise SceneError("adjoint", adjoint, " or ".join(adjoints.KINDS))
+    if adjoint not in (None, *ADJOINTS):
+        raise SceneError("adjoint", adjoint, " or ".join(ADJOINTS))
     for key, (value, low) in numbers.items():
         if value is not None and (type(value) is not int or value < low):
             raise SceneError(key, value, f"a whole number >= {low}")
@@ -281,6 +282,8 @@ def _same(wish: str | torch.device, own: torch.device) -> bool:
 
 def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rendering]) -> Rendering:
     """A rendering whose picture is on a tape from the parameters that are wanted; ``render`` makes it without."""
+    from torchpt import adjoint, edges  # a render without gradients does not wait for them
+
     scene, settings, params, backward = order.scene, order.settings, order.params, order.backward
     wanted, dtype, ranks = order.wanted, order.dtype, order.ranks
     if not settings.integrator.light:
@@ -288,10 +291,10 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         raise SceneError("integrator.type", settings.integrator.name, f"one of {radiant} where gradients are wanted")
     if settings.render.checkpoint is not None:
         raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
-    attached = adjoints.attached(scene, wanted)
-    if concerns(scene, wanted):
-        _warn_of_edges(scene, settings, backward["edges"] == 0)
-    for name in without_gradient(scene, wanted):
+    attached = adjoint.attached(scene, wanted)
+    if edges.concerns(scene, wanted):
+        _warn_of_edges(edges.left_out(scene, settings), backward["edges"] == 0)
+    for name in edges.without_gradient(scene, wanted):
         said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"
         warn_caller(said, EdgeWarning)
     names = (*wanted, *(name for name in params if name not in wanted))
@@ -315,13 +318,11 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         # One pass that is a derivative of the very estimator takes its own samples again.
         own = again().render
         exact = own.seed == settings.render.seed and own.spp == taken[0]
-        held = not exact and adjoints.suits(scene, settings, wanted)
-        found = adjoints.gradients(
-            scene, again(), given, wanted, dtype, attached, order.adjoint, cotangent, held, ranks
-        )
-        if of_edges and concerns(scene, wanted):
+        held = not exact and adjoint.suits(scene, settings, wanted)
+        found = adjoint.gradients(scene, again(), given, wanted, dtype, attached, order.adjoint, cotangent, held, ranks)
+        if of_edges and edges.concerns(scene, wanted):
             _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
-            moved = add_gradients(
+            moved = edges.add_gradients(
                 scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held, ranks
             )
             found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
@@ -334,19 +335,19 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
     def edges_taken() -> int:
         return 0 if backward["edges"] == 0 else backward["edges"] or backward["spp"] or taken[0]
 
-    def asked() -> Asked:
+    def asked() -> edges.Asked:
         order.check_unchanged(AFTER)
-        return Asked(scene, again(), wanted, dtype, edges_taken())
+        return edges.Asked(scene, again(), wanted, dtype, edges_taken())
 
     tensors = tuple(params[name] for name in names)
-    image = adjoints.on_tape(forward, backward_pass, tensors, scene.weights())
+    image = adjoint.on_tape(forward, backward_pass, tensors, scene.weights())
     rendering = made[-1]
     made.clear()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
-    layers = followed(settings)
+    layers = edges.followed(settings)
     if layers:
         values = {name: rendering.layers[name] for name in layers}
-        rendering.layers |= on_tape(values, tensors, asked, given_by)
+        rendering.layers |= edges.on_tape(values, tensors, asked, given_by)
     return replace(rendering, image=image)
 
 
@@ -354,19 +355,18 @@ def _constant(params: Mapping[str, Tensor], render: Callable[[Mapping[str, Tenso
     """A rendering without gradients, of parameters that may still be those of a transform of ``torch.func``."""
     made: list[Rendering] = []
 
-    def forward(*tensors: Tensor) -> Tensor:
+    def forward(*tensors: Tensor) -> tuple[Tensor]:
         made.append(render(dict(zip(params, tensors, strict=True))))
-        return made[-1].image
+        return (made[-1].image,)
 
-    image = adjoints.on_tape(forward, lambda *_: (), tuple(params.values()), ())
+    (image,) = on_tape(forward, lambda *_: (), tuple(params.values()), ())
     return replace(made[-1], image=image)
 
 
-def _warn_of_edges(scene: Scene, settings: Settings, every: bool) -> None:
-    """Say which visibility edges (``every`` one, or those of this scene that are not done) a gradient leaves out."""
+def _warn_of_edges(missing: Sequence[str], every: bool) -> None:
+    """Say which visibility edges (``every`` one, or those that are ``missing``) a gradient leaves out."""
     edges = "all visibility edges (silhouettes and shadow edges that move)"
     if not every:
-        missing = left_out(scene, settings)
         if not missing:
             return
         edges = f"some edges: {'; '.join(missing)}"

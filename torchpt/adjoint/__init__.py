@@ -35,10 +35,7 @@ from torchpt.ranks import Group
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
-__all__ = ["KINDS", "attached", "gradients", "on_tape", "suits"]
-
-#: By name, the default first.
-KINDS = ("replay", "autograd")
+__all__ = ["attached", "gradients", "on_tape", "suits"]
 
 
 def gradients(
@@ -62,7 +59,7 @@ def gradients(
         wanted: names of those that are differentiated.
         dtype: of the lanes.
         attached: whether geometry is differentiated.
-        kind: one of :data:`KINDS`.
+        kind: ``replay`` or ``autograd``.
         asked: derivatives of a loss by the pixels ``(3, H W)``.
         held: whether what the camera sees is held in place (:func:`suits`), and the picture moves over it.
         ranks: those that share the pixels, which are the same on each.

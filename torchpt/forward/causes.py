@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import TYPE_CHECKING
 
-from torchpt.integrators.faults import Fault, faults_of
 from torchpt.integrators.lost import Lost, Place
 from torchpt.integrators.wave import Wave
 from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
+
+if TYPE_CHECKING:  # what traces samples again is imported once there are such
+    from torchpt.integrators.faults import Fault
 
 __all__ = ["causes_of", "told"]
 
@@ -26,6 +29,8 @@ def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str
     """
     if not lost.count:
         return {}, ""
+    from torchpt.integrators.faults import faults_of
+
     faults = faults_of(wave, lost.places)
     causes = Counter(fault.name for fault in faults)
     nans = sum(place.nan for place in lost.places)
@@ -36,7 +41,9 @@ def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str
 
 
 def told(scene: Scene, wave: Wave, place: Place) -> str:
-    """A sentence about one sample that is not finite."""
+    """Return a sentence about one sample that is not finite."""
+    from torchpt.integrators.faults import faults_of
+
     return f"{_named(place)} is not finite: {_said(scene, wave, faults_of(wave, [place])[0])}"
 
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from torchpt.film import KnownError
 from torchpt.forward.causes import causes_of
 from torchpt.forward.result import Rendering
-from torchpt.forward.unlit import unlit
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.native.memory import Meter, let_go, mb
@@ -105,6 +104,8 @@ def known_of(run: Run, picture: Tensor) -> tuple[KnownError | None, str]:
         known = None if relmse is None else KnownError(relmse, None, False)
     if known is None or not run.done:
         return known, ""
+    from torchpt.forward.unlit import unlit
+
     lacks = unlit(run.scene, run.wave, run.geometry, picture, known.relmse)
     if lacks.reason:
         return known, lacks.reason
