@@ -15,7 +15,7 @@ from torchpt.rendering import Rendering, render_scene
 from torchpt.textures import TexturePoint
 
 NOISE: dict[str, Any] = {"type": "noise", "scale": 3, "octaves": 2, "seed": 1}
-SIZE = 512
+SIZE = 384
 SLOTS: dict[str, dict[str, Any]] = {
     "colour": {"color0": [0.9, 0.1, 0.2], "color1": [0.1, 0.6, 0.9]},
     "number": {"color0": 0.1, "color1": 0.9},
@@ -64,13 +64,13 @@ def scene(slot: str, texture: dict[str, Any]) -> dict[str, Any]:
         },
         "lights": {"lamp": {"type": "point", "position": [2, 3, 3], "intensity": 20}, "sky": {"type": "constant"}},
         "integrator": {"type": "path", "max_depth": 3},
-        "film": {"width": 32, "height": 32, "filter": "box"},
+        "film": {"width": 64, "height": 64, "filter": "box"},
     }  # fmt: skip
 
 
 def taken(loaded: torchpt.Scene, mode: str, **more: Any) -> Rendering:
     found = render_scene(
-        loaded, settings(loaded.description, {"render": {"spp": 16, "compile": mode, "seed": 3, **more}})
+        loaded, settings(loaded.description, {"render": {"spp": 4, "compile": mode, "seed": 3, **more}})
     )
     assert found.nonfinite_samples == 0
     return found
@@ -165,11 +165,11 @@ def test_gradients_of_a_render():
     loaded = torchpt.load(described, "cpu")
     wanted = {k: v.double() for k, v in loaded.params.items() if k.startswith("textures.")}
     assert len(wanted) == 10
-    ramp = torch.linspace(0.5, 1.5, 12, dtype=torch.float64)[:, None, None] * torch.tensor([1.0, 0.6, 0.3]).double()
+    ramp = torch.linspace(0.5, 1.5, 24, dtype=torch.float64)[:, None, None] * torch.tensor([1.0, 0.6, 0.3]).double()
 
     def loss(params: dict[str, torch.Tensor]) -> torch.Tensor:
-        film = {"width": 12, "height": 12, "filter": "box"}
-        options: dict[str, Any] = {"spp": 2, "seed": 1, "seed_grad": 1, "dtype": torch.float64, "device": "cpu"}
+        film = {"width": 12, "height": 24, "filter": "box"}
+        options: dict[str, Any] = {"spp": 1, "seed": 1, "seed_grad": 1, "dtype": torch.float64, "device": "cpu"}
         return (torchpt.render(loaded, params=params, film=film, **options) * ramp).mean()
 
     given = {key: value.clone().requires_grad_() for key, value in wanted.items()}

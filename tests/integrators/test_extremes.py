@@ -79,18 +79,20 @@ def test_touching_and_overlapping_walls_do_not_leak():
     }
     camera = {"origin": [0.3, 0.1, 0.2], "target": [1, -1, -1], "fov": 120}
     scene = {"camera": camera, "shapes": shapes, "lights": {"sky": {"type": "constant", "radiance": [1e6] * 3}}}
-    assert not shoot(scene, 32, integrator={"max_depth": 8}, film=film_of(64)).image.any()
+    assert not shoot(scene, 8, integrator={"max_depth": 8}, film=film_of(128)).image.any()
 
 
-@pytest.mark.parametrize("radiance", [1e-30, 1.0, 1e30])
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 1.0])
-def test_radiance_and_albedo_at_their_limits(radiance, albedo):
+def test_radiance_and_albedo_at_their_limits(albedo):
     # Shapes scale with the light: the picture over its radiance is the same to rounding.
-    image = shoot(room(albedo, radiance), 4, integrator={"max_depth": 12}, film=film_of(24)).image.double() / radiance
-    plain = shoot(room(albedo, 1.0), 4, integrator={"max_depth": 12}, film=film_of(24)).image.double()
-    assert torch.isfinite(image).all()
+    dim, plain, bright = (
+        shoot(room(albedo, radiance), 2, integrator={"max_depth": 12}, film=film_of(34)).image.double() / radiance
+        for radiance in (1e-30, 1.0, 1e30)
+    )
     assert plain.amax() > 0
-    torch.testing.assert_close(image, plain, rtol=1e-4, atol=1e-7)
+    for image in (dim, bright):
+        assert torch.isfinite(image).all()
+        torch.testing.assert_close(image, plain, rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p, coarse, film_of, shoot, spread, z_limit
 
@@ -131,8 +132,9 @@ MUSEUM: dict[str, Any] = {
 LIVE = {"zoo": ZOO, "deltas": DELTAS, "museum": MUSEUM, "bulbs": BULBS}
 
 
-def ours(scene: Any, size: int, spp: int = 16) -> tuple[Tensor, Tensor]:
-    return spread([shoot(scene, spp, 100 + k, "sobol", KEYS, film_of(size)).image for k in range(SEEDS)])
+def ours(scene: Any, size: int, spp: int = 16, compile: str = "off") -> tuple[Tensor, Tensor]:
+    shots = [shoot(scene, spp, 100 + k, "sobol", KEYS, film_of(size), compile=compile) for k in range(SEEDS)]
+    return spread([shot.image for shot in shots])
 
 
 def assert_equal_pictures(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor], pixels: bool = True) -> None:
@@ -162,14 +164,17 @@ def pooled(picture: Tensor, side: int) -> Tensor:
     return torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], side)[0]
 
 
-@pytest.mark.parametrize("name", ["cornell_box", pytest.param("cornell_bunny", marks=pytest.mark.slow)])
-def test_stored_references(name):
+# By kernels, a tenth of the time of tensor operations: that both show the same is for tests/render/test_loop.py to say.
+@pytest.mark.parametrize(
+    ("name", "compile"), few([("cornell_box", "on"), ("cornell_box", "off"), ("cornell_bunny", "off")], 1)
+)
+def test_stored_references(name, compile):
     assets = os.environ.get("TORCHPT_ASSETS")
     if name == "cornell_bunny" and not (assets and (Path(assets) / "bunny.ply").is_file()):
         pytest.skip("$TORCHPT_ASSETS/bunny.ply is not there")
     layers = torchpt.read_layers(ROOT / "tests" / "references" / f"{name}.exr")
     reference = layers["image"].double(), layers["variance"].double()
-    assert_equal_pictures(ours(torchpt.load(name, device="cpu"), 64), reference)
+    assert_equal_pictures(ours(torchpt.load(name, device="cpu"), 64, compile=compile), reference)
 
 
 #: Scenes of many materials, as ``scripts/make_references.py`` rendered them: width, height, max_depth, and the samples a
@@ -189,7 +194,7 @@ class Compared:
         width, height, depth, spp = MATERIALS[name]
         scene = comparable(name)
         film = {**film_of(FINE * width, FINE * height), "aovs": ["variance", "object_id"]}
-        shot = shoot(scene, more * spp, 1, "sobol", {**KEYS, "max_depth": depth}, film)
+        shot = shoot(scene, more * spp, 1, "sobol", {**KEYS, "max_depth": depth}, film, compile="on")
         layers = torchpt.read_layers(ROOT / "tests" / "references" / f"{name}.exr")
         seen = torch.ones(height, width, 1, dtype=torch.float64)
         if name == "veach_mis":  # the smallest covers a tenth of a pixel, at a radiance of 900: noise, and no material

@@ -71,9 +71,9 @@ def test_shadows_let_through_what_the_surfaces_do(strategy):
     keys = {"max_depth": 2, "strategy": strategy}
     # Seen through the leaf; lit through the leaf, by the sky through the ball as well.
     expected = (
-        0.6 * 0.6 * shoot({**LEAVES, "shapes": plain, "lights": veiled}, 256, 5, "sobol", keys, film_of(16)).image
+        0.6 * 0.6 * shoot({**LEAVES, "shapes": plain, "lights": veiled}, 16, 5, "sobol", keys, film_of(64)).image
     )
-    image = shoot(LEAVES, 256, 6, "sobol", keys, film_of(16)).image
+    image = shoot(LEAVES, 16, 6, "sobol", keys, film_of(64)).image
     (mean, error), (value, noise) = estimate(image), estimate(expected)
     assert ((mean - value).abs() < z_limit(12) * (error**2 + noise**2).sqrt()).all(), (mean, value, error)
 
@@ -125,8 +125,8 @@ def test_gradients_of_opacity():
     loaded = torchpt.load(described, device="cpu")
     name = "materials.leaf.opacity"
     wish: dict[str, Any] = {
-        "film": {**film_of(8), "filter": "box"},
-        "spp": 256,
+        "film": {**film_of(32), "filter": "box"},
+        "spp": 16,
         "integrator": {"type": "path", "max_depth": 2},
     }
 

@@ -59,7 +59,7 @@ def by_mis(cornell):
         ("bsdf", {}, 128),
         pytest.param("uniform", {}, 256, marks=pytest.mark.slow),
         pytest.param("mis", {"rr_depth": 1000}, 32, marks=pytest.mark.slow),
-        ("mis", {"rr_depth": 1}, 64),
+        pytest.param("mis", {"rr_depth": 1}, 64, marks=pytest.mark.slow),
         ("mis", {"rr_depth": 1, "rr_prob": 0.6}, 64),
         pytest.param("mis", {"rr_depth": 2, "rr_prob": 1.0}, 32, marks=pytest.mark.slow),
     ],
@@ -109,7 +109,7 @@ def moved(scale: float, offset: float) -> dict[str, Any]:
     return scene
 
 
-@pytest.mark.parametrize(("scale", "offset"), few([(1.0, 1e6), (1e-4, 0.0), (1e6, 0.0), (1e-4, 100.0), (1e6, -1e9)], 2))
+@pytest.mark.parametrize(("scale", "offset"), few([(1e6, -1e9), (1.0, 1e6), (1e-4, 0.0), (1e6, 0.0), (1e-4, 100.0)], 1))
 def test_place_and_size_do_not_matter(by_mis, cornell, scale, offset):
     scene = torchpt.load(moved(scale, offset), device="cpu")
     assert_same_mean(pictures(scene, 8, 32, 3000), by_mis)

@@ -55,8 +55,8 @@ def test_strategies_agree(kind: str, more: str):
     found = {}
     for strategy in ("mis", "light", "bsdf"):
         keys = {"strategy": strategy, "max_depth": 3}
-        images = [shoot(scene, 16, 10 + seed, "sobol", keys, film_of(24)).image for seed in range(12)]
-        found[strategy] = spread([coarse(image, 6) for image in images])
+        images = [shoot(scene, 4, 10 + seed, "sobol", keys, film_of(48)).image for seed in range(12)]
+        found[strategy] = spread([coarse(image, 12) for image in images])
     for strategy in ("light", "bsdf"):
         difference = found[strategy][0] - found["mis"][0]
         noise = (found[strategy][1] + found["mis"][1]).sqrt()
