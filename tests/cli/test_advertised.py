@@ -18,6 +18,8 @@ from torchpt.cli import main
 from torchpt.files import configs
 from torchpt.images import write_image
 
+from .conftest import Renderer
+
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 #: Settings by which a render takes no time, in place of what a command says.
@@ -133,28 +135,60 @@ def test_every_file_in_configs_opens_with_its_command() -> None:
             assert f" {path.parent.name}={path.stem}" in command
 
 
-@pytest.mark.parametrize(
-    ("where", "command"),
-    [pytest.param(*item, marks=marks(item[1])) for item in TORCHPT],
-    ids=lambda value: value,
-)
-def test_advertised_commands_run(
-    where: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def renders(words: list[str]) -> bool:
+    one_path = any(word.startswith("debug.") for word in words)  # which is printed
+    return words[0] in ("render", "orbit", "converge") and "--cfg" not in words and not one_path
+
+
+def written(where: str) -> bool:
+    """If a command stands where only its words are in doubt, not that what it asks for can be rendered."""
+    return where == "README.md" or where.startswith("configs/")
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with all files that commands name."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my").mkdir()
     (tmp_path / "my" / "scene.yaml").write_text(SCENE)
     for name in ("test.exr", "reference.exr"):  # what is compared
         write_image(tmp_path / name, torch.full((12, 12, 3), 0.5), {"albedo": torch.full((12, 12, 3), 0.3)})
+    return tmp_path
+
+
+def check(where: str, command: str, place: Path, capfd: pytest.CaptureFixture[str]) -> None:
     words = shlex.split(command)[1:]
-    renders = words[0] in ("render", "orbit", "converge") and "--cfg" not in words
-    renders &= not any(word.startswith("debug.") for word in words)  # one path, which is printed
-    assert main(shrunk(words) if renders else words) == 0, where
-    captured = capfd.readouterr()
-    assert captured.out
-    if renders:
-        files = [path for path in tmp_path.rglob("*") if path.is_file() and path.parent.name != "my"]
+    assert main(shrunk(words) if renders(words) else words) == 0, where
+    assert capfd.readouterr().out
+    if renders(words):
+        files = [path for path in place.rglob("*") if path.is_file() and path.parent.name != "my"]
         assert files and all(path.stat().st_size for path in files)
+
+
+@pytest.mark.parametrize(
+    ("where", "command"),
+    [item for item in TORCHPT if written(item[0]) and renders(item[1].split()[1:]) and not marks(item[1])],
+    ids=lambda value: value,
+)
+def test_advertised_commands_are_understood(
+    where: str, command: str, place: Path, renderer: Renderer, capfd: pytest.CaptureFixture[str]
+) -> None:
+    check(where, command, place, capfd)
+    assert renderer.settings
+
+
+@pytest.mark.parametrize(
+    ("where", "command"),
+    [
+        pytest.param(
+            *item, marks=marks(item[1]) or [pytest.mark.slow] * (written(item[0]) and renders(item[1].split()[1:]))
+        )
+        for item in TORCHPT
+    ],
+    ids=lambda value: value,
+)
+def test_advertised_commands_run(where: str, command: str, place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    check(where, command, place, capfd)
 
 
 SCRIPTS = commands("python")

@@ -93,7 +93,7 @@ CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("words", "says"), few(CASES, 24), ids=[" ".join(words) or "nothing" for words, _ in CASES])
+@pytest.mark.parametrize(("words", "says"), few(CASES, 16), ids=[" ".join(words) or "nothing" for words, _ in CASES])
 def test_bad_input(
     folder: Path, renderer: Renderer, capfd: pytest.CaptureFixture[str], words: list[str], says: str
 ) -> None:

@@ -58,7 +58,11 @@ def test_a_types_file_holds_its_own_keys_and_no_values() -> None:
         (["integrator=direct", "integrator.max_depth=8"], "expected only keys of integrator=direct"),
         (["integrator=aov", "integrator.clamp=8"], "clamp belongs to direct, ibl, path"),
         (["integrator.type=direct", "integrator.max_depth=8"], "max_depth belongs to path"),
-        (["-m", "integrator=path,direct", "integrator.max_depth=8"], "expected only keys of integrator=direct"),
+        pytest.param(
+            ["-m", "integrator=path,direct", "integrator.max_depth=8"],
+            "expected only keys of integrator=direct",
+            marks=pytest.mark.slow,
+        ),
         (["integrator=direct", "integrator.depth=8"], "integrator.depth: unknown key; known: integrator.type"),
     ],
 )
@@ -78,8 +82,8 @@ def test_keys_of_another_type_are_refused(
         (["integrator.max_depth=8"], ["path"]),
         (["integrator=direct"], ["direct"]),
         (["integrator.type=direct", "integrator.strategy=light"], ["direct"]),
-        (["-m", "integrator=path,direct,ibl"], ["path", "direct", "ibl"]),
-        (["-m", "integrator.type=path,ibl", "integrator.clamp=3"], ["path", "ibl"]),
+        pytest.param(["-m", "integrator=path,direct,ibl"], ["path", "direct", "ibl"], marks=pytest.mark.slow),
+        pytest.param(["-m", "integrator.type=path,ibl", "integrator.clamp=3"], ["path", "ibl"], marks=pytest.mark.slow),
     ],
 )
 def test_types_are_chosen_by_file_or_by_key(
@@ -93,17 +97,14 @@ def test_types_are_chosen_by_file_or_by_key(
     ("words", "overrides"),
     [
         ([], {}),
-        (["film.width=16", "film.exposure=-1"], {"film": {"width": 16, "exposure": -1}}),
-        (["render.seed=1e3", "film.gamma=-0.0"], {"render": {"seed": 1000.0}, "film": {"gamma": -0.0}}),
-        (["film.aovs=[albedo,normal]", "film.crop=[0,1,-2,3.5]"],
-         {"film": {"aovs": ["albedo", "normal"], "crop": [0, 1, -2, 3.5]}}),
-        (["film.filter=box"], {"film": {"filter": "box"}}),
+        (["film.width=16", "film.exposure=-1", "film.gamma=-0.0", "film.aovs=[albedo,normal]", "film.crop=[0,1,-2,3.5]",
+          "film.filter=box", "film.tonemap='a, b'", "integrator.clamp=null", "integrator.strict=TRUE",
+          "integrator.strategy=yes", "sampler.adaptive=False", "render.seed=1e3", "render.compile=off", "render.preview=a=b.png"],
+         {"film": {"width": 16, "exposure": -1, "gamma": -0.0, "aovs": ["albedo", "normal"], "crop": [0, 1, -2, 3.5],
+                   "filter": "box", "tonemap": "a, b"},
+          "integrator": {"clamp": None, "strict": True, "strategy": "yes"}, "sampler": {"adaptive": False},
+          "render": {"seed": 1000.0, "compile": "off", "preview": "a=b.png"}}),
         (["film.filter.radius=NULL", "film.filter.type=null"], {"film": {}}),
-        (["integrator.clamp=null"], {"integrator": {"clamp": None}}),
-        (["integrator.strict=TRUE", "sampler.adaptive=False"],
-         {"integrator": {"strict": True}, "sampler": {"adaptive": False}}),
-        (["render.compile=off", "integrator.strategy=yes"], {"render": {"compile": "off"}, "integrator": {"strategy": "yes"}}),
-        (["render.preview=a=b.png", "film.tonemap='a, b'"], {"render": {"preview": "a=b.png"}, "film": {"tonemap": "a, b"}}),
     ],
 )  # fmt: skip
 def test_words_become_settings_of_their_types(
@@ -125,7 +126,7 @@ def test_words_become_settings_of_their_types(
     [
         (["render.spp=1"], 1, {"s.png"}),
         (["hydra.mode=RUN"], 2, {"s.png"}),
-        (["hydra.mode=MULTIRUN", "render.spp=1,2"], 6, {"s_0.png", "s_1.png"}),
+        pytest.param(["hydra.mode=MULTIRUN", "render.spp=1,2"], 6, {"s_0.png", "s_1.png"}, marks=pytest.mark.slow),
     ],
 )
 def test_a_single_job_is_composed_once(
@@ -145,7 +146,7 @@ def test_a_single_job_is_composed_once(
 def test_no_litter_even_in_a_folder_that_cannot_be_written(folder: Path, renderer: Renderer, tmp_path: Path) -> None:
     pictures = tmp_path / "pictures"
     pictures.mkdir()
-    for words in ([], ["-m", "render.spp=1,2"]):
+    for words in ([], ["hydra.mode=MULTIRUN", "render.spp=1,2"]):
         assert main(["render", "scene=s.yaml", f"out={pictures}/a.png", *words]) == 0
     assert sorted(os.listdir(folder)) == ["pictures", "s.yaml"]
     assert sorted(os.listdir(pictures)) == ["a.png", "a_0.png", "a_1.png"]

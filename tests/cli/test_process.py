@@ -7,13 +7,15 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from few import few
 
+from torchpt.cli import main
 from torchpt.images import read_image, read_layers
 
 from .conftest import SCENE
@@ -21,11 +23,34 @@ from .conftest import SCENE
 TORCHPT = [sys.executable, "-m", "torchpt"]
 
 
-def test_a_real_render(tmp_path: Path) -> None:
+#: What a small render to a PNG file has no use for.
+NEEDLESS = (
+    *("trimesh", "kornia", "matplotlib", "numba", "OpenImageIO", "imageio", "mitsuba"),
+    *("networkx", "pandas", "pydantic", "rich", "scipy", "sympy", "triton"),
+    *("torch._dynamo", "torch._inductor", "torch.onnx", "torch.utils.tensorboard"),
+    "PIL.TiffImagePlugin",
+    *(f"torchpt.meshes.{name}" for name in ("gltf", "obj", "ply", "stl")),
+    "torchpt.ranks.launch",
+)
+#: A small render, what was imported for it, and then the command as ``python -m`` runs it.
+CODE = """
+import json, runpy, sys
+from torchpt.cli import main
+assert main(["render", "scene=cornell_box", "render.spp=16", "film.width=64", "film.height=64", "out=small.png"]) == 0
+print("imported", json.dumps([name for name in {needless!r} if name in sys.modules]))
+sys.argv[1:] = {words!r}
+runpy.run_module("torchpt", run_name="__main__", alter_sys=True)
+"""
+
+
+def test_real_renders_and_what_a_small_one_imports(tmp_path: Path) -> None:
     words = ["render", "scene=cornell_box", "film.width=16", "film.height=16", "render.spp=4"]
     words += ["out=[a.exr,a.png]", "film.aovs=[albedo,normal,depth,variance]", "render.preview=p.png"]
-    done = subprocess.run([*TORCHPT, *words], cwd=tmp_path, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0 and done.stderr == ""
+    code = CODE.format(needless=NEEDLESS, words=words)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    assert "imported []" in done.stdout.splitlines()
+    (tmp_path / "small.png").unlink()
     facts = json.loads(done.stdout.splitlines()[-1])
     assert facts["out"] == ["a.exr", "a.png"] and facts["spp"] == 4 and facts["nonfinite_samples"] == 0
     assert {"paths_per_second", "rays", "mean"} <= set(facts)
@@ -38,34 +63,59 @@ def test_a_real_render(tmp_path: Path) -> None:
     assert set(os.listdir(tmp_path)) == {"a.exr", "a.png", "p.png", "p.albedo.png", "p.normal.png"}
 
 
-@pytest.mark.parametrize(("signum", "code"), few([(signal.SIGINT, 130), (signal.SIGTERM, 143)], 1))
-def test_a_signal_ends_a_long_render_with_its_partial_picture(tmp_path: Path, signum: int, code: int) -> None:
+LONG = ["render", "scene=s.yaml", "render.spp=1000000", "render.compile=off", "out=a b.exr", "render.preview=p.exr"]
+
+
+def check_partial(folder: Path, out: str, err: str) -> None:
+    (said,) = (
+        line for line in err.splitlines() if not any(text in line for text in ("search kernels", "error is not known"))
+    )
+    assert "a b.exr holds the picture so far" in said
+    facts = json.loads(out.splitlines()[-1])
+    assert facts["complete"] is False
+    assert torch.isfinite(read_image(folder / "a b.exr")).all()
+    assert {name for name in os.listdir(folder) if name.startswith(".")} == set()
+
+
+def wait_for(file: Path, ended: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 120
+    while not file.exists() and time.monotonic() < deadline and not ended():
+        time.sleep(0.02)
+
+
+def test_a_signal_ends_a_long_render_with_its_partial_picture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "s.yaml").write_text(SCENE.replace("width: 8, height: 6", "width: 64, height: 64"))
-    words = [
-        "render",
-        "scene=s.yaml",
-        "render.spp=1000000",
-        "render.compile=off",
-        "out=a b.exr",
-        "render.preview=p.exr",
-    ]
-    with subprocess.Popen([*TORCHPT, *words], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    ended = threading.Event()
+
+    def interrupt() -> None:
+        wait_for(tmp_path / "p.exr", ended.is_set)
+        if not ended.is_set():
+            os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    try:
+        code = main(LONG)
+    finally:
+        ended.set()
+        thread.join()
+    assert code == 130
+    check_partial(tmp_path, *capfd.readouterr())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_a_process(tmp_path: Path, signum: int, code: int) -> None:
+    (tmp_path / "s.yaml").write_text(SCENE.replace("width: 8, height: 6", "width: 64, height: 64"))
+    with subprocess.Popen([*TORCHPT, *LONG], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         try:
-            deadline = time.monotonic() + 120
-            while not (tmp_path / "p.exr").exists() and time.monotonic() < deadline and process.poll() is None:
-                time.sleep(0.1)
+            wait_for(tmp_path / "p.exr", lambda: process.poll() is not None)
             process.send_signal(signum)
             out, err = process.communicate(timeout=120)
         finally:
             process.kill()
     assert process.returncode == code, err
-    (said,) = (
-        line
-        for line in err.splitlines()
-        if not any(text in line for text in (b"search kernels", b"error is not known"))
-    )
-    assert b"a b.exr holds the picture so far" in said
-    facts = json.loads(out.splitlines()[-1])
-    assert facts["complete"] is False
-    assert torch.isfinite(read_image(tmp_path / "a b.exr")).all()
-    assert {name for name in os.listdir(tmp_path) if name.startswith(".")} == set()
+    check_partial(tmp_path, out.decode(), err.decode())

@@ -113,7 +113,7 @@ def test_an_explicit_null_unsets_the_scenes_wish(folder: Path, renderer: Rendere
     assert renderer.settings[0].film.filter.name == "box"
 
 
-@pytest.mark.parametrize("name", ODD)
+@pytest.mark.parametrize("name", few(ODD, 3))
 def test_any_name_of_a_picture(folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str], name: str) -> None:
     assert main(["render", "scene=s.yaml", f"out={name}"]) == 0
     assert files(folder) == {name}
@@ -151,7 +151,7 @@ def test_display_settings_reach_the_8_bit_picture(folder: Path, renderer: Render
 
 
 @pytest.mark.parametrize("gamma", few([1 / 2.2, 0.6, 1.0], 1))
-@pytest.mark.parametrize("curve", ["none", "reinhard", "aces", "filmic"])
+@pytest.mark.parametrize("curve", few(["none", "reinhard", "aces", "filmic"], 2))
 def test_exposure_curve_and_exponent_reach_every_8_bit_picture_and_the_preview(
     folder: Path, renderer: Renderer, gamma: float, curve: str
 ) -> None:
@@ -274,10 +274,10 @@ def test_multirun_stops_at_a_signal(folder: Path, renderer: Renderer) -> None:
 
 
 def test_multirun_over_groups_without_out(folder: Path, renderer: Renderer) -> None:
-    assert main(["render", "-m", "scene=s.yaml", "sampler=sobol,independent", "integrator=path,direct"]) == 0
-    assert files(folder) == {f"s_{n}.png" for n in range(4)}
+    assert main(["render", "-m", "scene=s.yaml", "sampler=independent", "integrator=path,direct"]) == 0
+    assert files(folder) == {f"s_{n}.png" for n in range(2)}
     kinds = [(s.sampler.name, s.integrator.name) for s in renderer.settings]
-    assert kinds == [(s, i) for s in ("sobol", "independent") for i in ("path", "direct")]
+    assert kinds == [("independent", i) for i in ("path", "direct")]
 
 
 def test_a_defect_keeps_its_trace(folder: Path, renderer: Renderer) -> None:

@@ -70,9 +70,7 @@ def test_shadows_let_through_what_the_surfaces_do(strategy):
     veiled = {"sky": {"type": "constant", "radiance": 0.8}}
     keys = {"max_depth": 2, "strategy": strategy}
     # Seen through the leaf; lit through the leaf, by the sky through the ball as well.
-    expected = (
-        0.6 * 0.6 * shoot({**LEAVES, "shapes": plain, "lights": veiled}, 16, 5, "sobol", keys, film_of(64)).image
-    )
+    expected = 0.6 * 0.6 * shoot({**LEAVES, "shapes": plain, "lights": veiled}, 16, 5, "sobol", keys, film_of(64)).image
     image = shoot(LEAVES, 16, 6, "sobol", keys, film_of(64)).image
     (mean, error), (value, noise) = estimate(image), estimate(expected)
     assert ((mean - value).abs() < z_limit(12) * (error**2 + noise**2).sqrt()).all(), (mean, value, error)
