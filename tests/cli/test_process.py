@@ -103,7 +103,8 @@ def test_a_signal_ends_a_long_render_with_its_partial_picture(
         ended.set()
         thread.join()
     assert code == 130
-    check_partial(tmp_path, *capfd.readouterr())
+    captured = capfd.readouterr()
+    check_partial(tmp_path, captured.out, captured.err)
 
 
 @pytest.mark.slow

@@ -90,7 +90,7 @@ CASES: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("case", few(CASES, 4))
 def test_the_bits_of_a_render_that_nobody_stopped(case: str, box: torchpt.Scene, tmp_path: Path) -> None:
     whole, stopped = shot(box, **CASES[case]), []
-    for number, part in enumerate((0.02, 0.3, 0.6, 0.97)):
+    for number, part in enumerate((0.02, 0.6)):
         file = str(tmp_path / f"{number}.ckpt")
         stopped.append(not shot(box, int(part * whole.paths), checkpoint=file, **CASES[case]).complete)
         again = shot(box, checkpoint=file, resume=True, **CASES[case])
@@ -98,7 +98,7 @@ def test_the_bits_of_a_render_that_nobody_stopped(case: str, box: torchpt.Scene,
         once_more = shot(box, checkpoint=file, resume=True, **CASES[case])  # the checkpoint of a finished render
         assert equal(once_more, whole), part
     assert any(stopped), "a render that is whole at once tells nothing"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.ckpt", "1.ckpt", "2.ckpt", "3.ckpt"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.ckpt", "1.ckpt"]
 
 
 @pytest.mark.slow

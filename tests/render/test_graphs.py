@@ -95,7 +95,7 @@ def test_a_file_that_asks_for_layers_has_gradients(scene):
 
 @pytest.mark.parametrize(
     "wish",
-    [{"dtype": torch.float16}, {"seed": -5}, {"seed": 1 << 63}, {"seed": True}, {"time_limit": float("inf")}],
+    few([{"dtype": torch.float16}, {"seed": -5}, {"seed": 1 << 63}, {"seed": True}, {"time_limit": float("inf")}], 2),
     ids=str,
 )
 def test_what_is_refused_is_refused_in_graphs(scene, wish):

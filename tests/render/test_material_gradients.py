@@ -67,13 +67,11 @@ def checked(scene: torchpt.Scene, *names: str) -> None:
 DIRECT = {"max_depth": 3, "strategy": "light"}
 
 
-@pytest.mark.parametrize(
-    "name", ["shapes.plate.to_world", "shapes.before.to_world", "camera.to_world", "shapes.lamp.vertices"]
-)
-def test_what_a_mirror_shows_follows_the_geometry(name):
+def test_what_a_mirror_shows_follows_the_geometry():
     described = room(GOLD, DIRECT)
     del described["shapes"]["bulb"], described["shapes"]["behind"]
-    checked(torchpt.load(described, "cpu"), name)
+    names = ("shapes.plate.to_world", "shapes.before.to_world", "camera.to_world", "shapes.lamp.vertices")
+    checked(torchpt.load(described, "cpu"), *names)
 
 
 def test_a_mirrors_colours():

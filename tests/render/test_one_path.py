@@ -196,7 +196,12 @@ def test_places_are_the_scenes_own():
 
 
 def test_parts_and_copies_have_their_names():
-    scene = torchpt.load("instances", "cpu")
+    pane = {"type": "cube", "transform": [{"scale": [0.5, 1, 0.1]}, {"translate": [-1, 0, 0]}]}
+    copy = {"type": "instance", "of": "pane", "transform": [{"translate": [2, 0, 0]}]}
+    back = {"type": "rectangle", "transform": [{"scale": 5}, {"translate": [0, 0, -2]}]}
+    camera = {"origin": [0, 0, 6], "target": [0, 0, 0], "fov": 50}
+    shapes = {"pane": pane, "copy": copy, "back": back}
+    scene = torchpt.load({"camera": camera, "shapes": shapes, "lights": {"sky": {"type": "constant"}}}, "cpu")
     wish = wishes(scene)
     met = [vertex for pixel in pixels() for vertex in one_path(scene, wish, pixel, 0).vertices if vertex.shape]
     assert met and {vertex.shape for vertex in met} <= set(scene.description.shapes)

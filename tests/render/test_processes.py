@@ -4,9 +4,11 @@ in an interpreter of its own, and must give the picture that a plain render give
 from __future__ import annotations
 
 import hashlib
+import multiprocessing
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -77,9 +79,29 @@ def run(tmp_path: Path, body: str, name: str, environment: dict[str, str]) -> li
     return found.stdout.split()
 
 
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Python's, of a fork beside threads
+def test_threads_then_a_fork_give_the_same_picture():
+    """By the process of the tests; the scripts have interpreters of their own."""
+    found: list[str] = []
+    threads = [threading.Thread(target=lambda: found.append(expected("cornell_box"))) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    process = context.Process(target=lambda: queue.put(expected("cornell_box")))
+    process.start()
+    found.append(queue.get(timeout=100))
+    process.join()
+    assert len(found) == 3 and set(found) == {expected("cornell_box")}
+
+
 # Both CPU searches: packets and the wide tree.
 @pytest.mark.parametrize("name", ["cornell_box", pytest.param("cornell_bunny", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("way", [pytest.param(x, marks=[] if "then" in x else [pytest.mark.slow]) for x in SCRIPTS])
+@pytest.mark.slow
+@pytest.mark.parametrize("way", SCRIPTS)
 def test_threads_and_workers_give_the_same_picture(tmp_path, way, name):
     assert set(run(tmp_path, SCRIPTS[way], name, {})) == {expected(name)}
 

@@ -147,23 +147,23 @@ def test_kernels_take_none_of_the_time(monkeypatch):
         if not made:
             made.append(kernel)
             with global_compiler_lock:  # as numba has it while it compiles
-                time.sleep(0.5)
+                time.sleep(0.25)
         return kept_back(kernel, *args)
 
     monkeypatch.setattr(wide, "compiled", slow)
     start = time.perf_counter()
-    found = shot(scene, spp=10**6, accel="numba", time_limit=0.3, threads=1)
+    found = shot(scene, spp=10**6, accel="numba", time_limit=0.15, threads=1)
     wall = time.perf_counter() - start
     assert made and found.stopped_by == "time_limit" and found.spp > 1
-    assert found.compile_seconds >= 0.5 and 0.1 < found.render_seconds < wall - 0.45
-    assert 0.0 <= wall + found.load_seconds - found.seconds < 0.3
+    assert found.compile_seconds >= 0.25 and 0.05 < found.render_seconds < wall - 0.2
+    assert 0.0 <= wall + found.load_seconds - found.seconds < 0.15
 
 
 def test_a_time_limit(box):
     shot(box, spp=16)  # what is compiled is there
-    stopped = shot(box, spp=1_000_000, time_limit=0.5)
+    stopped = shot(box, spp=1_000_000, time_limit=0.2)
     assert stopped.stopped_by == "time_limit" and stopped.complete
-    assert 0.3 < stopped.render_seconds < 2.0  # longer on a busy machine: the long form is stricter
+    assert 0.1 < stopped.render_seconds < 1.5  # longer on a busy machine: the long form is stricter
     assert torch.equal(shot(box, spp=stopped.spp).image, stopped.image)
 
 
