@@ -276,7 +276,7 @@ def test_times_that_no_point_brackets_are_marked() -> None:
 def test_the_curves_are_drawn(suffix: str, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="extra `bench`")
     file = tmp_path / f"curves{suffix}"
-    bench_plot.plot({name: row(0.5) for name in bench_figures.SCENES}, [1.0, 4.0, 16.0], file)
+    bench_plot.plot({name: row(0.5) for name in list(bench_figures.SCENES)[:2]}, [1.0, 4.0, 16.0], file)
     assert file.stat().st_size > 10_000 and list(tmp_path.iterdir()) == [file]
     with pytest.raises(SystemExit, match="no scenes"):
         bench_plot.plot({}, [1.0], file)

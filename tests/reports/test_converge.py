@@ -82,6 +82,12 @@ def there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+@pytest.fixture
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without plots, which take most of the time."""
+    monkeypatch.setattr(report, "_figures", lambda *_: {})
+
+
 def facts(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "report.json").read_text())
 
@@ -191,7 +197,7 @@ def test_another_study_has_a_folder_of_its_own(
 
 
 def test_progress_is_told_in_lines_where_no_terminal_shows_a_bar(
-    there: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    no_plots: None, there: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(progress, "EVERY", 0.0)
     words = ["scene=s.yaml", "spp=[1,2]", "seeds=2", "reference=theirs.exr", "render.compile=off", "metrics=mse"]
@@ -218,7 +224,7 @@ def test_print_keeps_things_whole_and_small() -> None:
 
 
 def test_a_signal_keeps_what_is_done(
-    there: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    no_plots: None, there: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     renders = Renders(monkeypatch)
     renders.most = 4  # one that is thrown away and two runs, then another that is thrown away
