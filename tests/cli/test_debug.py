@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 import pytest
+from few import few
 
 from torchpt.cli import main
 
@@ -73,7 +74,7 @@ def test_hydras_words_lead_to_the_same_path(place: Path, capfd: Captured) -> Non
 
 @pytest.mark.parametrize(
     ("words", "line"),
-    [
+    few([
         (["debug.pixel=[16,0]"], f"debug.pixel: expected a pixel [x,y] of {FILM}, got [16, 0]"),
         (["debug.pixel=[1]"], "debug.pixel: expected [x,y], two whole numbers from 0, got '[1]'"),
         (["debug.pixel=[-1,0]"], "debug.pixel: expected [x,y], two whole numbers from 0, got '[-1,0]'"),
@@ -88,7 +89,7 @@ def test_hydras_words_lead_to_the_same_path(place: Path, capfd: Captured) -> Non
             ["debug.pixel=[1,1]", "integrator=aov"],
             "integrator.type: expected one that follows paths (path, direct) beside debug.pixel, got 'aov'",
         ),
-    ],
+    ], 6),
 )  # fmt: skip
 def test_what_is_wrong_is_told_in_a_line(place: Path, capfd: Captured, words: list[str], line: str) -> None:
     assert main(["render", "scene=sun.yaml", *words]) == 2

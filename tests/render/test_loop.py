@@ -228,7 +228,7 @@ def paired(
     return worst / t_limit(comparisons, seeds - 1)
 
 
-@pytest.mark.parametrize("name", few(["cornell_transmissive", "env_teapot", "ibl_row"], 2))
+@pytest.mark.parametrize("name", few(["cornell_transmissive", "env_teapot", "ibl_row"], 1))
 def test_pictures(name):
     assert paired(scene_of(name), {}, 16, 4) <= 1.0
 
@@ -271,7 +271,7 @@ def quick(some: tuple[Any, ...], all: Iterable[Any]) -> list[Any]:
     return [one if one in some else pytest.param(one, marks=pytest.mark.slow) for one in all]
 
 
-@pytest.mark.parametrize("sampler", quick(("sobol", "independent"), SAMPLERS))
+@pytest.mark.parametrize("sampler", quick(("sobol",), SAMPLERS))
 def test_samplers(sampler):
     assert paired(loaded("cornell_box"), {"sampler": {"type": sampler}}, 16, 4) <= 1.0
 
@@ -326,6 +326,7 @@ def test_a_crop_shows_the_very_pixels():
     assert paired(scene, {"film": {"crop": [3, 5, 16, 8]}}, 24, 4) <= 1.0
 
 
+@pytest.mark.slow  # of the contract of integrators is a quicker one
 def test_a_clamp_takes_the_same_light():
     scene = loaded("cornell_box")
     wish = {"integrator": {"type": "path", "clamp": 0.5}}

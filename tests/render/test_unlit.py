@@ -38,7 +38,7 @@ def shot(scene: torchpt.Scene, integrator: Any = "path", film: Any = None, **ren
 
 
 @pytest.mark.parametrize("accel", ["brute", "numba", "torch"])
-@pytest.mark.parametrize("light", [POINT, SPOT])
+@pytest.mark.parametrize("light", few([POINT, SPOT], 1))
 def test_a_light_inside_of_glass_is_named(light, accel):
     found = shot(room({"p": light}, bulb=BULB), accel=accel)
     assert found.relmse is None and found.relmse_interval is None and not bool(found.image.any())
