@@ -141,7 +141,7 @@ def renders(words: list[str]) -> bool:
 
 
 def written(where: str) -> bool:
-    """If a command stands where only its words are in doubt, not that what it asks for can be rendered."""
+    """Return True for where only the words of commands are in doubt, not that what they ask for can be rendered."""
     return where == "README.md" or where.startswith("configs/")
 
 

@@ -196,7 +196,7 @@ def slow(name: str, mode: str) -> list[pytest.MarkDecorator]:
     rows = ("many lights", "textures and normal maps", "strategy light", "some materials", "preview", "environment map",
             "searched by a tree", "parallel projection", "lens of six blades", "filter mitchell")  # fmt: skip
     others = name.startswith(("sampler ", "filter ", "strategy ")) and name not in ("sampler sobol", "filter mitchell")
-    eager = ("textures and normal maps", "many lights", "layers")  # these of "opacity"
+    eager = ("textures and normal maps", "many lights", "layers")  # of the scene of "opacity"
     return [pytest.mark.slow] * (others or (name in rows if mode == "compiled" else name not in eager))
 
 
