@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 from gradient_rooms import gradient_of, room
 from torch import Tensor
 
@@ -73,7 +74,7 @@ def test_other_lights(kind):
     agree(room(COLOUR["plate"], lights={"other": light}), f"lights.other.{key}")
 
 
-@pytest.mark.parametrize("name", ["materials.plate.int_ior", "lights.sky.texels"])
+@pytest.mark.parametrize("name", few(["materials.plate.int_ior", "lights.sky.texels"], 1))
 def test_tables_by_kernels(name, capfd):
     """Whose entries are made of what is differentiated, or are it: their derivatives are kernels' too."""
     texels = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(1)) + 0.1
@@ -118,7 +119,7 @@ def test_signed_filters_and_clamps():
     agree(room(COLOUR["plate"]), "materials.plate.reflectance", **wish)
 
 
-@pytest.mark.parametrize("mode", ["auto", "off"])
+@pytest.mark.parametrize("mode", few(["auto", "off"], 1))
 def test_clamped_samples_have_the_derivative_of_what_counts(mode):
     """A grey sample beyond the clamp counts as the clamp, whatever the light: by differences."""
     scene = torchpt.load(room(COLOUR["plate"]), "cpu")

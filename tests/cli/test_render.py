@@ -273,6 +273,7 @@ def test_multirun_stops_at_a_signal(folder: Path, renderer: Renderer) -> None:
     assert files(folder) == {"s_0.png"}
 
 
+@pytest.mark.slow  # a sweep of `info` is over groups too
 def test_multirun_over_groups_without_out(folder: Path, renderer: Renderer) -> None:
     assert main(["render", "-m", "scene=s.yaml", "sampler=independent", "integrator=path,direct"]) == 0
     assert files(folder) == {f"s_{n}.png" for n in range(2)}

@@ -26,9 +26,10 @@ def cornell_dict() -> dict[str, Any]:
     return yaml.safe_load((configs() / "scene" / "cornell_box.yaml").read_text())
 
 
-def pictures(scene: Any, count: int, spp: int, first_seed: int, **integrator: Any):
+def pictures(scene: Any, count: int, spp: int, first_seed: int, compile: str = "off", **integrator: Any):
     shots = [
-        shoot(scene, spp, first_seed + k, integrator={"max_depth": 6, **integrator}, film=SMALL) for k in range(count)
+        shoot(scene, spp, first_seed + k, integrator={"max_depth": 6, **integrator}, film=SMALL, compile=compile)
+        for k in range(count)
     ]
     return spread([shot.image for shot in shots])
 
@@ -49,7 +50,7 @@ def assert_same_mean(a: tuple[torch.Tensor, torch.Tensor], b: tuple[torch.Tensor
 
 @pytest.fixture(scope="module")
 def by_mis(cornell):
-    return pictures(cornell, 8, 64, 1000)
+    return pictures(cornell, 8, 64, 1000, "on")
 
 
 @pytest.mark.parametrize(

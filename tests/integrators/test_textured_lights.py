@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 from trials import coarse, film_of, shoot, spread, z_limit
 
 import torchpt
@@ -49,21 +50,20 @@ CASES = [
 ]
 
 
+@pytest.mark.parametrize("other", few(["bsdf", "light"], 1))
 @pytest.mark.parametrize(("kind", "more"), CASES)
-def test_strategies_agree(kind: str, more: str):
+def test_strategies_agree(kind: str, more: str, other: str):
     scene = torchpt.load(lit_by(LAMPS[kind], **({"opacity": HOLES} if more == "holes" else {})), device="cpu")
     found = {}
-    for strategy in ("mis", "light", "bsdf"):
+    for strategy in ("mis", other):
         keys = {"strategy": strategy, "max_depth": 3}
         images = [shoot(scene, 4, 10 + seed, "sobol", keys, film_of(48)).image for seed in range(12)]
         found[strategy] = spread([coarse(image, 12) for image in images])
-    for strategy in ("light", "bsdf"):
-        difference = found[strategy][0] - found["mis"][0]
-        noise = (found[strategy][1] + found["mis"][1]).sqrt()
-        # Student's t of about 22 degrees has wider tails than the normal: hence the margin.
-        assert (difference.abs() <= 1.4 * z_limit(difference.numel() * 24) * noise + 1e-5).all(), strategy
-        whole, error = difference.mean(), noise.square().sum().sqrt() / noise.numel()
-        assert whole.abs() < 3.5 * error, (strategy, float(whole), float(error))
+    difference, noise = found[other][0] - found["mis"][0], (found[other][1] + found["mis"][1]).sqrt()
+    # Student's t of about 22 degrees has wider tails than the normal: hence the margin.
+    assert (difference.abs() <= 1.4 * z_limit(difference.numel() * 24) * noise + 1e-5).all()
+    whole, error = difference.mean(), noise.square().sum().sqrt() / noise.numel()
+    assert whole.abs() < 3.5 * error, (float(whole), float(error))
 
 
 def test_emission_seen_directly_is_the_texture():

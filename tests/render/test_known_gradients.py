@@ -11,9 +11,7 @@ from known_gradients import PAIRS
 #: What is not done yet: the edge along which shapes cut through each other; surfaces that move near others, in reflected light.
 NOT_DONE = ("cylinder_pose", "block_pose_room_indirect")
 QUICK = (
-    "albedo_room",
     "roughness",
-    "sky_scale",
     "free_lamp",
     "fov_room",
     "camera_x_sky",

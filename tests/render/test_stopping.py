@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 from few_lanes import few_lanes
 from numba.core.compiler_lock import global_compiler_lock
 from trials import film_of
@@ -110,7 +111,7 @@ def test_the_first_rule_ends_it():
 # -- pictures
 
 
-@pytest.mark.parametrize("compile", ["on", "off"])
+@pytest.mark.parametrize("compile", few(["on", "off"], 1))
 def test_a_stopped_picture_is_that_of_its_samples(box, compile):
     film = film_of(16) if compile == "off" else None
     stopped = shot(box, film, spp=4096, target_error=0.02, compile=compile)
@@ -229,7 +230,7 @@ def test_adaptive_pictures_of_a_few_blocks_are_complete(box, size, spp):
     assert found.complete and found.stopped_by == "spp" and min(16, spp) <= found.spp <= spp
 
 
-@pytest.mark.parametrize("compile", ["on", "off"])
+@pytest.mark.parametrize("compile", few(["on", "off"], 1))
 @pytest.mark.parametrize("sampler", ["sobol", {"type": "sobol", "adaptive": True}])
 def test_a_crop_without_pilots(box, sampler, compile):
     """One pixel of sixteen is a pilot: most crops of one pixel have none, and know nothing."""

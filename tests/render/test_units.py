@@ -155,7 +155,7 @@ def ordinary(scene: Callable[[float], dict[str, Any]]) -> Rendering:
     return shoot(scene(1.0))
 
 
-@pytest.mark.parametrize("compile", ["on", "off"])
+@pytest.mark.parametrize("compile", few(["on", "off"], 1))
 @pytest.mark.parametrize("scale", few([1e-18, 1e18], 1))
 @pytest.mark.parametrize("scene", [many, copies, bumps, lens, parallel, deltas])
 def test_nor_for_what_else_has_a_length(scene, scale, compile):

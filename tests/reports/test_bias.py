@@ -39,7 +39,7 @@ def case(kind: str, seed: int, change: Tensor | float = 1.0) -> tuple[list[Tenso
     ("kind", "cases"),
     few(
         [
-            ("gaussian", 30),
+            ("gaussian", 15),
             ("fireflies", 30),
             *(pytest.param(kind, 500, marks=pytest.mark.slow) for kind in ("gaussian", "fireflies", "lognormal")),
         ],

@@ -27,7 +27,7 @@ def told(outcome: Outcome) -> str:
     return "; ".join(f"{one.at:g}: {one.figure:.3g} {one.problem}" for one in outcome.readings)
 
 
-@pytest.mark.parametrize("name", few(CASES, 8))
+@pytest.mark.parametrize("name", few(CASES, 6))
 def test_quickly(name: str) -> None:
     outcome = outcome_of(CASES[name], Bench(), quick=True)
     assert outcome.passed, told(outcome)
