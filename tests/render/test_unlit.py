@@ -149,7 +149,7 @@ def test_few_dark_pixels_widen_the_interval(monkeypatch):
     """A black pixel may be off by 1 at most, in squared error over radiance squared."""
     scene = torchpt.load("cornell_box", device="cpu")
     plain = shot(scene, film=film_of(32))
-    monkeypatch.setattr("torchpt.forward.picture.unlit", lambda *_: Unlit("", 0.003))
+    monkeypatch.setattr("torchpt.forward.unlit.unlit", lambda *_: Unlit("", 0.003))
     wide = shot(scene, film=film_of(32))
     assert plain.relmse_interval is not None and wide.relmse_interval is not None and wide.relmse == plain.relmse
     low, high = plain.relmse_interval
