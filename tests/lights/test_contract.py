@@ -339,7 +339,7 @@ def test_derivatives_are_those_of_differences(name):
     """Of the irradiance at a point, light by light drawn over a fine grid, with respect to every parameter."""
     scene = loaded(name)
     x, axis, _ = place(name, scene, 2.5)
-    u, weights = squares(160), _column([1, 0.7, 0.4])
+    u, weights = squares(96), _column([1, 0.7, 0.4])
     if name in lights.KINDS:
         axis = normalize(_column([0.3, 1.2, -0.1]))
     params = {key: value.double() for key, value in scene.params.items() if ".it." in key and ".material" not in key}

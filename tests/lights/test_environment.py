@@ -117,7 +117,7 @@ def test_a_constant_map_is_a_constant_light(tmp_path):
     image = shoot(furnace, 4, 3).image
     torch.testing.assert_close(image, torch.ones_like(image), rtol=0, atol=2e-3)
     pictures = [
-        spread([shoot(under(light), 16, 50 + k, "sobol", {"max_depth": 4}, film_of(16)).image for k in range(6)])
+        spread([shoot(under(light), 16, 50 + k, "sobol", {"max_depth": 4}, film_of(16)).image for k in range(4)])
         for light in (sky, {"type": "constant", "radiance": 1.0})
     ]
     (a, va), (b, vb) = pictures
@@ -135,7 +135,7 @@ def test_with_other_lights(quadrants):
         scene = plane(sky)
         scene["lights"] = lights
         scene["shapes"].update(shapes)
-        return estimate(shoot(scene, 64, 5, integrator={"max_depth": 2}).image)
+        return estimate(shoot(scene, 32, 5, integrator={"max_depth": 2}).image)
 
     dark = {**lamp, "emission": 0}
     parts = [picture({"sky": sky}, {"lamp": dark}), picture({"sun": sun}, {"lamp": dark}), picture({}, {"lamp": lamp})]
@@ -189,7 +189,7 @@ def test_a_turned_map_has_a_derivative(quadrants):
         return torchpt.render(
             scene,
             params=given,
-            spp=64,
+            spp=16,
             seed=3,
             seed_grad=3,
             integrator=keys,

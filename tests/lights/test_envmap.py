@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import pytest
 import torch
@@ -128,8 +129,7 @@ def shares(map: envmap.EnvironmentMap, mis: bool, turn: Tensor, bands: int, widt
     return value.view(bands, fine, width, fine).sum((1, 3)).reshape(-1)
 
 
-@pytest.mark.parametrize("name", few(MAPS, 3))
-@pytest.mark.parametrize("mis", [False, True], ids=["alone", "mis"])
+@pytest.mark.parametrize(("name", "mis"), few(product(MAPS, [False, True]), 3))
 def test_draws_follow_the_density(name, mis):
     """Chi-square over cells of equal solid angle, and the density of a draw is that of its direction."""
     turn = SKEW64 * torch.tensor([1.0, -1.0, 1.0])
@@ -179,7 +179,7 @@ def test_all_the_light_is_found(name):
     _, density, light = envmap.sample(map, squares(), False)
     assert (density > 0).float().mean() > 0.9999
     value = torch.where(density > 0, light[0] / torch.where(density > 0, density, 1.0), 0.0).double()
-    side = 1024
+    side = 384
     z = 1 - (torch.arange(side).double() + 0.5) * (2 / side)
     phi = (torch.arange(side).double() + 0.5) * (2 * math.pi / side)
     z, phi = (a.reshape(-1) for a in torch.meshgrid(z, phi, indexing="ij"))
@@ -301,15 +301,15 @@ def test_compensation():
 
 def test_derivatives():
     """Radiance is linear in texels and scale, and follows a turned map."""
-    texels = noise(5, 7).double().requires_grad_()
+    texels = noise(3, 5).double().requires_grad_()
     scale = torch.tensor(1.3, dtype=torch.float64, requires_grad=True)
     turn = SKEW64.clone().requires_grad_()
-    d = everywhere(7).double()
+    d = everywhere(5).double()
 
     def look(texels: Tensor, scale: Tensor, turn: Tensor) -> Tensor:
         return envmap.radiance(envmap.build(texels, turn, scale), d)
 
-    assert torch.autograd.gradcheck(look, (texels, scale, turn))
+    assert torch.autograd.gradcheck(look, (texels, scale, turn), fast_mode=True)
     u = squares(64).double()
     _, density, light = envmap.sample(envmap.build(texels, turn, scale), u, True)
     assert not density.requires_grad

@@ -54,7 +54,7 @@ def large(kind: str, size: float) -> tuple[dict[str, Any], float]:
 
 
 @pytest.mark.parametrize("compile", few(["on", "off"], 1))
-@pytest.mark.parametrize("size", few([1e10, 1e19, 1e20, 2e23], 2))
+@pytest.mark.parametrize("size", few([2e23, 1e20, 1e19, 1e10], 1))
 @pytest.mark.parametrize("kind", ["disk", "rectangle", "triangle", "shell", "egg", "far"])
 def test_a_lamp_far_larger_than_the_scene(kind, size, compile):
     lamp, share = large(kind, size)
@@ -66,7 +66,7 @@ def test_a_lamp_far_larger_than_the_scene(kind, size, compile):
 
 @pytest.mark.parametrize("compile", ["on", "off"])
 @pytest.mark.parametrize("strategy", ["mis", "light"])
-@pytest.mark.parametrize("size", [1e-6, 1e-12, 1e-18])
+@pytest.mark.parametrize("size", few([1e-6, 1e-12, 1e-18], 2))
 def test_a_lamp_far_smaller_than_the_scene(size, strategy, compile):
     # So bright that as much arrives of it: E = pi L (r / d)^2, with L r^2 = 1.
     lamp = {"type": "sphere", "radius": size, "center": [0, 5, 0]}

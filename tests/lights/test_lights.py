@@ -68,7 +68,7 @@ def solid_angle(name: str, x: Tensor) -> float:
     if "sphere" in name:
         sin2 = float(e1[0, 0] ** 2 / dot(p0 - x, p0 - x))
         return 2 * math.pi * sin2 / (1 + math.sqrt(1 - sin2))
-    side = 1500
+    side = 300
     g = (torch.arange(side, dtype=torch.float64) + 0.5) / side
     u, v = torch.cartesian_prod(g, g).T
     share = 1.0

@@ -38,7 +38,7 @@ def test_weights_of_random_pairs_sum_to_one(dtype):
     view, sky = {"origin": [0, 0, 5], "target": [0, 0, 0]}, {"type": "constant", "radiance": [0.3] * 3}
     scene = torchpt.load({"camera": view, "lights": {"sky": sky}, "shapes": {**shapes, "floor": FLOOR}}, device="cpu")
     world, _ = scene.world(dtype)
-    accel, g, n = scene.accel("auto", None), torch.Generator().manual_seed(3), 1 << 17
+    accel, g, n = scene.accel("auto", None), torch.Generator().manual_seed(3), 1 << 15
 
     def met(o: torch.Tensor, d: torch.Tensor) -> tuple[Any, torch.Tensor]:
         t, prim, u, v = accel.intersect(o.float(), d.float(), torch.full((o.shape[1],), torch.inf))

@@ -187,7 +187,7 @@ def test_the_density_integrates_to_one(name):
     """Over the light's area by a fine grid, where it is sampled by its angle and where by its area."""
     p0, e1, e2 = LIGHTS[name]
     area = torch.linalg.vector_norm(cross(e1, e2)) * (0.5 if name == "triangle" else 1.0)
-    g = (torch.arange(1024, dtype=D) + 0.5) / 1024
+    g = (torch.arange(256, dtype=D) + 0.5) / 256
     u = torch.cartesian_prod(g, g).T.contiguous()
     uv = uniform_triangle(u) if name == "triangle" else u
     for place in ("far", "near", "beyond"):
@@ -268,7 +268,7 @@ def test_place_and_threads_do_not_matter():
         torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("name", list(LIGHTS))
+@pytest.mark.parametrize("name", few(list(LIGHTS), 3))
 def test_points_in_the_plane_and_lights_without_area_are_sampled_by_area(name):
     p0, e1, e2 = LIGHTS[name]
     spots = [p0, p0 + e1, p0 + e2, p0 + 0.5 * e1, p0 + 0.3 * e1 + 0.3 * e2, p0 - e1, p0 + 3 * e1 + 1e-30]
@@ -396,7 +396,7 @@ def test_behind_the_emitter_there_is_nothing_and_gradients_are_those_of_the_area
     torch.testing.assert_close(slope, torch.tensor([0.5 / 0.4, 0.0, 1.0, 1.0], dtype=D))
 
 
-@pytest.mark.parametrize("place", ["near", "beyond"])
+@pytest.mark.parametrize("place", few(["near", "beyond"], 1))
 @pytest.mark.parametrize("name", ["triangle", "rectangle", "parallelogram"])
 def test_derivatives_of_a_moving_light_are_those_of_the_integral(name, place):
     """The draw is held and the weight follows: against differences of the irradiance, each over a fine grid."""
