@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from few import few
 from oracle import assert_same, both_sides, mitsuba_eval_pdf, ours_eval_pdf, random_pairs, rgb
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -152,7 +153,7 @@ def hemisphere(n: int = 400) -> tuple[Tensor, Tensor]:
     return torch.stack((r * phi.cos(), r * phi.sin(), z)), wz.repeat_interleave(2 * n) * (math.pi / n)
 
 
-@pytest.mark.parametrize(("angle", "albedo"), [(0, 1.05), (60, 1.08), (80, 1.31), (88, 1.54)])
+@pytest.mark.parametrize(("angle", "albedo"), few([(0, 1.05), (60, 1.08), (80, 1.31), (88, 1.54)], 2))
 def test_rough_white_has_its_known_albedo(angle, albedo):
     wi, weight = hemisphere()
     a = math.radians(angle)
