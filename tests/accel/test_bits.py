@@ -70,7 +70,7 @@ def check(g, accel, kind, n, seed, sort):
 @pytest.mark.parametrize("kind", KINDS)
 def test_bits_are_those_of_the_scalar_search(kind, sort):
     g = triangles(*sphere_mesh(40))
-    check(g, Wide(g, 1), kind, 30_000, 1, sort)
+    check(g, Wide(g, 1), kind, 20_000, 1, sort)
 
 
 @pytest.mark.slow

@@ -59,7 +59,7 @@ def as_explicit(prim: torch.Tensor, geometry: Geometry) -> torch.Tensor:
 @pytest.mark.parametrize("kind", BACKENDS)
 def test_copies_are_hit_as_explicit_meshes_are(kind):
     copied, explicit = scene(23)
-    o, d, t_max = rays(1, 30_000)
+    o, d, t_max = rays(1, 15_000)
     t_max[::3] = 1.0
     accel, plain = build(copied, kind), build(explicit, kind)
     t, prim, u, v = accel.intersect(o, d, t_max)
@@ -67,7 +67,7 @@ def test_copies_are_hit_as_explicit_meshes_are(kind):
     same = as_explicit(prim, copied) == prim2
     assert same.float().mean() > 0.9995  # but at edges: both are rounded, in places of their own
     hit = same & (prim >= copied.size)
-    assert hit.sum() > 800 and len(prim[hit].unique()) > 400
+    assert hit.sum() > 400 and len(prim[hit].unique()) > 250
     torch.testing.assert_close(t[hit], t2[hit], rtol=1e-4, atol=1e-5)
     assert ((u - u2)[hit].abs() < 5e-3).float().mean() > 0.999
     assert ((v - v2)[hit].abs() < 5e-3).float().mean() > 0.999

@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -21,6 +20,7 @@ from torchpt.accel.tables import prepare
 from torchpt.accel.topology import REBUILD
 from torchpt.accel.wide import Wide
 from torchpt.accel.wide_instances import WideInstanced
+from torchpt.native.jit import jit
 from torchpt.records import Geometry
 from torchpt.shapes.kinds.cylinder import Cylinder
 from torchpt.shapes.kinds.sphere import Ellipsoid
@@ -101,7 +101,7 @@ def check_blocks(accel, g):
     assert sorted(held) == np.flatnonzero(area).tolist()
 
 
-@numba.njit(error_model="numpy")
+@jit()
 def _nearest_of_all(o, d, p, rows, t, prim):
     for i in range(o.shape[1]):
         t[i], prim[i] = np.inf, -1
@@ -155,7 +155,7 @@ def test_hits_are_those_of_a_tree_built_anew(how, whatever_it_costs):
     p = torch.stack((g.p0, g.p1, g.p2)).permute(2, 0, 1).contiguous().numpy()
     rows, differ, hits = mesh_tree(g)[1], 0, 0
     for kind in KINDS:
-        rays = make_rays(kind, g, 40_000, 4)
+        rays = make_rays(kind, g, 20_000, 4)
         a, b = found(old, *rays), found(new, *rays)
         unlike = np.any([x.view(np.int32) != y.view(np.int32) for x, y in zip(a, b, strict=True)], 0)
         o, d = (x[:, unlike].copy() for x in rays[:2])
@@ -165,7 +165,7 @@ def test_hits_are_those_of_a_tree_built_anew(how, whatever_it_costs):
         assert unlike.mean() < (0.01 if how == "far" else 0.001)  # and a third of the rays is aimed at edges
         differ += unlike.sum()
         hits += (a[1] >= 0).sum()
-    assert hits > 20_000
+    assert hits > 10_000
     assert differ > 0 or how in ("anywhere", "flat")  # or nothing was told of the rays that differ
 
 
@@ -227,7 +227,7 @@ def without(g, name):
     return number, Geometry(p[0], p[1], p[2], g.counts)
 
 
-@pytest.mark.parametrize("name", few(LOST, 3))
+@pytest.mark.parametrize("name", few(LOST, 2))
 def test_what_loses_its_area_is_not_hit_and_may_return(name, whatever_it_costs):
     g = soup(3, (400, 20, 15, 15))
     p = torch.cat([(g.p0 * 4).round() / 4, (g.p1 * 4).round() / 4, (g.p2 * 4).round() / 4])  # so that lines are lines

@@ -52,9 +52,13 @@ def children(tree: Tree) -> Any:
 
 
 @pytest.mark.parametrize("made", [boxes, same, points, line, huge, twins])
-@pytest.mark.parametrize("n", [1, 2, 7, 8, 9, 64, 65, 1000])
 @pytest.mark.parametrize("kinds", ["triangles", "rectangles", "mixed"])
-def test_all_are_there_once_within_their_boxes(made: Any, n: int, kinds: str) -> None:
+def test_all_are_there_once_within_their_boxes(made: Any, kinds: str) -> None:
+    for n in (1, 2, 7, 8, 9, 64, 65, 1000):
+        _all_are_there_once(made, n, kinds)
+
+
+def _all_are_there_once(made: Any, n: int, kinds: str) -> None:
     given, ids = made(n, np.random.default_rng(n)), np.arange(n, dtype=np.int32)
     counts = {"triangles": (n, 0), "rectangles": (0, n), "mixed": (n // 2, n // 4)}[kinds]
     with np.errstate(over="ignore", invalid="ignore"):
