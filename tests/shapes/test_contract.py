@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib import import_module
 from typing import Any
 
@@ -33,7 +34,15 @@ QUADRICS = [
 QUADRICS = list(dict.fromkeys(kind for kind in QUADRICS if issubclass(kind, Quadric) and kind is not Quadric))
 
 every_row = pytest.mark.parametrize("name", list(ROWS))
-every_place = pytest.mark.parametrize("placed", list(PLACES))
+
+
+def placed_rows(names: Iterable[str]) -> list[Any]:
+    """Return each shape in each place as parameters: in two places it is fast, in the others slow."""
+    return [
+        pytest.param(name, placed, marks=[] if (j - i) % len(PLACES) in (1, 3) else [pytest.mark.slow])
+        for i, name in enumerate(names)
+        for j, placed in enumerate(PLACES)
+    ]
 
 
 def load(name: str, placed: str, **more: Any) -> tuple[torchpt.Scene, np.ndarray]:
@@ -86,8 +95,7 @@ def test_every_kind_has_a_row():
     assert {part.quadric for part in parts if part.quadric} == set(QUADRICS)
 
 
-@every_place
-@every_row
+@pytest.mark.parametrize(("name", "placed"), placed_rows(ROWS))
 def test_points_lie_on_the_shape_and_normals_are_its_slopes(name: str, placed: str):
     row, (scene, matrix) = ROWS[name], load(name, placed)
     o, d, hit = found(scene, *rays(matrix))
@@ -118,8 +126,7 @@ def test_flipped_normals(name: str):
     torch.testing.assert_close(one.p, other.p)
 
 
-@every_place
-@pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.chart])
+@pytest.mark.parametrize(("name", "placed"), placed_rows(name for name, row in ROWS.items() if row.chart))
 def test_texture_coordinates_lead_back_to_the_point(name: str, placed: str):
     row, (scene, matrix) = ROWS[name], load(name, placed)
     o, d, hit = found(scene, *rays(matrix))
@@ -157,8 +164,7 @@ def test_tangents_are_the_slopes_of_the_charts(name: str, placed: str):
             np.testing.assert_allclose(found_.double().numpy()[:, mine], matrix[:3, :3] @ slope, atol=2e-3)
 
 
-@every_place
-@every_row
+@pytest.mark.parametrize(("name", "placed"), placed_rows(ROWS))
 def test_all_searches_find_the_same(name: str, placed: str):
     scene, matrix = load(name, placed)
     o, d, t_max = rays(matrix, seed=2)
@@ -188,7 +194,7 @@ def test_areas_are_those_of_the_charts(name: str, placed: str):
     row, (scene, matrix) = ROWS[name], load(name, placed, emission=1)
     world, geometry = scene.world(torch.float64)
     assert world.lights is not None
-    u, v, weight = _grid(64)
+    u, v, weight = _grid(32)
     h = 1e-5
     curved = 0
     for number, part in enumerate(scene.built.parts):
@@ -260,8 +266,14 @@ def _inner(name: str, scene: torchpt.Scene, matrix: np.ndarray, n: int) -> tuple
     return o[:, keep].double(), d[:, keep].double(), hit
 
 
-@pytest.mark.parametrize("placed", ["turned", "sheared and mirrored"])
-@every_row
+@pytest.mark.parametrize(
+    ("name", "placed"),
+    [
+        pytest.param(name, placed, marks=[pytest.mark.slow] if (i + j) % 2 == 0 else [])
+        for i, name in enumerate(ROWS)
+        for j, placed in enumerate(("turned", "sheared and mirrored"))
+    ],
+)
 def test_points_follow_transforms_and_vertices(name: str, placed: str):
     """Derivatives of points and normals along a ray, by its place, the shape's transform and its vertices."""
     scene, matrix = load(name, placed)

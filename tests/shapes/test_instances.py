@@ -59,7 +59,7 @@ def described(explicit: bool, **mesh: Any) -> dict[str, Any]:
 def test_the_picture_is_that_of_explicit_copies(flat, accel):
     scenes = [torchpt.load(described(explicit, face_normals=flat), "cpu") for explicit in (False, True)]
     layers, more = (
-        [torchpt.render(scene, spp=spp, seed=5, accel=accel) for scene in scenes] for spp in (16, 64)
+        [torchpt.render(scene, spp=spp, seed=5, accel=accel) for scene in scenes] for spp in (4, 16)
     )  # pixel by pixel, and their mean
     # The same numbers meet the same surfaces: a sample differs only where rounding turns it across an edge. Smooth normals
     # computed of a mesh that is then stretched unevenly are not those of the stretched mesh.

@@ -112,7 +112,7 @@ def _ring(case: dict[str, Any], v: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize(("name", "placed"), PAIRS)
 def test_hits_normals_and_uv_are_those_of_plain_formulas(name, placed):
-    check(name, placed, 20_000, 1, BACKENDS if placed not in ("needle", "sliver") else BACKENDS[:2])
+    check(name, placed, 5_000, 1, BACKENDS if placed not in ("needle", "sliver") else BACKENDS[:2])
 
 
 @pytest.mark.slow
@@ -189,8 +189,8 @@ def test_points_follow_their_rays_and_transforms(name):
     t, prim, u, v = scene.accel("torch", None).intersect(o, d, t_max)
     truth = trace(case, matrix, o.numpy(), d.numpy())
     keep = (prim >= 0) & torch.from_numpy(truth["margin"] > 0.05)
-    o, d = o[:, keep].double()[:, :12], d[:, keep].double()[:, :12]
-    hit = Hit(*(x[keep][:12] for x in (t.double(), prim.long(), u.double(), v.double())))
+    o, d = o[:, keep].double()[:, :5], d[:, keep].double()[:, :5]
+    hit = Hit(*(x[keep][:5] for x in (t.double(), prim.long(), u.double(), v.double())))
 
     def point(o: torch.Tensor, d: torch.Tensor, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         world, _ = scene.world(torch.float64, {"shapes.s.to_world": pose})
@@ -199,7 +199,7 @@ def test_points_follow_their_rays_and_transforms(name):
 
     pose = scene.params["shapes.s.to_world"].double()
     leaves = [x.clone().requires_grad_() for x in (o, d)]
-    assert torch.autograd.gradcheck(lambda a, b: point(a, b, pose), leaves, eps=1e-5, atol=1e-5)
+    assert torch.autograd.gradcheck(lambda a, b: point(a, b, pose), leaves, eps=1e-5, atol=1e-5, fast_mode=True)
     wide = pose.clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda m: point(o, d, m), wide, eps=1e-5, atol=1e-5)
 
