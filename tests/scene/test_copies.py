@@ -124,6 +124,7 @@ def test_moving_to_where_it_is_does_nothing():
 def test_models_of_ones_own_are_copied_with_it(how):
     grey = Grey()
     own = {**SCENE, "materials": {**SCENE["materials"], "red": {"type": "grey"}}}
+    own["render"] = {**SCENE["render"], "compile": "off"}
     scene = torchpt.load(own, "cpu", bsdfs={"grey": grey})
     with torch.no_grad():
         made = COPIES[how](scene)

@@ -183,7 +183,7 @@ CHANGES: dict[str, tuple[str, Callable[[Path], None]]] = {
 }
 
 
-@pytest.mark.parametrize("name", few(CHANGES, 14))
+@pytest.mark.parametrize("name", few(CHANGES, 8))
 def test_what_changes_a_picture_changes_the_fingerprint(
     name: str, before: dict[str, tuple[str, Tensor]], tmp_path: Path
 ) -> None:
