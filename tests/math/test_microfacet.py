@@ -60,12 +60,12 @@ def test_projected_normals_cover_the_surface_once(au, av):
 @pytest.mark.parametrize(("au", "av"), ROUGH)
 def test_visible_normals_cover_the_view_once(au, av, angle):
     """Smith's masking is what makes them do so: ``integral of D max(0, wo . m) G1(wo) = cos(wo)``."""
-    psi, phi, weights = grid(60, 60, 6)
+    psi, phi, weights = grid(30, 30, 6)
     m, jacobian = normals(au, av, psi, phi)
     wo = towards(angle, len(psi))
     d, (u, v) = mf.ggx(m, *lanes(au, av, len(psi))), lanes(au, av, len(psi))
     g1 = mf.masking(wo[2], mf.stretched_length(wo, u, v))
-    total = (d * dot(wo, m).clamp_min(0) * g1 / wo[2] * jacobian).reshape(3600, -1).mul(weights).sum()
+    total = (d * dot(wo, m).clamp_min(0) * g1 / wo[2] * jacobian).reshape(900, -1).mul(weights).sum()
     assert abs(float(total) - 1) < 1e-3
 
 
@@ -74,7 +74,7 @@ def test_visible_normals_cover_the_view_once(au, av, angle):
 @pytest.mark.parametrize(("au", "av"), ROUGH)
 def test_drawn_reflections_have_their_density(au, av, angle, bounded):
     """Chi-square over cells in which normals of any roughness are spread evenly; 56 tests of z < 5: p < 2e-5 in all."""
-    n, psis, phis, inner = 100_000, 12, 16, 16
+    n, psis, phis, inner = 50_000, 12, 16, 12
     g = torch.Generator().manual_seed(3)
     wo = towards(angle, n)
     m = mf.sample_normal(wo, *lanes(au, av, n), torch.rand(2, n, generator=g, dtype=torch.float64), bounded)
@@ -101,7 +101,7 @@ def test_drawn_reflections_have_their_density(au, av, angle, bounded):
 
 @pytest.mark.parametrize(("au", "av"), [(0.5, 0.5), (1.0, 1.0), (0.2, 0.8)])
 def test_a_bound_leaves_out_what_cannot_be_seen_and_nothing_else(au, av):
-    n = 200_000
+    n = 80_000
     g = torch.Generator().manual_seed(4)
     u, wo, rough = torch.rand(2, n, generator=g, dtype=torch.float64), towards(40, n), lanes(au, av, n)
     means, failed = [], []
@@ -191,9 +191,8 @@ def test_derivatives():
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 1.0])
 def test_what_facets_give_back(alpha):
     """The quadratures agree with an average over draws, and with one another where they mean the same."""
-    n = 400_000
-    g = torch.Generator().manual_seed(7)
-    u = torch.rand(2, n, generator=g, dtype=torch.float64)
+    n = 1 << 15
+    u = torch.quasirandom.SobolEngine(2, scramble=True, seed=7).draw(n, dtype=torch.float64).T.contiguous()
     rough, one = lanes(alpha, alpha, n), torch.tensor([alpha], dtype=torch.float64)
     eta = torch.tensor([1.5], dtype=torch.float64)
     for angle in (0.0, 60.0, 85.0):
