@@ -35,7 +35,7 @@ def spot(depth: float, camera: dict[str, Any]) -> torch.Tensor:
     small = BALL * depth
     shape = {"type": "sphere", "center": [0, 0, -depth], "radius": small, "emission": 1}
     scene = torchpt.load({"camera": {**AHEAD, **camera}, "shapes": {"spot": shape}}, "cpu")
-    image = shoot(scene, 256, 1, "sobol", {"max_depth": 1}, film_of(SIZE)).image[..., 0].double()
+    image = shoot(scene, 64, 1, "sobol", {"max_depth": 1}, film_of(SIZE)).image[..., 0].double()
     return image / (math.pi * (BALL * slope_pixels(camera["fov"])) ** 2)
 
 
