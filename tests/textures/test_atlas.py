@@ -202,8 +202,8 @@ def test_nodes_that_do_not_filter_are_untouched_by_those_that_do():
 def test_gradients_of_filtered_look_ups():
     texels = FILTERED["odd"][:5, :3].clone().requires_grad_()
     heights = FILTERED["flat"][:, :5].clone().requires_grad_()
-    uv = points(6).requires_grad_()
-    footprint = (0.01 + torch.rand(6, generator=torch.Generator().manual_seed(3)).double()).requires_grad_()
+    uv = points(4).requires_grad_()
+    footprint = (0.01 + torch.rand(4, generator=torch.Generator().manual_seed(3)).double()).requires_grad_()
     transform = ((0.7, 0.2, 0.1), (0.3, -0.9, 0.2))
     nodes = [
         ImageNode("odd", None, "mirror", False, transform, (0.5, 2.0, 1.0), True),
@@ -212,9 +212,9 @@ def test_gradients_of_filtered_look_ups():
 
     def value(texels: Tensor, heights: Tensor, uv: Tensor, footprint: Tensor) -> Tensor:
         atlas = atlas_of(nodes, {"odd": texels, "flat": heights}, torch.float64, CPU)
-        index = torch.zeros(6, dtype=torch.int64)
+        index = torch.zeros(4, dtype=torch.int64)
         return torch.cat(
             (look_up(atlas, index, uv, True, footprint), torch.stack(slope(atlas, index + 1, uv, footprint)))
         )
 
-    assert torch.autograd.gradcheck(value, (texels, heights, uv, footprint))
+    assert torch.autograd.gradcheck(value, (texels, heights, uv, footprint), fast_mode=True)
