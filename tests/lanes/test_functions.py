@@ -169,7 +169,7 @@ TYPES = [
 
 
 @pytest.mark.parametrize("dtype", TYPES, ids=["float32", "float64"])
-@pytest.mark.parametrize("name", few(FUNCTIONS, 14))
+@pytest.mark.parametrize("name", few(FUNCTIONS, 10))
 def test_error(name, dtype, record_property):
     error, place = worst(name, dtype, 20_000)
     record_property("ulp", error)
