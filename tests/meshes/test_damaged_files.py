@@ -134,7 +134,7 @@ def run_images(folder: Path, name: str, seed: int, count: int) -> None:
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_damaged_meshes(tmp_path: Path, ending: str) -> None:
-    run_meshes(tmp_path, ending, 1, 100)
+    run_meshes(tmp_path, ending, 1, 50)
 
 
 @pytest.mark.parametrize("name", IMAGES)
