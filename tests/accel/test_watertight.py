@@ -120,7 +120,7 @@ def test_numba_is_torch_bit_for_bit(make, seed):
     assert torch.equal(b.occluded(o, d, t_max), hits[1] >= 0)
 
 
-@settings(max_examples=settings.default.max_examples // 2, deadline=None)
+@settings(max_examples=settings().max_examples // 2, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
     counts=st.tuples(*(st.integers(0, 12) for _ in range(4))),
