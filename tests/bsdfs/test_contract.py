@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -55,28 +55,31 @@ def heavy(model: bsdfs.Bsdf) -> bool:
     return getattr(model, "energy_compensation", False) and (model.refracts or model.anisotropic)
 
 
-def by_model(cases: list[Case], tables: bool = False) -> list[Any]:
+def by_model(cases: list[Case], tables: bool = False, later: Collection[str] = ()) -> list[Any]:
     """Return lists of cases of one model as parameters: the first case is fast, the others together are slow.
 
-    With ``tables`` that are asked for, the first of a heavy model is slow too, and of one whose variant has the same tables.
+    With ``tables`` that are asked for, the first of a heavy model is slow too, and of one whose variant has the same tables;
+    those of models named ``later`` are slow in any case.
     """
     groups: dict[str, list[Case]] = {}
     for case in cases:
         groups.setdefault(str(case.model), []).append(case)
     slow, parameters = [pytest.mark.slow], []
     for name, (first, *others) in groups.items():
-        later = tables and (heavy(first.model) or name == "roughplastic")  # its nonlinear variant has the same tables
-        parameters.append(pytest.param([first], marks=slow if later else [], id=name))
+        late = name in later or (tables and (heavy(first.model) or name == "roughplastic"))
+        parameters.append(pytest.param([first], marks=slow if late else [], id=name))
         if others:
             parameters.append(pytest.param(others, marks=slow, id=f"{name} others"))
     return parameters
 
 
-def each(cases: list[Case], tables: bool = False) -> Callable[[Callable[[Case], None]], Callable[[list[Case]], None]]:
+def each(
+    cases: list[Case], tables: bool = False, later: Collection[str] = ()
+) -> Callable[[Callable[[Case], None]], Callable[[list[Case]], None]]:
     """Make a test of a check of one case, see :func:`by_model`."""
 
     def made(check: Callable[[Case], None]) -> Callable[[list[Case]], None]:
-        @pytest.mark.parametrize("cases", by_model(cases, tables))
+        @pytest.mark.parametrize("cases", by_model(cases, tables, later))
         def test(cases: list[Case]) -> None:
             for case in cases:
                 with named(case):
@@ -620,7 +623,7 @@ def edge_lanes(case: Case) -> tuple[Tensor, Tensor, Tensor]:
     return wo, wi, u
 
 
-@each(EDGES)
+@each(EDGES, later=[str(model) for model in MODELS if heavy(model) and model.anisotropic])
 def test_edge_numbers_stay_finite(case):
     model = case.model
     wo, wi, u = edge_lanes(case)
@@ -698,7 +701,11 @@ def inside(values: bsdfs.Parameters) -> bsdfs.Parameters:
     return out
 
 
-@each([case for case in CASES if case.differentiable and not case.smooth], tables=True)
+@each(
+    [case for case in CASES if case.differentiable and not case.smooth],
+    tables=True,
+    later=("roughplastic (nonlinear)",),  # for its tables; those of a metal are differentiated
+)
 def test_gradients_of_eval(case):
     """Finite differences in every number that a material is given, at directions within its lobes."""
     values = inside(tensors(case.values, torch.float64))
