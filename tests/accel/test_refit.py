@@ -1,6 +1,7 @@
 """Trees whose primitives have moved: the hits of a tree built anew, and when one is built."""
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -169,8 +170,9 @@ def test_hits_are_those_of_a_tree_built_anew(how, whatever_it_costs):
     assert differ > 0 or how in ("anywhere", "flat")  # or nothing was told of the rays that differ
 
 
-@pytest.mark.parametrize("make", [lambda: soup(3, (400, 20, 15, 15)), with_quadrics])
-@pytest.mark.parametrize("size", [0.01, 1.0])
+@pytest.mark.parametrize(
+    ("size", "make"), few(product([0.01, 1.0], [lambda: soup(3, (400, 20, 15, 15)), with_quadrics]), 2)
+)
 def test_all_kinds_move(make, size, whatever_it_costs):
     g = make()
     there = moved(g, 1, size)
