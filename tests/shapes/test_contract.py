@@ -45,6 +45,15 @@ def placed_rows(names: Iterable[str]) -> list[Any]:
     ]
 
 
+def in_turn(names: Iterable[str], *places: str) -> list[Any]:
+    """Return each shape in each of two places as parameters: in one it is fast, by turns."""
+    return [
+        pytest.param(name, placed, marks=[pytest.mark.slow] if (i + j) % 2 == 0 else [])
+        for i, name in enumerate(names)
+        for j, placed in enumerate(places)
+    ]
+
+
 def load(name: str, placed: str, **more: Any) -> tuple[torchpt.Scene, np.ndarray]:
     """A scene of one shape (and of what an instance is of, out of the way), and its transform."""
     shapes: dict[str, Any] = {"s": {**ROWS[name].shape, "transform": PLACES[placed], **more}}
@@ -187,8 +196,9 @@ def _grid(n: int) -> tuple[Vectors, Vectors, Vectors]:
     return u.reshape(-1), v.reshape(-1), np.outer(w, w).reshape(-1) / 4
 
 
-@pytest.mark.parametrize("placed", ["turned", "sheared"])
-@pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.chart])
+@pytest.mark.parametrize(
+    ("name", "placed"), in_turn([name for name, row in ROWS.items() if row.chart], "turned", "sheared")
+)
 def test_areas_are_those_of_the_charts(name: str, placed: str):
     """Of the light table where it has them; of quadrics, whose density follows the map, those that its powers are made of."""
     row, (scene, matrix) = ROWS[name], load(name, placed, emission=1)
@@ -266,14 +276,7 @@ def _inner(name: str, scene: torchpt.Scene, matrix: np.ndarray, n: int) -> tuple
     return o[:, keep].double(), d[:, keep].double(), hit
 
 
-@pytest.mark.parametrize(
-    ("name", "placed"),
-    [
-        pytest.param(name, placed, marks=[pytest.mark.slow] if (i + j) % 2 == 0 else [])
-        for i, name in enumerate(ROWS)
-        for j, placed in enumerate(("turned", "sheared and mirrored"))
-    ],
-)
+@pytest.mark.parametrize(("name", "placed"), in_turn(ROWS, "turned", "sheared and mirrored"))
 def test_points_follow_transforms_and_vertices(name: str, placed: str):
     """Derivatives of points and normals along a ray, by its place, the shape's transform and its vertices."""
     scene, matrix = load(name, placed)
