@@ -56,7 +56,7 @@ def test_projected_normals_cover_the_surface_once(au, av):
     assert abs(float((d * m[2] * jacobian).reshape(256, -1).mul(weights).sum()) - 1) < 1e-6
 
 
-@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("angle", few(ANGLES, 2))
 @pytest.mark.parametrize(("au", "av"), ROUGH)
 def test_visible_normals_cover_the_view_once(au, av, angle):
     """Smith's masking is what makes them do so: ``integral of D max(0, wo . m) G1(wo) = cos(wo)``."""
@@ -71,7 +71,7 @@ def test_visible_normals_cover_the_view_once(au, av, angle):
 
 @pytest.mark.parametrize("bounded", [False, True])
 @pytest.mark.parametrize("angle", few(ANGLES, 2))
-@pytest.mark.parametrize(("au", "av"), ROUGH)
+@pytest.mark.parametrize(("au", "av"), few(ROUGH, 4))
 def test_drawn_reflections_have_their_density(au, av, angle, bounded):
     """Chi-square over cells in which normals of any roughness are spread evenly; 56 tests of z < 5: p < 2e-5 in all."""
     n, psis, phis, inner = 50_000, 12, 16, 12

@@ -11,7 +11,7 @@ from trials import SIGNIFICANCE, grid_cells, uniform_p
 from torchpt.math import warps
 
 TESTS = 17  # chi-square tests in this file
-U = torch.rand(2, 1 << 18, generator=torch.Generator().manual_seed(8))
+U = torch.rand(2, 1 << 16, generator=torch.Generator().manual_seed(8))
 EDGES = torch.cartesian_prod(*(torch.tensor([0.0, 2**-24, 0.5, 1 - 2**-24]),) * 2).T
 SIDE = 24
 
