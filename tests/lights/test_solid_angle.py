@@ -281,7 +281,7 @@ def test_points_in_the_plane_and_lights_without_area_are_sampled_by_area(name):
                 torch.testing.assert_close(uv, uniform_triangle(u) if code(name) == TRIANGLE else u)
 
 
-@pytest.mark.parametrize("near", [1e-5, 1e-7, 1e-9, 1e-12])
+@pytest.mark.parametrize("near", few([1e-5, 1e-7, 1e-9, 1e-12], 2))
 @pytest.mark.parametrize("name", few(list(LIGHTS), 2))
 def test_points_drawn_from_beside_an_edge_are_on_the_light(name, near):
     """Its ends are seen in opposite directions there, of which float64 keeps no angle between."""
