@@ -6,6 +6,7 @@ import copy
 import io
 import multiprocessing
 import pickle
+from itertools import product
 from typing import Any
 
 import pytest
@@ -87,8 +88,7 @@ def _saved(scene: torchpt.Scene) -> torchpt.Scene:
     return torch.load(file, weights_only=False)
 
 
-@pytest.mark.parametrize("how", COPIES)
-@pytest.mark.parametrize("rendered", [False, True])
+@pytest.mark.parametrize(("how", "rendered"), few(product(COPIES, [False, True]), 4))
 def test_a_copy_renders_the_same_and_goes_its_own_way(how, rendered):
     scene = torchpt.load(SCENE, "cpu")
     if rendered:
