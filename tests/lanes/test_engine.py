@@ -10,8 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+from forms import one_lane
 
-from torchpt.lanes import engine
+from torchpt.lanes import engine, shelf
 from torchpt.native import cache
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and modes of files here")
@@ -100,7 +101,14 @@ def test_within_a_process_a_kernel_is_made_once(here):
 def test_targets_have_entries_of_their_own(here):
     engine.compiled(ir(), engine.Target("generic", ""))
     engine.compiled(ir())
-    assert engine.counts() == (2, 0) and len(entries(here)) == 2
+    engine.compiled(ir(), one_lane())  # another form
+    assert engine.counts() == (3, 0) and len(entries(here)) == 3
+
+
+def test_forms_have_programs_of_their_own(monkeypatch):
+    vectors = shelf.key_of(("stage",))
+    monkeypatch.setitem(engine._state, "host", one_lane())
+    assert vectors is not None and shelf.key_of(("stage",)) not in (vectors, None)
 
 
 def test_switched_off(here, monkeypatch):

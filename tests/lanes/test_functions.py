@@ -18,8 +18,10 @@ import numpy as np
 import pytest
 import torch
 from few import few
+from forms import differing, one_lane
 from numpy.typing import NDArray
 
+from torchpt.lanes.engine import Target
 from torchpt.lanes.function import lanewise
 from torchpt.lanes.functions import FUNCTIONS
 
@@ -130,9 +132,9 @@ def arguments(name: str, dtype: type, count: int) -> list[Array]:
     return [x, rng.permutation(x)]
 
 
-def run(name: str, *given: Array) -> Array:
+def run(name: str, *given: Array, target: Target | None = None) -> Array:
     x = [torch.from_numpy(np.ascontiguousarray(a)) for a in given]
-    return lanewise(lambda *x: [of_torch(name)(*x)], x)(*x)[0].numpy()
+    return lanewise(lambda *x: [of_torch(name)(*x)], x, target)(*x)[0].numpy()
 
 
 def ulps(found: Array, exact: Array) -> Array:
@@ -183,6 +185,19 @@ def test_error(name, dtype, record_property):
 def test_error_dense(name, dtype):
     error, place = worst(name, dtype, 1_000_000)
     assert error <= (BOUNDS[name].single if dtype is np.float32 else BOUNDS[name].double), place
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["float32", "float64"])
+@pytest.mark.parametrize("name", few(FUNCTIONS, 8))
+def test_one_lane_at_a_time(name, dtype):
+    """The same bits at any width, of random arguments and of special ones."""
+    given = [*arguments(name, dtype, 2_000)]
+    ends = np.array(SPECIAL, dtype)
+    special = [ends] if len(given) == 1 else [a.reshape(-1) for a in np.meshgrid(ends, ends)]
+    given = [np.concatenate([a, b]) for a, b in zip(given, special, strict=True)]
+    vectors, single = (torch.from_numpy(run(name, *given, target=target)) for target in (None, one_lane()))
+    wrong = differing(vectors, single).numpy()
+    assert not wrong.any(), [a[wrong][:3] for a in given]
 
 
 @pytest.mark.skipif(not DENSE, reason="numpy has no wider floats here")

@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from few import few
+from forms import differing, one_lane
 from torch import Tensor, nn
 
 from torchpt.lanes.function import lanewise
@@ -707,6 +709,25 @@ def test_operators(number, monkeypatch):
         for k, (a, b) in enumerate(zip(found, wanted, strict=True)):
             if n == N or b.shape[-1] == N:
                 compare(a, b[..., :n], case.ulps, case.near, f"{case.operators}, form {k}, {n} lanes")
+
+
+@pytest.mark.parametrize("number", few(range(len(CASES)), 40), ids=lambda k: CASES[k].operators.replace(" ", "+"))
+def test_one_lane_at_a_time(number):
+    """The same bits at any width, of ordinary numbers and extreme ones; sums of products among them."""
+    case = CASES[number]
+
+    def function(*arguments: Tensor) -> list[Tensor]:
+        x = _namespace(arguments)
+        found = [form(x) for form in case.forms]
+        # Results behind and before sums, where a product may be rounded with one.
+        real = [y for y in found if y.dtype.is_floating_point and y.shape[-1] == x.f.shape[0]]
+        return [*found, *(y * x.f + x.g for y in real), *(x.f - y * y * 0.3 for y in real)]
+
+    with torch.inference_mode(case.inference), torch.no_grad():
+        given = list(INPUTS.values())
+        vectors, single = (lanewise(function, given, target)(*given) for target in (None, one_lane()))
+    for k, (a, b) in enumerate(zip(vectors, single, strict=True)):
+        assert not differing(a, b).any(), f"{case.operators}, result {k}"
 
 
 def _noted(name: str, called: set[str]) -> Any:

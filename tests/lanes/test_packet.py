@@ -18,16 +18,18 @@ from torch import Tensor
 
 from torchpt.accel.brute import Brute
 from torchpt.lanes import engine
+from torchpt.lanes.form import SCALAR, VECTORS, Form
 from torchpt.lanes.kernel import HEAD, text
-from torchpt.lanes.packet import KINDS, packet_search
+from torchpt.lanes.packet import KINDS
 from torchpt.lanes.sinks import Sinks, Store
+from torchpt.lanes.stage import TracedStage
 from torchpt.lanes.tracing import LANES, Tracer
 from torchpt.records import Geometry
 
 Search = Callable[[Tensor, Tensor, Tensor], list[Tensor]]
 
 
-def searches(accel: Brute, estimates: bool, kinds: Sequence[str] | None = None) -> Search:
+def searches(accel: Brute, kinds: Sequence[str] | None = None, form: Form = VECTORS) -> Search:
     """``t, prim, u, v, blocked`` of rays: a kernel around the nodes ``nearest`` and ``occluded``."""
     tracer = Tracer(LANES[0], {})
     graph = tracer.graph
@@ -38,8 +40,7 @@ def searches(accel: Brute, estimates: bool, kinds: Sequence[str] | None = None) 
     stores.append(Store((graph.node("occluded", "b", *ray),), "b"))
     if kinds is None:
         kinds = [kind for kind, count in zip(KINDS, accel.counts, strict=False) if count]
-    ir, _ = text(graph, Sinks(store=stores), 0, 0, 3, False, packet_search(tuple(kinds), estimates))
-    made = engine.compiled(ir)
+    made = engine.compiled(text(TracedStage(graph, Sinks(store=stores), tensors=3, searched=tuple(kinds)), form))
     words = (ctypes.c_int64 * 7)()
     words[0], words[1] = accel.table.data_ptr(), accel.spheres.data_ptr()
     words[2:6] = np.cumsum(accel.counts[:4]).tolist()
@@ -98,19 +99,17 @@ SCENES = {
     "rectangles and disks": (0, 5, 6, 0),
     "all": (10, 6, 6, 6),
 }
-ESTIMATES = [False, pytest.param(True, marks=pytest.mark.skipif(not engine.estimates(), reason="no AVX-512"))]
 COUNT = 20_000
 
 
-@pytest.mark.parametrize("estimates", ESTIMATES, ids=["divided", "estimated"])
 @pytest.mark.parametrize("name", SCENES)
-def test_against_brute(name, estimates):
+def test_against_brute(name):
     accel = Brute(soup(4, SCENES[name]), threads=1)
     o, d, t_max = rays(2, COUNT)
     for n in (COUNT, 1, 15, 17):
         ray = o[:, :n], d[:, :n], t_max[:n]
         at, number, *uv = accel.intersect(*ray)
-        t, prim, u, v, blocked = searches(accel, estimates)(*ray)
+        t, prim, u, v, blocked = searches(accel)(*ray)
         same = prim == number
         # Within rounding (2^-20 of the scene) of an edge, or of two surfaces at once, lies one ray in a million and primitive.
         assert (~same).sum() <= 2, int((~same).sum())
@@ -128,11 +127,10 @@ def test_against_brute(name, estimates):
         assert (blocked != accel.occluded(*ray)).sum() <= 2
 
 
-@pytest.mark.parametrize("estimates", ESTIMATES, ids=["divided", "estimated"])
-def test_rays_that_are_none(estimates):
+def test_rays_that_are_none():
     """Dead rays meet nothing, and do not disturb the others of their vector."""
     accel = Brute(soup(4, SCENES["all"]), threads=1)
-    search = searches(accel, estimates)
+    search = searches(accel)
     o, d, t_max = rays(3, 4000)
     whole = search(o, d, t_max)
     dead = torch.arange(4000) % 3 == 0
@@ -158,24 +156,38 @@ def test_rays_that_are_none(estimates):
 
 def test_a_ray_does_not_depend_on_its_neighbours():
     accel = Brute(soup(4, SCENES["all"]), threads=1)
-    search = searches(accel, engine.estimates())
+    search = searches(accel)
     ray = rays(5, 1000)
     order = torch.randperm(1000, generator=torch.Generator().manual_seed(1))
     for a, b in zip(search(*ray), search(*(x[..., order] for x in ray)), strict=True):
         assert torch.equal(a[order], b)
 
 
+@pytest.mark.parametrize("name", SCENES)
+def test_one_ray_at_a_time(name):
+    """The same bits of the same rays by packets of sixteen and of one; of rays that are none, too."""
+    accel = Brute(soup(4, SCENES[name]), threads=1)
+    o, d, t_max = rays(7, 3000)
+    bad = torch.tensor([math.nan, math.inf, -1.0, 0.0])
+    t_max = torch.where(torch.arange(3000) % 7 == 0, bad[torch.arange(3000) % 4], t_max)
+    o[:, ::11], d[1, ::13] = math.inf, math.nan
+    packets, single = (searches(accel, form=form)(o, d, t_max) for form in (VECTORS, SCALAR))
+    assert (packets[1] >= 0).any() and (packets[1] < 0).any()
+    for a, b in zip(packets, single, strict=True):
+        assert torch.equal(a.view(torch.uint8), b.view(torch.uint8))
+
+
 def test_kinds_that_the_scene_lacks_change_nothing():
     accel = Brute(soup(4, SCENES["triangles and spheres"]), threads=1)
     ray = rays(6, 2000)
-    for a, b in zip(searches(accel, False)(*ray), searches(accel, False, KINDS)(*ray), strict=True):
+    for a, b in zip(searches(accel)(*ray), searches(accel, KINDS)(*ray), strict=True):
         assert torch.equal(a, b)
 
 
 def test_empty_scene():
     accel = Brute(soup(4, (2, 0, 0, 0)), threads=1)
     accel.counts = [0, 0, 0, 0, 0]
-    t, prim, _, _, blocked = searches(accel, False, KINDS)(*rays(1, 100))
+    t, prim, _, _, blocked = searches(accel, KINDS)(*rays(1, 100))
     assert (prim == -1).all() and (t == math.inf).all() and not blocked.any()
 
 
@@ -195,15 +207,14 @@ def cube(kind: str, size: float) -> Geometry:
     return geometry(corners[at[:, 0]], corners[at[:, 1]], corners[at[:, 2]], counts)
 
 
-@pytest.mark.parametrize("estimates", ESTIMATES, ids=["divided", "estimated"])
 @pytest.mark.parametrize("size", few([0.01, 1.0, 100.0], 2))
 @pytest.mark.parametrize("kind", ["rectangles", "triangles"])
-def test_watertight(kind, size, estimates):
-    """No ray from inside a closed cube escapes, not along edges, diagonals and corners: 600,000 for each kind."""
+def test_watertight(kind, size):
+    """No ray from inside a closed cube escapes, not along edges, diagonals and corners: 300,000 for each kind."""
     scene = cube(kind, size)
     accel = Brute(scene, threads=1)
     rng = torch.Generator().manual_seed(3)
-    n = 100_000 if estimates == engine.estimates() else 50_000
+    n = 100_000
     p0, p1, p2 = scene.p0, scene.p1, scene.p2
     corners = torch.cat([p0, p1, p2, p1 + p2 - p0] if kind == "rectangles" else [p0, p1, p2], 1)
     prim = torch.randint(p0.shape[1], (n,), generator=rng)
@@ -220,7 +231,7 @@ def test_watertight(kind, size, estimates):
     close = torch.rand(n, generator=rng) < 0.1
     o = torch.where(close, o + (target - o) * 0.9, o)
     d = (target - o) * torch.exp(torch.randn(n, generator=rng))
-    t, prim, _, _, blocked = searches(accel, estimates)(o, d, torch.full((n,), math.inf))
+    t, prim, _, _, blocked = searches(accel)(o, d, torch.full((n,), math.inf))
     assert (prim < 0).sum() == 0 and blocked.all()
     # The hit is on the cube's surface near where the ray was aimed.
     away = ((o + t * d) - target).norm(dim=0)
@@ -235,7 +246,7 @@ def test_spheres_are_closed():
     o = torch.randn(3, 50_000, generator=rng)
     o = o / o.norm(dim=0) * torch.rand(50_000, generator=rng) * 0.499 + scene.p0
     d = torch.randn(3, 50_000, generator=rng)
-    t, prim, _, _, blocked = searches(accel, False)(o, d, torch.full((50_000,), math.inf))
+    t, prim, _, _, blocked = searches(accel)(o, d, torch.full((50_000,), math.inf))
     assert (prim == 0).all() and blocked.all()
     radius = (o.double() + t.double() * d.double() - scene.p0.double()).norm(dim=0)
     assert (radius - 0.5).abs().max() < 3e-6  # coordinates of size 5 are float32

@@ -14,11 +14,13 @@ import torch
 from torch import Tensor, nn
 
 from torchpt.lanes import engine, function
+from torchpt.lanes.form import VECTORS
 from torchpt.lanes.function import lanewise
 from torchpt.lanes.graph import Graph, Unsupported
 from torchpt.lanes.kernel import text
 from torchpt.lanes.program import Program, bound, holds, laid_out, replayed
 from torchpt.lanes.sinks import Sinks, Store
+from torchpt.lanes.stage import TracedStage
 from torchpt.lanes.tracing import LANES, Tracer, tracing
 from torchpt.math import vectors
 
@@ -34,7 +36,7 @@ def trace(stage: Callable[..., Iterable[Tensor]], *given: Tensor, **tables: Tens
     with torch.no_grad(), tracer:
         results = list(stage(*lanes, **tables))
     stores = [Store(tuple(tracer.nodes(x)), tracer.graph.type(tracer.nodes(x)[0])) for x in results]
-    return tracer, text(tracer.graph, Sinks(store=stores), len(tracer.tables), 0, len(given), False)[0]
+    return tracer, text(TracedStage(tracer.graph, Sinks(store=stores), tracer.tables, tensors=len(given)), VECTORS)
 
 
 REFUSED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {

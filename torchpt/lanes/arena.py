@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from torchpt.lanes.block import WIDTH
-
 __all__ = ["CAPACITY"]
 
-#: Lanes of an arena: a multiple of WIDTH, with WIDTH to spare at the end of each row.
-CAPACITY = 16384 + WIDTH
+#: Numbers of a row: lanes, a multiple of a vector's, and a vector's to spare, for kernels write whole ones.
+CAPACITY = 16384 + 16

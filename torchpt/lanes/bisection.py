@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from torchpt.lanes.block import WIDTH, Block
+from torchpt.lanes.block import Block
 from torchpt.lanes.emission import MEMORY
+from torchpt.lanes.form import Form
 from torchpt.lanes.graph import Graph
 
 __all__ = ["search_functions"]
 
 
-def search_functions(graph: Graph, needed: list[int]) -> Block:
+def search_functions(graph: Graph, needed: list[int], form: Form) -> Block:
     """Binary searches: all lanes take as many steps, which are as many as the table's length asks for."""
     asked = {extra[1:] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op == "search"}
-    whole = Block()
+    whole = Block(form)
     for ty, right in sorted(asked):
-        block, element = Block(), MEMORY[ty]
-        vector, places = block.vector(ty), f"<{WIDTH} x i32>"
+        block, element = Block(form), MEMORY[ty]
+        vector, places = block.vector(ty), block.each("i32")
         block.lines += [
             f"define internal {places} @sorted_{ty}_{'right' if right else 'left'}"
             f"(ptr %table, i64 %count, {vector} %value) #0 {{",
@@ -41,7 +42,7 @@ def search_functions(graph: Graph, needed: list[int]) -> Block:
         )
         further = block.add("i", "%base", block.splat("i", "%half"))
         block.lines += [
-            f"  %better = select <{WIDTH} x i1> {below}, {places} {further}, {places} %base",
+            f"  %better = select {block.each('i1')} {below}, {places} {further}, {places} %base",
             "  %rest = lshr i32 %length, 1",
             "  %done = icmp eq i32 %rest, 0",
             "  br i1 %done, label %exit, label %loop",

@@ -1,16 +1,18 @@
-"""Writing LLVM IR as text: vectors of 16 numbers, one operation a line."""
+"""Writing LLVM IR as text, in any form: one operation a line, on the numbers of all lanes that a value holds."""
 
 from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
-__all__ = ["ELEMENTS", "WIDTH", "Block"]
+from torchpt.lanes.form import Form
 
-#: Lanes of a vector. Where the machine's are narrower, LLVM takes several of them for one.
-WIDTH = 16
+__all__ = ["ELEMENTS", "Block"]
+
 #: How a node's type is held in a register.
 ELEMENTS = {"f": "float", "d": "double", "i": "i32", "l": "i32", "u": "i32", "L": "i64", "b": "i1"}
 _SUFFIX = {"float": "f32", "double": "f64", "i32": "i32", "i64": "i64", "i1": "i1", "i8": "i8"}
@@ -20,13 +22,18 @@ class Block:
     """Lines of IR in the body of a function, and the declarations that they need.
 
     Attributes:
+        form: how lanes are held.
+        width: lanes of a value.
         lines: of the body.
         declarations: of the functions that it calls.
+        label: of the basic block that lines are added to.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, form: Form) -> None:
+        self.form, self.width = form, form.width
         self.lines: list[str] = []
         self.declarations: set[str] = set()
+        self.label = "entry"
         self._count = 0
 
     def name(self) -> str:
@@ -44,36 +51,79 @@ class Block:
         """A line that gives none."""
         self.lines.append(f"  {text}")
 
+    def let(self, name: str, type_: str, value: str) -> None:
+        """Give a value a name of its own."""
+        self.do(f"%{name} = bitcast {type_} {value} to {type_}")
+
+    @contextmanager
+    def when(self, condition: str) -> Iterator[None]:
+        """Write lines that run where a condition holds: a branch, so for values of one lane."""
+        assert self.width == 1
+        self._count += 1
+        then, after = f"then{self._count}", f"after{self._count}"
+        self.do(f"br i1 {condition}, label %{then}, label %{after}")
+        self.lines.append(f"{then}:")
+        self.label = then
+        yield
+        self.do(f"br label %{after}")
+        self.lines.append(f"{after}:")
+        self.label = after
+
     # -- types and constants
 
-    def vector(self, ty: str, width: int = WIDTH) -> str:
-        """The type of a vector of numbers of type ``ty``."""
-        return f"<{width} x {ELEMENTS[ty]}>"
+    def each(self, element: str) -> str:
+        """Return LLVM's type of an element for each lane."""
+        return f"<{self.width} x {element}>" if self.width > 1 else element
+
+    def vector(self, ty: str) -> str:
+        """Return the type of the numbers of a node of type ``ty``."""
+        return self.each(ELEMENTS[ty])
+
+    def suffix(self, element: str) -> str:
+        """Return what LLVM's functions have behind their names for :meth:`each`."""
+        return (f"v{self.width}" if self.width > 1 else "") + _SUFFIX[element]
+
+    def numbers(self) -> str:
+        """Return 0, 1, 2, ... for the lanes of a value: int32."""
+        return f"<{', '.join(f'i32 {k}' for k in range(self.width))}>" if self.width > 1 else "0"
+
+    def places(self, first: str) -> str:
+        """Return consecutive places from an i64 on: int32."""
+        start = self.splat("i", self.op(f"trunc i64 {first} to i32"))
+        return self.op(f"add {self.each('i32')} {start}, {self.numbers()}")
 
     def constant(self, ty: str, value: float | int | bool) -> str:
         """The same number in all lanes."""
-        return f"splat ({ELEMENTS[ty]} {scalar(ty, value)})"
+        return f"splat ({ELEMENTS[ty]} {scalar(ty, value)})" if self.width > 1 else scalar(ty, value)
 
     def splat(self, ty: str, name: str) -> str:
         """A scalar in all lanes."""
+        if self.width == 1:
+            return name
         vector = self.vector(ty)
         one = self.op(f"insertelement {vector} poison, {ELEMENTS[ty]} {name}, i64 0")
-        return self.op(f"shufflevector {vector} {one}, {vector} poison, <{WIDTH} x i32> zeroinitializer")
+        return self.op(f"shufflevector {vector} {one}, {vector} poison, {self.each('i32')} zeroinitializer")
+
+    def some(self, mask: str) -> str:
+        """Return whether a mask holds in any lane: an i1."""
+        if self.width == 1:
+            return mask
+        bits = self.op(f"bitcast {self.each('i1')} {mask} to i{self.width}")
+        return self.op(f"icmp ne i{self.width} {bits}, 0")
 
     # -- arithmetic
 
     def call(self, function: str, ty: str, *arguments: str, result: str | None = None) -> str:
         """An intrinsic on vectors of one type, such as ``llvm.fabs``; the suffix is put behind it."""
         vector = self.vector(ty)
-        name = f"{function}.v{WIDTH}{_SUFFIX[ELEMENTS[ty]]}"
+        name = f"{function}.{self.suffix(ELEMENTS[ty])}"
         self.declarations.add(f"declare {result or vector} @{name}({', '.join([vector] * len(arguments))})")
-        flags = " contract" if ty in "fd" and result is None else ""
         given = ", ".join(f"{vector} {a}" for a in arguments)
-        return self.op(f"call{flags} {result or vector} @{name}({given})")
+        return self.op(f"call {result or vector} @{name}({given})")
 
     def binary(self, op: str, ty: str, a: str, b: str) -> str:
-        """An instruction of LLVM; those on floats may be contracted."""
-        return self.op(f"{op}{' contract' if ty in 'fd' else ''} {self.vector(ty)} {a}, {b}")
+        """An instruction of LLVM. No flag allows to fuse or to reorder those on floats."""
+        return self.op(f"{op} {self.vector(ty)} {a}, {b}")
 
     def add(self, ty: str, a: str, b: str) -> str:
         """``a + b``."""
@@ -92,8 +142,8 @@ class Block:
         return self.binary("fdiv", ty, a, b)
 
     def fma(self, ty: str, a: str, b: str, c: str) -> str:
-        """``a b + c``, rounded once where the machine can do that in one instruction."""
-        return self.call("llvm.fmuladd", ty, a, b, c)
+        """``a b + c``, rounded once: an instruction, and on machines that have none a call of the C library."""
+        return self.call("llvm.fma", ty, a, b, c)
 
     def negative(self, ty: str, a: str) -> str:
         """``-a``."""
@@ -108,7 +158,7 @@ class Block:
     def select(self, ty: str, condition: str, a: str, b: str) -> str:
         """``a`` in lanes where the condition holds, else ``b``."""
         vector = self.vector(ty)
-        return self.op(f"select <{WIDTH} x i1> {condition}, {vector} {a}, {vector} {b}")
+        return self.op(f"select {self.each('i1')} {condition}, {vector} {a}, {vector} {b}")
 
     def convert(self, op: str, source: str, target: str, a: str) -> str:
         """``sitofp``, ``bitcast``, ..."""
@@ -127,10 +177,10 @@ class Block:
             sign = "u" if ty == "b" else "s"  # a bit that is set is -1 to signed comparisons
             return self.select(ty, self.compare(sign + ("gt" if op == "max" else "lt"), ty, a, b), a, b)
         better = "ogt" if op == "max" else "olt"
-        if b.startswith("splat"):  # no NaN: the other one is kept where it is
+        if not b.startswith("%"):  # a constant, no NaN: the other one is kept where it is
             return self.select(ty, self.compare(better, ty, b, a), b, a)
         chosen = self.select(ty, self.compare(better, ty, a, b), a, b)
-        if a.startswith("splat"):
+        if not a.startswith("%"):
             return chosen
         return self.select(ty, self.compare("uno", ty, a, a), a, chosen)
 
@@ -142,55 +192,70 @@ class Block:
 
     def at(self, pointer: str, element: str, index: str | int) -> str:
         """The address of an element; ``index`` is a 64-bit number, or a vector's text with its type."""
-        index = index if isinstance(index, str) and index.startswith("<") else f"i64 {index}"
+        index = index if isinstance(index, str) and index.startswith(("<", "i32 ")) else f"i64 {index}"
         return self.op(f"getelementptr {element}, ptr {pointer}, {index}")
 
-    def gather(self, element: str, pointer: str, index: str) -> str:
-        """Elements at a vector of indices."""
-        vector, suffix = f"<{WIDTH} x {element}>", f"v{WIDTH}{_SUFFIX[element]}"
-        name = f"llvm.masked.gather.{suffix}.v{WIDTH}p0"
-        self.declarations.add(f"declare {vector} @{name}(<{WIDTH} x ptr>, i32, <{WIDTH} x i1>, {vector})")
-        places = self.at(pointer, element, f"<{WIDTH} x i32> {index}")
+    def gather(self, element: str, pointer: str, index: str, invariant: bool = False) -> str:
+        """Elements at the lanes' indices; ``invariant`` as in :meth:`load`."""
+        if self.width == 1:
+            return self.load(element, self.at(pointer, element, f"i32 {index}"), invariant)
+        vector, suffix = self.each(element), self.suffix(element)
+        name = f"llvm.masked.gather.{suffix}.v{self.width}p0"
+        self.declarations.add(f"declare {vector} @{name}({self.each('ptr')}, i32, {self.each('i1')}, {vector})")
+        places = self.at(pointer, element, f"{self.each('i32')} {index}")
         size = 8 if element in ("double", "i64") else 4
         return self.op(
-            f"call {vector} @{name}(<{WIDTH} x ptr> {places}, i32 {size}, <{WIDTH} x i1> splat (i1 true), "
+            f"call {vector} @{name}({self.each('ptr')} {places}, i32 {size}, {self.each('i1')} splat (i1 true), "
             f"{vector} zeroinitializer)"
         )
 
     def scatter(self, element: str, value: str, pointer: str, index: str, mask: str) -> None:
-        """Writes elements at a vector of indices where the mask holds."""
-        vector, suffix = f"<{WIDTH} x {element}>", f"v{WIDTH}{_SUFFIX[element]}"
-        name = f"llvm.masked.scatter.{suffix}.v{WIDTH}p0"
-        self.declarations.add(f"declare void @{name}({vector}, <{WIDTH} x ptr>, i32, <{WIDTH} x i1>)")
-        places = self.at(pointer, element, f"<{WIDTH} x i32> {index}")
-        self.do(f"call void @{name}({vector} {value}, <{WIDTH} x ptr> {places}, i32 4, <{WIDTH} x i1> {mask})")
+        """Write elements at the lanes' indices where the mask holds."""
+        if self.width == 1:
+            with self.when(mask):
+                self.do(f"store {element} {value}, ptr {self.at(pointer, element, f'i32 {index}')}")
+            return
+        vector, suffix = self.each(element), self.suffix(element)
+        name = f"llvm.masked.scatter.{suffix}.v{self.width}p0"
+        self.declarations.add(f"declare void @{name}({vector}, {self.each('ptr')}, i32, {self.each('i1')})")
+        places = self.at(pointer, element, f"{self.each('i32')} {index}")
+        self.do(f"call void @{name}({vector} {value}, {self.each('ptr')} {places}, i32 4, {self.each('i1')} {mask})")
 
     def masked_load(self, element: str, pointer: str, mask: str) -> str:
         """Consecutive elements; zero where the mask does not hold."""
-        vector, suffix = f"<{WIDTH} x {element}>", f"v{WIDTH}{_SUFFIX[element]}"
+        if self.width == 1:  # lanes go one by one to the last: the mask holds
+            return self.load(element, pointer, False)
+        vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.masked.load.{suffix}.p0"
-        self.declarations.add(f"declare {vector} @{name}(ptr, i32, <{WIDTH} x i1>, {vector})")
-        return self.op(f"call {vector} @{name}(ptr {pointer}, i32 1, <{WIDTH} x i1> {mask}, {vector} zeroinitializer)")
+        self.declarations.add(f"declare {vector} @{name}(ptr, i32, {self.each('i1')}, {vector})")
+        return self.op(
+            f"call {vector} @{name}(ptr {pointer}, i32 1, {self.each('i1')} {mask}, {vector} zeroinitializer)"
+        )
 
     def masked_store(self, element: str, value: str, pointer: str, mask: str) -> None:
         """Consecutive elements where the mask holds."""
-        vector, suffix = f"<{WIDTH} x {element}>", f"v{WIDTH}{_SUFFIX[element]}"
+        if self.width == 1:
+            with self.when(mask):
+                self.do(f"store {element} {value}, ptr {pointer}")
+            return
+        vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.masked.store.{suffix}.p0"
-        self.declarations.add(f"declare void @{name}({vector}, ptr, i32, <{WIDTH} x i1>)")
-        self.do(f"call void @{name}({vector} {value}, ptr {pointer}, i32 1, <{WIDTH} x i1> {mask})")
+        self.declarations.add(f"declare void @{name}({vector}, ptr, i32, {self.each('i1')})")
+        self.do(f"call void @{name}({vector} {value}, ptr {pointer}, i32 1, {self.each('i1')} {mask})")
 
     def compress(self, element: str, value: str, mask: str) -> str:
         """The elements where the mask holds, moved together; what follows them is left open."""
-        vector, suffix = f"<{WIDTH} x {element}>", f"v{WIDTH}{_SUFFIX[element]}"
+        vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.experimental.vector.compress.{suffix}"
-        self.declarations.add(f"declare {vector} @{name}({vector}, <{WIDTH} x i1>, {vector})")
-        return self.op(f"call {vector} @{name}({vector} {value}, <{WIDTH} x i1> {mask}, {vector} poison)")
+        self.declarations.add(f"declare {vector} @{name}({vector}, {self.each('i1')}, {vector})")
+        return self.op(f"call {vector} @{name}({vector} {value}, {self.each('i1')} {mask}, {vector} poison)")
 
     def count(self, mask: str) -> str:
         """How many lanes of a mask hold: an i64."""
-        self.declarations.add("declare i16 @llvm.ctpop.i16(i16)")
-        bits = self.op(f"bitcast <{WIDTH} x i1> {mask} to i16")
-        return self.op(f"zext i16 {self.op(f'call i16 @llvm.ctpop.i16(i16 {bits})')} to i64")
+        word = f"i{self.width}"
+        self.declarations.add(f"declare {word} @llvm.ctpop.{word}({word})")
+        bits = self.op(f"bitcast {self.each('i1')} {mask} to {word}")
+        return self.op(f"zext {word} {self.op(f'call {word} @llvm.ctpop.{word}({word} {bits})')} to i64")
 
 
 def scalar(ty: str, value: float | int | bool) -> str:

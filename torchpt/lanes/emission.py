@@ -1,14 +1,15 @@
-"""From nodes to vector instructions."""
+"""From nodes to instructions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from torchpt.lanes.block import ELEMENTS, WIDTH, Block
+from torchpt.lanes.block import ELEMENTS, Block
+from torchpt.lanes.form import Form
 from torchpt.lanes.functions import FUNCTIONS
 from torchpt.lanes.graph import FLOATS, Graph, Unsupported
 
-__all__ = ["MEMORY", "emit"]
+__all__ = ["MEMORY", "Body", "emit"]
 
 #: Types of elements as tables and the arena hold them; see :func:`torchpt.lanes.program.bound`.
 MEMORY = {"f": "float", "d": "double", "i": "i32", "l": "i32", "L": "i32", "u": "i32", "b": "i32"}
@@ -23,9 +24,24 @@ _COMPARISONS = {
 }
 
 
-def emit(block: Block, graph: Graph, node: int, names: dict[int, str]) -> str:
-    """The lines of one node; returns its name. ``names`` has those of its arguments."""
+class Body(Block):
+    """The body of a kernel's loop.
+
+    Attributes:
+        listed: whether lanes are those that a list names, else all in order.
+        products: those that are rounded with a sum, by that; see :func:`torchpt.lanes.fusing.fused`.
+    """
+
+    def __init__(self, form: Form, listed: bool, products: dict[int, int]) -> None:
+        super().__init__(form)
+        self.listed, self.products = listed, products
+
+
+def emit(block: Body, graph: Graph, node: int, names: dict[int, str]) -> str:
+    """Write the lines of one node, and return its name. ``names`` has those of its arguments."""
     op, ty, arguments, extra = graph.nodes[node]
+    if node in block.products:
+        return _fused(block, graph, node, names)
     a = [names[k] for k in arguments]
     types = [graph.type(k) for k in arguments]
     if op == "const":
@@ -45,6 +61,20 @@ def emit(block: Block, graph: Graph, node: int, names: dict[int, str]) -> str:
         raise Unsupported(f"the operation {op} on numbers of type {ty}")
     value = handler(block, ty, *a) if extra is None else handler(block, ty, *a, extra)
     return _byte(block, value) if ty == "u" and op in _CARRIES else value
+
+
+def _fused(block: Body, graph: Graph, node: int, names: dict[int, str]) -> str:
+    """``a b + c``, ``a b - c`` or ``c - a b``, rounded once."""
+    op, ty, terms, _ = graph.nodes[node]
+    product = block.products[node]
+    first = terms[0] == product
+    a, b = (names[k] for k in graph.nodes[product][2])
+    c = names[terms[1] if first else terms[0]]
+    if op == "sub" and first:
+        c = block.negative(ty, c)
+    elif op == "sub":
+        a = block.negative(ty, a)
+    return block.fma(ty, a, b, c)
 
 
 #: Operations on bytes, which are held in 32 bits, that may leave more than eight.
@@ -84,7 +114,7 @@ def _cast(block: Block, source: str, target: str, a: str) -> str:
 def _arithmetic(op: str) -> Callable[..., str]:
     def handler(block: Block, ty: str, a: str, b: str) -> str:
         if ty == "b":
-            return block.op(f"{'and' if op == 'mul' else 'or'} <{WIDTH} x i1> {a}, {b}")
+            return block.op(f"{'and' if op == 'mul' else 'or'} {block.each('i1')} {a}, {b}")
         return getattr(block, op)(ty, a, b)
 
     return handler
@@ -158,7 +188,7 @@ def _wide_quotient(block: Block, a: str, b: str) -> tuple[str, str]:
     zero, one = block.constant("L", 0), block.constant("L", 1)
     # The remainder has the divisor's sign, and is smaller.
     low = block.op(
-        f"and <{WIDTH} x i1> {block.compare('ne', 'L', r, zero)}, "
+        f"and {block.each('i1')} {block.compare('ne', 'L', r, zero)}, "
         + block.compare("slt", "L", block.op(f"xor {block.vector('L')} {r}, {b}"), zero)
     )
     q, r = block.select("L", low, block.sub("L", q, one), q), block.select("L", low, block.add("L", r, b), r)
@@ -191,7 +221,7 @@ def _truncdiv(block: Block, ty: str, a: str, b: str) -> str:
     q, r = _wide_quotient(block, a, b)
     zero, one = block.constant("L", 0), block.constant("L", 1)
     up = block.op(
-        f"and <{WIDTH} x i1> {block.compare('ne', 'L', r, zero)}, "
+        f"and {block.each('i1')} {block.compare('ne', 'L', r, zero)}, "
         + block.compare("slt", "L", block.op(f"xor {block.vector('L')} {a}, {b}"), zero)
     )
     return block.select("L", up, block.add("L", q, one), q)
@@ -210,8 +240,8 @@ def _remainder(block: Block, ty: str, a: str, b: str) -> str:
 def _against(block: Block, ty: str, r: str, b: str) -> str:
     """Whether a remainder of floats has another sign than the divisor."""
     zero = block.constant(ty, 0.0)
-    other = block.op(f"xor <{WIDTH} x i1> {block.compare('olt', ty, r, zero)}, {block.compare('olt', ty, b, zero)}")
-    return block.op(f"and <{WIDTH} x i1> {other}, {block.compare('une', ty, r, zero)}")
+    other = block.op(f"xor {block.each('i1')} {block.compare('olt', ty, r, zero)}, {block.compare('olt', ty, b, zero)}")
+    return block.op(f"and {block.each('i1')} {other}, {block.compare('une', ty, r, zero)}")
 
 
 def _fmod(block: Block, ty: str, a: str, b: str) -> str:
@@ -228,12 +258,12 @@ def _gather(block: Block, ty: str, index: str, extra: tuple[int, int, int]) -> s
         index = block.mul("i", index, block.constant("i", width))
     element = MEMORY[ty]
     pointer = block.at(f"%table{table}", element, k) if k else f"%table{table}"
-    return _from_memory(block, ty, block.gather(element, pointer, index))
+    return _from_memory(block, ty, block.gather(element, pointer, index, invariant=True))
 
 
 def _from_memory(block: Block, ty: str, held: str) -> str:
     if ty == "b":
-        return block.op(f"icmp ne <{WIDTH} x i32> {held}, zeroinitializer")
+        return block.op(f"icmp ne {block.each('i32')} {held}, zeroinitializer")
     return block.convert("sext", "i", "L", held) if ty == "L" else held
 
 
@@ -252,44 +282,44 @@ def _search(block: Block, ty: str, value: str, extra: tuple[int, str, bool]) -> 
     table, element, right = extra
     name = f"@sorted_{element}_{'right' if right else 'left'}"
     vector = block.vector(element)
-    return block.op(f"call <{WIDTH} x i32> {name}(ptr %table{table}, i64 %count{table}, {vector} {value})")
+    return block.op(f"call {block.each('i32')} {name}(ptr %table{table}, i64 %count{table}, {vector} {value})")
 
 
 def _occluded(block: Block, ty: str, *a: str) -> str:
-    given = ", ".join(f"<{WIDTH} x float> {x}" for x in a)
-    return block.op(f"call <{WIDTH} x i1> @occluded({given}, ptr %search)")
+    given = ", ".join(f"{block.each('float')} {x}" for x in a)
+    return block.op(f"call {block.each('i1')} @occluded({given}, ptr %search)")
 
 
 def _nearest(block: Block, ty: str, *a: str) -> str:
-    given = ", ".join(f"<{WIDTH} x float> {x}" for x in a)
-    return block.op(f"call {{{_HIT}}} @nearest({given}, ptr %search)")
+    given = ", ".join(f"{block.each('float')} {x}" for x in a)
+    return block.op(f"call {{{_hit(block)}}} @nearest({given}, ptr %search)")
 
 
-_HIT = f"<{WIDTH} x float>, <{WIDTH} x i32>, <{WIDTH} x float>, <{WIDTH} x float>"
+def _hit(block: Block) -> str:
+    return ", ".join(map(block.each, ("float", "i32", "float", "float")))
 
 
 def _part(block: Block, ty: str, a: str, extra: int) -> str:
-    return block.op(f"extractvalue {{{_HIT}}} {a}, {extra}")
+    return block.op(f"extractvalue {{{_hit(block)}}} {a}, {extra}")
 
 
 def _iota(block: Block, ty: str) -> str:
-    numbers = ", ".join(f"i32 {k}" for k in range(WIDTH))
-    places = block.op(f"add <{WIDTH} x i32> %i32s, <{numbers}>")
+    places = block.places("%i")
     return block.convert("sext", "i", "L", places) if ty == "L" else _cast(block, "i", ty, places)
 
 
-def _place(block: Block, ty: str) -> str:
+def _place(block: Body, ty: str) -> str:
     """Where in the arena the lane is."""
-    return "%place" if block.listed else _iota(block, ty)  # type: ignore[attr-defined]
+    return "%place" if block.listed else _iota(block, ty)
 
 
-def _arena(block: Block, ty: str, extra: int) -> str:
+def _arena(block: Body, ty: str, extra: int) -> str:
     """A row of the arena, at the lane's own place or at that which the list names."""
     element = MEMORY[ty]
-    if block.listed:  # type: ignore[attr-defined]
+    if block.listed:
         held = block.gather(element, f"%row{extra}", "%place")
     else:
-        held = block.op(f"load <{WIDTH} x {element}>, ptr {block.at(f'%row{extra}', element, '%i')}, align 4")
+        held = block.op(f"load {block.each(element)}, ptr {block.at(f'%row{extra}', element, '%i')}, align 4")
     return _from_memory(block, ty, held)
 
 
@@ -308,10 +338,10 @@ def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
     row = block.at(f"%in{slot}", "i8", block.op(f"mul i64 %in{slot}s, {k * size}")) if k else f"%in{slot}"
     held = block.masked_load(element, block.at(row, element, "%i"), "%mask")
     if element == "i64":
-        return held if ty == "L" else block.op(f"trunc <{WIDTH} x i64> {held} to <{WIDTH} x i32>")
+        return held if ty == "L" else block.op(f"trunc {block.each('i64')} {held} to {block.each('i32')}")
     if ty == "b":
-        return block.op(f"icmp ne <{WIDTH} x i8> {held}, zeroinitializer")
-    return block.op(f"zext <{WIDTH} x i8> {held} to <{WIDTH} x i32>") if ty == "u" else held
+        return block.op(f"icmp ne {block.each('i8')} {held}, zeroinitializer")
+    return block.op(f"zext {block.each('i8')} {held} to {block.each('i32')}") if ty == "u" else held
 
 
 _HANDLERS: dict[str, Callable[..., str]] = {

@@ -8,6 +8,7 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
+from torchpt.lanes.form import VECTORS, Form
 from torchpt.native import cache
 from torchpt.native.memory import MARGIN, room_for
 
@@ -16,14 +17,13 @@ __all__ = [
     "Target",
     "compiled",
     "counts",
-    "estimates",
     "host",
     "identity",
     "kept",
 ]
 
-#: Enters every key: entries of another form are never read.
-_FORM = "4"
+#: Enters every key: entries that are made otherwise are never read.
+_VERSION = "5"
 _lock = threading.Lock()
 _state: dict[str, Any] = {"ready": False, "compiled": 0, "loaded": 0}
 _functions: dict[str, Function] = {}
@@ -32,11 +32,19 @@ _machines: dict[Target, Any] = {}
 
 @dataclass(frozen=True)
 class Target:
-    """What code is made for; names are LLVM's."""
+    """What kernels are made for.
+
+    Attributes:
+        cpu: LLVM's name of it.
+        features: LLVM's names of its features.
+        triple: LLVM's name of the machine; None: this one.
+        form: how its kernels hold lanes.
+    """
 
     cpu: str
     features: str
     triple: str | None = None
+    form: Form = VECTORS
 
 
 @dataclass(frozen=True)
@@ -67,11 +75,6 @@ def host() -> Target:
         llvm = _llvm()
         _state["host"] = Target(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
     return _state["host"]
-
-
-def estimates() -> bool:
-    """Whether this machine has AVX-512's estimates of reciprocals."""
-    return "+avx512f" in host().features.split(",")
 
 
 def counts() -> tuple[int, int]:
@@ -121,18 +124,18 @@ def kept(key: str) -> Function | None:
 
 
 def identity() -> str:
-    """What machine code depends on beside the IR."""
+    """What this machine's code depends on beside a stage."""
+    return _named(host())
+
+
+def _named(target: Target) -> str:
     import llvmlite
 
-    target = host()
-    return "\n".join((_FORM, llvmlite.__version__, target.cpu, target.features))
+    return "\n".join((_VERSION, llvmlite.__version__, repr(target)))
 
 
 def _key(ir: str, target: Target) -> str:
-    import llvmlite
-
-    text = "\n".join((_FORM, llvmlite.__version__, target.cpu, target.features, str(target.triple), ir))
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(f"{_named(target)}\n{ir}".encode()).hexdigest()
 
 
 def _machine(target: Target) -> Any:

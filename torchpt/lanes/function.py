@@ -15,6 +15,7 @@ from torchpt.lanes.graph import DTYPES
 from torchpt.lanes.kernel import HEAD, text
 from torchpt.lanes.program import bound
 from torchpt.lanes.sinks import Sinks, Store
+from torchpt.lanes.stage import TracedStage
 from torchpt.lanes.tracing import Tracer, lanes_for
 
 __all__ = ["lanewise"]
@@ -43,9 +44,10 @@ def lanewise(
         results = list(function(*given))
     shapes = [tuple(x.shape[:-1]) for x in results]
     stores = [Store(tuple(tracer.nodes(x)), DTYPES[x.dtype]) for x in results]
-    ir, _ = text(tracer.graph, Sinks(store=stores), len(tracer.tables), 0, len(given), False)
-    made = engine.compiled(ir, target)
-    tables = bound(tracer.tables, tracer.steps, tracer.held, {})
+    stage = TracedStage(tracer.graph, Sinks(store=stores), tracer.tables, tracer.steps, tracer.held, tensors=len(given))
+    target = target or engine.host()
+    made = engine.compiled(text(stage, target.form), target)
+    tables = bound(stage.tables, stage.steps, stage.held, {})
 
     def run(*arguments: Tensor) -> list[Tensor]:
         inputs = [x.contiguous() for x in arguments]

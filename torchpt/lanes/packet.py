@@ -1,4 +1,4 @@
-"""Sixteen rays against every primitive, as functions inside a kernel: the search for scenes of few primitives.
+"""A packet of rays against every primitive, as functions inside a kernel: the search for scenes of few primitives.
 
 The tests are those of :mod:`torchpt.accel.kernels_brute`: affine rows with their own rounding error as tolerance for planar
 primitives, perpendiculars in float64 for spheres.
@@ -7,21 +7,21 @@ primitives, perpendiculars in float64 for spheres.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
-from torchpt.lanes.block import WIDTH, Block
+from torchpt.lanes.block import Block
+from torchpt.lanes.form import Form
 
 __all__ = ["KINDS", "packet_search"]
 
 #: Kinds of primitives that are searched here, in the order of their ids.
 KINDS = ("triangle", "rectangle", "disk", "sphere")
-_F, _I, _D, _B = (f"<{WIDTH} x {t}>" for t in ("float", "i32", "double", "i1"))
-_HIT = f"{{{_F}, {_I}, {_F}, {_F}}}"
 #: Numbers of a planar primitive's row.
 _ROW = 13
 _RAY = ("ox", "oy", "oz", "dx", "dy", "dz")
 
 
-def packet_search(kinds: tuple[str, ...], estimates: bool) -> Block:
+def packet_search(kinds: Sequence[str], form: Form) -> Block:
     """Functions ``nearest`` and ``occluded`` of rays and the address of what is searched.
 
     There lie, 64 bits each: the address of the rows of planar primitives, that of the spheres, for each of :data:`KINDS` the
@@ -29,11 +29,11 @@ def packet_search(kinds: tuple[str, ...], estimates: bool) -> Block:
 
     Args:
         kinds: those that the scene has.
-        estimates: whether the machine has AVX-512's reciprocal estimates; else it divides.
+        form: a packet has as many rays as a value has lanes.
     """
-    whole = Block()
+    whole = Block(form)
     for any_hit in (False, True):
-        block = _Search(kinds, estimates, any_hit)
+        block = _Search(kinds, any_hit, form)
         block.write()
         whole.lines += block.lines
         whole.declarations |= block.declarations
@@ -41,21 +41,23 @@ def packet_search(kinds: tuple[str, ...], estimates: bool) -> Block:
 
 
 class _Search(Block):
-    def __init__(self, kinds: tuple[str, ...], estimates: bool, any_hit: bool) -> None:
-        super().__init__()
-        self.kinds, self.estimates, self.any_hit = kinds, estimates, any_hit
+    def __init__(self, kinds: Sequence[str], any_hit: bool, form: Form) -> None:
+        super().__init__(form)
+        self.f, self.i, self.d, self.b = (self.vector(ty) for ty in "fidb")
+        self.hit = f"{{{self.f}, {self.i}, {self.f}, {self.f}}}"
+        self.kinds, self.any_hit = kinds, any_hit
 
     def write(self) -> None:
         """The function."""
-        given = ", ".join(f"{_F} %{name}" for name in (*_RAY, "t_max"))
-        name, result = ("occluded", _B) if self.any_hit else ("nearest", _HIT)
+        given = ", ".join(f"{self.f} %{name}" for name in (*_RAY, "t_max"))
+        name, result = ("occluded", self.b) if self.any_hit else ("nearest", self.hit)
         self.lines.append(f"define internal {result} @{name}({given}, ptr %search) noinline #0 {{\nentry:")
         self._start()
-        t, prim, before = "%t0", "splat (i32 -1)", "entry"
+        t, prim, before = "%t0", self.constant("i", -1), "entry"
         for kind in self.kinds:
             t, prim, before = self._loop(kind, t, prim, before)
         if self.any_hit:
-            self.do(f"ret {_B} {self.op(f'icmp sge {_I} {prim}, zeroinitializer')}")
+            self.do(f"ret {self.b} {self.op(f'icmp sge {self.i} {prim}, zeroinitializer')}")
         else:
             self._finish(t, prim)
         self.lines.append("}")
@@ -68,25 +70,24 @@ class _Search(Block):
         extent = self.load("double", self.at("%search", "i64", len(words)))
         extent = self.splat("f", self.op(f"fptrunc double {extent} to float"))
         zero = self.constant("f", 0.0)
-        # NaN unless all are finite; never contracted away, as no flag allows that.
+        # NaN unless all are finite.
         nothing = None
         for name in _RAY:
-            product = self.op(f"fmul {_F} %{name}, {zero}")
-            nothing = product if nothing is None else self.op(f"fadd {_F} {nothing}, {product}")
+            product = self.mul("f", f"%{name}", zero)
+            nothing = product if nothing is None else self.add("f", nothing, product)
         assert nothing is not None
         good = self.op(
-            f"and {_B} {self.compare('oeq', 'f', nothing, zero)}, {self.compare('ogt', 'f', '%t_max', zero)}"
+            f"and {self.b} {self.compare('oeq', 'f', nothing, zero)}, {self.compare('ogt', 'f', '%t_max', zero)}"
         )
-        self.lines.append(f"  %t0 = select {_B} {good}, {_F} %t_max, {_F} {self.constant('f', -1.0)}")
+        self.lines.append(f"  %t0 = select {self.b} {good}, {self.f} %t_max, {self.f} {self.constant('f', -1.0)}")
         far_o, far_d = self._size(_RAY[:3]), self._size(_RAY[3:])
-        self.lines.append(f"  %reach = fmul {_F} {far_d}, {self._larger(far_o, extent)}")
-        bits = self.op(f"bitcast {_B} {good} to i16")
-        self.lines.append(f"  %live = icmp ne i16 {bits}, 0")
+        self.lines.append(f"  %reach = fmul {self.f} {far_d}, {self._larger(far_o, extent)}")
+        self.let("live", "i1", self.some(good))
         if "sphere" in self.kinds:
             d = [self.convert("fpext", "f", "d", f"%{name}") for name in _RAY[3:]]
-            self.lines.append(f"  %square = fadd {_D} {self._dot(d, d)}, {self.constant('d', 0.0)}")
-            self.lines.append(f"  %shrink = fdiv {_D} {self.constant('d', 1.0)}, %square")
-            self.lines.append(f"  %shrink32 = fptrunc {_D} %shrink to {_F}")
+            self.lines.append(f"  %square = fadd {self.d} {self._dot(d, d)}, {self.constant('d', 0.0)}")
+            self.lines.append(f"  %shrink = fdiv {self.d} {self.constant('d', 1.0)}, %square")
+            self.lines.append(f"  %shrink32 = fptrunc {self.d} %shrink to {self.f}")
 
     def _larger(self, a: str, b: str) -> str:
         return self.select("f", self.compare("ogt", "f", a, b), a, b)
@@ -106,8 +107,8 @@ class _Search(Block):
             f"  br i1 %{kind}_go, label %{kind}, label %{kind}_done",
             f"{kind}:",
             f"  %{kind}_id = phi i64 [ {first}, %{before} ], [ %{kind}_next, %{last} ]",
-            f"  %{kind}_t = phi {_F} [ {t}, %{before} ], [ %{kind}_t1, %{last} ]",
-            f"  %{kind}_p = phi {_I} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
+            f"  %{kind}_t = phi {self.f} [ {t}, %{before} ], [ %{kind}_t1, %{last} ]",
+            f"  %{kind}_p = phi {self.i} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
         ]
         if kind == "sphere":
             self._near_ball(kind)
@@ -117,40 +118,31 @@ class _Search(Block):
             self.compare("olt", "f", distance, f"%{kind}_t"),
         ]
         for test in tests:
-            hit = test if hit is None else self.op(f"and {_B} {hit}, {test}")
+            hit = test if hit is None else self.op(f"and {self.b} {hit}, {test}")
         # A ray that meets anything at all is done: no distance is below the one it has then.
         better = self.constant("f", -1.0) if self.any_hit else distance
         number_ = self.splat("i", self.op(f"trunc i64 %{kind}_id to i32"))
         tail = "e" if kind == "sphere" else "1"
         self.lines += [
-            f"  %{kind}_t{tail} = select {_B} {hit}, {_F} {better}, {_F} %{kind}_t",
-            f"  %{kind}_p{tail} = select {_B} {hit}, {_I} {number_}, {_I} %{kind}_p",
+            f"  %{kind}_t{tail} = select {self.b} {hit}, {self.f} {better}, {self.f} %{kind}_t",
+            f"  %{kind}_p{tail} = select {self.b} {hit}, {self.i} {number_}, {self.i} %{kind}_p",
         ]
         if kind == "sphere":
             self.lines += [
                 f"  br label %{kind}_last",
                 f"{kind}_last:",
-                f"  %{kind}_t1 = phi {_F} [ %{kind}_t, %{kind} ], [ %{kind}_te, %{kind}_exact ]",
-                f"  %{kind}_p1 = phi {_I} [ %{kind}_p, %{kind} ], [ %{kind}_pe, %{kind}_exact ]",
+                f"  %{kind}_t1 = phi {self.f} [ %{kind}_t, %{kind} ], [ %{kind}_te, %{kind}_exact ]",
+                f"  %{kind}_p1 = phi {self.i} [ %{kind}_p, %{kind} ], [ %{kind}_pe, %{kind}_exact ]",
             ]
         self.lines += [
             f"  %{kind}_next = add i64 %{kind}_id, 1",
             f"  %{kind}_more = icmp slt i64 %{kind}_next, %end_{kind}",
             f"  br i1 %{kind}_more, label %{kind}, label %{kind}_done",
             f"{kind}_done:",
-            f"  %{kind}_t2 = phi {_F} [ {t}, %{before} ], [ %{kind}_t1, %{last} ]",
-            f"  %{kind}_p2 = phi {_I} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
+            f"  %{kind}_t2 = phi {self.f} [ {t}, %{before} ], [ %{kind}_t1, %{last} ]",
+            f"  %{kind}_p2 = phi {self.i} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
         ]
         return f"%{kind}_t2", f"%{kind}_p2", f"{kind}_done"
-
-    def _reciprocal(self, a: str) -> str:
-        if not self.estimates:
-            return self.div("f", self.constant("f", 1.0), a)
-        name = "llvm.x86.avx512.rcp14.ps.512"
-        self.declarations.add(f"declare {_F} @{name}({_F}, {_F}, i16)")
-        e = self.op(f"call {_F} @{name}({_F} {a}, {_F} zeroinitializer, i16 -1)")
-        rest = self.fma("f", self.negative("f", a), e, self.constant("f", 1.0))
-        return self.fma("f", rest, e, e)
 
     def _affine(self, row: list[str], x: tuple[str, ...]) -> str:
         value = row[3]
@@ -165,7 +157,7 @@ class _Search(Block):
         slope = self.mul("f", row[0], d[0])
         for k in (1, 2):
             slope = self.fma("f", row[k], d[k], slope)
-        inverse = self._reciprocal(slope)
+        inverse = self.div("f", self.constant("f", 1.0), slope)
         t = self.mul("f", self.negative("f", self._affine(row[:4], o)), inverse)
         p = tuple(self.fma("f", t, d[k], o[k]) for k in range(3))
         u, v = self._affine(row[4:8], p), self._affine(row[8:12], p)
@@ -180,7 +172,7 @@ class _Search(Block):
             other = self.compare("ole", "f", self.add("f", u, v), most)
         else:
             other = self.compare("ole", "f", self._larger(u, v), self.add("f", slack, self.constant("f", 1.0)))
-        return t, self.op(f"and {_B} {inside}, {other}")
+        return t, self.op(f"and {self.b} {inside}, {other}")
 
     def _dot(self, a: list[str], b: list[str]) -> str:
         value = self.mul("d", a[0], b[0])
@@ -214,9 +206,8 @@ class _Search(Block):
         reach = self.fma("f", size, self.constant("f", 2.0**-19), self.call("llvm.fabs", "f", c[3]))
         # Not "farther away": what overflows or is no number takes the exact test.
         near = self.compare("ule", "f", square, self.mul("f", reach, reach))
-        near = self.op(f"and {_B} {near}, {self.compare('ogt', 'f', f'%{kind}_t', self.constant('f', 0.0))}")
-        bits = self.op(f"bitcast {_B} {near} to i16")
-        some = self.op(f"icmp ne i16 {bits}, 0")
+        near = self.op(f"and {self.b} {near}, {self.compare('ogt', 'f', f'%{kind}_t', self.constant('f', 0.0))}")
+        some = self.some(near)
         self.lines += [f"  br i1 {some}, label %{kind}_exact, label %{kind}_last", f"{kind}_exact:"]
 
     def _ball(self, kind: str) -> tuple[str, str | None]:
@@ -241,27 +232,27 @@ class _Search(Block):
 
     def _finish(self, t: str, prim: str) -> None:
         """Parameters of the planar hits; those in the slack beyond an edge are brought back to the edge."""
-        hit = self.op(f"icmp sge {_I} {prim}, zeroinitializer")
+        hit = self.op(f"icmp sge {self.i} {prim}, zeroinitializer")
         zero, one = self.constant("f", 0.0), self.constant("f", 1.0)
         ends = {kind: self.splat("i", self.op(f"trunc i64 %end_{kind} to i32")) for kind in KINDS[:3]}
-        planar = self.op(f"and {_B} {hit}, {self.op(f'icmp slt {_I} {prim}, ' + ends['disk'])}")
+        planar = self.op(f"and {self.b} {hit}, {self.op(f'icmp slt {self.i} {prim}, ' + ends['disk'])}")
         u = v = zero
         if any(kind != "sphere" for kind in self.kinds):
             place = self.mul("i", self.select("i", planar, prim, "zeroinitializer"), self.constant("i", _ROW))
             p = tuple(self.fma("f", t, f"%{d}", f"%{o}") for o, d in zip(_RAY[:3], _RAY[3:], strict=True))
             row = [self.gather("float", self.at("%rows", "float", k), place) for k in range(4, 12)]
             u, v = self._affine(row[:4], p), self._affine(row[4:], p)
-            flat = self.op(f"icmp slt {_I} {prim}, {ends['rectangle']}")
-            three = self.op(f"icmp slt {_I} {prim}, {ends['triangle']}")
+            flat = self.op(f"icmp slt {self.i} {prim}, {ends['rectangle']}")
+            three = self.op(f"icmp slt {self.i} {prim}, {ends['triangle']}")
             inner = self._between(u, zero, one)
             top = self.select("f", three, self.sub("f", one, inner), one)
             u, v = self.select("f", flat, inner, u), self.select("f", flat, self._between(v, zero, top), v)
             u, v = (self.select("f", planar, x, zero) for x in (u, v))
         t = self.select("f", hit, t, self.constant("f", math.inf))
         value = "poison"
-        for k, (ty, x) in enumerate(((_F, t), (_I, prim), (_F, u), (_F, v))):
-            value = self.op(f"insertvalue {_HIT} {value}, {ty} {x}, {k}")
-        self.do(f"ret {_HIT} {value}")
+        for k, (ty, x) in enumerate(((self.f, t), (self.i, prim), (self.f, u), (self.f, v))):
+            value = self.op(f"insertvalue {self.hit} {value}, {ty} {x}, {k}")
+        self.do(f"ret {self.hit} {value}")
 
     def _between(self, x: str, low: str, high: str) -> str:
         x = self._larger(x, low)

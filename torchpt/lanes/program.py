@@ -11,8 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.lanes.engine import Function
 from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.prologue import Guard, Name, Source, Step, Table, names_of, replayed
+from torchpt.lanes.stage import TracedStage
 
 __all__ = ["Program", "Tables", "bound", "holds", "laid_out"]
 
@@ -52,6 +54,30 @@ class Program:
     shadows: int
     nodes: Mapping[str, int]
     sums: Sequence[Sequence[Any]] = ()
+
+    @classmethod
+    def of(cls, stage: TracedStage, function: Function) -> Program:
+        """Return a stage's program with the machine code that was made of it."""
+        nodes: dict[str, int] = {}
+        for node in stage.needed():
+            for file in stage.graph.origins[node]:
+                nodes[file] = nodes.get(file, 0) + 1
+        return cls(
+            call=function.call,
+            code=function.key,
+            tables=tuple(stage.tables),
+            steps=tuple(stage.steps),
+            held=tuple(stage.held),
+            guards=tuple(stage.guards),
+            uniforms=tuple(stage.uniforms),
+            lists=stage.sinks.lists(),
+            counters=stage.sinks.counters(),
+            tensors=stage.tensors,
+            results=len(stage.sinks.store),
+            shadows=stage.sinks.shadows,
+            nodes=nodes,
+            sums=stage.sums,
+        )
 
     def leaves(self) -> frozenset[str]:
         """Paths of the leaves that enter its tables."""

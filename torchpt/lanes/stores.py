@@ -1,61 +1,71 @@
-"""The end of a kernel's loop: LLVM IR that puts the results where the sinks say."""
+"""The end of a kernel's loop: LLVM IR that puts the results where the sinks say.
+
+Vectors of lanes and single ones differ in how lanes find places behind each other: a vector is compressed and counters are
+held in registers, a single lane takes the next place of a counter in memory and writes behind a branch.
+"""
 
 from __future__ import annotations
 
-from torchpt.lanes.arena import CAPACITY
-from torchpt.lanes.block import ELEMENTS, WIDTH, Block
-from torchpt.lanes.emission import MEMORY
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+from torchpt.lanes.block import ELEMENTS
+from torchpt.lanes.emission import MEMORY, Body
 from torchpt.lanes.graph import Graph, Unsupported
 from torchpt.lanes.sinks import Note, Pack, Scatter, Sinks, Store
 
-__all__ = ["SinkLines"]
+__all__ = ["SinkLines", "sink_lines"]
 
 
-class SinkLines:
+class SinkLines(ABC):
     """The lines of a kernel's sinks.
 
+    In the loop ``%i`` is the lane's number, or that of a vector's first, ``%mask`` says which lanes there are, and ``%first0``,
+    ``%first1``, ... are the counters as the kernel found them.
+
     Attributes:
-        after: names of the counters after this turn of the loop.
+        before: lines that begin a turn of the loop.
+        after: lines that follow the last turn.
+        functions: lines of functions that the loop calls.
     """
 
-    def __init__(self, block: Block, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
+    def __init__(self, block: Body, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
         self.block, self.graph, self.names, self.sinks = block, graph, names, sinks
-        self.after = {k: f"%c{k}" for k in range(sinks.counters())}
+        self.before: list[str] = []
+        self.after: list[str] = []
+        self.functions: list[str] = []
 
     def write(self) -> None:
         """All of them."""
         block, sinks = self.block, self.sinks
         for pack in sinks.pack:
             self._pack(pack)
-        own = "%place" if getattr(block, "listed", False) else None
         for note in sinks.notes:
-            mask = self._masked(note.mask)
-            places = own or self._places("%i")
-            self._note(note, mask, places)
+            self._note(note, self._masked(note.mask), "%place" if block.listed else self.block.places("%i"))
         if sinks.write:
-            place = "%i" if sinks.shift is None else block.op(f"add i64 %i, %first{sinks.shift}")
-            for row, node in sinks.write:
-                element, value = self._held(node)
-                block.do(f"store <{WIDTH} x {element}> {value}, ptr {self._row(row, element, place)}, align 4")
+            self._write("%i" if sinks.shift is None else block.op(f"add i64 %i, %first{sinks.shift}"))
         for scatter in sinks.scatter:
             self._scatter(scatter)
         for mask, counter in sinks.count:
-            self._advance(counter, block.count(self._masked(mask)))
+            self._count(counter, self._masked(mask))
         for k, store in enumerate(sinks.store):
             self._store(k, store)
 
+    @abstractmethod
+    def _pack(self, pack: Pack) -> None: ...
+
+    @abstractmethod
+    def _note(self, note: Note, mask: str, places: str) -> None: ...
+
+    @abstractmethod
+    def _write(self, place: str) -> None:
+        """Rows of the target arena from a place on: an i64."""
+
+    @abstractmethod
+    def _count(self, counter: int, mask: str) -> None: ...
+
     def _masked(self, mask: int) -> str:
-        return self.block.op(f"and <{WIDTH} x i1> {self.names[mask]}, %mask")
-
-    def _advance(self, counter: int, by: str) -> None:
-        self.after[counter] = self.block.op(f"add i64 {self.after[counter]}, {by}")
-
-    def _places(self, first: str) -> str:
-        """Consecutive places from a 64-bit number on."""
-        block = self.block
-        start = block.splat("i", block.op(f"trunc i64 {first} to i32"))
-        numbers = ", ".join(f"i32 {k}" for k in range(WIDTH))
-        return block.op(f"add <{WIDTH} x i32> {start}, <{numbers}>")
+        return self.block.op(f"and {self.block.each('i1')} {self.names[mask]}, %mask")
 
     def _held(self, node: int) -> tuple[str, str]:
         """The 32 bits by which the arena holds a number: their type and name."""
@@ -63,45 +73,15 @@ class SinkLines:
         if ty == "d":
             raise Unsupported("a float64 in the state of a path")
         if ty == "b":
-            return "i32", block.op(f"zext <{WIDTH} x i1> {name} to <{WIDTH} x i32>")
+            return "i32", block.op(f"zext {block.each('i1')} {name} to {block.each('i32')}")
         return MEMORY[ty], block.convert("trunc", "L", "i", name) if ty == "L" else name
 
+    def _start(self, row: int) -> str:
+        """The first byte of a row of the target arena."""
+        return self.block.at("%dst", "i8", 4 * self.block.form.row * row) if row else "%dst"
+
     def _row(self, row: int, element: str, place: str) -> str:
-        start = self.block.at("%dst", "i8", 4 * CAPACITY * row) if row else "%dst"
-        return self.block.at(start, element, place)
-
-    def _pack(self, pack: Pack) -> None:
-        block, mask = self.block, self._masked(pack.mask)
-        start = self.after[pack.counter]
-        for row, node in pack.rows:
-            element, value = self._held(node)
-            together = block.compress(element, value, mask)
-            block.do(f"store <{WIDTH} x {element}> {together}, ptr {self._row(row, element, start)}, align 4")
-        if pack.notes:
-            places = self._places(start)
-            for note in pack.notes:
-                # Which of the packed lanes are meant: their mask packed likewise, no further than there are any.
-                both = block.op(f"and <{WIDTH} x i1> {self.names[note.mask]}, {mask}")
-                wide = block.op(f"sext <{WIDTH} x i1> {both} to <{WIDTH} x i32>")
-                chosen = block.op(f"icmp ne <{WIDTH} x i32> {self._packed(wide, mask)}, zeroinitializer")
-                self._note(note, chosen, places)
-        self._advance(pack.counter, block.count(mask))
-
-    def _packed(self, value: str, mask: str) -> str:
-        """As :meth:`Block.compress`, with zeros behind."""
-        name = f"llvm.experimental.vector.compress.v{WIDTH}i32"
-        vector = f"<{WIDTH} x i32>"
-        self.block.declarations.add(f"declare {vector} @{name}({vector}, <{WIDTH} x i1>, {vector})")
-        return self.block.op(
-            f"call {vector} @{name}({vector} {value}, <{WIDTH} x i1> {mask}, {vector} zeroinitializer)"
-        )
-
-    def _note(self, note: Note, mask: str, places: str) -> None:
-        block = self.block
-        together = self._packed(places, mask)  # zeros behind: whatever reads on past the end reads a place
-        end = block.at(f"%list{note.list}", "i32", self.after[note.counter])
-        block.do(f"store <{WIDTH} x i32> {together}, ptr {end}, align 4")
-        self._advance(note.counter, block.count(mask))
+        return self.block.at(self._start(row), element, place)
 
     def _scatter(self, scatter: Scatter) -> None:
         block = self.block
@@ -112,7 +92,7 @@ class SinkLines:
             if scatter.slots:
                 start = block.at("%slots", element, block.op(f"mul i64 %stride, {row}")) if row else "%slots"
             else:
-                start = block.at("%dst", "i8", 4 * CAPACITY * row)
+                start = self._start(row)
             block.scatter(element, value, start, place, mask)
 
     def _store(self, number: int, store: Store) -> None:
@@ -122,12 +102,124 @@ class SinkLines:
         for k, node in enumerate(store.nodes):
             ty, value = self.graph.type(node), self.names[node]
             if store.ty in "lL" and ty != "L":
-                value = block.op(f"sext <{WIDTH} x i32> {value} to <{WIDTH} x i64>")
+                value = block.op(f"sext {block.each('i32')} {value} to {block.each('i64')}")
             elif store.ty == "b":
-                value = block.op(f"zext <{WIDTH} x i1> {value} to <{WIDTH} x i8>")
+                value = block.op(f"zext {block.each('i1')} {value} to {block.each('i8')}")
             elif store.ty == "u":
-                value = block.op(f"trunc <{WIDTH} x i32> {value} to <{WIDTH} x i8>")
+                value = block.op(f"trunc {block.each('i32')} {value} to {block.each('i8')}")
             row = f"%out{number}"
             if k:
                 row = block.at(row, "i8", block.op(f"mul i64 %out{number}s, {k * size}"))
             block.masked_store(element, value, block.at(row, element, "%i"), "%mask")
+
+
+class _Vectors(SinkLines):
+    """Lanes of a vector are moved together and stored whole; counters are values that go around the loop."""
+
+    def __init__(self, block: Body, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
+        super().__init__(block, graph, names, sinks)
+        self._counters = {k: f"%c{k}" for k in range(sinks.counters())}
+
+    def write(self) -> None:
+        """All of them."""
+        super().write()
+        for k, last in self._counters.items():
+            arriving = f"[ %first{k}, %entry ], [ {last}, %{self.block.label} ]"
+            self.before.append(f"  %c{k} = phi i64 {arriving}")
+            self.after += [
+                f"  %end{k} = phi i64 {arriving}",
+                f"  %slot{k} = getelementptr i64, ptr %counters, i64 {k}",
+                f"  store i64 %end{k}, ptr %slot{k}",
+            ]
+        self.after.sort(key=lambda line: " phi " not in line)  # which come first in their block
+
+    def _count(self, counter: int, mask: str) -> None:
+        by = self.block.count(mask)
+        self._counters[counter] = self.block.op(f"add i64 {self._counters[counter]}, {by}")
+
+    def _write(self, place: str) -> None:
+        for row, node in self.sinks.write:
+            element, value = self._held(node)
+            self._put(element, value, self._row(row, element, place))
+
+    def _put(self, element: str, value: str, pointer: str) -> None:
+        self.block.do(f"store {self.block.each(element)} {value}, ptr {pointer}, align 4")
+
+    def _pack(self, pack: Pack) -> None:
+        block, mask = self.block, self._masked(pack.mask)
+        start = self._counters[pack.counter]
+        for row, node in pack.rows:
+            element, value = self._held(node)
+            self._put(element, block.compress(element, value, mask), self._row(row, element, start))
+        if pack.notes:
+            places = self.block.places(start)
+            for note in pack.notes:
+                # Which of the packed lanes are meant: their mask packed likewise, no further than there are any.
+                both = block.op(f"and {block.each('i1')} {self.names[note.mask]}, {mask}")
+                wide = block.op(f"sext {block.each('i1')} {both} to {block.each('i32')}")
+                chosen = block.op(f"icmp ne {block.each('i32')} {self._packed(wide, mask)}, zeroinitializer")
+                self._note(note, chosen, places)
+        self._count(pack.counter, mask)
+
+    def _packed(self, value: str, mask: str) -> str:
+        """As :meth:`Block.compress`, with zeros behind."""
+        name = f"llvm.experimental.vector.compress.{self.block.suffix('i32')}"
+        vector, truth = self.block.each("i32"), self.block.each("i1")
+        self.block.declarations.add(f"declare {vector} @{name}({vector}, {truth}, {vector})")
+        return self.block.op(f"call {vector} @{name}({vector} {value}, {truth} {mask}, {vector} zeroinitializer)")
+
+    def _note(self, note: Note, mask: str, places: str) -> None:
+        together = self._packed(places, mask)  # zeros behind: whatever reads on past the end reads a place
+        self._put("i32", together, self.block.at(f"%list{note.list}", "i32", self._counters[note.counter]))
+        self._count(note.counter, mask)
+
+
+#: ``@take(counter, mask)``: the next place, and the counter goes on where the mask holds.
+_TAKE = """define internal i64 @take(ptr %counter, i1 %mask) alwaysinline {
+  %place = load i64, ptr %counter
+  %by = zext i1 %mask to i64
+  %next = add i64 %place, %by
+  store i64 %next, ptr %counter
+  ret i64 %place
+}"""
+
+
+class _Lanes(SinkLines):
+    """One lane takes its places from counters in memory by the function ``take``, all that knows in which order lanes come."""
+
+    def __init__(self, block: Body, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
+        super().__init__(block, graph, names, sinks)
+        self.functions.append(_TAKE)
+
+    def _count(self, counter: int, mask: str) -> None:
+        self._take(counter, mask)
+
+    def _take(self, counter: int, mask: str) -> str:
+        return self.block.op(f"call i64 @take(ptr {self.block.at('%counters', 'i64', counter)}, i1 {mask})")
+
+    def _write(self, place: str) -> None:
+        self._put(self.sinks.write, place, "%mask")
+
+    def _put(self, rows: Sequence[tuple[int, int]], place: str, mask: str) -> None:
+        held = [(row, *self._held(node)) for row, node in rows]
+        with self.block.when(mask):
+            for row, element, value in held:
+                self.block.do(f"store {element} {value}, ptr {self._row(row, element, place)}")
+
+    def _pack(self, pack: Pack) -> None:
+        mask = self._masked(pack.mask)
+        place = self._take(pack.counter, mask)
+        self._put(pack.rows, place, mask)
+        for note in pack.notes:
+            both = self.block.op(f"and i1 {self.names[note.mask]}, {mask}")
+            self._note(note, both, self.block.places(place))
+
+    def _note(self, note: Note, mask: str, places: str) -> None:
+        end = self._take(note.counter, mask)
+        with self.block.when(mask):
+            self.block.do(f"store i32 {places}, ptr {self.block.at(f'%list{note.list}', 'i32', end)}")
+
+
+def sink_lines(block: Body, graph: Graph, names: dict[int, str], sinks: Sinks) -> SinkLines:
+    """Return what writes the sinks of a stage whose nodes have names, in the block's form."""
+    return (_Vectors if block.width > 1 else _Lanes)(block, graph, names, sinks)

@@ -36,12 +36,12 @@ from torchpt.integrators.path import ENDLESS
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
 from torchpt.lanes.arena import CAPACITY
-from torchpt.lanes.block import WIDTH
+from torchpt.lanes.form import VECTORS
 
 __all__ = ["LANES", "Chunk", "Worker"]
 
 #: Lanes of a chunk.
-LANES = CAPACITY - WIDTH
+LANES = CAPACITY - VECTORS.width
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from torchpt.integrators.loop.packets import kinds_of
 from torchpt.integrators.loop.trace import Trace
 from torchpt.lanes import engine, operators, shelf  # noqa: F401  (the operators register how they are lowered)
 from torchpt.lanes.kernel import text
-from torchpt.lanes.packet import packet_search
 from torchpt.lanes.program import Program, holds
 from torchpt.lanes.prologue import pruned
 from torchpt.lanes.sinks import Sinks
+from torchpt.lanes.stage import TracedStage
 from torchpt.lanes.tracing import Tracer, lanes_for
 
 __all__ = ["forget", "program_of"]
@@ -49,7 +49,7 @@ def program_of(
         if program is None and name is not None:
             program = shelf.load(name)
         if program is None or not holds(program, leaves.tensors):
-            program = _traced(leaves, layout, build, listed)
+            program = _compiled(_traced(leaves, layout, build, listed))
             if name is not None:
                 shelf.store(name, program)
         if _programs.get(whole) is not program:
@@ -65,34 +65,28 @@ def forget() -> None:
     _programs.clear()
 
 
-def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> Program:
+def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
     tracer = Tracer(lanes_for(leaves.tensors.values()), leaves.ids)
     trace = Trace(tracer, layout)
     with torch.no_grad():
         sinks = build(trace)
-    search = None
-    if any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes):
-        search = packet_search(kinds_of(layout.world), engine.estimates())
-    ir, needed = text(tracer.graph, sinks, len(tracer.tables), len(trace.uniforms), trace.tensors, listed, search)
-    made = engine.compiled(ir)
     tables, steps, guards = pruned(tracer.tables, tracer.steps, tracer.guards)
-    nodes: dict[str, int] = {}
-    for node in needed:
-        for file in tracer.graph.origins[node]:
-            nodes[file] = nodes.get(file, 0) + 1
-    return Program(
-        call=made.call,
-        code=made.key,
+    searches = any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes)
+    return TracedStage(
+        graph=tracer.graph,
+        sinks=sinks,
         tables=tables,
         steps=steps,
         held=tuple(tracer.held),
         guards=guards,
         uniforms=tuple(trace.uniforms),
-        lists=sinks.lists(),
-        counters=sinks.counters(),
         tensors=trace.tensors,
-        results=len(sinks.store),
-        shadows=sinks.shadows,
-        nodes=nodes,
+        listed=listed,
+        searched=kinds_of(layout.world) if searches else None,
         sums=tuple(trace.sums),
     )
+
+
+def _compiled(stage: TracedStage) -> Program:
+    target = engine.host()
+    return Program.of(stage, engine.compiled(text(stage, target.form), target))

@@ -21,7 +21,7 @@ from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
 from torchpt.lanes.arena import CAPACITY
-from torchpt.lanes.block import WIDTH
+from torchpt.lanes.form import VECTORS
 from torchpt.lanes.kernel import HEAD
 from torchpt.native.memory import let_go
 from torchpt.shortage import needing, ran_out
@@ -201,9 +201,9 @@ class Loop:
         """
         self.release()
         if self.threads == 1:
-            if self.lanes <= WIDTH:
+            if self.lanes <= VECTORS.width:
                 raise RenderError("not enough memory for the compiled loop on one thread")
-            self.lanes = max(self.lanes // 4, WIDTH)
+            self.lanes = max(self.lanes // 4, VECTORS.width)
         self.threads = 1
         self.said("torchpt: memory ran out: one thread and fewer lanes from now on, for the same picture")
         return [
@@ -218,7 +218,7 @@ class Loop:
         size = pixels
         if tasks > 1 and self.threads > 1:
             size = max(-(-pixels // tasks), -(-FEWEST // samples), min(NARROW, -(-pixels // self.threads)))
-        size = max(min(-(-size // WIDTH) * WIDTH, self.lanes), 1)
+        size = max(min(-(-size // VECTORS.width) * VECTORS.width, self.lanes), 1)
         for start in range(0, pixels, size):
             yield start, min(size, pixels - start)
 

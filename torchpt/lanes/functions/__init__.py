@@ -1,4 +1,4 @@
-"""Elementary functions over vectors, without branches and without calls: argument reduction and a polynomial.
+"""Elementary functions, without branches and without calls: argument reduction and a polynomial.
 
 The polynomials are those of Moshier's Cephes library (*Methods and Programs for Mathematical Functions*, 1989) unless
 something else is said. ``tests/lanes/test_functions.py`` states the error of each in units of the last place.
@@ -15,7 +15,7 @@ from torchpt.lanes.functions.trigonometric import acos, asin, atan, atan2, tan, 
 
 __all__ = ["FUNCTIONS"]
 
-#: Functions of one or two vectors: ``function(block, type, *arguments)``.
+#: Functions of one or two values: ``function(block, type, *arguments)``.
 FUNCTIONS: dict[str, Callable[..., str]] = {
     "sin": trigonometric(0),
     "cos": trigonometric(1),

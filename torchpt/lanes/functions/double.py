@@ -1,36 +1,26 @@
-"""Sums and products of float64 with what rounding took from them (Dekker 1971). No flag allows to contract them."""
+"""Sums and products of float64 with what rounding took from them (Dekker 1971)."""
 
 from __future__ import annotations
 
 from torchpt.lanes.block import Block
 
-__all__ = ["double_product", "once", "plain", "two_product", "two_sum"]
-
-
-def plain(b: Block, op: str, x: str, y: str) -> str:
-    """One operation on float64 that is never contracted."""
-    return b.op(f"{op} {b.vector('d')} {x}, {y}")
-
-
-def once(b: Block, x: str, y: str, z: str) -> str:
-    """``x y + z`` rounded once on every machine."""
-    return b.call("llvm.fma", "d", x, y, z)
+__all__ = ["double_product", "two_product", "two_sum"]
 
 
 def two_sum(b: Block, x: str, y: str) -> tuple[str, str]:
     """A sum and its rounding error, where ``x`` is the larger, or 0."""
-    s = plain(b, "fadd", x, y)
-    return s, plain(b, "fsub", y, plain(b, "fsub", s, x))
+    s = b.add("d", x, y)
+    return s, b.sub("d", y, b.sub("d", s, x))
 
 
 def two_product(b: Block, x: str, y: str) -> tuple[str, str]:
     """A product and its rounding error."""
-    p = plain(b, "fmul", x, y)
-    return p, once(b, x, y, b.negative("d", p))
+    p = b.mul("d", x, y)
+    return p, b.fma("d", x, y, b.negative("d", p))
 
 
 def double_product(b: Block, x: tuple[str, str], y: tuple[str, str]) -> tuple[str, str]:
     """The product of two sums of two."""
     p, rest = two_product(b, x[0], y[0])
-    rest = once(b, x[0], y[1], once(b, x[1], y[0], rest))
+    rest = b.fma("d", x[0], y[1], b.fma("d", x[1], y[0], rest))
     return two_sum(b, p, rest)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from torchpt.lanes.block import Block
-from torchpt.lanes.functions.double import double_product, once, plain, two_sum
+from torchpt.lanes.functions.double import double_product, two_sum
 from torchpt.lanes.functions.values import absolute, narrow, wide
 
 __all__ = ["log", "log1p", "log_by", "log_ends", "log_parts", "log_wide"]
@@ -61,22 +61,22 @@ def log_parts(b: Block, x: str) -> tuple[str, str]:
     m, e = _mantissa(b, b.select("d", tiny, b.mul("d", x, b.constant("d", 2.0**54)), x))
     e = b.select("d", tiny, b.sub("d", e, b.constant("d", 54.0)), e)
     one = b.constant("d", 1.0)
-    f = plain(b, "fsub", m, one)
+    f = b.sub("d", m, one)
     # s = f / (2 + f), with the rest of the division.
     d = two_sum(b, b.constant("d", 2.0), f)
     sh = b.div("d", f, d[0])
-    off = once(b, b.negative("d", sh), d[1], once(b, b.negative("d", sh), d[0], f))
+    off = b.fma("d", b.negative("d", sh), d[1], b.fma("d", b.negative("d", sh), d[0], f))
     s = sh, b.div("d", off, d[0])
     z = double_product(b, s, s)
     # 2 + z (2/3 + z (2/5 + ...)): the last bracket needs no more than float64 has.
     p = b.polynomial("d", z[0], tuple(2.0 / k for k in range(23, 4, -2)))
-    w = two_sum(b, b.constant("d", 2.0 / 3.0), plain(b, "fmul", z[0], p))
+    w = two_sum(b, b.constant("d", 2.0 / 3.0), b.mul("d", z[0], p))
     w = w[0], b.add("d", w[1], b.constant("d", 3.700743415417188e-17))  # what 2/3 lacks
     w = double_product(b, z, w)
     h = two_sum(b, b.constant("d", 2.0), w[0])
     r = double_product(b, s, (h[0], b.add("d", h[1], w[1])))
-    t = two_sum(b, plain(b, "fmul", e, b.constant("d", _LN2_PARTS[0])), r[0])
-    rest = once(b, e, b.constant("d", _LN2_PARTS[1]), b.add("d", t[1], r[1]))
+    t = two_sum(b, b.mul("d", e, b.constant("d", _LN2_PARTS[0])), r[0])
+    rest = b.fma("d", e, b.constant("d", _LN2_PARTS[1]), b.add("d", t[1], r[1]))
     return two_sum(b, t[0], rest)
 
 
@@ -100,9 +100,9 @@ def log1p(b: Block, ty: str, x: str) -> str:
         value = narrow(b, ty, log_wide(b, b.add("d", wide(b, ty, x), one)))
         return b.select(ty, small, x, value)
     # The logarithm of the rounded sum u, and what rounding took: ln(u + c) = ln u + c / u.
-    u = plain(b, "fadd", x, one)
-    less = plain(b, "fsub", u, x)
-    c = plain(b, "fadd", plain(b, "fsub", x, plain(b, "fsub", u, less)), plain(b, "fsub", one, less))
+    u = b.add("d", x, one)
+    less = b.sub("d", u, x)
+    c = b.add("d", b.sub("d", x, b.sub("d", u, less)), b.sub("d", one, less))
     high, low = log_parts(b, u)
     value = b.add(ty, high, b.add(ty, low, b.div(ty, c, u)))
     return b.select(ty, small, x, log_ends(b, ty, u, value))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from torchpt.lanes.block import WIDTH, Block
+from torchpt.lanes.block import Block
 from torchpt.lanes.functions.values import absolute, clamped, narrow, negative, wide
 
 __all__ = ["acos", "asin", "atan", "atan2", "tan", "trigonometric"]
@@ -143,7 +143,7 @@ def atan2(b: Block, ty: str, y: str, x: str) -> str:
     u, v = absolute(b, ty, y), absolute(b, ty, x)
     inf = b.constant(ty, math.inf)
     # Both infinite: as if both were 1. Both zero: as if the quotient were 0.
-    both = b.op(f"and <{WIDTH} x i1> {b.compare('oeq', ty, u, inf)}, {b.compare('oeq', ty, v, inf)}")
+    both = b.op(f"and {b.each('i1')} {b.compare('oeq', ty, u, inf)}, {b.compare('oeq', ty, v, inf)}")
     u, v = (b.select(ty, both, b.constant(ty, 1.0), w) for w in (u, v))
     none = b.compare("oeq", ty, b.extreme("max", ty, u, v), b.constant(ty, 0.0))
     v = b.select(ty, none, b.constant(ty, 1.0), v)

@@ -1,0 +1,28 @@
+"""The same kernels on one lane at a time, and comparison by bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchpt.lanes import engine
+from torchpt.lanes.engine import Target
+from torchpt.lanes.form import SCALAR
+
+__all__ = ["differing", "one_lane"]
+
+_BITS = {1: torch.uint8, 4: torch.int32, 8: torch.int64}
+
+
+def one_lane() -> Target:
+    """Return this machine, with kernels that take one lane at a time."""
+    return replace(engine.host(), form=SCALAR)
+
+
+def differing(a: Tensor, b: Tensor) -> Tensor:
+    """Return where two tensors of one shape differ in any bit; any NaN is as good as any other."""
+    assert a.shape == b.shape and a.dtype == b.dtype
+    bits = _BITS[a.element_size()]
+    return (a.contiguous().view(bits) != b.contiguous().view(bits)) & ~((a != a) & (b != b))
