@@ -13,7 +13,7 @@ from features import FEATURES, Feature, kernels, with_feature
 
 import torchpt
 from torchpt.format.description import settings
-from torchpt.integrators.loop.kernels import Kernels
+from torchpt.engines.kernels.kernels import Kernels
 from torchpt.rendering import render_scene
 
 REPEATS = 15

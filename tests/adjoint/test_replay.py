@@ -12,8 +12,8 @@ from gradient_rooms import gradient_of, room
 import torchpt
 from torchpt.adjoint import replay, sweep
 from torchpt.adjoint.samples import asked_of, counted
+from torchpt.engines.kernels import chunk
 from torchpt.format.description import settings
-from torchpt.integrators.loop import chunk
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 
@@ -106,8 +106,8 @@ def test_no_gradient_as_large_as_the_table_for_each_look_up():
 
 @pytest.mark.parametrize("name", [NAME, "shapes.plate.to_world"])
 def test_stages_of_which_no_kernel_can_be_made(monkeypatch, name, capfd):
+    from torchpt.engines.kernels.joint_kernels import JointKernels
     from torchpt.forward.waves import say_once
-    from torchpt.integrators.loop.joint_kernels import JointKernels
     from torchpt.lanes.graph import Unsupported
 
     scene = torchpt.load(room(PLATE, lights={"sky": {"type": "constant", "radiance": [0.2, 0.3, 0.4]}}), "cpu")

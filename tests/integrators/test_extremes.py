@@ -9,7 +9,7 @@ import torch
 from trials import estimate, film_of, shoot
 
 import torchpt
-from torchpt.integrators import path
+from torchpt.integrators import base
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0], "fov": 40}
 SKY = {"sky": {"type": "constant", "radiance": [0.25, 0.5, 1.0]}}
@@ -103,7 +103,7 @@ def test_a_closed_room_of_albedo_one_ends():
 
 
 def test_endless_paths_are_ended_and_counted(monkeypatch):
-    monkeypatch.setattr(path, "ENDLESS", 100)
+    monkeypatch.setattr(base, "ENDLESS", 100)
     never = {"max_depth": -1, "rr_depth": 2**31 - 1, "strategy": "bsdf"}
     shot = shoot(room(1.0, 1.0), 1, integrator=never, film=film_of(2, 1))
     assert torch.isfinite(shot.image).all()

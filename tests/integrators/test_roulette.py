@@ -9,8 +9,8 @@ import pytest
 import torch
 from trials import estimate, film_of, shoot, z_limit
 
-from torchpt.integrators import path, roulette
-from torchpt.integrators.path import Limits
+from torchpt.integrators import base, roulette
+from torchpt.integrators.base import Limits
 from torchpt.samplers import Draws
 
 
@@ -55,7 +55,7 @@ def test_only_deep_paths_without_an_end_are_capped():
     assert [endless.roulette(depth) for depth in (1, 4, 5, 1000, 1001)] == [0, 0, 1, 1, roulette.DEEP_CAP]
     assert [ended.roulette(depth) for depth in (4, 5, 1001)] == [0, 1, 1]
     # That no path which loses nothing comes to the end: one of a million million would be many.
-    assert roulette.DEEP_CAP ** (path.ENDLESS - roulette.DEEP) < 1e-12
+    assert roulette.DEEP_CAP ** (base.ENDLESS - roulette.DEEP) < 1e-12
 
 
 def room(albedo: float) -> dict[str, Any]:
@@ -136,8 +136,7 @@ def test_light_that_is_never_lost_ends_too():
 
 @pytest.mark.parametrize("compile", ["on", "off"])
 def test_paths_that_roulette_may_not_end_are_cut_and_counted(monkeypatch, compile):
-    monkeypatch.setattr(path, "ENDLESS", 50)
-    monkeypatch.setattr("torchpt.integrators.loop.chunk.ENDLESS", 50)
+    monkeypatch.setattr(base, "ENDLESS", 50)
     never = {"max_depth": -1, "rr_depth": 2**31 - 1, "strategy": "bsdf"}
     shot = shoot(room(0.9), 3, integrator=never, film=film_of(4, 2), compile=compile)
     assert shot.truncated_paths == 3 * 8

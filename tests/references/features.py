@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import torchpt
+from torchpt.engines.kernels.kernels import Kernels
 from torchpt.forward import kept
-from torchpt.integrators.loop.kernels import Kernels
 
 __all__ = ["FEATURES", "PLAIN", "Feature", "kernels", "with_feature"]
 

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 import pytest
 
+from torchpt.engines.kernels import schedule as loop
 from torchpt.forward import schedule as eager
-from torchpt.integrators.loop import schedule as loop
 
 __all__ = ["few_lanes"]
 

@@ -20,11 +20,12 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.engines import tensors
+from torchpt.engines.kernels.chunk import Chunk, Worker
+from torchpt.engines.kernels.kernels import Kernels
+from torchpt.engines.kernels.rows import HIT, Memory
 from torchpt.format.description import settings
 from torchpt.forward import kernels_of, make_wave
-from torchpt.integrators.loop.chunk import Chunk, Worker
-from torchpt.integrators.loop.kernels import Kernels
-from torchpt.integrators.loop.rows import HIT, Memory
 from torchpt.integrators.path import partition
 from torchpt.integrators.search import Search
 from torchpt.integrators.stage_runner import Stages
@@ -126,7 +127,7 @@ def waves(wave: Wave, pixels: int, samples: int) -> _Recorder:
     """What the stages of a wave were given."""
     recorder = _Recorder(wave.stages)
     with torch.no_grad():
-        replace(wave, stages=recorder).radiance(0, pixels, 0, samples)
+        tensors.radiance(replace(wave, stages=recorder), 0, pixels, 0, samples)
     return recorder
 
 
@@ -362,7 +363,7 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
 def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:
     """The preview has no vertices beyond the first: samples are compared whole."""
     tally = Tally()
-    eager = wave.brought(wave.rays(0, pixels, 0, samples), tally)
+    eager = tensors.brought(wave, wave.rays(0, pixels, 0, samples), tally)
     worker = Worker(kernels)
     took = worker.trace(Chunk(0, pixels, 0, samples))
     assert took.rays == tally.rays

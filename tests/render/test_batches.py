@@ -13,11 +13,11 @@ from few import few
 
 import torchpt
 from torchpt import accel
+from torchpt.engines.kernels import chunk, programs
+from torchpt.engines.kernels import kernels as loop_kernels
 from torchpt.errors import RenderError, SceneError
 from torchpt.forward import Run, run
-from torchpt.integrators import path
-from torchpt.integrators.loop import chunk, programs
-from torchpt.integrators.loop import kernels as loop_kernels
+from torchpt.integrators import base
 from torchpt.scene import scene as scenes_room
 
 SIZE = {"width": 24, "height": 16, "filter": "box"}
@@ -270,7 +270,7 @@ def test_pictures_with_and_without_kernels():
 
 
 def test_paths_that_are_cut_are_counted_by_picture(monkeypatch):
-    monkeypatch.setattr(path, "ENDLESS", 4)
+    monkeypatch.setattr(base, "ENDLESS", 4)
     scene, wishes = room(), {"integrator": {"type": "path", "max_depth": -1, "rr_depth": 99}, "compile": "off"}
     batch = torchpt.render_batch(scene, VIEWS, full=True, **wishes)
     found = [batch[0, c].truncated_paths for c in range(4)]

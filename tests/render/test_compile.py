@@ -10,11 +10,11 @@ import torch
 from trials import film_of
 
 import torchpt
+from torchpt.engines.kernels import kernels
+from torchpt.engines.kernels.schedule import Loop
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
 from torchpt.forward import kept, looped
-from torchpt.integrators.loop import kernels
-from torchpt.integrators.loop.schedule import Loop
 from torchpt.integrators.path import PathIntegrator
 from torchpt.rendering import Rendering, render_scene
 

@@ -21,10 +21,10 @@ from showcase import showcase
 from trials import film_of
 
 import torchpt
+from torchpt.engines.kernels import schedule
 from torchpt.film import FILTERS
 from torchpt.format.description import settings
 from torchpt.forward.stopping import Stop
-from torchpt.integrators.loop import schedule
 from torchpt.rendering import Rendering, render_scene
 from torchpt.samplers import KINDS as SAMPLERS
 

@@ -19,13 +19,13 @@ from trials import coarse, film_of
 
 import torchpt
 from torchpt.bsdfs import KINDS
+from torchpt.engines.kernels.chunk import Chunk, Worker
+from torchpt.engines.kernels.rows import HIT
+from torchpt.engines.kernels.schedule import Loop
 from torchpt.film import Film
 from torchpt.format.description import settings
 from torchpt.forward import kernels_of
 from torchpt.integrators import LAYERS
-from torchpt.integrators.loop.chunk import Chunk, Worker
-from torchpt.integrators.loop.rows import HIT
-from torchpt.integrators.loop.schedule import Loop
 from torchpt.integrators.stages import STRATEGIES
 from torchpt.records import Hit, rows
 from torchpt.rendering import Rendering, render_scene
@@ -121,7 +121,7 @@ def test_what_goes_where_after_a_hit():
             **{name: getattr(hit, name) for name in HIT}, shadow_radiance=light, clear=clear,
         )  # fmt: skip
         worker.calls.clear()
-        lists = worker._lists[0]
+        lists = worker.room(1).lists
         worker.calls.run(kernels.settle(True), n, here, here, lists=lists)
         _, places = worker.calls.counted()
         wanted = torch.addcmul(state.radiance, light, clear)

@@ -18,9 +18,9 @@ from showcase import showcase
 from trials import film_of
 
 import torchpt
+from torchpt.engines.kernels.chunk import Chunk, Worker
 from torchpt.errors import RenderError
 from torchpt.format.description import settings
-from torchpt.integrators.loop.chunk import Chunk, Worker
 from torchpt.integrators.tally import Tally
 from torchpt.rendering import Progress, Rendering, render_scene
 
@@ -89,8 +89,7 @@ def test_strict_names_pixel_and_sample(broken, threads):
 
 
 def test_paths_without_end_are_counted(monkeypatch):
-    monkeypatch.setattr("torchpt.integrators.path.ENDLESS", 5)
-    monkeypatch.setattr("torchpt.integrators.loop.chunk.ENDLESS", 5)
+    monkeypatch.setattr("torchpt.integrators.base.ENDLESS", 5)
     scene = torchpt.load("cornell_box", "cpu")
     wish = {"max_depth": -1, "rr_depth": 100}
     on, off = (rendered(scene, 2, integrator=wish, compile=mode) for mode in ("on", "off"))
@@ -213,7 +212,8 @@ def test_a_worker_is_used_again_as_if_new():
     with torch.no_grad():
         kernels = kernels_of(scene, wave)
     worker, fresh = Worker(kernels), Worker(kernels)
-    for memory in (*worker._arenas, *worker.search.passed, worker.slots, *worker._lists[0], *worker._lists[1]):
+    rooms = [memory for depth in (1, 2) for memory in (worker.room(depth).arena, *worker.room(depth).lists)]
+    for memory in (*rooms, *worker.search.passed, worker.slots):
         memory.words[:] = np.float32(np.nan).view(np.int32) if memory.words.shape[0] > 1 else 5
     worker.trace(Chunk(0, 1600, 0, 3))
     a, b = worker.trace(Chunk(64, 99, 1, 3)), fresh.trace(Chunk(64, 99, 1, 3))

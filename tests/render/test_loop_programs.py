@@ -17,11 +17,11 @@ from trials import film_of
 
 import torchpt
 from torchpt.bsdfs import Parameters
+from torchpt.engines.kernels import programs
+from torchpt.engines.kernels.kernels import Kernels
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
 from torchpt.forward import say_once
-from torchpt.integrators.loop import programs
-from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.stage_runner import Stages
 from torchpt.lanes import engine
 from torchpt.lanes.graph import Unsupported
@@ -164,7 +164,7 @@ def test_larger_pictures_and_maps(work, tmp_path):
 
 AGAIN = """
 import sys, torchpt
-from torchpt.integrators.loop import programs
+from torchpt.engines.kernels import programs
 from torchpt.lanes import engine
 traced, kept = [0], programs._traced
 def counting(*args):

@@ -18,10 +18,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
+from torchpt.engines.kernels import rows
+from torchpt.engines.kernels.chunk import Worker
 from torchpt.errors import RenderError, SceneError
 from torchpt.forward import say_once
-from torchpt.integrators.loop import rows
-from torchpt.integrators.loop.chunk import Worker
 from torchpt.shortage import ran_out
 
 #: How allocations fail, on a CPU and on CUDA.

@@ -9,8 +9,8 @@ import torch
 from few import few
 
 import torchpt
+from torchpt.engines.kernels import programs
 from torchpt.format.description import settings
-from torchpt.integrators.loop import programs
 from torchpt.lanes import engine
 from torchpt.rendering import render_scene
 

@@ -35,10 +35,10 @@ from torchpt.adjoint.attachment import attached
 from torchpt.adjoint.samples import counted
 from torchpt.adjoint.sums import Sums
 from torchpt.adjoint.tape import chunk_by_chunk
+from torchpt.engines import tensors
 from torchpt.forward.schedule import Span
 from torchpt.integrators.path import PathIntegrator
 from torchpt.integrators.search import Search
-from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave, camera_state
 from torchpt.math.vectors import dot, normalize, take
 from torchpt.records import PathState
@@ -128,7 +128,7 @@ def interior(still: Wave, wave: Wave, span: Span) -> Tensor:
     Args:
         still: a wave of detached parameters.
         wave: the same under a tape.
-        span: as of :meth:`Wave.radiance`.
+        span: as of :func:`torchpt.engines.tensors.radiance`.
     """
     with torch.no_grad():
         state = still.rays(*span)
@@ -248,7 +248,7 @@ def _rays(still: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
 
 def _brought(wave: Wave, state: PathState) -> Tensor:
     """Radiance ``(3, N)`` that camera rays bring."""
-    return wave.integrator.radiance(wave.stages, wave.accel, state, wave.first, Tally())
+    return tensors.trace(wave, state)
 
 
 def _held(still: Wave, wave: Wave, state: PathState) -> _Seen:

@@ -14,10 +14,10 @@ from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.replay import replay
 from torchpt.adjoint.sums import ChunkSums, Sums
 from torchpt.adjoint.sweep import KEPT, Sweep
+from torchpt.engines.kernels.chunk import LANES, Chunk
+from torchpt.engines.kernels.joint_kernels import JointKernels
 from torchpt.forward.schedule import Span
 from torchpt.forward.waves import say_once
-from torchpt.integrators.loop.chunk import LANES, Chunk
-from torchpt.integrators.loop.joint_kernels import JointKernels
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.graph import Unsupported
 from torchpt.scene import Scene

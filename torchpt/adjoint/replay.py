@@ -17,17 +17,17 @@ from torch import Tensor
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
 from torchpt.adjoint.sums import Sums
+from torchpt.engines.tensors import Paths, Tensors
 from torchpt.forward.budget import Budget
 from torchpt.forward.schedule import Span
 from torchpt.forward.waves import Waves
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Behind
-from torchpt.integrators.path import ENDLESS, Ends, partition, slides, trace
+from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.search import Search
-from torchpt.integrators.stage_runner import Stages
-from torchpt.integrators.tally import Tally
 from torchpt.math.gathers import gathered_by
 from torchpt.math.vectors import take
+from torchpt.paths.walk import Observer, walk
 from torchpt.records import Hit, PathState, Shadow, rows
 from torchpt.samplers import salts
 from torchpt.settings import Settings
@@ -50,34 +50,32 @@ class Vertex:
     clear: list[Tensor] = field(default_factory=list)
 
 
-class Keeper(Stages):
-    """Stages that keep the vertices which they pass: the first ones all, of those behind some as marks."""
+class Keeper(Observer[Paths]):
+    """Keeps the vertices of a walk: the first ones all, of those behind some as marks."""
 
-    def __init__(self, stages: Stages, end: int | None) -> None:
-        super().__init__(stages.plan, stages.world, stages.pixel)
+    def __init__(self) -> None:
         self.kept: list[Vertex] = []
         self.marks: list[Vertex] = []
-        self._end, self._step = end, KEPT
+        self._step = KEPT
         self._now: Vertex | None = None
 
-    def met(self, depth: int, state: PathState, hit: Hit) -> bool:
-        """See :class:`Stages`; ends where another part begins."""
-        if depth == self._end:
-            return True
-        self._now = Vertex(depth, state, hit)
+    def follow(self, paths: Paths) -> None:
+        """Keep how much of the light that the latest vertex sampled gets through."""
+        if self._now is not None:
+            self._now.clear = paths.clear
+
+    def arrived(self, paths: Paths) -> bool:
+        """See :class:`Observer`."""
+        self.follow(paths)
+        self._now = Vertex(paths.depth, paths.state, paths.met)
         if len(self.kept) < KEPT:
             self.kept.append(self._now)
-        elif (depth - self.kept[-1].depth - 1) % self._step == 0:
+        elif (paths.depth - self.kept[-1].depth - 1) % self._step == 0:
             self.marks.append(self._now)
             if len(self.marks) > MARKS:
                 self.marks = self.marks[::2]
                 self._step *= 2
         return False
-
-    def cleared(self, clear: Tensor) -> None:
-        """See :class:`Stages`."""
-        assert self._now is not None
-        self._now.clear.append(clear)
 
 
 def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
@@ -147,12 +145,12 @@ class _Chunk:
     # -- forward
 
     def _trace(self, state: PathState, depth: int, hit: Hit | None, end: int | None) -> tuple[Tensor, Keeper]:
-        keeper = Keeper(self.wave.stages, end)
-        limits = self.wave.limits
-        assert limits is not None
-        lanes = self.span[1] * self.span[3]
-        radiance = trace(keeper, limits, self.wave.accel, state, Tally(), lanes, depth, hit)
-        return radiance, keeper
+        keeper, engine = Keeper(), Tensors(self.wave, self.span[1] * self.span[3])
+        paths = engine.spawn(state) if depth == 1 else Paths(state, depth, hit)
+        rest = walk(engine, paths, self.wave.integrator.limits, keeper, end)
+        if rest is not None:
+            keeper.follow(rest)
+        return engine.radiance, keeper
 
     # -- back
 
@@ -175,9 +173,8 @@ class _Chunk:
         hit = replace(hit, chance=chance)
         limits = self.wave.limits
         assert limits is not None
-        last = limits.max_depth if limits.max_depth >= 0 else ENDLESS
         clear = iter(vertex.clear)
-        if depth < last:
+        if depth < limits.last:
             for model, index in groups:
                 self._bounce(model, depth, slide, clear, state, hit, index, asked)
         self._light(ends, slide, state, hit, asked)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
 from torchpt.adjoint.sums import Sums
+from torchpt.engines import tensors
 from torchpt.forward.budget import Budget
 from torchpt.forward.schedule import BYTES_PER_LANE, Span, budget_of
 from torchpt.forward.waves import Waves
@@ -48,7 +49,7 @@ def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> N
     wave = assembly.taped
 
     def part(span: Span) -> tuple[Tensor, Tensor]:
-        radiance = wave.radiance(*span)
+        radiance = tensors.radiance(wave, *span)
         share = asked_of(settings, radiance.detach(), asked[:, span[0] : span[0] + span[1]].to(radiance.dtype))
         # What is not finite must not meet its share of 0.
         return torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0), share

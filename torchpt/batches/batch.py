@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from torchpt.batches.inputs import Cameras, Seeds, cameras_of, named, params_of, scenes_of, seeds_of
+from torchpt.engines.kernels.schedule import TASKS
 from torchpt.errors import SceneError
 from torchpt.forward import Entry, Rendering, Run, limited_threads, render_many
 from torchpt.forward.budget import too_little
-from torchpt.integrators.loop.schedule import TASKS
 from torchpt.integrators.wave import Wave
 from torchpt.native.memory import mb
 from torchpt.native.modes import lasting

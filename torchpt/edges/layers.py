@@ -10,10 +10,10 @@ from torch import Tensor
 
 from torchpt import taped
 from torchpt.edges.gradients import Boundary, boundary_of
+from torchpt.engines import tensors
 from torchpt.forward import limited_threads, make_wave, rebound
 from torchpt.integrators import LAYERS, aov
 from torchpt.integrators.layer import SurfaceLayer
-from torchpt.integrators.search import Search
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
@@ -88,13 +88,10 @@ def _gradients(
             return list(total)
 
         def look(boundary: Boundary) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
-            traced, wave = boundary.traced, boundary.traced.wave
-            plan, world = wave.stages.plan, wave.stages.world
-            search = Search(wave.accel, world, plan.sampler, plan.dtype)
+            traced = boundary.traced
 
             def values(o: Tensor, d: Tensor, key: Tensor) -> Tensor:
-                state = traced.state(o, d, key)
-                found = aov.first_hit(names, world, search, state, wave.centre, plan.dtype, wave.stages.pixel)
+                found = tensors.seen(traced.wave, names, traced.state(o, d, key))
                 return torch.cat([found[name] for name in names]).double()
 
             return values
@@ -123,7 +120,7 @@ def _interior(asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], w
             with torch.enable_grad():
                 leaves = [plain[name].clone().requires_grad_() for name in asked.wanted]
                 wave = rebound(still, scene, settings, {**plain, **dict(zip(asked.wanted, leaves, strict=True))})
-                found = wave.layers(names, first, count, sample, many, slide=True)
+                found = tensors.layers(wave, names, first, count, sample, many, slide=True)
                 mean = torch.cat([found[name] for name in names]).sum(1) / spp
             if mean.requires_grad:
                 grads = torch.autograd.grad(mean, leaves, flat[:, first : first + count], allow_unused=True)

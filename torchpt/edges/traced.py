@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchpt.engines import tensors
 from torchpt.forward import make_wave
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.plan import FOREVER
-from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave, camera_state
 from torchpt.records import PathState
 from torchpt.samplers import Sampler
@@ -53,8 +53,9 @@ class Traced:
         ``depth``: vertices of their paths at most, in place of the integrator's own limit.
         """
         wave = self.wave
-        integrator = wave.integrator if depth is None else wave.integrator.but(max_depth=depth)
-        values = integrator.radiance(wave.stages, wave.accel, self.state(o, d, key), wave.first, Tally())
+        if depth is not None:
+            wave = replace(wave, integrator=wave.integrator.but(max_depth=depth))
+        values = tensors.trace(wave, self.state(o, d, key))
         values = torch.where(torch.isfinite(values).all(0), values, 0.0).double()
         if self.clamp is not None:
             values = values * clamp_scale(values, self.clamp)

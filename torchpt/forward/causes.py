@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from torch import Tensor
+
+from torchpt.engines.tensors import brought
 from torchpt.integrators.lost import Lost, Place
 from torchpt.integrators.wave import Wave
+from torchpt.records import PathState
 from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
 
 if TYPE_CHECKING:  # what traces samples again is imported once there are such
-    from torchpt.integrators.faults import Fault
+    from torchpt.paths.faults import Fault
 
 __all__ = ["causes_of", "told"]
 
@@ -29,9 +33,9 @@ def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str
     """
     if not lost.count:
         return {}, ""
-    from torchpt.integrators.faults import faults_of
+    from torchpt.paths.faults import faults_of
 
-    faults = faults_of(wave, lost.places)
+    faults = faults_of(_trace, wave, lost.places)
     causes = Counter(fault.name for fault in faults)
     nans = sum(place.nan for place in lost.places)
     causes["nan, not traced"] = lost.nan - nans
@@ -42,9 +46,13 @@ def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str
 
 def told(scene: Scene, wave: Wave, place: Place) -> str:
     """Return a sentence about one sample that is not finite."""
-    from torchpt.integrators.faults import faults_of
+    from torchpt.paths.faults import faults_of
 
-    return f"{_named(place)} is not finite: {_said(scene, wave, faults_of(wave, [place])[0])}"
+    return f"{_named(place)} is not finite: {_said(scene, wave, faults_of(_trace, wave, [place])[0])}"
+
+
+def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
+    return brought(wave, state, observer=observer)
 
 
 def _named(place: Place) -> str:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 from torchpt.cameras import Camera
+from torchpt.engines.kernels.kernels import Kernels
 from torchpt.integrators.base import Integrator
-from torchpt.integrators.loop.kernels import Kernels
 from torchpt.records import World
 from torchpt.scene import Scene
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import torch
 
+from torchpt.engines.kernels.together import Job, Together
 from torchpt.forward.result import Rendering
 from torchpt.forward.run import Run
-from torchpt.integrators.loop.together import Job, Together
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.threads import one_thread
 from torchpt.native.modes import undisturbed

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchpt.engines import tensors
 from torchpt.errors import SceneError
 from torchpt.forward.threads import limited_threads
 from torchpt.forward.wave import make_wave
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.path import PathIntegrator
-from torchpt.integrators.recorder import Bounced, Left, Lit, Met, Recorder, Shone
+from torchpt.paths.recorder import Bounced, Left, Lit, Met, Recorder, Shone
 from torchpt.records import World
 from torchpt.scene import Scene
 from torchpt.scene.names import Names
@@ -186,7 +187,7 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         wave = replace(wave, stages=recorder)
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
         state = wave.rays_of(x, y, number)
-        brought = wave.brought(state)
+        brought = tensors.brought(wave, state, observer=recorder)
         return _Story(scene, recorder).told(settings, pixel, sample, brought)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torchpt.engines import tensors
 from torchpt.errors import RenderError
 from torchpt.forward.schedule import Span
 from torchpt.integrators.clamp import clamp_scale
@@ -70,7 +71,7 @@ def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
     piece = Piece()
     first, pixels, sample, samples = span
     if wave.integrator.light:
-        radiance = wave.brought(wave.rays(*span, plate), piece.tally).view(3, samples, pixels)
+        radiance = tensors.brought(wave, wave.rays(*span, plate), piece.tally).view(3, samples, pixels)
         finite = torch.isfinite(radiance).all(0)
         if not bool(finite.all()):
             piece.lost = Lost.of(radiance, first, sample, wave.crop, plate)
@@ -84,6 +85,6 @@ def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
         piece.writes += plate.film.after(radiance, first, sample)
     if plate.layers:
         piece.tally.rays += pixels * samples
-        for name, values in wave.layers(tuple(plate.layers), *span, plate).items():
+        for name, values in tensors.layers(wave, tuple(plate.layers), *span, plate).items():
             piece.writes += plate.layers[name].after(values, first, sample)
     return piece

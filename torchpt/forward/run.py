@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.engines.kernels.schedule import Block, Loop, Share
 from torchpt.errors import LostRankError, OutputError, RenderError, SceneError
 from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
@@ -30,7 +31,6 @@ from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
 from torchpt.forward.wave import loop_of, looped, make_wave, surface_layers
 from torchpt.forward.waves import Waves, say_once
-from torchpt.integrators.loop.schedule import Block, Loop, Share
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from torchpt.cameras import Camera
+from torchpt.engines.kernels.kernels import Kernels
+from torchpt.engines.kernels.schedule import Loop
 from torchpt.errors import SceneError
 from torchpt.film import Filter
 from torchpt.forward.kept import kept
@@ -19,8 +21,6 @@ from torchpt.forward.waves import say_once
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
-from torchpt.integrators.loop.kernels import Kernels
-from torchpt.integrators.loop.schedule import Loop
 from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.wave import Wave
 from torchpt.records import World

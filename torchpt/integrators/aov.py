@@ -9,14 +9,12 @@ from torch import Tensor
 
 from torchpt.integrators import LAYERS
 from torchpt.integrators.layer import Seen, SurfaceLayer
-from torchpt.integrators.path import partition
-from torchpt.integrators.search import Search
 from torchpt.integrators.surfaces import texture_point_at
-from torchpt.math.vectors import dot, take
-from torchpt.records import Hit, PathState, World, rows
+from torchpt.math.vectors import dot
+from torchpt.records import Hit, World
 from torchpt.shapes import interact
 
-__all__ = ["first_hit", "surface_layer", "values", "weighted"]
+__all__ = ["surface_layer", "values", "weighted"]
 
 
 def surface_layer(name: str) -> type[SurfaceLayer]:
@@ -24,32 +22,6 @@ def surface_layer(name: str) -> type[SurfaceLayer]:
     layer = LAYERS[name]
     assert issubclass(layer, SurfaceLayer)
     return layer
-
-
-def first_hit(
-    names: tuple[str, ...],
-    world: World,
-    search: Search,
-    state: PathState,
-    centre: Tensor,
-    dtype: torch.dtype,
-    pixel: Tensor | None = None,
-    slide: bool = False,
-) -> dict[str, Tensor]:
-    """The layers ``names``, each ``(C, N)``, for camera rays ``state``; a miss is 0 in all of them.
-
-    ``pixel``: see ``surfaces.texture_point_at``. ``slide``: whether points follow the rays and the geometry, for derivatives.
-    """
-    hit = search.nearest(state, 1)
-    n, device = len(hit.t), centre.device
-    layers = {name: torch.zeros(len(LAYERS[name].channels), n, dtype=dtype, device=device) for name in names}
-    _, groups = partition(world, hit)
-    for model, index in groups:
-        o, d = take(state.o, index), take(state.d, index)
-        here = values(names, world, model, o, d, rows(hit, index), centre, dtype, pixel, slide)
-        for name, value in here.items():
-            layers[name].scatter_(1, index.expand(len(value), -1), value)
-    return layers
 
 
 def values(
@@ -64,7 +36,7 @@ def values(
     pixel: Tensor | None,
     slide: bool = False,
 ) -> dict[str, Tensor]:
-    """The layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of one model; see :func:`first_hit`."""
+    """The layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of one model."""
     at = interact(world, o, d, hit, slide)
     if slide:
         hit = replace(hit, t=dot(at.p - o, d))

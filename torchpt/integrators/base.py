@@ -1,9 +1,9 @@
-"""What an integrator is: its settings, what it plans of a render, and what it makes of camera rays."""
+"""What an integrator is: its settings, what it asks of the stages, and where its paths end."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
@@ -15,16 +15,15 @@ from torchpt.spec import Choice, Flag, Scalar, Spec, Valued, parameters_of
 if TYPE_CHECKING:
     from typing import Self
 
-    from torch import Tensor
-
-    from torchpt.accel import Accel
     from torchpt.integrators.first_surface import FirstSurface
-    from torchpt.integrators.stage_runner import Stages
-    from torchpt.integrators.tally import Tally
-    from torchpt.records import PathState, World
+    from torchpt.records import World
     from torchpt.samplers import Points
 
-__all__ = ["LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits"]
+__all__ = ["ENDLESS", "LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits"]
+
+#: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
+#: paths that lose nothing none comes so far (``DEEP_CAP``): only those are cut that roulette was told to leave alone.
+ENDLESS = 1 << 15
 
 #: Parameters that several kinds have.
 STRATEGY: dict[str, Spec] = {
@@ -49,10 +48,27 @@ SAMPLES: dict[str, Spec] = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Where paths end."""
+    """Where paths end.
 
-    max_depth: int  # -1: only roulette ends them
-    rr_depth: int  # roulette from this vertex on
+    Attributes:
+        max_depth: vertices at most; -1: only roulette ends them.
+        rr_depth: roulette plays from this vertex on.
+        first_surface: whether paths end behind the first surface, with the light that is sampled there.
+    """
+
+    max_depth: int
+    rr_depth: int
+    first_surface: bool = False
+
+    @property
+    def endless(self) -> bool:
+        """Whether roulette alone is to end paths."""
+        return self.max_depth < 0
+
+    @property
+    def last(self) -> int:
+        """The vertex at which paths end that came so far."""
+        return ENDLESS if self.endless else self.max_depth
 
     def roulette(self, depth: int) -> float:
         """The most that roulette lets paths survive with at a vertex; 0 where it does not play."""
@@ -66,7 +82,7 @@ class Integrator(Valued):
 
     Attributes:
         name: its ``type`` in a scene file.
-        light: whether it estimates radiance; else the picture shows layers, and :meth:`radiance` is not asked for.
+        light: whether it estimates radiance; else the picture shows layers.
         layers: layers that are shown where ``film.aovs`` names none.
         lit: whether it sees the scene's lights; else its world has none.
         looped: whether the compiled loop of CPUs can run it; else it runs as tensor operations.
@@ -103,18 +119,3 @@ class Integrator(Valued):
     def first(self, world: World) -> FirstSurface | None:
         """What happens at first surfaces, made once a scene and differentiable in its world; None where paths go on."""
         return None
-
-    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: Any, tally: Tally) -> Tensor:
-        """What camera rays bring.
-
-        Args:
-            stages: bound to the scene.
-            accel: the search.
-            state: camera rays, ``state.radiance`` zero; N lanes.
-            first: of :meth:`first`.
-            tally: counts what it takes.
-
-        Returns:
-            Radiance ``(3, N)``.
-        """
-        raise NotImplementedError

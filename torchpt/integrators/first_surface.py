@@ -4,18 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-import torch
 from torch import Tensor
 
-from torchpt.accel import Accel
-from torchpt.integrators.base import Integrator
-from torchpt.integrators.path import gather_light, partition
-from torchpt.integrators.search import Search
-from torchpt.integrators.stage_runner import Stages
+from torchpt.integrators.base import Integrator, Limits
 from torchpt.integrators.stages import Plan
-from torchpt.integrators.tally import Tally
-from torchpt.records import Hit, PathState, Shadow, World, rows
-from torchpt.samplers import salts
+from torchpt.records import Hit, PathState, Shadow, World
 
 __all__ = ["FirstSurface", "FirstSurfaceIntegrator"]
 
@@ -68,22 +61,7 @@ class FirstSurfaceIntegrator(Integrator):
 
     looped = True
 
-    def radiance(self, stages: Stages, accel: Accel, state: PathState, first: FirstSurface, tally: Tally) -> Tensor:
+    @property
+    def limits(self) -> Limits:
         """See :class:`Integrator`."""
-        plan, world = stages.plan, stages.world
-        search = Search(accel, world, plan.sampler, plan.dtype)
-        slide = plan.attached or plan.dtype == torch.float64
-        hit = search.nearest(state, 1)
-        tally.rays += len(state.lane)
-        stages.met(1, state, hit)
-        ends, groups = partition(world, hit)
-        gather_light(stages, state, hit, ends, slide)
-        salt = salts(1, state.lane.device)
-        for model, index in groups:
-            here, met = rows(state, index), rows(hit, index)
-            radiance, shadow = first.shade(plan, world, model, here, met, salt, stages.pixel, slide)
-            if shadow is not None:
-                tally.rays += len(here.lane)
-                radiance = torch.addcmul(radiance, shadow.radiance, search.clear(shadow))
-            state.radiance.scatter_add_(1, index.expand(3, -1), radiance)
-        return state.radiance
+        return Limits(2, 3, first_surface=True)

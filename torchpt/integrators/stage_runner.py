@@ -55,13 +55,3 @@ class Stages:
         return stages.bounce(
             self.plan, self.world, model, roulette, slide, search, state, hit, index, salts, self.pixel
         )
-
-    def met(self, depth: int, state: PathState, hit: Hit) -> bool:
-        """Told of each vertex, before anything is made of it; returns whether nobody wants to see more of these paths.
-
-        Nobody listens but :class:`torchpt.integrators.recorder.Recorder`.
-        """
-        return False
-
-    def cleared(self, clear: Tensor) -> None:
-        """Told how much of the light ``(n,)`` of the latest bounce gets through."""

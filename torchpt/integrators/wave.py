@@ -14,9 +14,7 @@ from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.base import Integrator, Limits
 from torchpt.integrators.plate import Plate
-from torchpt.integrators.search import Search
 from torchpt.integrators.stage_runner import Stages
-from torchpt.integrators.tally import Tally
 from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, Streams, salts
 
@@ -84,45 +82,10 @@ class Wave:
         x, y = (a.to(self.stages.plan.dtype) for a in (x, y))
         return self.stages.generate(self.camera, self.filter, x, y, key, salts(0, self.centre.device))
 
-    def radiance(
-        self, first_pixel: int, pixels: int, first_sample: int, samples: int, plate: Plate | None = None
-    ) -> Tensor:
-        """Radiance ``(3, samples, pixels)``."""
-        return self.brought(self.rays(first_pixel, pixels, first_sample, samples, plate)).view(3, samples, pixels)
-
-    def brought(self, state: PathState, tally: Tally | None = None) -> Tensor:
-        """Radiance ``(3, N)`` that camera rays bring, weighted by the filter; ``tally`` counts what it takes."""
-        tally = Tally() if tally is None else tally
-        radiance = self.integrator.radiance(self.stages, self.accel, state, self.first, tally)
-        return radiance * self.weight(state) if self.filter.signed else radiance
-
     def weight(self, state: PathState) -> Tensor:
         """What the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""
         draws = Draws(self.stages.plan.sampler, state.key, salts(0, self.centre.device))
         return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.stages.plan.dtype)
-
-    def layers(
-        self,
-        names: tuple[str, ...],
-        first_pixel: int,
-        pixels: int,
-        first_sample: int,
-        samples: int,
-        plate: Plate | None = None,
-        slide: bool = False,
-    ) -> dict[str, Tensor]:
-        """The layers ``names``, each ``(C, samples, pixels)``; ``slide``: see :func:`torchpt.integrators.aov.first_hit`."""
-        state = self.rays(first_pixel, pixels, first_sample, samples, plate)
-        return {name: value.view(-1, samples, pixels) for name, value in self.seen(names, state, slide).items()}
-
-    def seen(self, names: tuple[str, ...], state: PathState, slide: bool = False) -> dict[str, Tensor]:
-        """The layers ``names`` of first surfaces that camera rays meet, each ``(C, N)``, weighted by the filter."""
-        from torchpt.integrators import aov
-
-        plan, world = self.stages.plan, self.stages.world
-        search = Search(self.accel, world, plan.sampler, plan.dtype)
-        found = aov.first_hit(names, world, search, state, self.centre, plan.dtype, self.stages.pixel, slide)
-        return aov.weighted(found, self.weight(state)) if self.filter.signed else found
 
 
 def camera_state(o: Tensor, d: Tensor, key: Tensor) -> PathState:

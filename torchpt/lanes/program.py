@@ -37,7 +37,7 @@ class Program:
         results: how many result tensors.
         shadows: how many shadow rays each lane asks for.
         nodes: how many of its nodes each file of the package asked for.
-        sums: what rows of its results are derivatives by, see :mod:`torchpt.integrators.loop.joint`.
+        sums: what rows of its results are derivatives by, see :mod:`torchpt.engines.kernels.joint`.
     """
 
     call: Any

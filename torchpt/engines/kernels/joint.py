@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.engines.kernels.rows import HIT, Fields, Rows
+from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Before, Behind
-from torchpt.integrators.loop.rows import HIT, Fields, Rows
-from torchpt.integrators.loop.trace import Trace
 from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.operators.derivatives import summands
 from torchpt.lanes.sinks import Scatter, Sinks
@@ -26,7 +26,7 @@ from torchpt.math.gathers import gathered_by
 from torchpt.records import Hit, PathState, Shadow
 
 if TYPE_CHECKING:
-    from torchpt.integrators.loop.joint_kernels import JointKernels
+    from torchpt.engines.kernels.joint_kernels import JointKernels
 
 __all__ = ["SLOTS", "back_bounce", "back_emit", "back_escape", "report"]
 

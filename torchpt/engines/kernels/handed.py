@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from torchpt.integrators.loop.leaves import Leaves, State
+from torchpt.engines.kernels.leaves import Leaves, State
 from torchpt.lanes.program import Program
 from torchpt.lanes.prologue import Name
 
 if TYPE_CHECKING:
-    from torchpt.integrators.loop.kernels import Kernel
+    from torchpt.engines.kernels.kernels import Kernel
 
 __all__ = ["Handed"]
 

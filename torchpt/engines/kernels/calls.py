@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchpt.integrators.loop.kernels import Kernel, Kernels
-from torchpt.integrators.loop.rows import Memory
-from torchpt.integrators.loop.vertex import PLACE
+from torchpt.engines.kernels.kernels import Kernel, Kernels
+from torchpt.engines.kernels.rows import Memory
+from torchpt.engines.kernels.vertex import PLACE
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.kernel import HEAD
 from torchpt.samplers import salts
@@ -33,8 +33,8 @@ class Calls:
         halt: set where the render is to end.
 
     Attributes:
-        counters: see :class:`torchpt.integrators.loop.layout.Layout`.
-        place: which samples the chunk holds, see :data:`torchpt.integrators.loop.vertex.PLACE`.
+        counters: see :class:`torchpt.engines.kernels.layout.Layout`.
+        place: which samples the chunk holds, see :data:`torchpt.engines.kernels.vertex.PLACE`.
         slots: radiance of the chunk's samples.
     """
 

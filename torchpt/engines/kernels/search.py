@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from torchpt.accel import Accel
-from torchpt.integrators.loop.calls import Calls
-from torchpt.integrators.loop.rows import Memory, Rows
+from torchpt.engines.kernels.calls import Calls
+from torchpt.engines.kernels.rows import Memory, Rows
 from torchpt.integrators.search import PASSES
 
 __all__ = ["ChunkSearch"]

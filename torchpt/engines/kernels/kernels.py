@@ -1,7 +1,7 @@
 """The kernels of a render: which there are, and how each is made once.
 
 To add a kernel: write the function that traces it (in ``vertex.py``, ``packets.py``, ``opacity.py``, ``output.py`` or a file of
-its own; it takes a :class:`~torchpt.integrators.loop.trace.Trace` and returns sinks), give it a method here, and run it where
+its own; it takes a :class:`~torchpt.engines.kernels.trace.Trace` and returns sinks), give it a method here, and run it where
 ``chunk.py`` needs it. What a path must carry for it is a row in ``layout.py``.
 """
 
@@ -17,12 +17,12 @@ import numpy as np
 import torch
 
 from torchpt.core.tree import signature
-from torchpt.integrators.loop import opacity, output, vertex
-from torchpt.integrators.loop import packets as packet_kernels
-from torchpt.integrators.loop.handed import Handed
-from torchpt.integrators.loop.layout import Layout
-from torchpt.integrators.loop.leaves import Leaves
-from torchpt.integrators.loop.programs import program_of
+from torchpt.engines.kernels import opacity, output, vertex
+from torchpt.engines.kernels import packets as packet_kernels
+from torchpt.engines.kernels.handed import Handed
+from torchpt.engines.kernels.layout import Layout
+from torchpt.engines.kernels.leaves import Leaves
+from torchpt.engines.kernels.programs import program_of
 from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.program import Program, Tables, bound
 from torchpt.lanes.sinks import Sinks
@@ -46,7 +46,7 @@ class Kernels(Layout):
 
     Args:
         wave: the render.
-        packets: see :class:`~torchpt.integrators.loop.layout.Layout`.
+        packets: see :class:`~torchpt.engines.kernels.layout.Layout`.
         fused: see there.
         before: kernels of another render, whose tables are taken over where they are made of the same tensors.
         fixed: whether a world says the same of itself as long as it is the same one; models of the caller's own may not.
@@ -105,76 +105,76 @@ class Kernels(Layout):
         return reasons
 
     def rows(self, layers: Mapping[str, Any]) -> int:
-        """Rows of 32-bit numbers that a thread keeps for its lanes, see :mod:`torchpt.integrators.loop.chunk`."""
+        """Rows of 32-bit numbers that a thread keeps for its lanes, see :mod:`torchpt.engines.kernels.chunk`."""
         shown = sum(len(layer.channels) for layer in layers.values())
         return 2 * self.state.count + 2 * (self.models + 2) + 3 + shown
 
     # -- vertices of paths
 
     def generate(self, chosen: bool) -> Kernel:
-        """See :func:`torchpt.integrators.loop.vertex.generate`."""
+        """See :func:`torchpt.engines.kernels.vertex.generate`."""
         return self._get(False, vertex.generate, chosen)
 
     def settle(self, shadow: bool) -> Kernel:
-        """See :func:`torchpt.integrators.loop.vertex.settle`."""
+        """See :func:`torchpt.engines.kernels.vertex.settle`."""
         return self._get(False, vertex.settle, shadow)
 
     def emit(self) -> Kernel:
-        """See :func:`torchpt.integrators.loop.vertex.emit`."""
+        """See :func:`torchpt.engines.kernels.vertex.emit`."""
         return self._get(True, vertex.emit)
 
     def escape(self) -> Kernel:
-        """See :func:`torchpt.integrators.loop.vertex.escape`."""
+        """See :func:`torchpt.engines.kernels.vertex.escape`."""
         return self._get(True, vertex.escape)
 
     def bounce(self, model: int, roulette: float) -> Kernel:
-        """See :func:`torchpt.integrators.loop.vertex.bounce`."""
+        """See :func:`torchpt.engines.kernels.vertex.bounce`."""
         return self._get(self.listed, vertex.bounce, model, roulette)
 
     def retire(self) -> Kernel:
-        """See :func:`torchpt.integrators.loop.vertex.retire`."""
+        """See :func:`torchpt.engines.kernels.vertex.retire`."""
         return self._get(self.listed, vertex.retire)
 
     def first(self, model: int) -> Kernel:
-        """See :func:`torchpt.integrators.loop.vertex.first`."""
+        """See :func:`torchpt.engines.kernels.vertex.first`."""
         return self._get(True, vertex.first, model)
 
     # -- the search by packets
 
     def find(self, passed: bool) -> Kernel:
-        """See :func:`torchpt.integrators.loop.packets.find`."""
+        """See :func:`torchpt.engines.kernels.packets.find`."""
         return self._get(False, packet_kernels.find, passed)
 
     def block(self) -> Kernel:
-        """See :func:`torchpt.integrators.loop.packets.block`."""
+        """See :func:`torchpt.engines.kernels.packets.block`."""
         return self._get(False, packet_kernels.block)
 
     # -- surfaces that are not opaque
 
     def sift(self) -> Kernel:
-        """See :func:`torchpt.integrators.loop.opacity.sift`."""
+        """See :func:`torchpt.engines.kernels.opacity.sift`."""
         return self._get(False, opacity.sift)
 
     def meet(self, again: bool) -> Kernel:
-        """See :func:`torchpt.integrators.loop.opacity.meet`."""
+        """See :func:`torchpt.engines.kernels.opacity.meet`."""
         return self._get(not again, opacity.meet, again)
 
     def begin(self) -> Kernel:
-        """See :func:`torchpt.integrators.loop.opacity.begin`."""
+        """See :func:`torchpt.engines.kernels.opacity.begin`."""
         return self._get(False, opacity.begin)
 
     def through(self) -> Kernel:
-        """See :func:`torchpt.integrators.loop.opacity.through`."""
+        """See :func:`torchpt.engines.kernels.opacity.through`."""
         return self._get(False, opacity.through)
 
     # -- what leaves a chunk
 
     def layers(self, model: int, names: tuple[str, ...]) -> Kernel:
-        """See :func:`torchpt.integrators.loop.output.layers`."""
+        """See :func:`torchpt.engines.kernels.output.layers`."""
         return self._get(self.listed, output.layers, model, names)
 
     def deposit(self, channels: int, clamp: bool) -> Kernel:
-        """See :func:`torchpt.integrators.loop.output.deposit`."""
+        """See :func:`torchpt.engines.kernels.output.deposit`."""
         return self._get(False, output.deposit, channels, clamp)
 
     # -- how they are made

@@ -1,7 +1,7 @@
 """A stage on its way to become a kernel: what it reads of the arena, and how its results go back.
 
-The functions of :mod:`~torchpt.integrators.loop.vertex`, :mod:`~torchpt.integrators.loop.packets`,
-:mod:`~torchpt.integrators.loop.opacity` and :mod:`~torchpt.integrators.loop.output` take a :class:`Trace` and return sinks.
+The functions of :mod:`~torchpt.engines.kernels.vertex`, :mod:`~torchpt.engines.kernels.packets`,
+:mod:`~torchpt.engines.kernels.opacity` and :mod:`~torchpt.engines.kernels.output` take a :class:`Trace` and return sinks.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.integrators.loop.layout import Layout
-from torchpt.integrators.loop.rows import HIT, Rows
+from torchpt.engines.kernels.layout import Layout
+from torchpt.engines.kernels.rows import HIT, Rows
 from torchpt.lanes.sinks import Note, Scatter, Sinks
 from torchpt.lanes.tracing import Tracer
 from torchpt.records import Hit, PathState

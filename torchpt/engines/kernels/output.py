@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from torchpt.integrators.loop.trace import Trace
+from torchpt.engines.kernels.trace import Trace
 from torchpt.lanes.sinks import Scatter, Sinks, Store
 
 __all__ = ["deposit", "layers"]

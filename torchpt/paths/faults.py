@@ -6,7 +6,7 @@ on. Only where one of these is not finite it asks which of their factors was the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,9 +16,10 @@ from torchpt.core.tree import leaves
 from torchpt.integrators.first_surface import FirstSurface
 from torchpt.integrators.lost import Place
 from torchpt.integrators.plan import Plan
-from torchpt.integrators.recorder import Bounced, Left, Met, Record, Recorder, Shone
 from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.wave import Wave
+from torchpt.paths.recorder import Bounced, Left, Legible, Met, Record, Recorder, Shone
+from torchpt.paths.walk import Observer
 from torchpt.records import Hit, PathState, Shadow, World
 from torchpt.samplers import Streams
 
@@ -64,22 +65,27 @@ class Fault:
         return self.cause if self.cause == "not repeated" else f"{'nan' if self.nan else 'infinite'} {self.cause}"
 
 
-def faults_of(wave: Wave, places: Sequence[Place]) -> list[Fault]:
+#: From camera rays of a wave to the radiance that they bring, while somebody looks on.
+Trace = Callable[[Wave, PathState, Observer[Legible]], Tensor]
+
+
+def faults_of(trace: Trace, wave: Wave, places: Sequence[Place]) -> list[Fault]:
     """The faults of samples, each traced again by tensor operations.
 
     Args:
+        trace: by tensor operations.
         wave: of their render.
         places: of the samples.
     """
     found: dict[Place, Fault] = {}
     for streams in sorted({(place.first, place.streams) for place in places}):
         own = [place for place in places if (place.first, place.streams) == streams]
-        found |= zip(own, _again(wave, own, Streams(*streams)), strict=True)
+        found |= zip(own, _again(trace, wave, own, Streams(*streams)), strict=True)
     return [found[place] for place in places]
 
 
 @torch.no_grad()
-def _again(wave: Wave, places: Sequence[Place], streams: Streams) -> list[Fault]:
+def _again(trace: Trace, wave: Wave, places: Sequence[Place], streams: Streams) -> list[Fault]:
     """The same for samples of the same streams."""
     watch = Watch(wave.stages, len(places))
     first = None if wave.first is None else _Watched(wave.first, watch)
@@ -88,7 +94,7 @@ def _again(wave: Wave, places: Sequence[Place], streams: Streams) -> list[Fault]
         torch.tensor([getattr(place, name) for place in places], device=wave.centre.device)
         for name in ("x", "y", "sample")
     )
-    radiance = again.brought(again.rays_of(x, y, sample, streams))
+    radiance = trace(again, again.rays_of(x, y, sample, streams), watch)
     if not watch.full:  # a path that is given up has brought nothing
         watch.look("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
     rest = Fault("not repeated", False, 0)
@@ -115,9 +121,9 @@ class Watch(Recorder):
         """Whether every lane has its fault."""
         return None not in self.faults
 
-    def met(self, depth: int, state: PathState, hit: Hit) -> bool:
-        """See :class:`Stages`: paths that carry what is not finite may have no end, and need none here."""
-        super().met(depth, state, hit)
+    def arrived(self, paths: Legible) -> bool:
+        """See :class:`Recorder`: paths that carry what is not finite may have no end, and need none here."""
+        super().arrived(paths)
         return self.full
 
     def keep(self, record: Record) -> None:

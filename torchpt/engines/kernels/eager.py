@@ -6,9 +6,9 @@ from dataclasses import fields
 
 import torch
 
-from torchpt.integrators.loop.kernels import Kernels
-from torchpt.integrators.loop.rows import HIT, Memory
-from torchpt.integrators.loop.vertex import no_search
+from torchpt.engines.kernels.kernels import Kernels
+from torchpt.engines.kernels.rows import HIT, Memory
+from torchpt.engines.kernels.vertex import no_search
 from torchpt.records import Hit, PathState
 from torchpt.samplers import salts
 

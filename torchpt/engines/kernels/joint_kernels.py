@@ -8,9 +8,9 @@ from typing import Any
 
 from torch import Tensor
 
-from torchpt.integrators.loop import joint
-from torchpt.integrators.loop.kernels import Kernel, Kernels
-from torchpt.integrators.loop.rows import Rows
+from torchpt.engines.kernels import joint
+from torchpt.engines.kernels.kernels import Kernel, Kernels
+from torchpt.engines.kernels.rows import Rows
 from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
@@ -28,7 +28,7 @@ class JointKernels(Kernels):
         taped: the same with leaves in place of those that are differentiated.
         plain: tensors that are differentiated, as the wave has them.
         tapes: their leaves.
-        packets: see :class:`~torchpt.integrators.loop.layout.Layout`.
+        packets: see :class:`~torchpt.engines.kernels.layout.Layout`.
 
     Attributes:
         joint_plan: of the vertices that are gone back along.
@@ -36,7 +36,7 @@ class JointKernels(Kernels):
         taped_pixel: see :func:`torchpt.integrators.surfaces.texture_point_at`.
         numbers_of: which of the leaves a tensor is, by its id.
         back_eager: stages that no kernel can be made of, and why.
-        slots: rows of :data:`torchpt.integrators.loop.joint.SLOTS`.
+        slots: rows of :data:`torchpt.engines.kernels.joint.SLOTS`.
     """
 
     def __init__(
@@ -72,5 +72,5 @@ class JointKernels(Kernels):
             return None
 
     def report(self) -> Kernel:
-        """See :func:`torchpt.integrators.loop.joint.report`."""
+        """See :func:`torchpt.engines.kernels.joint.report`."""
         return self._get(False, joint.report)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchpt.integrators.loop.trace import Trace
+from torchpt.engines.kernels.trace import Trace
 from torchpt.lanes.packet import KINDS
 from torchpt.lanes.sinks import Sinks
 from torchpt.lanes.tracing import Tracer

@@ -2,7 +2,7 @@
 
 Rays of paths: ``sift`` lists those that met such a surface; ``meet`` stops them by chance and sends the others on behind it,
 once from the paths' arena and then (``again``) from that of the rays on their way, until none is left. Shadow rays: ``begin``
-and ``through`` do the same with the light that is left. The loop around them is :mod:`torchpt.integrators.loop.search`.
+and ``through`` do the same with the light that is left. The loop around them is :mod:`torchpt.engines.kernels.search`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.integrators.loop.trace import Trace
+from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators.search import beyond, opacity_at
 from torchpt.lanes.sinks import Note, Pack, Scatter, Sinks
 from torchpt.records import World

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from typing import Generic, TypeVar
 
+from torchpt.engines.kernels.chunk import Worker
+from torchpt.engines.kernels.schedule import PATIENCE, Block, Loop, Share
 from torchpt.errors import RenderError
-from torchpt.integrators.loop.chunk import Worker
-from torchpt.integrators.loop.schedule import PATIENCE, Block, Loop, Share
 
 __all__ = ["Job", "Together"]
 

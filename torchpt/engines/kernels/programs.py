@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from torchpt.integrators.loop.layout import Layout
-from torchpt.integrators.loop.leaves import Leaves
-from torchpt.integrators.loop.packets import kinds_of
-from torchpt.integrators.loop.trace import Trace
+from torchpt.engines.kernels.layout import Layout
+from torchpt.engines.kernels.leaves import Leaves
+from torchpt.engines.kernels.packets import kinds_of
+from torchpt.engines.kernels.trace import Trace
 from torchpt.lanes import engine, operators, shelf  # noqa: F401  (the operators register how they are lowered)
 from torchpt.lanes.kernel import text
 from torchpt.lanes.program import Program, holds

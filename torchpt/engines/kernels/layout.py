@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from torchpt import lights
-from torchpt.integrators.loop.rows import HIT, PASS, SHADOW, Fields, Rows
+from torchpt.engines.kernels.rows import HIT, PASS, SHADOW, Fields, Rows
 
 if TYPE_CHECKING:
     from torchpt.integrators.wave import Wave

@@ -10,9 +10,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchpt.engines.kernels.packets import nearest, occluded
+from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators import stages
-from torchpt.integrators.loop.packets import nearest, occluded
-from torchpt.integrators.loop.trace import Trace
 from torchpt.lanes.sinks import Pack, Scatter, Sinks
 from torchpt.records import Hit, PathState, Shadow
 from torchpt.samplers import Dimension, Draws

@@ -1,6 +1,6 @@
 """Eager stages that keep what each of them was given and what it made of it.
 
-A recorder takes the place of :class:`~torchpt.integrators.stage_runner.Stages` in a wave, and the integrators run as ever. It
+A recorder takes the place of :class:`~torchpt.integrators.stage_runner.Stages` in a wave, and observes its walk. It
 hands on what the stages themselves return; what they do not return (which light, the density of a direction) it asks again of
 the same pure functions, which give the same numbers.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -24,6 +25,7 @@ from torchpt.integrators.stages import shining
 from torchpt.integrators.surfaces import Surface, surface_at
 from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import largest, take
+from torchpt.paths.walk import Observer, Population
 from torchpt.records import Hit, Interaction, LightSample, PathState, Shadow, rows
 from torchpt.samplers import Draws
 from torchpt.shapes import interact
@@ -141,7 +143,26 @@ class Bounced:
 Record = Left | Met | Shone | Bounced
 
 
-class Recorder(Stages):
+class Legible(Population, Protocol):
+    """Paths whose tensors may be looked at."""
+
+    @property
+    def state(self) -> PathState:
+        """Of the paths as they arrive."""
+        ...
+
+    @property
+    def met(self) -> Hit:
+        """What their rays met."""
+        ...
+
+    @property
+    def clear(self) -> list[Tensor]:
+        """How much gets through of the light that was sampled at the vertex before, for each of its models."""
+        ...
+
+
+class Recorder(Stages, Observer[Legible]):
     """Stages that keep records; to be used for one wave of few lanes.
 
     Args:
@@ -157,6 +178,7 @@ class Recorder(Stages):
         self.records: list[Record] = []
         self.clear: dict[int, Tensor] = {}
         self._depth = 1
+        self._lit: list[int] = []
 
     def keep(self, record: Record) -> None:
         """Told of every record."""
@@ -168,15 +190,13 @@ class Recorder(Stages):
         self.keep(Left(state.lane, state))
         return state
 
-    def met(self, depth: int, state: PathState, hit: Hit) -> bool:
-        """See :class:`Stages`."""
-        self._depth = depth
-        self.keep(Met(depth, state.lane, replace(state, radiance=state.radiance.clone()), hit))
+    def arrived(self, paths: Legible) -> bool:
+        """See :class:`Observer`."""
+        self.clear |= zip(self._lit, paths.clear, strict=True)
+        self._lit = []
+        self._depth, state = paths.depth, paths.state
+        self.keep(Met(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.met))
         return False
-
-    def cleared(self, clear: Tensor) -> None:
-        """See :class:`Stages`."""
-        self.clear[len(self.records) - 1] = clear
 
     def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
         """See :class:`Stages`."""
@@ -215,17 +235,19 @@ class Recorder(Stages):
         arriving = rows(state, index)
         at = interact(world, arriving.o, arriving.d, rows(hit, index), slide)
         surface = surface_at(world, model, arriving.d, at, self.pixel)
-        lit = None if result[2] is None else self._lit(model, arriving, at, surface, salts, result[2])
+        lit = None if result[2] is None else self._lit_of(model, arriving, at, surface, salts, result[2])
         draws = Draws(plan.sampler, arriving.key, salts)
         drawn = draw(plan, world, model, at, surface, draws)
         onward, chance = carry_on(plan, arriving, surface, drawn, draws, 0.0), None
         if roulette:
             chance = chance_of(plan.rr_prob, roulette, largest(onward.throughput), onward.eta)
         after = result[0]
+        if lit is not None:
+            self._lit.append(len(self.records))
         self.keep(Bounced(self._depth, arriving.lane, model, at, surface, lit, drawn, onward.throughput, chance, after))
         return result
 
-    def _lit(
+    def _lit_of(
         self, model: int, state: PathState, at: Interaction, surface: Surface, salts: Tensor, shadow: Shadow
     ) -> Lit:
         """What is known of the light that was sampled."""

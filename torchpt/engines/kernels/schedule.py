@@ -12,11 +12,11 @@ from queue import Empty, SimpleQueue
 import numpy as np
 import torch
 
+from torchpt.engines.kernels.calls import Halted
+from torchpt.engines.kernels.chunk import LANES, Chunk, Worker
+from torchpt.engines.kernels.kernels import Kernels
 from torchpt.errors import RenderError
 from torchpt.film import Film
-from torchpt.integrators.loop.calls import Halted
-from torchpt.integrators.loop.chunk import LANES, Chunk, Worker
-from torchpt.integrators.loop.kernels import Kernels
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally

@@ -1,0 +1,272 @@
+"""One chunk of lanes from its camera rays to the radiance of its samples, in one thread and in memory of its own.
+
+A chunk is some thousand samples, one path a lane. Paths lie in an *arena* (:mod:`~torchpt.engines.kernels.rows`); a vertex
+takes them from one arena to the other, without those that ended. Where the search is inside of the stages (``fused``)::
+
+    generate   camera rays and their first hits; lanes listed by what they met
+    emit       light of the lanes that met an emitter: list `emissive`
+    escape     light of the lanes that met nothing, and their ends: list `missed`
+    bounce     one kernel a BSDF model, on the lanes of its list: light sample, shadow ray, BSDF sample, roulette, next hit;
+               lanes that go on are packed in the other arena and listed
+               ... from `emit` on again, until none is left or paths are long enough; then
+    retire     ends of the paths that are cut
+
+Else searches come between stages: ``generate``, then each vertex is *search* (:mod:`~torchpt.engines.kernels.search`),
+``settle`` (adds the light of the last shadow rays, lists lanes, ends paths), ``emit``, ``escape``, ``bounce``, *search of
+shadow rays*.
+
+A path that ends writes its radiance to the slot of its sample; :mod:`~torchpt.engines.kernels.schedule` adds slots to the
+film. :mod:`~torchpt.engines.kernels.kernels` says how a kernel is added.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchpt.engines.kernels.calls import Calls
+from torchpt.engines.kernels.eager import bounce_eagerly
+from torchpt.engines.kernels.kernels import Kernel, Kernels
+from torchpt.engines.kernels.rows import Memory
+from torchpt.engines.kernels.search import ChunkSearch
+from torchpt.integrators import LAYERS
+from torchpt.integrators.plate import Plate
+from torchpt.integrators.tally import Tally
+from torchpt.lanes.arena import CAPACITY
+from torchpt.lanes.form import VECTORS
+from torchpt.paths.walk import Counts, Observer, walk
+
+__all__ = ["LANES", "Chunk", "Paths", "Worker"]
+
+#: Lanes of a chunk.
+LANES = CAPACITY - VECTORS.width
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Consecutive pixels of a plate (None: of the picture), and consecutive samples of each."""
+
+    first_pixel: int
+    pixels: int
+    first_sample: int
+    samples: int
+    plate: Plate | None = None
+
+
+@dataclass
+class Paths:
+    """Paths of a chunk at a vertex.
+
+    Attributes:
+        arena: what they carry, lane by lane.
+        lists: lanes by what they met: by model, at an emitter, nowhere.
+        depth: of the vertex.
+        count: how many lanes there are.
+        arrived: whether their hits are in the arena already.
+        listed: whether lanes are in the lists already.
+        shadows: whether light from the vertex before is still pending.
+        groups: how many lanes each model has.
+        places: how many lanes are in each list.
+    """
+
+    arena: Memory
+    lists: list[Memory]
+    depth: int = 1
+    count: int = 0
+    arrived: bool = False
+    listed: bool = False
+    shadows: bool = False
+    groups: Sequence[int] = ()
+    places: Sequence[int] = ()
+
+
+class Worker:
+    """What one thread needs to take chunks through their paths: the engine of its walks.
+
+    Args:
+        kernels: of the render.
+        halt: set where the render is to end; None: it never is.
+
+    Attributes:
+        slots: radiance of the chunk's samples.
+        shown: layers of the chunk's samples, once they were asked for.
+        tally: rays and paths of the chunk.
+    """
+
+    def __init__(self, kernels: Kernels, halt: threading.Event | None = None) -> None:
+        self.kernels, self.wave = kernels, kernels.wave
+        self.calls = Calls(kernels, halt or threading.Event())
+        self.search = ChunkSearch(self.calls)
+        self.slots = self.calls.slots
+        self.shown: Memory | None = None
+        self.tally = Tally()
+        self._rooms = [self._room() for _ in range(2)]
+
+    def _room(self) -> Paths:
+        """Memory for the paths of a vertex."""
+        return Paths(Memory(self.kernels.state.count), [Memory(1) for _ in range(self.kernels.models + 2)])
+
+    def room(self, depth: int) -> Paths:
+        """Return the memory of a vertex: two take turns."""
+        return self._rooms[depth % 2]
+
+    def serve(self, kernels: Kernels, halt: threading.Event) -> None:
+        """Go on with another render of the same structure: fresh memory would cost time."""
+        self.kernels, self.wave = kernels, kernels.wave
+        self.calls.serve(kernels, halt)
+        self.search.kernels = kernels
+
+    def trace(self, chunk: Chunk) -> Tally:
+        """Fills ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
+        self.tally = Tally()
+        walk(self, self.spawn(chunk), self.wave.integrator.limits)
+        return self.tally
+
+    def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
+        """Fills ``shown`` with layers of the first surfaces, channel after channel; returns how many rays it took."""
+        count = chunk.pixels * chunk.samples
+        channels = sum(len(LAYERS[name].channels) for name in names)
+        if self.shown is None or len(self.shown.words) != channels:
+            self.shown = Memory(channels)
+        self.shown.words[:, :count] = 0
+        walk(self, self.spawn(chunk), self.wave.integrator.limits, _Layers(self, names))
+        return count
+
+    def start(self, chunk: Chunk) -> None:
+        """Say which samples are next."""
+        wave, plate = self.wave, chunk.plate
+        streams = wave.sampler.streams if plate is None else plate.streams
+        x, y, width, _ = wave.crop
+        point, turn = divmod(chunk.first_sample, streams.count)
+        self.calls.place[:] = np.array(
+            (
+                chunk.first_pixel, chunk.pixels, turn, (point + (1 << 31)) % (1 << 32) - (1 << 31),
+                streams.first, streams.count, x, y, width, wave.camera.resolution[0],
+            ),
+            np.int64,
+        ).astype(np.int32)  # fmt: skip
+
+    def spawn(self, chunk: Chunk) -> Paths:
+        """Start the paths of a chunk at the camera; where the search is inside of the stages with their first hits."""
+        self.start(chunk)
+        kernels, calls = self.kernels, self.calls
+        count, places = chunk.pixels * chunk.samples, None if chunk.plate is None else chunk.plate.places
+        paths, source = self._begin(self.room(1), 1, count), self.room(1).arena
+        calls.clear()
+        calls.name_salts(0)
+        if places is not None:  # the numbers of chosen pixels lie in the arena of the next vertex until then
+            chosen = places[chunk.first_pixel : chunk.first_pixel + chunk.pixels].numpy().astype(np.int32)
+            source = self.room(2).arena
+            source.words[kernels.state.first("prim"), :count] = np.tile(chosen, chunk.samples)
+        lists = paths.lists if kernels.fused else None
+        calls.run(kernels.generate(places is not None), count, source, paths.arena, lists=lists)
+        if kernels.fused:
+            self.tally.rays += count
+        return paths
+
+    def _begin(self, paths: Paths, depth: int, count: int) -> Paths:
+        """Take memory for the paths of a vertex."""
+        paths.depth, paths.count, paths.shadows, paths.groups = depth, count, False, ()
+        paths.arrived = paths.listed = self.kernels.fused
+        return paths
+
+    # -- the events of a walk
+
+    def intersect(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        if not paths.arrived:
+            self.tally.rays += paths.count
+            self.search.nearest(paths.arena, paths.count, paths.depth)
+
+    def sort(self, paths: Paths) -> Counts:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        kernels, calls = self.kernels, self.calls
+        if not paths.listed:
+            self._settle(paths)
+        live, places = calls.counted()
+        paths.groups, paths.places = places[: kernels.models] if kernels.listed else [live], places
+        emissive = places[kernels.emissive] if kernels.has_emitters else 0
+        return Counts(paths.groups, emissive, places[kernels.missed] if kernels.has_environment else 0)
+
+    def _settle(self, paths: Paths) -> None:
+        """Add the light that was pending, list lanes by what they met, and end those that met nothing that shines."""
+        calls = self.calls
+        calls.clear()
+        calls.run(self.kernels.settle(paths.shadows), paths.count, paths.arena, paths.arena, lists=paths.lists)
+
+    def emit(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        self._on_list(self.kernels.emit(), paths, self.kernels.emissive)
+
+    def escape(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        self._on_list(self.kernels.escape(), paths, self.kernels.missed)
+
+    def _on_list(self, kernel: Kernel, paths: Paths, number: int) -> None:
+        self.calls.run(kernel, paths.places[number], paths.arena, paths.arena, paths.lists[number])
+
+    def terminate(self, paths: Paths, truncated: bool) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        kernels, calls = self.kernels, self.calls
+        if not paths.groups:  # not sorted: all end where they are
+            paths.arena.words[kernels.state.first("prim"), : paths.count] = -1
+            self._settle(paths)
+            return
+        for model, count in enumerate(paths.groups):
+            if count:
+                lanes = paths.lists[model] if kernels.listed else None
+                calls.run(kernels.retire(), count, paths.arena, paths.arena, lanes)
+                self.tally.truncated += count if truncated else 0
+
+    def scatter(self, paths: Paths, roulette: float) -> Paths:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        kernels, calls = self.kernels, self.calls
+        after = self._begin(self.room(paths.depth + 1), paths.depth + 1, sum(paths.groups))
+        if kernels.fused:
+            self.tally.rays += after.count
+        calls.clear()
+        calls.name_salts(paths.depth)
+        done = 0
+        for model, count in enumerate(paths.groups):
+            if not count:
+                continue
+            if not kernels.fused:
+                calls.counters[0] = done
+            lanes = paths.lists[model]
+            if model in kernels.eager:
+                self.tally.rays += bounce_eagerly(
+                    kernels, model, roulette, paths.arena, after.arena, lanes, count, done, paths.depth
+                )
+            else:
+                kernel = kernels.bounce(model, roulette) if self.wave.first is None else kernels.first(model)
+                lanes = lanes if kernels.listed else None
+                calls.run(kernel, count, paths.arena, after.arena, lanes, lists=after.lists)
+                self.tally.rays += count * kernel.program.shadows
+            done += count
+        return after
+
+    def occlude(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`; the light itself is added where lanes are listed."""
+        paths.shadows = "shadow_o" in self.kernels.state
+        if paths.shadows:
+            self.search.light(paths.arena, paths.count)
+
+
+class _Layers(Observer[Paths]):
+    """Reads layers off first surfaces, and ends the walk there."""
+
+    def __init__(self, worker: Worker, names: tuple[str, ...]) -> None:
+        self.worker, self.names = worker, names
+
+    def sorted(self, paths: Paths, counts: Counts) -> bool:
+        """See :class:`Observer`."""
+        worker, kernels = self.worker, self.worker.kernels
+        for model, count in enumerate(paths.groups):
+            if count:
+                lanes = paths.lists[model] if kernels.listed else None
+                kernel = kernels.layers(model, self.names)
+                worker.calls.run(kernel, count, paths.arena, paths.arena, lanes, slots=worker.shown)
+        return True

@@ -1,0 +1,261 @@
+"""The events of paths by tensor operations: any device, float32 or float64, under a tape or without, models of any kind.
+
+The readable reference for kernels. Each verb is a few operations on all lanes of a wave, or a stage
+(:mod:`torchpt.integrators.stages`) on those that it concerns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from torchpt import lights
+from torchpt.integrators import LAYERS, aov
+from torchpt.integrators.path import Ends, partition, slides
+from torchpt.integrators.plate import Plate
+from torchpt.integrators.search import Search
+from torchpt.integrators.tally import Tally
+from torchpt.integrators.wave import Wave
+from torchpt.math.vectors import take
+from torchpt.paths.walk import Counts, Observer, walk
+from torchpt.records import Hit, PathState, Shadow, joined, rows
+from torchpt.samplers import salts
+
+__all__ = ["Paths", "Tensors", "brought", "layers", "radiance", "seen", "trace"]
+
+#: Groups before lanes are sorted.
+_UNSORTED = Ends(torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int64))
+
+
+@dataclass
+class Paths:
+    """Paths of a wave at a vertex; lanes are those of the state.
+
+    Attributes:
+        state: of the paths as they arrive.
+        depth: of the vertex.
+        hit: what their rays met; None where that is not known yet.
+        ends: lanes that met light by chance, once they are sorted.
+        groups: number and lanes of each BSDF model that was met; None before lanes are sorted.
+        pending: shadow rays from the vertex before, with the first lane that they bring light to.
+        clear: how much of their light gets through ``(n,)``, one for each of ``pending``, once they are traced.
+    """
+
+    state: PathState
+    depth: int = 1
+    hit: Hit | None = None
+    ends: Ends = field(default=_UNSORTED)
+    groups: list[tuple[int, Tensor]] | None = None
+    pending: list[tuple[int, Shadow]] = field(default_factory=list)
+    clear: list[Tensor] = field(default_factory=list)
+
+    @property
+    def met(self) -> Hit:
+        """What the rays met, which is known by now."""
+        assert self.hit is not None
+        return self.hit
+
+
+class Tensors:
+    """The engine of one wave.
+
+    Args:
+        wave: the scene's stages, search and first surfaces.
+        lanes: how many camera rays the paths are of.
+        tally: counts rays and paths that are cut short.
+
+    Attributes:
+        radiance: ``(3, lanes)`` what ended paths brought.
+    """
+
+    def __init__(self, wave: Wave, lanes: int, tally: Tally | None = None) -> None:
+        self.stages, self.first, self.tally = wave.stages, wave.first, Tally() if tally is None else tally
+        self.plan, self.world = wave.stages.plan, wave.stages.world
+        self.search = Search(wave.accel, self.world, self.plan.sampler, self.plan.dtype)
+        self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=wave.centre.device)
+
+    def spawn(self, state: PathState) -> Paths:
+        """Start paths with rays; what only some scenes ask of a path is added here."""
+        if any(model.refracts for model in self.world.materials.models):
+            state = replace(state, eta=torch.ones_like(state.t_max))
+        if lights.local(self.world.lights):
+            state = replace(state, p=state.o.clone(), n=torch.zeros_like(state.o))
+        return Paths(state)
+
+    def intersect(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        self.tally.rays += len(paths.state.lane)
+        if paths.hit is None:
+            paths.hit = self.search.nearest(paths.state, paths.depth)
+
+    def sort(self, paths: Paths) -> Counts:
+        """See :class:`torchpt.paths.walk.Engine`: one sort of small keys and one transfer of the counts."""
+        paths.ends, paths.groups = partition(self.world, paths.met)
+        return Counts([len(index) for _, index in paths.groups], len(paths.ends.emissive), len(paths.ends.missed))
+
+    def emit(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        if self.world.lights is not None:
+            index, slide = paths.ends.emissive, slides(self.plan, self.world, paths.depth)
+            light = self.stages.emit(paths.state, paths.met, index, slide)
+            paths.state.radiance.scatter_add_(1, index.expand(3, -1), light)
+
+    def escape(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        index = paths.ends.missed
+        if self.world.lights is not None and self.world.lights.environment is not None:
+            light = self.stages.escape(paths.state, paths.met, index)
+            paths.state.radiance.scatter_add_(1, index.expand(3, -1), light)
+        self._end(paths, index)
+
+    def scatter(self, paths: Paths, roulette: float) -> Paths:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        assert paths.groups is not None
+        following = partial(self.search.nearest, depth=paths.depth + 1)
+        slide, salt = slides(self.plan, self.world, paths.depth), salts(paths.depth, paths.state.lane.device)
+        after: list[PathState] = []
+        found: list[Hit] = []
+        pending: list[tuple[int, Shadow]] = []
+        start = 0
+        for model, index in paths.groups:
+            if self.first is None:
+                leaving, hit, shadow = self.stages.bounce(
+                    model, roulette, slide, following, paths.state, paths.met, index, salt
+                )
+            else:
+                leaving, hit, shadow = self._first_surface(
+                    model, rows(paths.state, index), rows(paths.met, index), slide
+                )
+            after.append(leaving)
+            if hit is not None:
+                found.append(hit)
+            if shadow is not None:
+                pending.append((start, shadow))
+                self.tally.rays += len(index)
+            start += len(index)
+        return Paths(joined(after), paths.depth + 1, joined(found) if found else None, pending=pending)
+
+    def _first_surface(
+        self, model: int, state: PathState, hit: Hit, slide: bool
+    ) -> tuple[PathState, None, Shadow | None]:
+        """What a first surface brings, where paths end there."""
+        assert self.first is not None
+        salt = salts(1, state.lane.device)
+        light, shadow = self.first.shade(self.plan, self.world, model, state, hit, salt, self.stages.pixel, slide)
+        return replace(state, radiance=state.radiance + light), None, shadow
+
+    def occlude(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        whole = paths.state.radiance
+        parts, done = [], 0
+        for start, shadow in paths.pending:
+            paths.clear.append(self.search.clear(shadow))
+            end = start + len(shadow.t_max)
+            if start > done:
+                parts.append(whole[:, done:start])
+            parts.append(torch.addcmul(whole[:, start:end], shadow.radiance, paths.clear[-1]))
+            done = end
+        if parts:
+            if done < whole.shape[1]:
+                parts.append(whole[:, done:])
+            paths.state = replace(paths.state, radiance=parts[0] if len(parts) == 1 else torch.cat(parts, 1))
+        paths.pending.clear()
+
+    def terminate(self, paths: Paths, truncated: bool) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        if paths.groups is None:
+            self._end(paths, None)
+            return
+        for _, index in paths.groups:
+            self._end(paths, index)
+            if truncated:
+                self.tally.truncated += len(index)
+
+    def _end(self, paths: Paths, index: Tensor | None) -> None:
+        """End paths at lanes (None: all): what they carry goes to their samples."""
+        state = paths.state
+        if index is None or len(index):
+            self.radiance.scatter_(1, take(state.lane, index).expand(3, -1), take(state.radiance, index))
+
+
+def trace(wave: Wave, state: PathState, tally: Tally | None = None, observer: Observer[Paths] | None = None) -> Tensor:
+    """Return the radiance ``(3, N)`` that rays bring.
+
+    Args:
+        wave: of a scene.
+        state: camera rays, or such as begin elsewhere; N lanes without radiance.
+        tally: counts what it takes.
+        observer: looks on.
+    """
+    engine = Tensors(wave, len(state.lane), tally)
+    if len(state.lane):
+        walk(engine, engine.spawn(state), wave.integrator.limits, observer)
+    return engine.radiance
+
+
+def brought(
+    wave: Wave, state: PathState, tally: Tally | None = None, observer: Observer[Paths] | None = None
+) -> Tensor:
+    """Return the radiance ``(3, N)`` of camera rays weighted by the filter; arguments as of :func:`trace`."""
+    found = trace(wave, state, tally, observer)
+    return found * wave.weight(state) if wave.filter.signed else found
+
+
+def radiance(
+    wave: Wave, first_pixel: int, pixels: int, first_sample: int, samples: int, plate: Plate | None = None
+) -> Tensor:
+    """Return the radiance ``(3, samples, pixels)`` of consecutive pixels of a plate, weighted by the filter."""
+    state = wave.rays(first_pixel, pixels, first_sample, samples, plate)
+    return brought(wave, state).view(3, samples, pixels)
+
+
+class _Layers(Observer[Paths]):
+    """Reads layers off first surfaces, and ends the walk there."""
+
+    def __init__(self, wave: Wave, names: tuple[str, ...], slide: bool) -> None:
+        self.wave, self.names, self.slide = wave, names, slide
+        self.found: dict[str, Tensor] = {}
+
+    def sorted(self, paths: Paths, counts: Counts) -> bool:
+        """See :class:`Observer`."""
+        stages, centre = self.wave.stages, self.wave.centre
+        state, hit, dtype = paths.state, paths.met, stages.plan.dtype
+        n, device = len(state.lane), centre.device
+        self.found = {k: torch.zeros(len(LAYERS[k].channels), n, dtype=dtype, device=device) for k in self.names}
+        for model, index in paths.groups or ():
+            o, d, met = take(state.o, index), take(state.d, index), rows(hit, index)
+            here = aov.values(self.names, stages.world, model, o, d, met, centre, dtype, stages.pixel, self.slide)
+            for name, value in here.items():
+                self.found[name].scatter_(1, index.expand(len(value), -1), value)
+        return True
+
+
+def seen(wave: Wave, names: tuple[str, ...], state: PathState, slide: bool = False) -> dict[str, Tensor]:
+    """Return the layers ``names`` of first surfaces that camera rays meet, each ``(C, N)``; a miss is 0 in all of them.
+
+    They are not weighted by the filter. ``slide``: whether points follow the rays and the geometry, for derivatives.
+    """
+    engine, layer = Tensors(wave, len(state.lane)), _Layers(wave, names, slide)
+    walk(engine, Paths(state), wave.integrator.limits, layer)
+    return layer.found
+
+
+def layers(
+    wave: Wave,
+    names: tuple[str, ...],
+    first_pixel: int,
+    pixels: int,
+    first_sample: int,
+    samples: int,
+    plate: Plate | None = None,
+    slide: bool = False,
+) -> dict[str, Tensor]:
+    """Return the layers ``names`` of consecutive pixels of a plate, each ``(C, samples, pixels)``, weighted by the filter."""
+    state = wave.rays(first_pixel, pixels, first_sample, samples, plate)
+    found = seen(wave, names, state, slide)
+    if wave.filter.signed:
+        found = aov.weighted(found, wave.weight(state))
+    return {name: value.view(-1, samples, pixels) for name, value in found.items()}

@@ -1,0 +1,129 @@
+"""The one loop over the vertices of paths: the order of events along a path, whoever runs them.
+
+Forward renders, first surfaces, layers, the first half of a replay and a path that is printed all come through :func:`walk`.
+A *population* is some thousand paths at one vertex. The walk never looks into it but for its depth: an engine made it, and only
+that engine can read it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+from torchpt.integrators.base import Limits
+
+__all__ = ["Counts", "Engine", "Observer", "Population", "walk"]
+
+
+class Population(Protocol):
+    """Paths at one vertex."""
+
+    @property
+    def depth(self) -> int:
+        """Which vertex it is, from 1: the first that a camera ray meets."""
+        ...
+
+
+P = TypeVar("P", bound=Population)
+Q = TypeVar("Q", bound=Population, contravariant=True)
+
+
+@dataclass(frozen=True)
+class Counts:
+    """How many lanes of a population met what, known to the host: one transfer a vertex.
+
+    Attributes:
+        scatter: lanes by BSDF model.
+        emissive: lanes that met an emitter; they are counted by their models too.
+        missed: lanes that met nothing, where that means something.
+    """
+
+    scatter: Sequence[int]
+    emissive: int
+    missed: int
+
+
+class Engine(Protocol[P]):
+    """Who runs the events of paths. Verbs take whole populations; none returns a tensor to the walk."""
+
+    def intersect(self, paths: P) -> None:
+        """Find the nearest hits; nothing to do where they are known already."""
+
+    def sort(self, paths: P) -> Counts:
+        """List lanes by what they met."""
+        ...
+
+    def emit(self, paths: P) -> None:
+        """Add the light of emitters that were hit, weighted by MIS."""
+
+    def escape(self, paths: P) -> None:
+        """Add the light of the environment, and end the paths that met nothing."""
+
+    def scatter(self, paths: P, roulette: float) -> P:
+        """Sample lights and BSDFs, play roulette, and return the paths that go on.
+
+        ``roulette``: the most that it lets paths survive with; 0: it does not play.
+        """
+        ...
+
+    def occlude(self, paths: P) -> None:
+        """Resolve pending light: add what gets through."""
+
+    def terminate(self, paths: P, truncated: bool) -> None:
+        """End all paths that remain; ``truncated``: they are counted as cut short."""
+
+
+class Observer(Generic[Q]):
+    """Who looks on: replays keep populations, layers read the first surface, a debugger prints one path.
+
+    Either method may return True, which ends the walk there.
+    """
+
+    def arrived(self, paths: Q) -> bool:
+        """Look at paths that have their hits but are not sorted yet."""
+        return False
+
+    def sorted(self, paths: Q, counts: Counts) -> bool:
+        """Look at paths that are about to gather light and to scatter."""
+        return False
+
+
+def walk(
+    engine: Engine[P], paths: P, limits: Limits, observer: Observer[P] | None = None, until: int | None = None
+) -> P | None:
+    """Take a population from its vertex to the ends of all its paths.
+
+    Args:
+        engine: runs the events.
+        paths: of that engine.
+        limits: where paths end.
+        observer: looks on, and may end the walk.
+        until: vertex at which the walk is to stop, before rays to it are searched for; None: it goes on to the ends.
+
+    Returns:
+        The population at ``until``; None where all paths ended before.
+    """
+    observer = observer or Observer()
+    while paths.depth != until:
+        engine.intersect(paths)
+        if observer.arrived(paths):
+            return None
+        counts = engine.sort(paths)
+        if observer.sorted(paths, counts):
+            return None
+        if counts.emissive:
+            engine.emit(paths)
+        if counts.missed:
+            engine.escape(paths)
+        if paths.depth >= limits.last:
+            engine.terminate(paths, truncated=limits.endless)
+            return None
+        if not any(counts.scatter):
+            return None
+        paths = engine.scatter(paths, limits.roulette(paths.depth))
+        engine.occlude(paths)
+        if limits.first_surface:
+            engine.terminate(paths, truncated=False)
+            return None
+    return paths
