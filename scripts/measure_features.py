@@ -12,8 +12,8 @@ import from_tests  # noqa: F401
 from features import FEATURES, Feature, kernels, with_feature
 
 import torchpt
-from torchpt.format.description import settings
 from torchpt.engines.kernels.kernels import Kernels
+from torchpt.format.description import settings
 from torchpt.rendering import render_scene
 
 REPEATS = 15
