@@ -316,6 +316,7 @@ class LightSample:
     weight: Tensor  # (N,) = 1 / pdf, differentiable in the geometry
     at: Interaction | None = None  # the point itself, without tangents; None where no texture asks for it
     bare: Tensor | None = None  # (N,) bool: where `at` has no meaning, as the light is no surface; None: nowhere
+    row: Tensor | None = None  # (N,) int64 of the light in the table; None: there is but one
 
 
 @dataclass(frozen=True)

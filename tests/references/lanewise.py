@@ -24,14 +24,17 @@ from torchpt.engines import tensors
 from torchpt.engines.kernels.chunk import Chunk, Worker
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.engines.kernels.rows import HIT, Memory
+from torchpt.engines.tensors import Paths, Tensors
 from torchpt.format.description import settings
 from torchpt.forward import kernels_of, make_wave
+from torchpt.integrators import stages
 from torchpt.integrators.path import partition
 from torchpt.integrators.search import Search
-from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.tally import Tally
+from torchpt.integrators.vertex import VertexInput
 from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
+from torchpt.paths.walk import walk
 from torchpt.records import Hit, PathState, Shadow, rows
 from torchpt.samplers import salts
 
@@ -79,33 +82,26 @@ class Differences:
         return [(*key, self.off[key], self.values[key]) for key in found if self.off[key]]
 
 
-class _Recorder(Stages):
-    """Eager stages that keep what they were given."""
+class _Recorder(Tensors):
+    """The engine by tensors, which keeps what its stages were given."""
 
-    def __init__(self, stages: Stages) -> None:
-        super().__init__(stages.plan, stages.world, stages.pixel)
+    def __init__(self, wave: Wave, lanes: int) -> None:
+        super().__init__(wave, lanes)
         self.bounces: list[tuple[int, PathState, Hit, Tensor, int]] = []
         self.emits: list[tuple[PathState, Hit, Tensor]] = []
         self.escapes: list[tuple[PathState, Hit, Tensor]] = []
         self.states: list[PathState] = []
-        self._seen: list[Tensor] = []
 
-    def emit(self, state: PathState, hit: Hit, index: Tensor, slide: bool) -> Tensor:
-        self.emits.append((_copied(state), hit, index))
-        return super().emit(state, hit, index, slide)
+    def _gather(self, paths: Paths, index: Tensor, stage: Any) -> None:
+        kept = self.emits if stage is stages.emit else self.escapes
+        kept.append((_copied(paths.state), paths.met, index))
+        super()._gather(paths, index, stage)
 
-    def escape(self, state: PathState, hit: Hit, index: Tensor) -> Tensor:
-        self.escapes.append((_copied(state), hit, index))
-        return super().escape(state, hit, index)
-
-    def bounce(  # names as in Stages
-        self, model: int, roulette: Any, slide: Any, search: Any, state: Any, hit: Any, index: Any, salts: Any
-    ) -> Any:
-        if not self._seen or self._seen[-1] is not salts:
-            self._seen.append(salts)
-            self.states.append(_copied(state))
-        self.bounces.append((model, _copied(state), hit, index, len(self._seen)))
-        return super().bounce(model, roulette, slide, search, state, hit, index, salts)
+    def scatter(self, paths: Paths, roulette: float) -> Paths:
+        state = _copied(paths.state)
+        self.states.append(state)
+        self.bounces += [(model, state, paths.met, index, paths.depth) for model, index in paths.groups or ()]
+        return super().scatter(paths, roulette)
 
 
 def _copied(state: PathState) -> PathState:
@@ -125,9 +121,9 @@ def prepared(scene: torchpt.Scene, wishes: Mapping[str, Any]) -> tuple[Wave, Any
 
 def waves(wave: Wave, pixels: int, samples: int) -> _Recorder:
     """What the stages of a wave were given."""
-    recorder = _Recorder(wave.stages)
+    recorder = _Recorder(wave, pixels * samples)
     with torch.no_grad():
-        tensors.radiance(replace(wave, stages=recorder), 0, pixels, 0, samples)
+        walk(recorder, recorder.spawn(wave.rays(0, pixels, 0, samples)), wave.integrator.limits)
     return recorder
 
 
@@ -241,7 +237,7 @@ def _routes(worker: Worker, taken: dict[str, Tensor], lists: list[Memory], count
 
 
 def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorder) -> None:
-    worker, plan, world = Worker(kernels), wave.stages.plan, wave.stages.world
+    worker, plan, world = Worker(kernels), wave.context.plan, wave.context.world
     search = Search(wave.accel, world, plan.sampler, plan.dtype)
     kind = "fused" if kernels.fused else "apart"
     done: set[tuple[int, bool]] = set()
@@ -253,9 +249,9 @@ def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recor
                 continue
             done.add((model, roulette))
             name = f"{kind} bounce {world.materials.models[model]}{' with roulette' if roulette else ''}"
-            after, _, shadow = Stages.bounce(
-                recorder, model, roulette, False, _none, state, hit, index, salts(depth, torch.device("cpu"))
-            )
+            context = wave.context.at(salts(depth, torch.device("cpu")), roulette=roulette)
+            output = stages.bounce(context, model, VertexInput(rows(state, index), rows(hit, index)))
+            after, shadow = output.leaving, output.shadow
             try:
                 values, on, ended = run_bounce(worker, model, roulette, state, hit, index, depth)
             except Unsupported as error:
@@ -268,14 +264,14 @@ def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recor
                 after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
             _compare_fused(found, name, kernels, after, search.nearest(after, depth + 1), values, on, ended)
     for state, hit, index in recorder.emits:
-        light = Stages.emit(recorder, state, hit, index, False)
+        light = stages.emit(wave.context, VertexInput(rows(state, index), rows(hit, index))).brought
         here = arena(kernels, **_fields(state, hit))
         worker.calls.run(kernels.emit(), len(index), here, here, _listed(index))
         taken = kernels.state.take(here, index.numpy(), ("radiance",))["radiance"]
         found.add(f"{kind} emit", "radiance", state.radiance[:, index] + light, taken)
     for state, hit, index in recorder.escapes:
         index = index[state.t_max[index] > 0]
-        light = Stages.escape(recorder, state, hit, index)
+        light = stages.escape(wave.context, VertexInput(rows(state, index), rows(hit, index))).brought
         here = arena(kernels, **_fields(state, hit))
         worker.calls.run(kernels.escape(), len(index), here, here, _listed(index))
         lanes = state.lane[index].numpy()
@@ -333,7 +329,7 @@ def _floor(name: str) -> float:
 
 def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorder) -> None:
     """Rays from vertices on, and light: the search with the surfaces that let rays through."""
-    worker, plan, world = Worker(kernels), wave.stages.plan, wave.stages.world
+    worker, plan, world = Worker(kernels), wave.context.plan, wave.context.world
     search = Search(wave.accel, world, plan.sampler, plan.dtype)
     for depth, state in enumerate(recorder.states, 1):
         hit = search.nearest(state, depth)
@@ -343,9 +339,8 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
         for key in HIT:
             found.add("nearest", key, getattr(hit, key), taken[key], _floor(key))
     for model, state, hit, index, depth in recorder.bounces:
-        _, _, shadow = Stages.bounce(
-            recorder, model, False, False, _none, state, hit, index, salts(depth, torch.device("cpu"))
-        )
+        context = wave.context.at(salts(depth, torch.device("cpu")))
+        shadow = stages.bounce(context, model, VertexInput(rows(state, index), rows(hit, index))).shadow
         if shadow is None:
             continue
         n = len(index)
@@ -369,7 +364,3 @@ def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, s
     assert took.rays == tally.rays
     slots = torch.from_numpy(worker.slots.floats[:, : pixels * samples].copy())
     found.add("first", "radiance", eager.reshape(3, -1), slots)
-
-
-def _none(state: PathState) -> Hit:
-    raise AssertionError("no tape here")

@@ -127,7 +127,7 @@ def test_what_goes_where_after_a_hit():
         wanted = torch.addcmul(state.radiance, light, clear)
         held = kernels.state.take(here, np.arange(n), ("radiance",))["radiance"]
         assert torch.allclose(held, wanted, rtol=1e-6, atol=0)
-        key = wave.stages.world.materials.key[wave.stages.world.geometry.slot(hit.prim) + 1].long()
+        key = wave.context.world.materials.key[wave.context.world.geometry.slot(hit.prim) + 1].long()
         alive = state.t_max > 0
         expected = [(key == m) | (key == 2 + m) for m in range(2)]
         expected += [(key < 2) & (hit.prim >= 0), (hit.prim < 0) & alive]

@@ -72,7 +72,7 @@ def gradients(
         attached = follows(scene, wanted) if held else attached
         assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks)
         if settings.render.max_memory is not None:
-            need = need_of(settings, scene.device, "tape", len(assembly.wave.stages.world.materials.models))
+            need = need_of(settings, scene.device, "tape", len(assembly.wave.context.world.materials.models))
             check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)
         sums = assembly.sums()
         # Integrators that end at the first surface have but one vertex to keep.

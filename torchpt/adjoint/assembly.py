@@ -17,7 +17,6 @@ from torchpt.core.tree import leaves, map_leaves
 from torchpt.forward.schedule import Span
 from torchpt.forward.wave import make_wave
 from torchpt.forward.waves import Waves
-from torchpt.integrators.stage_runner import Stages
 from torchpt.integrators.wave import Wave
 from torchpt.ranks import Group, blocks
 from torchpt.scene import Scene
@@ -93,7 +92,7 @@ class Assembly:
     @property
     def passing(self) -> bool:
         """Whether it is differentiated by what lets rays pass surfaces."""
-        world = self.taped.stages.world
+        world = self.taped.context.world
         opacity, maps = world.materials.opacity, world.textures.opacity
         if opacity is None:
             return False
@@ -131,6 +130,6 @@ class Assembly:
 
 def _over(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
     """A wave with other tensors; stages run as tensor operations."""
-    stages = wave.stages
-    world, pixel, camera, first = map_leaves(change, (stages.world, stages.pixel, wave.camera, wave.first))
-    return replace(wave, stages=Stages(stages.plan, world, pixel), camera=camera, first=first)
+    context = wave.context
+    world, pixel, camera, first = map_leaves(change, (context.world, context.pixel, wave.camera, wave.first))
+    return replace(wave, context=replace(context, world=world, pixel=pixel), camera=camera, first=first)

@@ -235,13 +235,13 @@ def _cells(still: Wave, span: Span, columns: int, samples: int, stream: int) -> 
     sample = torch.arange(start, start + several, device=device).repeat_interleave(count)
     sampler = replace(still.sampler, seed=still.sampler.seed ^ _OTHER, spp=samples, randomizations=1)
     key = sampler.key(2 * cell + stream, sample)
-    offset = Draws(sampler.points, key, salts(0, device)).two(Dimension.PIXEL).to(still.stages.plan.dtype)
+    offset = Draws(sampler.points, key, salts(0, device)).two(Dimension.PIXEL).to(still.context.plan.dtype)
     return cell % columns, cell // columns, offset, key
 
 
 def _rays(still: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
     """Camera rays through places of the film."""
-    dtype = still.stages.plan.dtype
+    dtype = still.context.plan.dtype
     o, d = still.camera.rays(x.to(dtype), y.to(dtype), None)
     return camera_state(o.expand_as(d), d, key)
 
@@ -253,7 +253,7 @@ def _brought(wave: Wave, state: PathState) -> Tensor:
 
 def _held(still: Wave, wave: Wave, state: PathState) -> _Seen:
     """What camera rays of detached parameters meet, as a camera under a tape sees it."""
-    world, plan = still.stages.world, still.stages.plan
+    world, plan = still.context.world, still.context.plan
     with torch.no_grad():
         hit = Search(still.accel, world, plan.sampler, plan.dtype).nearest(state, 1)
         missed = hit.prim < 0

@@ -41,9 +41,9 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
         replay(assembly, settings, asked, sums)
         return
     wave = assembly.wave
-    packets = wave.accel.name == "brute" and not wave.stages.world.geometry.counts[4]
+    packets = wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
     kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets)
-    models = wave.stages.world.materials.models
+    models = wave.context.world.materials.models
     kernels.eager = kernels.probe([k for k, model in enumerate(models) if any(model is x for x in scene.own_models)])
     threads = _threads(kernels, settings)
     blocks = assembly.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
@@ -122,7 +122,7 @@ def _threads(kernels: JointKernels, settings: Settings) -> int:
 def _looped(assembly: Assembly, settings: Settings) -> bool:
     """Whether kernels may be made: on a CPU, in float32, without weights of modules and without derivatives by opacity."""
     wave = assembly.wave
-    plan = wave.stages.plan
+    plan = wave.context.plan
     if wave.centre.device.type != "cpu" or plan.dtype != torch.float32 or settings.render.compile == "off":
         return False
     return wave.integrator.looped and not assembly.held and not assembly.passing

@@ -25,6 +25,8 @@ from torchpt.integrators import joint
 from torchpt.integrators.joint import Behind
 from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.search import Search
+from torchpt.integrators.vertex import VertexInput
+from torchpt.integrators.wave import still_of
 from torchpt.math.gathers import gathered_by
 from torchpt.math.vectors import take
 from torchpt.paths.walk import Observer, walk
@@ -59,14 +61,13 @@ class Keeper(Observer[Paths]):
         self._step = KEPT
         self._now: Vertex | None = None
 
-    def follow(self, paths: Paths) -> None:
-        """Keep how much of the light that the latest vertex sampled gets through."""
-        if self._now is not None:
-            self._now.clear = paths.clear
+    def left(self, paths: Paths) -> None:
+        """See :class:`Observer`."""
+        assert self._now is not None
+        self._now.clear = paths.clear
 
     def arrived(self, paths: Paths) -> bool:
         """See :class:`Observer`."""
-        self.follow(paths)
         self._now = Vertex(paths.depth, paths.state, paths.met)
         if len(self.kept) < KEPT:
             self.kept.append(self._now)
@@ -114,8 +115,8 @@ class _Chunk:
     def __init__(self, assembly: Assembly, settings: Settings, span: Span, sums: Sums) -> None:
         self.assembly, self.settings, self.span, self.sums = assembly, settings, span, sums
         self.wave, self.taped = assembly.wave, assembly.taped
-        self.plan = self.wave.stages.plan
-        self.world = self.taped.stages.world
+        self.plan = self.wave.context.plan
+        self.world = self.taped.context.world
         self.tensors = [*assembly.leaves, *assembly.held]
         self.passing = assembly.passing
         self.search = Search(self.wave.accel, self.world, self.plan.sampler, self.plan.dtype)
@@ -145,11 +146,9 @@ class _Chunk:
     # -- forward
 
     def _trace(self, state: PathState, depth: int, hit: Hit | None, end: int | None) -> tuple[Tensor, Keeper]:
-        keeper, engine = Keeper(), Tensors(self.wave, self.span[1] * self.span[3])
+        keeper, engine = Keeper(), Tensors(still_of(self.wave), self.span[1] * self.span[3])
         paths = engine.spawn(state) if depth == 1 else Paths(state, depth, hit)
-        rest = walk(engine, paths, self.wave.integrator.limits, keeper, end)
-        if rest is not None:
-            keeper.follow(rest)
+        walk(engine, paths, self.wave.integrator.limits, keeper, end)
         return engine.radiance, keeper
 
     # -- back
@@ -221,10 +220,9 @@ class _Chunk:
         limits = self.wave.limits
         assert limits is not None
         with gathered_by(self.sums):
-            before = joint.bounce(
-                self.plan, self.world, model, limits.roulette(depth), slide, following, passed, rows(state, index),
-                rows(hit, index), behind, salts(depth, lane.device), self.taped.stages.pixel, self._others,
-            )  # fmt: skip
+            context = self.taped.context.at(salts(depth, lane.device), slide, limits.roulette(depth))
+            vertex = VertexInput(rows(state, index), rows(hit, index))
+            before = joint.bounce(context, model, vertex, following, passed, behind, self._others)
         for name, rows_ in self.behind.items():
             found = getattr(before, name)
             rows_.index_copy_(1, lane, torch.zeros_like(behind.throughput) if found is None else found)
@@ -241,13 +239,10 @@ class _Chunk:
             if not len(index) or (not here and table.environment is None):
                 continue
             lane = take(state.lane, index)
-            given = rows(state, index), rows(hit, index), take(self.radiance, lane), self._others
+            vertex = VertexInput(rows(state, index), rows(hit, index))
+            stage, context = joint.emit if here else joint.escape, replace(self.taped.context, slide=slide)
             with gathered_by(self.sums):
-                before = (
-                    joint.emit(self.plan, self.world, slide, *given)
-                    if here
-                    else joint.escape(self.plan, self.world, *given)
-                )
+                before = stage(context, vertex, take(self.radiance, lane), self._others)
             for name, rows_ in self.behind.items():
                 found = getattr(before, name)
                 if found is not None:

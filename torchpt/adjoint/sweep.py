@@ -7,7 +7,7 @@ from the last arena to the first. Paths of more vertices than there are arenas a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from torchpt.engines.kernels.rows import HIT, Memory
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Before, Behind
 from torchpt.integrators.path import slides
+from torchpt.integrators.vertex import VertexInput
 from torchpt.math.gathers import gathered_by
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.records import Hit, PathState, Shadow
@@ -105,7 +106,7 @@ class Sweep(Worker):
         self._behind.words[:, :n] = 0
         self._behind.floats[first("radiance") : first("radiance") + 3, :n] = asked.numpy()
         self._back(keeper, None)
-        if self.joint.joint_plan.attached:
+        if self.joint.taped.plan.attached:
             self._camera(n)
         return self.sums
 
@@ -153,7 +154,7 @@ class Sweep(Worker):
         kernels, calls, depth = self.joint, self.calls, paths.depth
         limits = self.wave.limits
         assert limits is not None
-        slide = slides(kernels.joint_plan, kernels.world, depth)
+        slide = slides(kernels.taped.plan, kernels.world, depth)
         calls.name_salts(depth)
         if depth < limits.last:
             for model, count in enumerate(paths.groups):
@@ -191,11 +192,12 @@ class Sweep(Worker):
 
     def _eagerly(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
         """Back through a stage by tensor operations, for what no kernel can be made of."""
-        kernels, plan = self.joint, self.joint.joint_plan
+        kernels, context = self.joint, self.joint.taped
+        plan = context.plan
         lanes = places.words[0, :count]
         given = kernels.state.take(paths.arena, lanes, _STATE)
         state = PathState(**{"eta": None, "p": None, "n": None, **given})  # type: ignore[arg-type]
-        hit = Hit(**kernels.state.take(paths.arena, lanes, tuple(HIT)))
+        vertex = VertexInput(state, Hit(**kernels.state.take(paths.arena, lanes, tuple(HIT))))
         lane = state.lane.numpy()
         rows = kernels.slots.take(self._behind, lane, tuple(joint_names(plan.attached)))
 
@@ -207,14 +209,13 @@ class Sweep(Worker):
             if key[0] == "bounce":
                 behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"))
                 following = Hit(*(rows[name] for name in HIT)) if plan.attached else None
-                before = joint.bounce(
-                    plan, kernels.taped, key[1], key[2], key[3], following, clear, state, hit, behind,
-                    salts(paths.depth, torch.device("cpu")), kernels.taped_pixel, self._tensors,
-                )  # fmt: skip
+                _, model, roulette, slide = key
+                context = context.at(salts(paths.depth, torch.device("cpu")), slide, roulette)
+                before = joint.bounce(context, model, vertex, following, clear, behind, self._tensors)
             elif key[0] == "emit":
-                before = joint.emit(plan, kernels.taped, key[1], state, hit, rows["radiance"], self._tensors)
+                before = joint.emit(replace(context, slide=key[1]), vertex, rows["radiance"], self._tensors)
             else:
-                before = joint.escape(plan, kernels.taped, state, hit, rows["radiance"], self._tensors)
+                before = joint.escape(context, vertex, rows["radiance"], self._tensors)
         for name in ("throughput", "o", "d") if plan.attached else ("throughput",):
             found, first = getattr(before, name), kernels.slots.first(name)
             found = np.zeros((3, count), np.float32) if found is None else found.numpy()

@@ -133,7 +133,7 @@ class Boundary:
             low, high = primitive_bounds(geometry)
             reach = float((high.double().amax(1) - low.double().amin(1)).norm()) * 0.5
             met = integrator.strategy in ("bsdf", "uniform")
-            sources = sources_of(still, self.traced.wave.stages.world, reach, met)
+            sources = sources_of(still, self.traced.wave.context.world, reach, met)
         if sources is None:
             return
         # Where nothing but the camera moves, what it does not see itself stays as it is.

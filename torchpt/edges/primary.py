@@ -133,7 +133,7 @@ class Primary:
         t, prim = t.view(2, n), prim.view(2, n)
         own = (prim == held.prim) | (prim == mate)  # a round surface comes forward quickly behind its outline
         seen = (t > reach * torch.where(own, _OWN, _BEFORE)).all(0)
-        if self.traced.wave.stages.world.materials.opacity is not None:
+        if self.traced.wave.context.world.materials.opacity is not None:
             seen = torch.ones_like(seen)  # what hides may let pass
         near = (t - reach).abs() < reach * 2.0**-8
         return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step), 0.0)

@@ -32,7 +32,7 @@ class Traced:
     @property
     def dtype(self) -> torch.dtype:
         """Of the lanes."""
-        return self.wave.stages.plan.dtype
+        return self.wave.context.plan.dtype
 
     def key(self, sample: Tensor, row: int = 0) -> Tensor:
         """The sampler's keys of samples ``(N,)`` int64; those of one ``row`` share their numbers with those of no other."""

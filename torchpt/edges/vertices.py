@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpt.edges.traced import Traced
-from torchpt.integrators.light_sampling import held_back
+from torchpt.integrators.light_sampling import shared
 from torchpt.integrators.path import partition
 from torchpt.integrators.surfaces import surface_at
 from torchpt.math.vectors import dot, take
@@ -50,10 +50,10 @@ class Spot:
 
     def _each(self, found: list[Tensor], make: Callable[[int, Tensor, Interaction], list[Tensor]]) -> None:
         """Fill in what each model makes of its lanes."""
-        _, groups = partition(self.traced.wave.stages.world, self.hit)
+        _, groups = partition(self.traced.wave.context.world, self.hit)
         for model, index in groups:
             at = interact(
-                self.traced.wave.stages.world, take(self.o, index), take(self.d, index), rows(self.hit, index)
+                self.traced.wave.context.world, take(self.o, index), take(self.d, index), rows(self.hit, index)
             )
             for into, value in zip(found, make(model, index, at), strict=True):
                 into.index_copy_(into.dim() - 1, index, value.to(into.dtype))
@@ -69,26 +69,27 @@ class Spot:
         return out
 
     def _weighed(self, model: int, at: Interaction, wo: Tensor, wi: Tensor) -> Tensor:
-        world = self.traced.wave.stages.world
+        world = self.traced.wave.context.world
         kind = world.materials.models[model]
         if kind.smooth:
             return torch.zeros_like(wo)
-        surface = surface_at(world, model, -wo, at, self.traced.wave.stages.pixel)
+        surface = surface_at(world, model, -wo, at, self.traced.wave.context.pixel)
         local = surface.frame.to_local(wi)
         cosine = dot(wi, at.ng).abs()
-        weight = held_back(1.0 / cosine.clamp_min(1e-6), world, model, at, surface, wi, local)
+        weight, share = 1.0 / cosine.clamp_min(1e-6), shared(world, model, at, surface, wi, local)
+        weight = weight if share is None else weight * share
         return kind.eval(surface.parameters, surface.wo, local) * weight
 
     def scattered(self, wi: Tensor, key: Tensor, depth: int) -> tuple[Tensor, Tensor, Tensor]:
         """Where light that comes from ``wi`` goes on: origins, unit directions, and ``f cos_s / cos_g |cos_g(wo)| / pdf``."""
         o, d, weight = torch.zeros_like(wi), wi.clone(), torch.zeros_like(wi)
-        world, plan = self.traced.wave.stages.world, self.traced.wave.stages.plan
+        world, plan = self.traced.wave.context.world, self.traced.wave.context.plan
 
         def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
             kind, back = world.materials.models[model], take(wi, index)
             if kind.smooth:
                 return [torch.zeros_like(at.p), back, torch.zeros_like(back)]
-            surface = surface_at(world, model, -back, at, self.traced.wave.stages.pixel)
+            surface = surface_at(world, model, -back, at, self.traced.wave.context.pixel)
             draws = Draws(plan.sampler, take(key, index), salts(depth, key.device))
             lobe = draws.one(Dimension.LOBE).to(plan.dtype) if kind.lobed else None
             sample = kind.sample(surface.parameters, surface.wo, lobe, draws.two(Dimension.BSDF).to(plan.dtype))
@@ -104,7 +105,7 @@ class Spot:
 
 def met(traced: Traced, o: Tensor, d: Tensor) -> Spot:
     """Where rays ``(3, N)`` meet surfaces; ``d`` of any length."""
-    world, dtype = traced.wave.stages.world, traced.dtype
+    world, dtype = traced.wave.context.world, traced.dtype
     d = (d / (d * d).sum(0).sqrt()).to(dtype)
     o = o.to(dtype)
     t, prim, u, v = traced.wave.accel.intersect(o, d, torch.full_like(d[0], torch.inf))

@@ -6,6 +6,7 @@ The readable reference for kernels. Each verb is a few operations on all lanes o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -13,11 +14,12 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
-from torchpt.integrators import LAYERS, aov
+from torchpt.integrators import LAYERS, aov, stages
 from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.search import Search
 from torchpt.integrators.tally import Tally
+from torchpt.integrators.vertex import Emission, StageContext, VertexInput, VertexOutput
 from torchpt.integrators.wave import Wave
 from torchpt.math.vectors import take
 from torchpt.paths.walk import Counts, Observer, walk
@@ -42,6 +44,9 @@ class Paths:
         groups: number and lanes of each BSDF model that was met; None before lanes are sorted.
         pending: shadow rays from the vertex before, with the first lane that they bring light to.
         clear: how much of their light gets through ``(n,)``, one for each of ``pending``, once they are traced.
+        emissions: light that lanes met here by chance, where an engine keeps it.
+        outputs: of the vertex before: number of the BSDF model, lanes of the wave, and what its surfaces made of them, where an
+            engine keeps it.
     """
 
     state: PathState
@@ -51,6 +56,8 @@ class Paths:
     groups: list[tuple[int, Tensor]] | None = None
     pending: list[tuple[int, Shadow]] = field(default_factory=list)
     clear: list[Tensor] = field(default_factory=list)
+    emissions: list[tuple[Tensor, Emission]] = field(default_factory=list)
+    outputs: list[tuple[int, Tensor, VertexOutput]] = field(default_factory=list)
 
     @property
     def met(self) -> Hit:
@@ -66,14 +73,16 @@ class Tensors:
         wave: the scene's stages, search and first surfaces.
         lanes: how many camera rays the paths are of.
         tally: counts rays and paths that are cut short.
+        keeps: whether populations keep what stages returned, for an observer.
 
     Attributes:
         radiance: ``(3, lanes)`` what ended paths brought.
     """
 
-    def __init__(self, wave: Wave, lanes: int, tally: Tally | None = None) -> None:
-        self.stages, self.first, self.tally = wave.stages, wave.first, Tally() if tally is None else tally
-        self.plan, self.world = wave.stages.plan, wave.stages.world
+    def __init__(self, wave: Wave, lanes: int, tally: Tally | None = None, keeps: bool = False) -> None:
+        self.keeps = keeps
+        self.context, self.first, self.tally = wave.context, wave.first, Tally() if tally is None else tally
+        self.plan, self.world = wave.context.plan, wave.context.world
         self.search = Search(wave.accel, self.world, self.plan.sampler, self.plan.dtype)
         self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=wave.centre.device)
 
@@ -99,53 +108,51 @@ class Tensors:
     def emit(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
         if self.world.lights is not None:
-            index, slide = paths.ends.emissive, slides(self.plan, self.world, paths.depth)
-            light = self.stages.emit(paths.state, paths.met, index, slide)
-            paths.state.radiance.scatter_add_(1, index.expand(3, -1), light)
+            self._gather(paths, paths.ends.emissive, stages.emit)
 
     def escape(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
-        index = paths.ends.missed
         if self.world.lights is not None and self.world.lights.environment is not None:
-            light = self.stages.escape(paths.state, paths.met, index)
-            paths.state.radiance.scatter_add_(1, index.expand(3, -1), light)
-        self._end(paths, index)
+            self._gather(paths, paths.ends.missed, stages.escape)
+        self._end(paths, paths.ends.missed)
+
+    def _gather(self, paths: Paths, index: Tensor, stage: Callable[[StageContext, VertexInput], Emission]) -> None:
+        """Add light that the lanes ``index`` met by chance."""
+        found = stage(self._context(paths), self._input(paths, index))
+        paths.state.radiance.scatter_add_(1, index.expand(3, -1), found.brought)
+        if self.keeps:
+            paths.emissions.append((index, found))
+
+    def _context(self, paths: Paths, roulette: float = 0.0) -> StageContext:
+        """Return what the stages of a vertex read beside their lanes."""
+        slide, salt = slides(self.plan, self.world, paths.depth), salts(paths.depth, paths.state.lane.device)
+        return self.context.at(salt, slide, roulette, partial(self.search.nearest, depth=paths.depth + 1))
+
+    def _input(self, paths: Paths, index: Tensor) -> VertexInput:
+        return VertexInput(rows(paths.state, index), rows(paths.met, index))
 
     def scatter(self, paths: Paths, roulette: float) -> Paths:
         """See :class:`torchpt.paths.walk.Engine`."""
         assert paths.groups is not None
-        following = partial(self.search.nearest, depth=paths.depth + 1)
-        slide, salt = slides(self.plan, self.world, paths.depth), salts(paths.depth, paths.state.lane.device)
-        after: list[PathState] = []
-        found: list[Hit] = []
-        pending: list[tuple[int, Shadow]] = []
+        context, bounce = self._context(paths, roulette), stages.bounce if self.first is None else self.first.bounce
+        leaving: list[PathState] = []
+        following: list[Hit] = []
+        after = Paths(paths.state, paths.depth + 1)
         start = 0
         for model, index in paths.groups:
-            if self.first is None:
-                leaving, hit, shadow = self.stages.bounce(
-                    model, roulette, slide, following, paths.state, paths.met, index, salt
-                )
-            else:
-                leaving, hit, shadow = self._first_surface(
-                    model, rows(paths.state, index), rows(paths.met, index), slide
-                )
-            after.append(leaving)
-            if hit is not None:
-                found.append(hit)
-            if shadow is not None:
-                pending.append((start, shadow))
+            output = bounce(context, model, self._input(paths, index))
+            leaving.append(output.leaving)
+            if output.following is not None:
+                following.append(output.following)
+            if output.shadow is not None:
+                after.pending.append((start, output.shadow))
                 self.tally.rays += len(index)
+            if self.keeps:
+                after.outputs.append((model, take(paths.state.lane, index), output))
             start += len(index)
-        return Paths(joined(after), paths.depth + 1, joined(found) if found else None, pending=pending)
-
-    def _first_surface(
-        self, model: int, state: PathState, hit: Hit, slide: bool
-    ) -> tuple[PathState, None, Shadow | None]:
-        """What a first surface brings, where paths end there."""
-        assert self.first is not None
-        salt = salts(1, state.lane.device)
-        light, shadow = self.first.shade(self.plan, self.world, model, state, hit, salt, self.stages.pixel, slide)
-        return replace(state, radiance=state.radiance + light), None, shadow
+        after.state = joined(leaving)
+        after.hit = joined(following) if following else None
+        return after
 
     def occlude(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -188,9 +195,9 @@ def trace(wave: Wave, state: PathState, tally: Tally | None = None, observer: Ob
         wave: of a scene.
         state: camera rays, or such as begin elsewhere; N lanes without radiance.
         tally: counts what it takes.
-        observer: looks on.
+        observer: looks on, and finds what stages returned in populations.
     """
-    engine = Tensors(wave, len(state.lane), tally)
+    engine = Tensors(wave, len(state.lane), tally, observer is not None)
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
     return engine.radiance
@@ -221,13 +228,13 @@ class _Layers(Observer[Paths]):
 
     def sorted(self, paths: Paths, counts: Counts) -> bool:
         """See :class:`Observer`."""
-        stages, centre = self.wave.stages, self.wave.centre
-        state, hit, dtype = paths.state, paths.met, stages.plan.dtype
+        context, centre = self.wave.context, self.wave.centre
+        state, hit, dtype = paths.state, paths.met, context.plan.dtype
         n, device = len(state.lane), centre.device
         self.found = {k: torch.zeros(len(LAYERS[k].channels), n, dtype=dtype, device=device) for k in self.names}
         for model, index in paths.groups or ():
             o, d, met = take(state.o, index), take(state.d, index), rows(hit, index)
-            here = aov.values(self.names, stages.world, model, o, d, met, centre, dtype, stages.pixel, self.slide)
+            here = aov.values(self.names, context.world, model, o, d, met, centre, dtype, context.pixel, self.slide)
             for name, value in here.items():
                 self.found[name].scatter_(1, index.expand(len(value), -1), value)
         return True

@@ -15,7 +15,7 @@ from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
 
 if TYPE_CHECKING:  # what traces samples again is imported once there are such
-    from torchpt.paths.faults import Fault
+    from torchpt.paths.explain import Fault
 
 __all__ = ["causes_of", "told"]
 
@@ -33,7 +33,7 @@ def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str
     """
     if not lost.count:
         return {}, ""
-    from torchpt.paths.faults import faults_of
+    from torchpt.paths.explain import faults_of
 
     faults = faults_of(_trace, wave, lost.places)
     causes = Counter(fault.name for fault in faults)
@@ -46,7 +46,7 @@ def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str
 
 def told(scene: Scene, wave: Wave, place: Place) -> str:
     """Return a sentence about one sample that is not finite."""
-    from torchpt.paths.faults import faults_of
+    from torchpt.paths.explain import faults_of
 
     return f"{_named(place)} is not finite: {_said(scene, wave, faults_of(_trace, wave, [place])[0])}"
 
@@ -66,4 +66,4 @@ def _said(scene: Scene, wave: Wave, fault: Fault) -> str:
     depth = f" at depth {fault.depth}" if fault.depth else ""
     if fault.slot < 0:
         return fault.name + depth
-    return f"{fault.name}{depth} ({Names(scene.built, wave.stages.world).owner(fault.slot)})"
+    return f"{fault.name}{depth} ({Names(scene.built, wave.context.world).owner(fault.slot)})"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -15,8 +15,8 @@ from torchpt.forward.wave import make_wave
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.path import PathIntegrator
-from torchpt.paths.recorder import Bounced, Left, Lit, Met, Recorder, Shone
-from torchpt.records import World
+from torchpt.integrators.vertex import Direct, VertexOutput
+from torchpt.paths.explain import Bounced, Explainer, Left, Met, Shone
 from torchpt.scene import Scene
 from torchpt.scene.names import Names
 from torchpt.settings import Settings
@@ -183,25 +183,24 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         raise SceneError("integrator.type", settings.integrator.name, expected)
     with torch.no_grad(), limited_threads(settings.render.threads):
         wave = make_wave(scene, settings, None, torch.float32)
-        recorder = Recorder(wave.stages)
-        wave = replace(wave, stages=recorder)
+        explainer = Explainer(wave.context.world)
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
         state = wave.rays_of(x, y, number)
-        brought = tensors.brought(wave, state, observer=recorder)
-        return _Story(scene, recorder).told(settings, pixel, sample, brought)
+        explainer.began(state)
+        brought = tensors.brought(wave, state, observer=explainer)
+        return _Story(scene, explainer).told(settings, pixel, sample, brought)
 
 
 class _Story:
-    """Turns the records of one lane into a :class:`Path`."""
+    """Turns what happened in one lane into a :class:`Path`."""
 
-    def __init__(self, scene: Scene, recorder: Recorder) -> None:
-        self.scene, self.recorder = scene, recorder
-        self.world: World = recorder.world
-        self.names = Names(scene.built, recorder.world)
+    def __init__(self, scene: Scene, explainer: Explainer) -> None:
+        self.scene, self.events, self.world = scene, explainer.events, explainer.world
+        self.names = Names(scene.built, self.world)
         self.centre, self.unit = scene.space.centre, scene.space.unit
 
     def told(self, settings: Settings, pixel: tuple[int, int], sample: int, brought: Tensor) -> Path:
-        left = self.recorder.records[0]
+        left = self.events[0]
         assert isinstance(left, Left)
         vertices = tuple(self._vertices())
         value = torch.where(torch.isfinite(brought).all(0), brought, 0.0)
@@ -227,28 +226,28 @@ class _Story:
 
     def _vertices(self) -> Iterator[Vertex]:
         """One for each time that a ray of the path met something, or nothing."""
-        records = self.recorder.records
-        for k, met in enumerate(records):
+        for k, met in enumerate(self.events):
             if not isinstance(met, Met) or float(met.state.t_max) == 0.0:  # a path that ended has rays without length
                 continue
-            here = [(n, r) for n, r in enumerate(records[k:], k) if not isinstance(r, Left) and r.depth == met.depth]
-            shone = next((record for _, record in here if isinstance(record, Shone)), None)
-            number, bounced = next(((n, r) for n, r in here if isinstance(r, Bounced)), (-1, None))
-            yield self._vertex(met, shone, bounced, self.recorder.clear.get(number))
+            here = [event for event in self.events[k:] if not isinstance(event, Left) and event.depth == met.depth]
+            shone = next((event for event in here if isinstance(event, Shone)), None)
+            yield self._vertex(met, shone, next((event for event in here if isinstance(event, Bounced)), None))
 
-    def _vertex(self, met: Met, shone: Shone | None, bounced: Bounced | None, clear: Tensor | None) -> Vertex:
-        radiance = met.state.radiance if shone is None else met.state.radiance + shone.brought
-        light = None
-        if bounced is not None and bounced.lit is not None and clear is not None:
-            light = self._chosen(bounced.lit, clear)
-            radiance = torch.addcmul(bounced.after.radiance, bounced.lit.brought, clear)
+    def _vertex(self, met: Met, shone: Shone | None, bounced: Bounced | None) -> Vertex:
+        radiance = met.state.radiance if shone is None else met.state.radiance + shone.light.brought
+        light, output = None, None if bounced is None else bounced.output
+        if bounced is not None and bounced.clear is not None:
+            output = bounced.output
+            assert output.direct is not None and output.shadow is not None
+            light = self._chosen(output.direct, output.shadow.radiance, bounced.clear)
+            radiance = torch.addcmul(output.leaving.radiance, output.shadow.radiance, bounced.clear)
         wo, escaped = _three(-met.state.d), int(met.hit.prim) < 0
         emission = None if shone is None else self._emission(shone)
         if escaped:
             return Vertex(depth=met.depth, wo=wo, emission=emission, radiance=_three(radiance))
         at = interact(self.world, met.state.o, met.state.d, met.hit)
         found = self.names.surface(int(at.slot), int(at.prim))
-        normal = at.ns if bounced is None else bounced.surface.frame.n
+        normal = at.ns if output is None else output.surface.frame.n
         return Vertex(
             depth=met.depth,
             position=self._place(at.p),
@@ -262,7 +261,7 @@ class _Story:
             wo=wo,
             emission=emission,
             light=light,
-            scattered=None if bounced is None else _scattered(bounced),
+            scattered=None if output is None else _scattered(output),
             radiance=_three(radiance),
         )
 
@@ -273,37 +272,46 @@ class _Story:
         if shone.slot is not None:
             assert lights.row_of_prim is not None
             row = int(lights.row_of_prim[shone.slot])
-        weight = float(shone.weight)
-        return Emission(self.names.light(row), _three(shone.radiance), float(shone.pdf), weight, _three(shone.brought))
+        light = shone.light
+        return Emission(
+            self.names.light(row),
+            _three(light.radiance),
+            float(light.pdf),
+            float(light.weight),
+            _three(light.brought),
+        )
 
-    def _chosen(self, lit: Lit, clear: Tensor) -> Chosen:
+    def _chosen(self, direct: Direct, brought: Tensor, clear: Tensor) -> Chosen:
+        sample, reflected = direct.sample, direct.reflected
         return Chosen(
-            light=self.names.light(int(lit.row)),
-            wi=_three(lit.sample.wi),
-            pdf=float(lit.sample.pdf),
-            arriving=_three(lit.radiance * lit.sample.weight),
-            bsdf=_three(lit.reflected * lit.share),
-            mis_weight=float(lit.weight),
-            visible=float(clear) if bool((lit.brought != 0).any()) else None,
-            contribution=_three(lit.brought * clear),
+            light=self.names.light(0 if sample.row is None else int(sample.row)),
+            wi=_three(sample.wi),
+            pdf=float(sample.pdf),
+            arriving=_three(direct.radiance * sample.weight),
+            bsdf=_three(reflected if direct.share is None else reflected * direct.share),
+            mis_weight=1.0 if direct.weight is None else float(direct.weight),
+            visible=float(clear) if bool((brought != 0).any()) else None,
+            contribution=_three(brought * clear),
         )
 
     def _ended(self) -> str:
         """How the path did."""
-        last = next(r for r in reversed(self.recorder.records) if not isinstance(r, Shone))
+        last = next(event for event in reversed(self.events) if not isinstance(event, Shone))
         if isinstance(last, Met) and float(last.state.t_max) > 0.0:
             return "escaped" if int(last.hit.prim) < 0 else "max_depth"
-        bounced = next(r for r in reversed(self.recorder.records) if isinstance(r, Bounced))
-        if not bool(torch.isfinite(bounced.carried).all()):
+        output = next(event.output for event in reversed(self.events) if isinstance(event, Bounced))
+        assert output.drawn is not None and output.carried is not None
+        if not bool(torch.isfinite(output.carried).all()):
             return "not finite"
-        if float(bounced.drawn.least) > 0.0 and bool((bounced.carried > 0).any()):
+        if float(output.drawn.least) > 0.0 and bool((output.carried > 0).any()):
             return "roulette"
         return "absorbed"
 
 
-def _scattered(bounced: Bounced) -> Scattered:
-    drawn, chance, after = bounced.drawn, bounced.chance, bounced.after
-    goes_on, weight, relief = float(after.t_max) > 0.0, drawn.weight, bounced.surface.relief
+def _scattered(output: VertexOutput) -> Scattered:
+    drawn, carried, chance, after = output.drawn, output.carried, output.chance, output.leaving
+    assert drawn is not None and carried is not None
+    goes_on, weight, relief = float(after.t_max) > 0.0, drawn.weight, output.surface.relief
     if relief is not None:
         weight = weight * relief.shadowing(drawn.d)
     return Scattered(
@@ -312,7 +320,7 @@ def _scattered(bounced: Bounced) -> Scattered:
         weight=_three(weight),
         eta=None if drawn.eta is None else float(drawn.eta),
         survival=None if chance is None else float(chance),
-        throughput=_three(after.throughput if goes_on else bounced.carried),
+        throughput=_three(after.throughput if goes_on else carried),
     )
 
 

@@ -101,7 +101,7 @@ class Run:
         self.loop = loop_of(scene, self.wave, self.eager, threads) if compiled else None
         how = "eager" if self.loop is None else "compiled"
         rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
-        self.need = need_of(settings, self.device, how, len(self.wave.stages.world.materials.models), rows)
+        self.need = need_of(settings, self.device, how, len(self.wave.context.world.materials.models), rows)
         if limit is not None:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
             check_memory(limit, self.device, self.need.least, loading)

@@ -61,7 +61,7 @@ def unlit(scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: T
         picture: ``(H, W, C)`` float64.
         relmse: what the samples tell of its error.
     """
-    lights, names = wave.stages.world.lights, Names(scene.built, wave.stages.world)
+    lights, names = wave.context.world.lights, Names(scene.built, wave.context.world)
     if wave.integrator.lit and (lights is None or (lights.environment is None and not bool(lights.radiance.any()))):
         return Unlit("there is no light at all in the scene", 0.0)
     search = _Search(wave, geometry)
@@ -84,7 +84,7 @@ class _Search:
 
     def __init__(self, wave: Wave, geometry: Callable[[], Geometry]) -> None:
         self._wave, self.geometry = wave, geometry
-        self.integrator, self.world = wave.integrator, wave.stages.world
+        self.integrator, self.world = wave.integrator, wave.context.world
         self._own: Accel | None = None
 
     @property
@@ -112,7 +112,7 @@ def _dark(search: _Search, black: Tensor) -> float:
     asked = places[torch.linspace(0, count - 1, min(count, ASKED), dtype=torch.float64).round().long()].to(
         wave.centre.device
     )
-    state, plan, world = _through(wave, asked), wave.stages.plan, wave.stages.world
+    state, plan, world = _through(wave, asked), wave.context.plan, wave.context.world
     hit = Search(wave.accel, world, plan.sampler, plan.dtype).nearest(state, 1)
     reflects = hit.prim >= 0
     with suppress(NotImplementedError):  # a model of the caller's own without an albedo
@@ -127,7 +127,7 @@ def _through(wave: Wave, places: Tensor) -> PathState:
     """Rays from the middle of the lens through the middles of pixels ``places (n,)`` of the picture."""
     x0, y0, width, _ = wave.crop
     x, y = places % width + x0, places // width + y0
-    dtype, camera = wave.stages.plan.dtype, wave.camera
+    dtype, camera = wave.context.plan.dtype, wave.camera
     lens = torch.full((2, len(places)), 0.5, dtype=dtype, device=places.device) if camera.lens else None
     o, d = camera.rays(x.to(dtype) + 0.5, y.to(dtype) + 0.5, lens)
     key = wave.sampler.key(y * camera.resolution[0] + x, torch.zeros_like(places))  # for surfaces of some opacity
@@ -136,10 +136,10 @@ def _through(wave: Wave, places: Tensor) -> PathState:
 
 def _albedo(wave: Wave, state: PathState, hit: Hit) -> Tensor:
     """The albedo ``(3, n)`` of the surfaces that rays meet; 0 where they miss."""
-    found, plan, world = torch.zeros_like(state.d), wave.stages.plan, wave.stages.world
+    found, plan, world = torch.zeros_like(state.d), wave.context.plan, wave.context.world
     for model, index in partition(world, hit)[1]:
         met, o, d = rows(hit, index), take(state.o, index), take(state.d, index)
-        here = values(("albedo",), world, model, o, d, met, wave.centre, plan.dtype, wave.stages.pixel)
+        here = values(("albedo",), world, model, o, d, met, wave.centre, plan.dtype, wave.context.pixel)
         found.scatter_(1, index.expand(3, -1), here["albedo"])
     return found
 
@@ -149,7 +149,7 @@ def _in_sight(wave: Wave, state: PathState, hit: Hit) -> bool:
 
     Else, as behind a single ball in the sun, no path goes on, and what the lights were asked for is all there is.
     """
-    world = wave.stages.world
+    world = wave.context.world
     for model, _ in partition(world, hit)[1]:
         if world.materials.models[model].transmits:
             return True

@@ -21,7 +21,7 @@ from torchpt.forward.waves import say_once
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
-from torchpt.integrators.stage_runner import Stages
+from torchpt.integrators.vertex import StageContext
 from torchpt.integrators.wave import Wave
 from torchpt.records import World
 from torchpt.samplers import ADAPTIVE, Points, Sampler
@@ -64,12 +64,12 @@ def make_wave(
         if not integrator.lit:
             world = _dark(scene, world, own)
     else:
-        world, accel = like.stages.world, like.accel
+        world, accel = like.context.world, like.accel
     points = points_of(settings.sampler)
     plan = integrator.plan(points, dtype, tape, attached)
     camera = _camera(scene, settings, params, dtype)
     return Wave(
-        stages=Stages(plan, world, _pixel_of(world, camera)),
+        context=StageContext(plan, world, _pixel_of(world, camera)),
         integrator=integrator,
         accel=accel,
         camera=camera,
@@ -110,12 +110,12 @@ def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, T
     The search structure stays.
     """
     uv = any(layer.uv for layer in surface_layers(settings).values())
-    world, _ = scene.world(wave.stages.plan.dtype, params, uv, settings.light_choice)
+    world, _ = scene.world(wave.context.plan.dtype, params, uv, settings.light_choice)
     if not wave.integrator.lit:
         world = replace(world, lights=None)
-    camera = scene.camera(settings.film, scene.merged(params), wave.stages.plan.dtype)
-    stages = Stages(wave.stages.plan, world, _pixel_of(world, camera))
-    return replace(wave, stages=stages, camera=camera, first=None if wave.first is None else wave.first.again(world))
+    camera = scene.camera(settings.film, scene.merged(params), wave.context.plan.dtype)
+    context = replace(wave.context, world=world, pixel=_pixel_of(world, camera))
+    return replace(wave, context=context, camera=camera, first=None if wave.first is None else wave.first.again(world))
 
 
 def points_of(sampler: Described) -> Points:
@@ -184,12 +184,12 @@ def looped(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool
 
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
     """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
-    packets = wave.accel.name == "brute" and not wave.stages.world.geometry.counts[4]
-    fused = packets and wave.stages.world.materials.opacity is None and wave.first is None
+    packets = wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
+    fused = packets and wave.context.world.materials.opacity is None and wave.first is None
     kernels = Kernels(wave, packets, fused, before, fixed=not scene.own_models)
     own = [
         k
-        for k, model in enumerate(wave.stages.world.materials.models)
+        for k, model in enumerate(wave.context.world.materials.models)
         if any(model is mine for mine in scene.own_models)
     ]
     eager = kernels.probe(own) if wave.integrator.light else {}
@@ -207,7 +207,7 @@ def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
         wave = make_wave(scene, settings, None, torch.float32)
         kernels = kernels_of(scene, wave)
     search = "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else wave.accel.name
-    names = [str(model) for model in wave.stages.world.materials.models]
+    names = [str(model) for model in wave.context.world.materials.models]
     eager = {names[number]: reason for number, reason in kernels.eager.items()}
     return {
         "stages": "compiled to loops over lanes",
@@ -225,7 +225,7 @@ def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = No
     keeper = kept(scene)
     kernels = keeper.kernels = kernels_of(scene, wave, keeper.kernels)
     for number, reason in kernels.eager.items():
-        name = str(wave.stages.world.materials.models[number])
+        name = str(wave.context.world.materials.models[number])
         eager.append(f"{name}: {reason}")
         say_once(f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}")
     integrator = wave.integrator

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from torch import Tensor
-
 from torchpt.integrators.base import Integrator, Limits
-from torchpt.integrators.stages import Plan
-from torchpt.records import Hit, PathState, Shadow, World
+from torchpt.integrators.vertex import StageContext, VertexInput, VertexOutput
+from torchpt.records import World
 
 __all__ = ["FirstSurface", "FirstSurfaceIntegrator"]
 
@@ -24,35 +22,14 @@ class FirstSurface(ABC):
         return self
 
     def shadows(self, world: World) -> bool:
-        """Whether :meth:`shade` gives shadow rays for any model."""
+        """Whether :meth:`bounce` gives shadow rays for any model."""
         return world.lights is not None
 
     @abstractmethod
-    def shade(
-        self,
-        plan: Plan,
-        world: World,
-        model: int,
-        state: PathState,
-        hit: Hit,
-        salts: Tensor,
-        pixel: Tensor | None,
-        slide: bool,
-    ) -> tuple[Tensor, Shadow | None]:
-        """What surfaces of one model bring: pure, of n lanes.
+    def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
+        """Return what surfaces of one BSDF model bring: pure, of n lanes.
 
-        Args:
-            plan: static needs.
-            world: the scene's tensors.
-            model: number of the BSDF model.
-            state: camera rays.
-            hit: what they met.
-            salts: names of the dimensions.
-            pixel: see :func:`torchpt.integrators.surfaces.texture_point_at`.
-            slide: see :func:`torchpt.shapes.interact`.
-
-        Returns:
-            Radiance ``(3, n)``, and shadow rays whose light is still to be added (None: there are none).
+        The paths leave with what the surfaces bring added to their radiance; where they go is not asked for.
         """
 
 

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from torchpt.integrators import stages
-from torchpt.integrators.stages import Plan
-from torchpt.records import Hit, PathState, Shadow, World
+from torchpt.integrators.plan import Plan
+from torchpt.integrators.vertex import StageContext, VertexInput
+from torchpt.records import Hit, PathState, Shadow
 
 __all__ = ["Behind", "bounce", "emit", "escape"]
 
@@ -58,35 +59,23 @@ Others = Callable[[], Sequence[Tensor]]
 
 
 def bounce(
-    plan: Plan,
-    world: World,
+    context: StageContext,
     model: int,
-    roulette: float,
-    slide: bool,
+    vertex: VertexInput,
     following: Hit | None,
     clear: Callable[[Shadow], Tensor],
-    state: PathState,
-    hit: Hit,
     behind: Behind,
-    salts: Tensor,
-    pixel: Tensor | None,
     others: Others,
 ) -> Before:
-    """Back through :func:`torchpt.integrators.stages.bounce`.
+    """Go back through :func:`torchpt.integrators.stages.bounce`.
 
     Args:
-        plan: as of the stage.
-        world: with leaves where derivatives are wanted.
+        context: as of the stage, its world with leaves where derivatives are wanted.
         model: as of the stage.
-        roulette: as of the stage.
-        slide: as of the stage.
+        vertex: as of the stage.
         following: what the rays that leave met; None where geometry is not differentiated.
         clear: how much of the light of shadow rays gets through.
-        state: of the paths at this vertex.
-        hit: of them.
         behind: what is asked of what the vertex hands on.
-        salts: as of the stage.
-        pixel: as of the stage.
         others: tensors whose derivatives are wanted too, asked for after the stage ran.
     """
 
@@ -95,8 +84,9 @@ def bounce(
         return following
 
     with torch.enable_grad():
-        state, hit, given = _given(plan, state, hit)
-        after, _, shadow = stages.bounce(plan, world, model, roulette, slide, found, state, hit, None, salts, pixel)
+        vertex, given = _given(context.plan, vertex)
+        output = stages.bounce(replace(context, search=found), model, vertex)
+        after, shadow = output.leaving, output.shadow
         asked = [(after.throughput, behind.throughput)]
         if behind.o is not None and behind.d is not None:
             asked += [(after.o, behind.o), (after.d, behind.d)]
@@ -109,31 +99,32 @@ def bounce(
         return _back(asked, given, others)
 
 
-def emit(plan: Plan, world: World, slide: bool, state: PathState, hit: Hit, radiance: Tensor, others: Others) -> Before:
-    """Back through :func:`torchpt.integrators.stages.emit`; ``radiance``: what is asked of the samples' radiance ``(3, n)``."""
+def emit(context: StageContext, vertex: VertexInput, radiance: Tensor, others: Others) -> Before:
+    """Go back through :func:`torchpt.integrators.stages.emit`; ``radiance``: what is asked of the samples' ``(3, n)``."""
     with torch.enable_grad():
-        state, hit, given = _given(plan, state, hit)
-        return _back([(stages.emit(world, state, hit, None, slide), radiance)], given, others)
+        vertex, given = _given(context.plan, vertex)
+        return _back([(stages.emit(context, vertex).brought, radiance)], given, others)
 
 
-def escape(plan: Plan, world: World, state: PathState, hit: Hit, radiance: Tensor, others: Others) -> Before:
-    """Back through :func:`torchpt.integrators.stages.escape`, likewise."""
+def escape(context: StageContext, vertex: VertexInput, radiance: Tensor, others: Others) -> Before:
+    """Go back through :func:`torchpt.integrators.stages.escape`, likewise."""
     with torch.enable_grad():
-        state, hit, given = _given(plan, state, hit)
-        return _back([(stages.escape(world, state, hit, None), radiance)], given, others)
+        vertex, given = _given(context.plan, vertex)
+        return _back([(stages.escape(context, vertex).brought, radiance)], given, others)
 
 
-def _given(plan: Plan, state: PathState, hit: Hit) -> tuple[PathState, Hit, list[Tensor | None]]:
-    """The state and hit with leaves for what may be differentiated, and these."""
+def _given(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, list[Tensor | None]]:
+    """Return the vertex with leaves for what may be differentiated, and these."""
 
     def leaf(x: Tensor) -> Tensor:
         return x.detach().requires_grad_()
 
+    state, hit = vertex.state, vertex.hit
     throughput = leaf(state.throughput)
     o, d = (leaf(state.o), leaf(state.d)) if plan.attached else (None, None)
     state = replace(state, throughput=throughput, o=state.o if o is None else o, d=state.d if d is None else d)
     chance = None if hit.chance is None else leaf(hit.chance)
-    return state, replace(hit, chance=chance), [throughput, o, d, chance]
+    return VertexInput(state, replace(hit, chance=chance)), [throughput, o, d, chance]
 
 
 def _back(asked: list[tuple[Tensor, Tensor]], given: list[Tensor | None], others: Others) -> Before:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchpt import lights
 from torchpt.integrators.plan import Plan
 from torchpt.integrators.surfaces import Surface, emission_map, opacity_map, surface_at
+from torchpt.integrators.vertex import Direct, StageContext
 from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import dot, largest
 from torchpt.records import Interaction, LightSample, PathState, Shadow, World
@@ -20,49 +21,45 @@ from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import offset_origin
 from torchpt.shapes.interaction import OFFSET
 
-__all__ = ["held_back", "leaning", "light_radiance", "light_wish", "sample_light", "shade", "through"]
+__all__ = ["leaning", "light_radiance", "sample_light", "shade", "shared", "through"]
 
 #: Shadow rays end this fraction of their length short of the light, beside the offset off its surface.
 SHORTEN = 1e-4
 
 
 def shade(
-    plan: Plan,
-    world: World,
-    model: int,
-    state: PathState,
-    at: Interaction,
-    salts: Tensor,
-    pixel: Tensor | None,
-) -> tuple[Surface, Shadow | None]:
-    """Resolve the material at the surface points and sample a light for each.
+    context: StageContext, model: int, state: PathState, at: Interaction
+) -> tuple[Surface, Direct | None, Shadow | None]:
+    """Resolve the material at surface points of a BSDF model and sample a light for each.
 
     Returns:
-        The surface, and the shadow rays (None where no light is sampled).
+        The surface; the light and the shadow rays to it (None where no light is sampled).
     """
-    surface, kind = surface_at(world, model, state.d, at, pixel), world.materials.models[model]
+    plan, world = context.plan, context.world
+    surface, kind = surface_at(world, model, state.d, at, context.pixel), world.materials.models[model]
     if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
-        return surface, None
-    light = sample_light(plan, world, model, state, at, surface, salts)
+        return surface, None, None
+    light = sample_light(context, model, state, at, surface)
     wi = surface.frame.to_local(light.wi)
-    weight = light.weight
+    weight, pdf, heuristic = light.weight, None, None
     if plan.strategy == "mis":
         reflected, pdf = kind.eval_pdf(surface.parameters, surface.wo, wi)
-        weight = weight * power_heuristic(light.pdf, pdf).detach()
+        heuristic = power_heuristic(light.pdf, pdf).detach()
+        weight = weight * heuristic
     else:
         reflected = kind.eval(surface.parameters, surface.wo, wi)
-    weight = held_back(weight, world, model, at, surface, light.wi, wi)
-    radiance = state.throughput * reflected * light_radiance(world, light) * weight
-    return surface, _shadow_ray(plan, world, at, light, radiance, weight)
+    share = shared(world, model, at, surface, light.wi, wi)
+    weight = weight if share is None else weight * share
+    shining = light_radiance(world, light)
+    radiance = state.throughput * reflected * shining * weight
+    direct = Direct(light, shining, reflected, share, pdf, heuristic)
+    return surface, direct, _shadow_ray(plan, world, at, light, radiance, weight)
 
 
-def held_back(
-    weight: Tensor, world: World, model: int, at: Interaction, surface: Surface, light: Tensor, wi: Tensor
-) -> Tensor:
-    """A weight of light ``(n,)``, times what the surface lets pass before its BSDF is asked.
+def shared(world: World, model: int, at: Interaction, surface: Surface, light: Tensor, wi: Tensor) -> Tensor | None:
+    """Return the share ``(n,)`` of light that a surface lets pass before its BSDF is asked; None: all.
 
     Args:
-        weight: of the light.
         world: the scene's tensors.
         model: number of the BSDF model.
         at: the points.
@@ -70,31 +67,23 @@ def held_back(
         light: ``(3, n)`` direction to the light.
         wi: the same in the surface's frame.
     """
+    share: Tensor | None = None
     if leaning(world, model):
-        weight = weight * (through(at, surface, light, wi) > 0)
+        share = (through(at, surface, light, wi) > 0).to(wi.dtype)
     if surface.shown is not None:
-        weight = weight * surface.shown
+        share = surface.shown if share is None else share * surface.shown
     if surface.relief is not None:
-        weight = weight * surface.relief.shadowing(light)
-    return weight
+        shadowing = surface.relief.shadowing(light)
+        share = shadowing if share is None else share * shadowing
+    return share
 
 
-def sample_light(
-    plan: Plan, world: World, model: int, state: PathState, at: Interaction, surface: Surface, salts: Tensor
-) -> LightSample:
-    """A point on the lights for each surface point."""
-    assert world.lights is not None
-    x, which, numbers, n = light_wish(plan, world, model, state, at, surface, salts)
-    return lights.sample(world.lights, x, which, numbers, OFFSET, n, plan.strategy == "mis")
-
-
-def light_wish(
-    plan: Plan, world: World, model: int, state: PathState, at: Interaction, surface: Surface, salts: Tensor
-) -> tuple[Tensor, Tensor | None, Tensor, Tensor | None]:
-    """What ``lights.sample`` is asked for each surface point: ``x (3, n)``, ``which (n,)``, ``u (2, n)``, ``n (3, n)``."""
+def sample_light(context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface) -> LightSample:
+    """Sample a point on the lights for each surface point."""
+    plan, world = context.plan, context.world
     table = world.lights
     assert table is not None
-    draws = Draws(plan.sampler, state.key, salts)
+    draws = Draws(plan.sampler, state.key, context.salts)
     # The density of a light that a ray meets is asked for from where the ray left. That is where a reflected one will leave,
     # unless paths keep the vertex itself, or nothing that can be met shines.
     kept = lights.local(table) or table.row_of_prim is None
@@ -104,7 +93,7 @@ def light_wish(
     if table.choice is not None:
         # One number chooses the light and goes on to the place on it, so that both are stratified together.
         which = lights.fine(torch.stack((numbers[0], draws.one(Dimension.LIGHT_DIGITS))))
-    return x, which, numbers.to(plan.dtype), n
+    return lights.sample(table, x, which, numbers.to(plan.dtype), OFFSET, n, plan.strategy == "mis")
 
 
 def light_radiance(world: World, light: LightSample) -> Tensor:

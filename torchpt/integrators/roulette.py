@@ -20,39 +20,32 @@ DEEP_CAP = 0.999
 LEAST = 0.25
 
 
-def survived(
-    chance: float | None,
-    cap: float,
-    draws: Draws,
-    alive: Tensor,
-    throughput: Tensor,
-    brightest: Tensor,
-    eta: Tensor | None,
-    tape: bool = False,
-) -> tuple[Tensor, Tensor]:
-    """Which paths are alive after roulette ``(N,)``, and their throughput ``(3, N)``.
+def survived(chance: Tensor, draws: Draws, alive: Tensor, throughput: Tensor) -> tuple[Tensor, Tensor]:
+    """Return which paths are alive after roulette ``(N,)``, and their throughput ``(3, N)``.
 
     Args:
-        chance: to survive; None: as much as a path can still bring, ``min(cap, throughput * eta^2)``.
-        cap: of that.
+        chance: to survive ``(N,)``, see :func:`chance_of`.
         draws: the vertex's random numbers.
         alive: before.
         throughput: before.
-        brightest: its largest component ``(N,)``.
+    """
+    alive = alive & (draws.one(Dimension.ROULETTE) < chance)
+    return alive, throughput / torch.where(alive, chance, 1.0)
+
+
+def chance_of(chance: float | None, cap: float, brightest: Tensor, eta: Tensor | None, tape: bool = False) -> Tensor:
+    """Return the chance with which paths survive ``(N,)``.
+
+    Args:
+        chance: a constant one; None: as much as a path can still bring, ``min(cap, throughput * eta^2)``.
+        cap: of that.
+        brightest: largest component of the throughput ``(N,)``.
         eta: index of refraction along the path ``(N,)``, where there is refraction.
         tape: whether derivatives are wanted: no path is then ended because it carries little, see :data:`LEAST`.
     """
-    survival = chance_of(chance, cap, brightest, eta)
-    if tape and chance is None:
-        survival = survival.clamp_min(min(LEAST, cap))
-    alive = alive & (draws.one(Dimension.ROULETTE) < survival)
-    return alive, throughput / torch.where(alive, survival, 1.0)
-
-
-def chance_of(chance: float | None, cap: float, brightest: Tensor, eta: Tensor | None) -> Tensor:
-    """With what chance paths survive ``(N,)``; see :func:`survived`."""
     if chance is not None:
         return torch.full_like(brightest, chance)
     # Radiance is scaled at refraction; what a path can still bring is not.
     expected = brightest if eta is None else brightest * eta * eta
-    return expected.clamp_max(float(cap))
+    expected = expected.clamp_max(float(cap))
+    return expected.clamp_min(min(LEAST, cap)) if tape else expected

@@ -7,7 +7,6 @@ roulette) -> :func:`next_ray`. Each hands a record to the next.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,29 +14,16 @@ from torch import Tensor
 
 from torchpt.integrators.light_sampling import leaning, through
 from torchpt.integrators.plan import FOREVER, Plan
-from torchpt.integrators.roulette import survived
+from torchpt.integrators.roulette import chance_of, survived
 from torchpt.integrators.surfaces import Surface
+from torchpt.integrators.vertex import Drawn, StageContext
 from torchpt.math.vectors import largest
 from torchpt.math.warps import uniform_hemisphere, uniform_sphere
-from torchpt.records import BsdfSample, Hit, Interaction, PathState, World
+from torchpt.records import BsdfSample, Hit, Interaction, PathState
 from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import offset_origin, reattach
 
-__all__ = ["Drawn", "Onward", "attach", "carry_on", "draw", "next_ray", "scatter"]
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """The next ray as the BSDF gave it."""
-
-    o: Tensor  # (3, n) detached
-    d: Tensor  # (3, n) in the world, detached but for what `attach` adds
-    wi: Tensor  # (3, n) local; that of a delta follows its parameters
-    pdf: Tensor  # (n,) detached; inf where the lobe is a delta
-    weight: Tensor  # (3, n) = eval / pdf
-    least: Tensor  # (n,) positive where a path may go on
-    sharp: Tensor | None  # (n,) bool: whether the lobe is a delta; None: the model has none
-    eta: Tensor | None  # see BsdfSample
+__all__ = ["Onward", "attach", "carry_on", "draw", "next_ray", "scatter"]
 
 
 @dataclass(frozen=True)
@@ -47,36 +33,32 @@ class Onward:
     alive: Tensor  # (n,) bool
     throughput: Tensor  # (3, n)
     eta: Tensor | None  # see PathState
+    carried: Tensor  # (3, n) throughput before roulette
+    chance: Tensor | None  # (n,) to survive roulette; None where it does not play
 
 
 def scatter(
-    plan: Plan,
-    world: World,
-    model: int,
-    state: PathState,
-    at: Interaction,
-    surface: Surface,
-    salts: Tensor,
-    roulette: float,
-    search: Callable[[PathState], Hit],
-) -> tuple[PathState, Hit | None]:
+    context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface
+) -> tuple[PathState, Hit | None, Drawn, Onward]:
     """Draw the next direction from the BSDF and let roulette decide who goes on.
 
     Where derivatives with respect to geometry are wanted, the next hit is found here already, since the throughput must
     follow both ends of the ray; it is returned beside the state.
     """
-    draws = Draws(plan.sampler, state.key, salts)
-    drawn, hit = draw(plan, world, model, at, surface, draws), None
+    plan = context.plan
+    draws = Draws(plan.sampler, state.key, context.salts)
+    drawn, hit = draw(context, model, at, surface, draws), None
     if plan.tape:
-        drawn, hit = attach(plan, world, model, state, at, surface, drawn, search)
-    onward = carry_on(plan, state, surface, drawn, draws, roulette)
+        drawn, hit = attach(context, model, state, at, surface, drawn)
+    onward = carry_on(plan, state, surface, drawn, draws, context.roulette)
     if hit is not None:
         hit = replace(hit, prim=torch.where(onward.alive, hit.prim, -1))
-    return next_ray(plan, world, model, state, at, surface, drawn, onward), hit
+    return next_ray(context, model, state, at, surface, drawn, onward), hit, drawn, onward
 
 
-def draw(plan: Plan, world: World, model: int, at: Interaction, surface: Surface, draws: Draws) -> Drawn:
-    """A direction from the BSDF, or from the hemisphere (strategy ``uniform``), and the ray that leaves along it."""
+def draw(context: StageContext, model: int, at: Interaction, surface: Surface, draws: Draws) -> Drawn:
+    """Draw a direction from the BSDF, or from the hemisphere (strategy ``uniform``), and the ray that leaves along it."""
+    plan, world = context.plan, context.world
     kind = world.materials.models[model]
     u = draws.two(Dimension.BSDF).to(plan.dtype)
     if plan.strategy == "uniform" and not kind.delta:
@@ -100,24 +82,18 @@ def draw(plan: Plan, world: World, model: int, at: Interaction, surface: Surface
 
 
 def attach(
-    plan: Plan,
-    world: World,
-    model: int,
-    state: PathState,
-    at: Interaction,
-    surface: Surface,
-    drawn: Drawn,
-    search: Callable[[PathState], Hit],
+    context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface, drawn: Drawn
 ) -> tuple[Drawn, Hit | None]:
-    """What was drawn, with derivatives: direction and density are constants, the integrand follows the parameters.
+    """Return what was drawn with derivatives: direction and density are constants, the integrand follows the parameters.
 
     Where geometry is differentiated (``plan.attached``) the next hit is found, and the direction follows both of its ends.
     """
+    plan, world = context.plan, context.world
     kind, frame = world.materials.models[model], surface.frame
     d, weight, pdf, sharp = drawn.d, drawn.weight, drawn.pdf, drawn.sharp
     hit, follow, measure, alive = None, d, 1.0, drawn.least > 0
     if plan.attached:
-        hit = search(replace(state, o=drawn.o, d=d, t_max=alive.to(plan.dtype) * FOREVER))
+        hit = context.search(replace(state, o=drawn.o, d=d, t_max=alive.to(plan.dtype) * FOREVER))
         follow, measure = reattach(world, at.p, hit, d)
     if not kind.smooth:
         value = kind.eval(surface.parameters, surface.wo, frame.to_local(follow))
@@ -141,14 +117,15 @@ def carry_on(plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws
     eta = state.eta
     if eta is not None and drawn.eta is not None:
         eta = eta * drawn.eta.detach()
-    if roulette:
-        alive, throughput = survived(plan.rr_prob, roulette, draws, alive, throughput, brightest, eta, plan.tape)
-    return Onward(alive, throughput, eta)
+    if not roulette:
+        return Onward(alive, throughput, eta, throughput, None)
+    chance = chance_of(plan.rr_prob, roulette, brightest, eta, plan.tape)
+    alive, survivors = survived(chance, draws, alive, throughput)
+    return Onward(alive, survivors, eta, throughput, chance)
 
 
 def next_ray(
-    plan: Plan,
-    world: World,
+    context: StageContext,
     model: int,
     state: PathState,
     at: Interaction,
@@ -156,7 +133,8 @@ def next_ray(
     drawn: Drawn,
     onward: Onward,
 ) -> PathState:
-    """The state of the paths with the rays that leave the surface; those that ended have rays of length 0."""
+    """Return the paths with the rays that leave the surface; those that ended have rays of length 0."""
+    plan, world = context.plan, context.world
     on = onward.alive.to(plan.dtype)
     # What MIS is to know of the density, should the ray meet a light.
     if plan.strategy == "mis" and world.lights is not None:

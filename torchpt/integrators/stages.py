@@ -1,4 +1,4 @@
-"""The stages of the wavefront: pure functions of whole-wave tensors and an index of the lanes concerned.
+"""The stages of the wavefront: pure functions of lanes (:mod:`torchpt.integrators.vertex` has what they read and return).
 
 Python ``if`` here asks only what the scene or the settings hold (:class:`~torchpt.integrators.plan.Plan` is static), so a stage
 leaves out what is not needed, and compiles to one graph whatever the number of lanes.
@@ -7,7 +7,6 @@ leaves out what is not needed, and compiles to one graph whatever the number of 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -20,13 +19,13 @@ from torchpt.integrators.light_sampling import shade
 from torchpt.integrators.plan import STRATEGIES, Plan
 from torchpt.integrators.scattering import scatter
 from torchpt.integrators.surfaces import emission_map
+from torchpt.integrators.vertex import Emission, StageContext, VertexInput, VertexOutput
 from torchpt.math.mis import power_heuristic
-from torchpt.math.vectors import take
-from torchpt.records import Hit, PathState, Shadow, World, rows
+from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import interact
 
-__all__ = ["STRATEGIES", "Plan", "bounce", "emit", "escape", "generate", "scatter", "shade", "shining"]
+__all__ = ["STRATEGIES", "Plan", "bounce", "emit", "escape", "generate", "scatter", "shade"]
 
 
 def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
@@ -43,79 +42,40 @@ def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, k
     return PathState(o.expand(3, n).clone(), d, forever, ones, torch.zeros_like(d), forever.clone(), lane, key)
 
 
-def emit(world: World, state: PathState, hit: Hit, index: Tensor | None, slide: bool) -> Tensor:
-    """Radiance ``(3, n)`` that the paths at ``index`` (None: all) gather from the emitters they hit, weighted by MIS."""
-    radiance, pdf = shining(world, state, hit, index, slide)
-    return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
-
-
-def shining(world: World, state: PathState, hit: Hit, index: Tensor | None, slide: bool) -> tuple[Tensor, Tensor]:
-    """Radiance ``(3, n)`` of the emitters that the paths at ``index`` hit, and the density of sampling it ``(n,)``."""
+def emit(context: StageContext, vertex: VertexInput) -> Emission:
+    """Return what paths gather from the emitters that they hit."""
+    world, state = context.world, vertex.state
     assert world.lights is not None
-    o, d = take(state.o, index), take(state.d, index)
-    at = interact(world, o, d, rows(hit, index), slide)
+    at = interact(world, state.o, state.d, vertex.hit, context.slide)
     # Where lights are chosen by place the density is that at the vertex itself, which is not quite where the ray begins.
-    x = o if state.p is None else take(state.p, index)
-    radiance, pdf = lights.emitted(world.lights, x, at, d, None if state.n is None else take(state.n, index))
+    x = state.o if state.p is None else state.p
+    radiance, pdf = lights.emitted(world.lights, x, at, state.d, state.n)
     if world.textures.emission is not None:
         radiance = radiance * emission_map(world, at)
-    return radiance, pdf
+    return _gathered(vertex, radiance, pdf)
 
 
-def escape(world: World, state: PathState, hit: Hit, index: Tensor | None) -> Tensor:
-    """Radiance ``(3, n)`` that the paths at ``index`` (None: all) gather from the environment they escape to."""
-    assert world.lights is not None
-    radiance, pdf = lights.environment(world.lights, take(state.d, index))
-    return _weighted(_arrived(state, hit, index), radiance, take(state.pdf, index), pdf)
+def escape(context: StageContext, vertex: VertexInput) -> Emission:
+    """Return what paths gather from the environment that they escape to."""
+    assert context.world.lights is not None
+    return _gathered(vertex, *lights.environment(context.world.lights, vertex.state.d))
 
 
-def _arrived(state: PathState, hit: Hit, index: Tensor | None) -> Tensor:
-    """Throughput ``(3, n)`` with the derivative of the chance that the rays came here."""
-    throughput = take(state.throughput, index)
-    return throughput if hit.chance is None else throughput * take(hit.chance, index)
-
-
-def _weighted(throughput: Tensor, radiance: Tensor, pdf: Tensor, light_pdf: Tensor) -> Tensor:
+def _gathered(vertex: VertexInput, radiance: Tensor, light_pdf: Tensor) -> Emission:
+    state, hit = vertex.state, vertex.hit
+    # With the derivative of the chance that the rays came here.
+    throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
     # PathState.pdf is inf where emission counts whole and 0 where it does not count: the heuristic's own limits.
-    return throughput * radiance * power_heuristic(pdf, light_pdf).detach()
+    weight = power_heuristic(state.pdf, light_pdf).detach()
+    return Emission(radiance, light_pdf, weight, throughput * radiance * weight)
 
 
-def bounce(
-    plan: Plan,
-    world: World,
-    model: int,
-    roulette: float,
-    slide: bool,
-    search: Callable[[PathState], Hit],
-    state: PathState,
-    hit: Hit,
-    index: Tensor | None,
-    salts: Tensor,
-    pixel: Tensor | None = None,
-) -> tuple[PathState, Hit | None, Shadow | None]:
-    """One vertex of the paths at ``index``, all of which hit surfaces of one BSDF model.
-
-    Args:
-        plan: static needs.
-        world: the scene's tensors.
-        model: number of the BSDF model.
-        roulette: the most that roulette lets paths survive with at this depth; 0: it does not play.
-        slide: see :func:`torchpt.shapes.interact`.
-        search: finds hits; called only where ``plan.attached``.
-        state: of the whole wave.
-        hit: of the whole wave.
-        index: lanes concerned ``(n,)``; None: all.
-        salts: names of this depth's dimensions.
-        pixel: see :func:`torchpt.integrators.surfaces.texture_point_at`.
-
-    Returns:
-        The state of the ``n`` paths with their next rays, the next hits where they had to be found already, and the shadow
-        rays whose light is still to be added (None where no light is sampled).
-    """
-    arriving, met = rows(state, index), rows(hit, index)
-    at = interact(world, arriving.o, arriving.d, met, slide)
-    if met.chance is not None:
-        arriving = replace(arriving, throughput=arriving.throughput * met.chance)
-    surface, shadow = shade(plan, world, model, arriving, at, salts, pixel)
-    leaving, next_hit = scatter(plan, world, model, arriving, at, surface, salts, roulette, search)
-    return leaving, next_hit, shadow
+def bounce(context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
+    """Return what surfaces of one BSDF model make of paths: light that is sampled, the next ray, roulette."""
+    world, state, hit = context.world, vertex.state, vertex.hit
+    at = interact(world, state.o, state.d, hit, context.slide)
+    if hit.chance is not None:
+        state = replace(state, throughput=state.throughput * hit.chance)
+    surface, direct, shadow = shade(context, model, state, at)
+    leaving, following, drawn, onward = scatter(context, model, state, at, surface)
+    return VertexOutput(leaving, following, shadow, at, surface, direct, drawn, onward.carried, onward.chance)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,14 +14,15 @@ from torchpt.cameras import Camera
 from torchpt.film import Filter
 from torchpt.integrators.base import Integrator, Limits
 from torchpt.integrators.plate import Plate
-from torchpt.integrators.stage_runner import Stages
+from torchpt.integrators.stages import generate
+from torchpt.integrators.vertex import StageContext
 from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, Streams, salts
 
 if TYPE_CHECKING:
     from torchpt.integrators.first_surface import FirstSurface
 
-__all__ = ["Wave", "camera_state"]
+__all__ = ["Wave", "camera_state", "still_of"]
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Wave:
     """What a render fixes for all of its waves.
 
     Attributes:
-        stages: the stages bound to the scene.
+        context: what stages read beside their lanes.
         integrator: what makes radiance of camera rays.
         accel: the search.
         camera: on the whole film.
@@ -40,7 +41,7 @@ class Wave:
         first: what happens at first surfaces; None where paths go on.
     """
 
-    stages: Stages
+    context: StageContext
     integrator: Integrator
     accel: Accel
     camera: Camera
@@ -79,13 +80,18 @@ class Wave:
         """
         # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
         key = self.sampler.key(y * self.camera.resolution[0] + x, sample, streams)
-        x, y = (a.to(self.stages.plan.dtype) for a in (x, y))
-        return self.stages.generate(self.camera, self.filter, x, y, key, salts(0, self.centre.device))
+        x, y = (a.to(self.context.plan.dtype) for a in (x, y))
+        return generate(self.context.plan, self.camera, self.filter, x, y, key, salts(0, self.centre.device))
 
     def weight(self, state: PathState) -> Tensor:
         """What the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""
-        draws = Draws(self.stages.plan.sampler, state.key, salts(0, self.centre.device))
-        return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.stages.plan.dtype)
+        draws = Draws(self.context.plan.sampler, state.key, salts(0, self.centre.device))
+        return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.context.plan.dtype)
+
+
+def still_of(wave: Wave) -> Wave:
+    """Return the wave as where no geometry is differentiated: the same values, and hits found between stages."""
+    return replace(wave, context=replace(wave.context, plan=replace(wave.context.plan, attached=False)))
 
 
 def camera_state(o: Tensor, d: Tensor, key: Tensor) -> PathState:

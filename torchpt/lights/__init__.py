@@ -13,11 +13,11 @@ from __future__ import annotations
 from torchpt.lights.base import COLUMNS, KINDS, Environment, Light, Row, Setting, Surroundings, order
 from torchpt.lights.choice import WAYS, choice_of, local
 from torchpt.lights.surface import SURFACES, Faces, Surface, emitter
-from torchpt.lights.table import chosen, emitted, environment, sample, surroundings, without_environment
+from torchpt.lights.table import emitted, environment, sample, surroundings, without_environment
 from torchpt.lights.tree import fine
 
 __all__ = [
     "COLUMNS", "KINDS", "SURFACES", "WAYS", "Environment", "Faces", "Light", "Row", "Setting", "Surface", "Surroundings",
-    "choice_of", "chosen", "emitted", "emitter", "environment", "fine", "local", "order", "sample", "surroundings",
+    "choice_of", "emitted", "emitter", "environment", "fine", "local", "order", "sample", "surroundings",
     "without_environment",
 ]  # fmt: skip

@@ -19,7 +19,7 @@ from torchpt.lights.surface import SURFACES, Surface, emitter
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.records import Interaction, Lights, LightSample
 
-__all__ = ["chosen", "emitted", "environment", "sample", "surroundings", "without_environment"]
+__all__ = ["emitted", "environment", "sample", "surroundings", "without_environment"]
 
 
 def _surfaces(lights: Lights) -> list[tuple[int, type[Surface]]]:
@@ -82,14 +82,7 @@ def sample(
         own = replace(own, pdf=own.pdf * probability, weight=own.weight / probability)
         drawn = own if drawn is None else _merged(here, own, drawn)
     assert drawn is not None
-    return replace(drawn, distant=distant, bare=bare)
-
-
-def chosen(lights: Lights, which: Tensor | None, x: Tensor, n: Tensor | None) -> Tensor:
-    """Rows ``(N,)`` of the lights that :func:`sample` draws."""
-    if lights.choice is None or which is None:
-        return torch.zeros(x.shape[1], dtype=torch.int64, device=x.device)
-    return choice.draw(lights.choice, which, x, n)[0]
+    return replace(drawn, distant=distant, bare=bare, row=row)
 
 
 def _merged(mask: Tensor, a: LightSample, b: LightSample) -> LightSample:

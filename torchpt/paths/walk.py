@@ -77,7 +77,7 @@ class Engine(Protocol[P]):
 class Observer(Generic[Q]):
     """Who looks on: replays keep populations, layers read the first surface, a debugger prints one path.
 
-    Either method may return True, which ends the walk there.
+    The first two may return True, which ends the walk there.
     """
 
     def arrived(self, paths: Q) -> bool:
@@ -88,10 +88,16 @@ class Observer(Generic[Q]):
         """Look at paths that are about to gather light and to scatter."""
         return False
 
+    def gathered(self, paths: Q, counts: Counts) -> None:
+        """Look at paths that have the light that they met by chance."""
+
+    def left(self, paths: Q) -> None:
+        """Look at paths behind a vertex, once the light that was sampled there is resolved."""
+
 
 def walk(
     engine: Engine[P], paths: P, limits: Limits, observer: Observer[P] | None = None, until: int | None = None
-) -> P | None:
+) -> None:
     """Take a population from its vertex to the ends of all its paths.
 
     Args:
@@ -100,30 +106,28 @@ def walk(
         limits: where paths end.
         observer: looks on, and may end the walk.
         until: vertex at which the walk is to stop, before rays to it are searched for; None: it goes on to the ends.
-
-    Returns:
-        The population at ``until``; None where all paths ended before.
     """
     observer = observer or Observer()
     while paths.depth != until:
         engine.intersect(paths)
         if observer.arrived(paths):
-            return None
+            return
         counts = engine.sort(paths)
         if observer.sorted(paths, counts):
-            return None
+            return
         if counts.emissive:
             engine.emit(paths)
         if counts.missed:
             engine.escape(paths)
+        observer.gathered(paths, counts)
         if paths.depth >= limits.last:
             engine.terminate(paths, truncated=limits.endless)
-            return None
+            return
         if not any(counts.scatter):
-            return None
+            return
         paths = engine.scatter(paths, limits.roulette(paths.depth))
         engine.occlude(paths)
+        observer.left(paths)
         if limits.first_surface:
             engine.terminate(paths, truncated=False)
-            return None
-    return paths
+            return

@@ -8,7 +8,8 @@ import torch
 
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.engines.kernels.rows import HIT, Memory
-from torchpt.engines.kernels.vertex import no_search
+from torchpt.integrators import stages
+from torchpt.integrators.vertex import VertexInput
 from torchpt.records import Hit, PathState
 from torchpt.samplers import salts
 
@@ -48,10 +49,10 @@ def bounce_eagerly(
     with torch.no_grad():
         given = rows.take(source, lanes, _STATE)
         state = PathState(**{"eta": None, "p": None, "n": None, **given})  # type: ignore[arg-type]
-        hit = Hit(**rows.take(source, lanes, tuple(HIT)))
-        after, _, shadow = kernels.wave.stages.bounce(
-            model, roulette, False, no_search, state, hit, torch.arange(count), salts(depth, torch.device("cpu"))
-        )
+        vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
+        context = kernels.wave.context.at(salts(depth, torch.device("cpu")), roulette=roulette)
+        output = stages.bounce(context, model, vertex)
+        after, shadow = output.leaving, output.shadow
     values = {name: getattr(after, name) for name in _STATE}
     values |= rows.take(source, lanes, ("weight",))
     if "shadow_o" in rows:

@@ -8,6 +8,7 @@ it ask of the ray that left, and leaves what it asks of the ray that came.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from torchpt.engines.kernels.rows import HIT, Fields, Rows
 from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Before, Behind
+from torchpt.integrators.vertex import VertexInput
 from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.operators.derivatives import summands
 from torchpt.lanes.sinks import Scatter, Sinks
@@ -75,17 +77,15 @@ def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks
     salts = trace.salts()
     state, hit, rows = _given(trace)
     behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"))
-    following = Hit(*(rows[name] for name in HIT)) if kernels.joint_plan.attached else None
+    following = Hit(*(rows[name] for name in HIT)) if kernels.taped.plan.attached else None
 
     def clear(_: Shadow) -> Tensor:
         return rows["clear"]
 
     noted = _Noted(tracer, kernels)
     with tracer, gathered_by(noted):
-        before = joint.bounce(
-            kernels.joint_plan, kernels.taped, model, roulette, slide, following, clear, state, hit, behind, salts,
-            kernels.taped_pixel, noted.leaves,
-        )  # fmt: skip
+        context = kernels.taped.at(salts, slide, roulette)
+        before = joint.bounce(context, model, VertexInput(state, hit), following, clear, behind, noted.leaves)
     return _ended(trace, noted, state, before, {})
 
 
@@ -95,7 +95,8 @@ def back_emit(trace: Trace, slide: bool) -> Sinks:
     state, hit, rows = _given(trace)
     noted = _Noted(tracer, kernels)
     with tracer, gathered_by(noted):
-        before = joint.emit(kernels.joint_plan, kernels.taped, slide, state, hit, rows["radiance"], noted.leaves)
+        context = replace(kernels.taped, slide=slide)
+        before = joint.emit(context, VertexInput(state, hit), rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
 
 
@@ -105,7 +106,7 @@ def back_escape(trace: Trace) -> Sinks:
     state, hit, rows = _given(trace)
     noted = _Noted(tracer, kernels)
     with tracer, gathered_by(noted):
-        before = joint.escape(kernels.joint_plan, kernels.taped, state, hit, rows["radiance"], noted.leaves)
+        before = joint.escape(kernels.taped, VertexInput(state, hit), rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
 
 
@@ -135,7 +136,7 @@ def _given(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
     hit = trace.hit()
     tracer, lane, slots = trace.tracer, trace.node(state.lane), Rows(SLOTS)
     kernels: Any = trace.layout
-    names = tuple(SLOTS) if kernels.joint_plan.attached else ("radiance", "throughput", "clear")
+    names = tuple(SLOTS) if kernels.taped.plan.attached else ("radiance", "throughput", "clear")
     return state, hit, slots.read(tracer, *names, place=lane)
 
 
@@ -145,7 +146,7 @@ def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added:
     tracer, graph = trace.tracer, trace.tracer.graph
     fields: dict[str, Tensor] = {}
     with tracer:
-        for name in ("throughput", "o", "d") if kernels.joint_plan.attached else ("throughput",):
+        for name in ("throughput", "o", "d") if kernels.taped.plan.attached else ("throughput",):
             found = getattr(before, name)
             if found is None and added:
                 continue

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
@@ -11,8 +10,7 @@ from torch import Tensor
 from torchpt.engines.kernels import joint
 from torchpt.engines.kernels.kernels import Kernel, Kernels
 from torchpt.engines.kernels.rows import Rows
-from torchpt.integrators.stage_runner import Stages
-from torchpt.integrators.wave import Wave
+from torchpt.integrators.wave import Wave, still_of
 from torchpt.lanes.graph import Unsupported
 
 __all__ = ["JointKernels"]
@@ -31,9 +29,7 @@ class JointKernels(Kernels):
         packets: see :class:`~torchpt.engines.kernels.layout.Layout`.
 
     Attributes:
-        joint_plan: of the vertices that are gone back along.
-        taped: their world.
-        taped_pixel: see :func:`torchpt.integrators.surfaces.texture_point_at`.
+        taped: what stages read where they are gone back along.
         numbers_of: which of the leaves a tensor is, by its id.
         back_eager: stages that no kernel can be made of, and why.
         slots: rows of :data:`torchpt.engines.kernels.joint.SLOTS`.
@@ -42,19 +38,15 @@ class JointKernels(Kernels):
     def __init__(
         self, wave: Wave, taped: Wave, plain: Sequence[Tensor], tapes: Sequence[Tensor], packets: bool
     ) -> None:
-        self.joint_plan = wave.stages.plan
-        # Paths are traced as they are where no geometry is differentiated: the same values, and hits found between stages.
-        plan = replace(self.joint_plan, attached=False)
-        still = replace(wave, stages=Stages(plan, wave.stages.world, wave.stages.pixel))
-        super().__init__(still, packets, False)
-        self.taped, self.taped_pixel = taped.stages.world, taped.stages.pixel
+        super().__init__(still_of(wave), packets, False)
+        self.taped = taped.context
         self.plain, self.tapes = tuple(plain), tuple(tapes)
         self.numbers_of = {id(tape): number for number, tape in enumerate(tapes)}
         paths = [self._leaves.ids[id(one)][0] if id(one) in self._leaves.ids else None for one in plain]
         for path, tape in zip(paths, tapes, strict=True):
             if path is not None:
                 self._leaves.ids[id(tape)] = path, tape
-        self.structure = (*self.structure, self.joint_plan.attached, tuple(paths))
+        self.structure = (*self.structure, self.taped.plan.attached, tuple(paths))
         self.slots = Rows(joint.SLOTS)
         self.back_eager: dict[tuple[Any, ...], str] = {}
 

@@ -71,7 +71,7 @@ class Kernels(Layout):
                 "filter": wave.filter.tensors(),
                 "sampler": self.numbers,
                 "centre": wave.centre,
-                "pixel": wave.stages.pixel,
+                "pixel": wave.context.pixel,
                 "first": wave.first,
             },
             None if before is None else before._leaves,

@@ -19,7 +19,7 @@ def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
     hit = trace.hit()
     with trace.tracer:
         values = aov.values(
-            names, layout.world, model, state.o, state.d, hit, wave.centre, layout.plan.dtype, wave.stages.pixel
+            names, layout.world, model, state.o, state.d, hit, wave.centre, layout.plan.dtype, wave.context.pixel
         )
         if "weight" in unseen:
             values = aov.weighted(values, unseen["weight"])

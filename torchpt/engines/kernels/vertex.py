@@ -13,20 +13,16 @@ from torch import Tensor
 from torchpt.engines.kernels.packets import nearest, occluded
 from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators import stages
+from torchpt.integrators.vertex import VertexInput
 from torchpt.lanes.sinks import Pack, Scatter, Sinks
-from torchpt.records import Hit, PathState, Shadow
+from torchpt.records import PathState, Shadow
 from torchpt.samplers import Dimension, Draws
 
-__all__ = ["PLACE", "bounce", "emit", "escape", "first", "generate", "no_search", "retire", "settle"]
+__all__ = ["PLACE", "bounce", "emit", "escape", "first", "generate", "retire", "settle"]
 
 #: Numbers that say which samples a chunk holds: the first pixel of the picture and how many there are; the stream and point
 #: of the first sample, the first stream and how many share the samples; the crop's corner and width, the film's width.
 PLACE = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y", "crop", "film")
-
-
-def no_search(state: PathState) -> Hit:
-    """Stands for a search in stages that must not ask for one."""
-    raise AssertionError("hits are found between stages where there is no tape")
 
 
 def generate(trace: Trace, chosen: bool) -> Sinks:
@@ -93,8 +89,7 @@ def emit(trace: Trace) -> Sinks:
     hit = trace.hit()
     place = trace.place()
     with tracer:
-        light = stages.emit(layout.world, state, hit, torch.arange(tracer.lanes), False)
-        radiance = state.radiance + light
+        radiance = state.radiance + stages.emit(layout.wave.context, VertexInput(state, hit)).brought
     rows = tuple(layout.state.nodes(tracer, radiance=radiance))
     return Sinks(scatter=[Scatter(-1, trace.node(place), rows)])
 
@@ -104,8 +99,7 @@ def escape(trace: Trace) -> Sinks:
     state, unseen = trace.state()
     hit = trace.hit()
     with trace.tracer:
-        light = stages.escape(trace.layout.world, state, hit, torch.arange(trace.tracer.lanes))
-        radiance = state.radiance + light
+        radiance = state.radiance + stages.escape(trace.layout.wave.context, VertexInput(state, hit)).brought
     return Sinks(scatter=[trace.ended(-1, state.lane, radiance, unseen)])
 
 
@@ -122,11 +116,9 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
     state, unseen = trace.state()
     hit = trace.hit()
     with tracer:
-        index = torch.arange(tracer.lanes)
-        after, _, shadow = stages.bounce(
-            layout.plan, layout.world, model, roulette, False, no_search, state, hit, index, salts,
-            layout.wave.stages.pixel,
-        )  # fmt: skip
+        context = layout.wave.context.at(salts, roulette=roulette)
+        output = stages.bounce(context, model, VertexInput(state, hit))
+    after, shadow = output.leaving, output.shadow
     if not layout.fused:
         return _with_shadow(trace, after, shadow, unseen)
     sinks = Sinks(shadows=int(shadow is not None))
@@ -141,18 +133,14 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
 
 def first(trace: Trace, model: int) -> Sinks:
     """The first surfaces of a model, where paths end at them."""
-    layout, wave = trace.layout, trace.layout.wave
+    wave = trace.layout.wave
     salts = trace.salts()
     state, unseen = trace.state()
     hit = trace.hit()
     assert wave.first is not None
     with trace.tracer:
-        radiance, shadow = wave.first.shade(
-            layout.plan, layout.world, model, state, hit, salts, wave.stages.pixel, False
-        )
-        # No ray goes on: the lane ends where its shadow ray is known.
-        after = replace(state, radiance=state.radiance + radiance, t_max=torch.zeros_like(state.t_max))
-    return _with_shadow(trace, after, shadow, unseen)
+        output = wave.first.bounce(wave.context.at(salts), model, VertexInput(state, hit))
+    return _with_shadow(trace, output.leaving, output.shadow, unseen)
 
 
 # -- the two ways in which lanes go on

@@ -18,9 +18,9 @@ from torchpt.integrators import stages as pure
 from torchpt.integrators.base import LIGHT_CHOICE, SAMPLES
 from torchpt.integrators.first_surface import FirstSurface, FirstSurfaceIntegrator
 from torchpt.integrators.split_sum import under
-from torchpt.integrators.stages import Plan
+from torchpt.integrators.vertex import StageContext, VertexInput, VertexOutput
 from torchpt.math.vectors import dot
-from torchpt.records import Hit, PathState, Shadow, World
+from torchpt.records import World
 from torchpt.shapes import interact
 
 __all__ = ["Ibl", "Preview"]
@@ -70,27 +70,20 @@ class Preview(FirstSurface):
         environment = None if world.lights is None else world.lights.environment
         return Preview.of(world) if any(t.requires_grad for t in leaves(environment)) else self
 
-    def shade(
-        self,
-        plan: Plan,
-        world: World,
-        model: int,
-        state: PathState,
-        hit: Hit,
-        salts: Tensor,
-        pixel: Tensor | None,
-        slide: bool,
-    ) -> tuple[Tensor, Shadow | None]:
+    def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
         """See :class:`FirstSurface`."""
-        local = replace(world, lights=lights.without_environment(world.lights))
-        if hit.chance is not None:
-            state = replace(state, throughput=state.throughput * hit.chance)
-        at = interact(world, state.o, state.d, hit, slide)
-        surface, shadow = pure.shade(plan, local, model, state, at, salts, pixel)
+        world, state, hit = context.world, vertex.state, vertex.hit
+        local = replace(context, world=replace(world, lights=lights.without_environment(world.lights)))
+        throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
+        arriving = replace(state, throughput=throughput)
+        at = interact(world, state.o, state.d, hit, context.slide)
+        surface, direct, shadow = pure.shade(local, model, arriving, at)
         radiance = torch.zeros_like(state.radiance)
         if self.sky is not None:
             n, v = self.turned(surface.frame.n), self.turned(-state.d)
-            radiance = state.throughput * under(self.sky, world.materials.models[model], surface.parameters, n, v)
+            radiance = throughput * under(self.sky, world.materials.models[model], surface.parameters, n, v)
             if surface.shown is not None:
                 radiance = radiance * surface.shown
-        return radiance, shadow
+        # No ray goes on: the lane ends where its shadow ray is known.
+        leaving = replace(state, radiance=state.radiance + radiance, t_max=torch.zeros_like(state.t_max))
+        return VertexOutput(leaving, None, shadow, at, surface, direct)

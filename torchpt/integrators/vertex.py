@@ -1,0 +1,155 @@
+"""The records of a path vertex: what its stages read and return.
+
+A stage is a pure function of a :class:`StageContext` and a :class:`VertexInput`. What happens at a surface returns a
+:class:`VertexOutput` with every intermediate that an observer may ask for: compiled stages drop what nobody reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchpt.integrators.plan import Plan
+from torchpt.records import Hit, Interaction, LightSample, PathState, Shadow, World
+
+if TYPE_CHECKING:
+    from torchpt.integrators.surfaces import Surface
+
+__all__ = ["Direct", "Drawn", "Emission", "StageContext", "VertexInput", "VertexOutput", "no_search"]
+
+
+def no_search(state: PathState) -> Hit:
+    """Stand for a search in stages that must not ask for one."""
+    raise AssertionError("hits are found between stages where no geometry is differentiated")
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """What does not change from lane to lane.
+
+    A wave has one for all of its vertices; :meth:`at` adds what belongs to a depth.
+
+    Attributes:
+        plan: static needs of the render.
+        world: the scene's tensors.
+        pixel: how large a pixel is in the world, see :func:`torchpt.integrators.surfaces.texture_point_at`; None where nothing
+            asks.
+        salts: names of the random dimensions at this depth, see :func:`torchpt.samplers.salts`.
+        slide: whether points slide along their rays, see :func:`torchpt.shapes.interact`.
+        roulette: the most that roulette lets paths survive with; 0: it does not play.
+        search: finds the hits of rays that leave; called only where ``plan.attached``.
+    """
+
+    plan: Plan
+    world: World
+    pixel: Tensor | None = None
+    salts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int32))
+    slide: bool = False
+    roulette: float = 0.0
+    search: Callable[[PathState], Hit] = no_search
+
+    def at(
+        self,
+        salts: Tensor,
+        slide: bool = False,
+        roulette: float = 0.0,
+        search: Callable[[PathState], Hit] = no_search,
+    ) -> StageContext:
+        """Return the same at a vertex."""
+        return replace(self, salts=salts, slide=slide, roulette=roulette, search=search)
+
+
+@dataclass(frozen=True)
+class VertexInput:
+    """What a stage reads of its lanes.
+
+    Attributes:
+        state: of the paths as they arrive.
+        hit: what their rays met.
+    """
+
+    state: PathState
+    hit: Hit
+
+
+@dataclass(frozen=True)
+class Emission:
+    """Light that paths met by chance.
+
+    Attributes:
+        radiance: ``(3, n)`` of it.
+        pdf: ``(n,)`` density in solid angle with which it would have been sampled.
+        weight: ``(n,)`` of MIS.
+        brought: ``(3, n)`` to the samples.
+    """
+
+    radiance: Tensor
+    pdf: Tensor
+    weight: Tensor
+    brought: Tensor
+
+
+@dataclass(frozen=True)
+class Direct:
+    """Light that was sampled at a vertex.
+
+    Attributes:
+        sample: a point on the lights.
+        radiance: ``(3, n)`` of the light, with its textures.
+        reflected: ``(3, n)`` what the BSDF, with the cosine, makes of it.
+        share: ``(n,)`` of that: less than 1 where normals lean, and 0 on a back that is black; None: all.
+        pdf: ``(n,)`` with which the BSDF would have drawn the direction; None where nobody asks.
+        weight: ``(n,)`` of MIS; None: 1.
+    """
+
+    sample: LightSample
+    radiance: Tensor
+    reflected: Tensor
+    share: Tensor | None
+    pdf: Tensor | None
+    weight: Tensor | None
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The next ray as the BSDF gave it."""
+
+    o: Tensor  # (3, n) detached
+    d: Tensor  # (3, n) in the world, detached but for what `attach` adds
+    wi: Tensor  # (3, n) local; that of a delta follows its parameters
+    pdf: Tensor  # (n,) detached; inf where the lobe is a delta
+    weight: Tensor  # (3, n) = eval / pdf
+    least: Tensor  # (n,) positive where a path may go on
+    sharp: Tensor | None  # (n,) bool: whether the lobe is a delta; None: the model has none
+    eta: Tensor | None  # see BsdfSample
+
+
+@dataclass(frozen=True)
+class VertexOutput:
+    """What surfaces of one BSDF model make of the paths that met them.
+
+    Attributes:
+        leaving: the paths with their next rays; of those that ended ``t_max`` is 0.
+        following: what these rays met, where that had to be found already.
+        shadow: shadow rays whose light is still to be added; None where no light is sampled.
+        at: the points.
+        surface: with its material.
+        direct: the light that was sampled; None where none was.
+        drawn: the direction that the BSDF gave; None where paths end here.
+        carried: ``(3, n)`` throughput before roulette; None where paths end here.
+        chance: ``(n,)`` to survive roulette; None where it does not play.
+    """
+
+    leaving: PathState
+    following: Hit | None
+    shadow: Shadow | None
+    at: Interaction
+    surface: Surface
+    direct: Direct | None
+    drawn: Drawn | None = None
+    carried: Tensor | None = None
+    chance: Tensor | None = None
