@@ -17,12 +17,11 @@ from trials import film_of
 
 import torchpt
 from torchpt.bsdfs import Parameters
-from torchpt.engines.kernels import programs
+from torchpt.engines.kernels import chunk, programs
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
 from torchpt.forward import say_once
-from torchpt.integrators.stage_runner import Stages
 from torchpt.lanes import engine
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.warps import cosine_hemisphere
@@ -164,7 +163,7 @@ def test_larger_pictures_and_maps(work, tmp_path):
 
 AGAIN = """
 import sys, torchpt
-from torchpt.engines.kernels import programs
+from torchpt.engines.kernels import chunk, programs
 from torchpt.lanes import engine
 traced, kept = [0], programs._traced
 def counting(*args):
@@ -255,14 +254,14 @@ def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
     scene = torchpt.load(room("odd"), "cpu", bsdfs={"odd": Odd()})
     eager = rendered(scene, render={"compile": "off", "spp": 4})
     asked: list[int] = []
-    kept = Stages.bounce
+    kept = chunk.bounce_eagerly
 
-    def noted(self: Any, model: int, *args: Any) -> Any:
+    def noted(kernels: Any, model: int, *args: Any) -> int:
         asked.append(model)
-        return kept(self, model, *args)
+        return kept(kernels, model, *args)
 
     capsys.readouterr()
-    monkeypatch.setattr("torchpt.integrators.stage_runner.Stages.bounce", noted)
+    monkeypatch.setattr(chunk, "bounce_eagerly", noted)
     found = rendered(scene, render={"spp": 4})
     models = scene.world(torch.float32)[0].materials.models
     (own,) = [k for k, model in enumerate(models) if model.name == "odd"]
