@@ -83,7 +83,9 @@ def test_direct_is_a_path_of_two_edges(cornell):
 
 
 def test_max_depth_0_is_black_and_1_is_emission(cornell):
-    assert not shoot(cornell, 2, integrator={"max_depth": 0}, film=SMALL).image.any()
+    for compile in ("off", "on"):
+        none = torchpt.render(cornell, spp=2, integrator={"type": "path", "max_depth": 0}, film=SMALL, compile=compile)
+        assert not none.any()
     once = shoot(cornell, 16, integrator={"max_depth": 1}, film=film_of(64)).image
     lamp = torch.tensor([17.0, 12.0, 4.0])
     share = once / lamp  # coverage of the pixel by the lamp, the same in all channels

@@ -26,7 +26,6 @@ from torchpt.integrators.joint import Behind
 from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.search import Search
 from torchpt.integrators.vertex import VertexInput
-from torchpt.integrators.wave import still_of
 from torchpt.math.gathers import gathered_by
 from torchpt.math.vectors import take
 from torchpt.paths.walk import Observer, walk
@@ -146,7 +145,7 @@ class _Chunk:
     # -- forward
 
     def _trace(self, state: PathState, depth: int, hit: Hit | None, end: int | None) -> tuple[Tensor, Keeper]:
-        keeper, engine = Keeper(), Tensors(still_of(self.wave), self.span[1] * self.span[3])
+        keeper, engine = Keeper(), Tensors(self.wave, self.span[1] * self.span[3])
         paths = engine.spawn(state) if depth == 1 else Paths(state, depth, hit)
         walk(engine, paths, self.wave.integrator.limits, keeper, end)
         return engine.radiance, keeper

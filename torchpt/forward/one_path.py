@@ -15,7 +15,7 @@ from torchpt.forward.wave import make_wave
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.path import PathIntegrator
-from torchpt.integrators.vertex import Direct, VertexOutput
+from torchpt.integrators.vertex import DirectLight, VertexOutput
 from torchpt.paths.explain import Bounced, Explainer, Left, Met, Shone
 from torchpt.scene import Scene
 from torchpt.scene.names import Names
@@ -247,7 +247,7 @@ class _Story:
             return Vertex(depth=met.depth, wo=wo, emission=emission, radiance=_three(radiance))
         at = interact(self.world, met.state.o, met.state.d, met.hit)
         found = self.names.surface(int(at.slot), int(at.prim))
-        normal = at.ns if output is None else output.surface.frame.n
+        normal = at.ns if output is None or output.surface is None else output.surface.frame.n
         return Vertex(
             depth=met.depth,
             position=self._place(at.p),
@@ -281,7 +281,7 @@ class _Story:
             _three(light.brought),
         )
 
-    def _chosen(self, direct: Direct, brought: Tensor, clear: Tensor) -> Chosen:
+    def _chosen(self, direct: DirectLight, brought: Tensor, clear: Tensor) -> Chosen:
         sample, reflected = direct.sample, direct.reflected
         return Chosen(
             light=self.names.light(0 if sample.row is None else int(sample.row)),
@@ -310,7 +310,7 @@ class _Story:
 
 def _scattered(output: VertexOutput) -> Scattered:
     drawn, carried, chance, after = output.drawn, output.carried, output.chance, output.leaving
-    assert drawn is not None and carried is not None
+    assert drawn is not None and carried is not None and output.surface is not None
     goes_on, weight, relief = float(after.t_max) > 0.0, drawn.weight, output.surface.relief
     if relief is not None:
         weight = weight * relief.shadowing(drawn.d)

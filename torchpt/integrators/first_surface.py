@@ -29,7 +29,7 @@ class FirstSurface(ABC):
     def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
         """Return what surfaces of one BSDF model bring: pure, of n lanes.
 
-        The paths leave with what the surfaces bring added to their radiance; where they go is not asked for.
+        The paths leave with what the surfaces bring added to their radiance, and end there.
         """
 
 

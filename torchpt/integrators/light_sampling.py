@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpt import lights
 from torchpt.integrators.plan import Plan
 from torchpt.integrators.surfaces import Surface, emission_map, opacity_map, surface_at
-from torchpt.integrators.vertex import Direct, StageContext
+from torchpt.integrators.vertex import DirectLight, StageContext
 from torchpt.math.mis import power_heuristic
 from torchpt.math.vectors import dot, largest
 from torchpt.records import Interaction, LightSample, PathState, Shadow, World
@@ -29,7 +29,7 @@ SHORTEN = 1e-4
 
 def shade(
     context: StageContext, model: int, state: PathState, at: Interaction
-) -> tuple[Surface, Direct | None, Shadow | None]:
+) -> tuple[Surface, DirectLight | None, Shadow | None]:
     """Resolve the material at surface points of a BSDF model and sample a light for each.
 
     Returns:
@@ -52,7 +52,7 @@ def shade(
     weight = weight if share is None else weight * share
     shining = light_radiance(world, light)
     radiance = state.throughput * reflected * shining * weight
-    direct = Direct(light, shining, reflected, share, pdf, heuristic)
+    direct = DirectLight(light, shining, reflected, share, pdf, heuristic)
     return surface, direct, _shadow_ray(plan, world, at, light, radiance, weight)
 
 

@@ -19,7 +19,7 @@ from torchpt.records import Hit, Interaction, LightSample, PathState, Shadow, Wo
 if TYPE_CHECKING:
     from torchpt.integrators.surfaces import Surface
 
-__all__ = ["Direct", "Drawn", "Emission", "StageContext", "VertexInput", "VertexOutput", "no_search"]
+__all__ = ["DirectLight", "Drawn", "Emission", "StageContext", "VertexInput", "VertexOutput", "no_search"]
 
 
 def no_search(state: PathState) -> Hit:
@@ -94,7 +94,7 @@ class Emission:
 
 
 @dataclass(frozen=True)
-class Direct:
+class DirectLight:
     """Light that was sampled at a vertex.
 
     Attributes:
@@ -137,7 +137,7 @@ class VertexOutput:
         following: what these rays met, where that had to be found already.
         shadow: shadow rays whose light is still to be added; None where no light is sampled.
         at: the points.
-        surface: with its material.
+        surface: with its material; None where nobody asked for it.
         direct: the light that was sampled; None where none was.
         drawn: the direction that the BSDF gave; None where paths end here.
         carried: ``(3, n)`` throughput before roulette; None where paths end here.
@@ -148,8 +148,8 @@ class VertexOutput:
     following: Hit | None
     shadow: Shadow | None
     at: Interaction
-    surface: Surface
-    direct: Direct | None
+    surface: Surface | None = None
+    direct: DirectLight | None = None
     drawn: Drawn | None = None
     carried: Tensor | None = None
     chance: Tensor | None = None

@@ -345,6 +345,7 @@ def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
 
 
 _HANDLERS: dict[str, Callable[..., str]] = {
+    "bitreverse": lambda block, ty, a: block.call("llvm.bitreverse", ty, a),
     "add": _arithmetic("add"),
     "sub": _arithmetic("sub"),
     "mul": _arithmetic("mul"),

@@ -28,6 +28,7 @@ __all__ = [
     "Value",
     "handles",
     "lanes_for",
+    "tracer_of",
     "tracing",
 ]
 
@@ -70,6 +71,11 @@ def lanes_for(tables: Iterable[Tensor]) -> int:
 def tracing() -> bool:
     """Whether a stage is being traced in this process: then tensor forms are wanted, not calls of kernels."""
     return bool(_active)
+
+
+def tracer_of(tensor: Tensor) -> Tracer | None:
+    """Return the tracer under which a tensor depends on lanes or inputs; None where none does."""
+    return next((tracer for tracer in _active if tracer.is_traced(tensor)), None)
 
 
 @dataclass(frozen=True)

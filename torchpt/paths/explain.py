@@ -319,11 +319,11 @@ def _of_vertex(event: Bounced, world: World) -> Iterator[tuple[str, Tensor]]:
 
     read = "texture" if world.materials.textures[event.model] is not None else "material"
     yield of("surface", torch.cat((at.p, at.ng, at.ns)))
-    for value in leaves(surface.parameters):
-        if value.dim() and value.shape[-1] == len(spoiled):
-            yield of(read, value.reshape(-1, len(spoiled)))
-    frame = surface.frame
-    yield of("surface" if surface.relief is None else "texture", torch.cat((frame.n, surface.wo)))
+    if surface is not None:
+        for value in leaves(surface.parameters):
+            if value.dim() and value.shape[-1] == len(spoiled):
+                yield of(read, value.reshape(-1, len(spoiled)))
+        yield of("surface" if surface.relief is None else "texture", torch.cat((surface.frame.n, surface.wo)))
     if direct is not None:
         unlit = torch.isfinite(brought).all(0)
         factors = [("light", direct.radiance), ("light", direct.sample.weight), ("bsdf", direct.reflected)]
@@ -331,7 +331,7 @@ def _of_vertex(event: Bounced, world: World) -> Iterator[tuple[str, Tensor]]:
             factors.append(("bsdf", direct.weight))
         for cause, value in factors:
             yield of(cause, torch.where(unlit, 0.0, value))
-        yield of("light", brought)
+    yield of("light", brought)
     if drawn is None:
         yield of("preview", own)
         return

@@ -108,6 +108,9 @@ def walk(
         until: vertex at which the walk is to stop, before rays to it are searched for; None: it goes on to the ends.
     """
     observer = observer or Observer()
+    if limits.last < paths.depth:
+        engine.terminate(paths, truncated=False)
+        return
     while paths.depth != until:
         engine.intersect(paths)
         if observer.arrived(paths):

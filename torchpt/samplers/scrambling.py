@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from torchpt.core.dispatch import dispatched
 from torchpt.math.hashing import as_int32, logical_shift
 
 __all__ = ["W", "X", "Y", "Z", "fourth_dimension", "reverse_bits", "scramble", "second_dimension", "third_dimension"]
@@ -31,6 +32,7 @@ _STAYS = as_int32(3 * _FIRST)
 _HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
 
 
+@dispatched
 def reverse_bits(x: Tensor) -> Tensor:
     """Reverse the 32 bits of int32 lanes."""
     for shift, mask in _HALVES:

@@ -213,6 +213,7 @@ class Worker:
         kernels, calls = self.kernels, self.calls
         if not paths.groups:  # not sorted: all end where they are
             paths.arena.words[kernels.state.first("prim"), : paths.count] = -1
+            paths.arena.floats[kernels.state.first("t_max"), : paths.count] = 0.0
             self._settle(paths)
             return
         for model, count in enumerate(paths.groups):

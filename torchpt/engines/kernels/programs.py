@@ -12,15 +12,18 @@ from torchpt.engines.kernels.layout import Layout
 from torchpt.engines.kernels.leaves import Leaves
 from torchpt.engines.kernels.packets import kinds_of
 from torchpt.engines.kernels.trace import Trace
-from torchpt.lanes import engine, operators, shelf  # noqa: F401  (the operators register how they are lowered)
+from torchpt.lanes import bits, engine, operators, shelf  # noqa: F401  (the operators register how they are lowered)
 from torchpt.lanes.kernel import text
 from torchpt.lanes.program import Program, holds
 from torchpt.lanes.prologue import pruned
 from torchpt.lanes.sinks import Sinks
 from torchpt.lanes.stage import TracedStage
 from torchpt.lanes.tracing import Tracer, lanes_for
+from torchpt.samplers import scrambling
 
 __all__ = ["forget", "program_of"]
+
+scrambling.reverse_bits.register(bits.reverse_bits)
 
 #: More programs than this are not kept.
 MOST_PROGRAMS = 512

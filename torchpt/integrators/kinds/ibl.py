@@ -84,6 +84,4 @@ class Preview(FirstSurface):
             radiance = throughput * under(self.sky, world.materials.models[model], surface.parameters, n, v)
             if surface.shown is not None:
                 radiance = radiance * surface.shown
-        # No ray goes on: the lane ends where its shadow ray is known.
-        leaving = replace(state, radiance=state.radiance + radiance, t_max=torch.zeros_like(state.t_max))
-        return VertexOutput(leaving, None, shadow, at, surface, direct)
+        return VertexOutput(replace(state, radiance=state.radiance + radiance), None, shadow, at, surface, direct)
