@@ -19,8 +19,8 @@ from gradient_rooms import gradient_of, room
 from torch import Tensor
 
 import torchpt
-from torchpt.integrators.loop import calls, programs
-from torchpt.integrators.loop.kernels import Kernel
+from torchpt.engines.kernels import calls, programs
+from torchpt.engines.kernels.kernels import Kernel
 from torchpt.lanes import engine, shelf
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.engine import Target

@@ -30,7 +30,7 @@ class TracedStage:
         tensors: how many inputs are tensors instead of rows of an arena.
         listed: whether its lanes are those that a list names, else all in order.
         searched: kinds of primitives that its rays are searched among, see :mod:`torchpt.lanes.packet`; None where it has none.
-        sums: what rows of its results are derivatives by, see :mod:`torchpt.integrators.loop.joint`.
+        sums: what rows of its results are derivatives by, see :mod:`torchpt.engines.kernels.joint`.
     """
 
     graph: Graph
