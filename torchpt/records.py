@@ -6,7 +6,8 @@ Directions (pbrt): ``wo`` points toward the previous vertex, ``wi`` toward the n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from torchpt.core.tree import map_leaves
@@ -346,6 +347,8 @@ class PathState:
     #: same everywhere.
     p: Tensor | None = None
     n: Tensor | None = None
+    #: By name what the integrator carries along, see :class:`torchpt.integrators.vertex.Field`; `(N,)` or `(rows, N)` each.
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 T = TypeVar("T")
@@ -361,8 +364,4 @@ def joined(records: list[R]) -> R:
     """Records joined along the lane axis."""
     import torch
 
-    if len(records) == 1:
-        return records[0]
-    columns = {f.name: [getattr(r, f.name) for r in records] for f in fields(records[0])}
-    whole: dict[str, Any] = {name: None if c[0] is None else torch.cat(c, -1) for name, c in columns.items()}
-    return type(records[0])(**whole)
+    return records[0] if len(records) == 1 else map_leaves(lambda *parts: torch.cat(parts, -1), *records)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -270,6 +270,9 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
         SceneError: an unknown block or key, a key that does nothing for the chosen type, a bad value.
         NotBuiltError: a setting that this version does not build.
     """
+    own = overrides.get("integrator")
+    if isinstance(own, Integrator):  # one of the caller's own kinds, or of ours, made already
+        return replace(merge(scene, {**overrides, "integrator": None}, file), integrator=own)
     given = {name: _plain_mappings(blocks) for name, blocks in (("scene", scene), ("overrides", overrides))}
     return _merged.get(file, given, lambda: _merge(scene, overrides, file))
 

@@ -45,7 +45,7 @@ TOLERANCE = 1e-3
 #: to a few 1e-7 may then fall the other way, and conditions as bad as 1e4 turn 1e-7 into 1e-3.
 ALLOWED = 1e-4
 
-_STATE = tuple(f.name for f in fields(PathState))
+_STATE = tuple(f.name for f in fields(PathState) if f.name != "extra")
 _WHOLE = {"lane", "key", "prim"}  # equal or not
 
 

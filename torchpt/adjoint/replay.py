@@ -25,7 +25,7 @@ from torchpt.integrators import joint
 from torchpt.integrators.joint import Behind
 from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.search import Search
-from torchpt.integrators.vertex import VertexInput
+from torchpt.integrators.vertex import EXTRA, VertexInput
 from torchpt.math.gathers import gathered_by
 from torchpt.math.vectors import take
 from torchpt.paths.walk import Observer, walk
@@ -133,6 +133,9 @@ class _Chunk:
             self.radiance = asked if weight is None else asked * weight
             self.behind = {name: torch.zeros_like(asked) for name in ("throughput", "o", "d")[: self._rows]}
             n = asked.shape[1]
+            for own in self.wave.integrator.fields:
+                if not own.whole:
+                    self.behind[EXTRA + own.name] = torch.zeros_like(own.begin(asked[0]))
             zero = torch.zeros(n, dtype=asked.dtype, device=asked.device)
             self.met = Hit(zero.clone(), torch.full_like(start.lane, -1), zero.clone(), zero.clone())
             self._back(keeper)
@@ -210,6 +213,7 @@ class _Chunk:
             take(self.radiance, lane),
             take(self.behind["throughput"], lane),
             *(take(self.behind[name], lane) if self.plan.attached else None for name in ("o", "d")),
+            extra={k.removeprefix(EXTRA): take(x, lane) for k, x in self.behind.items() if k.startswith(EXTRA)},
         )
 
         def passed(shadow: Shadow) -> Tensor:
@@ -221,10 +225,10 @@ class _Chunk:
         with gathered_by(self.sums):
             context = self.taped.context.at(salts(depth, lane.device), slide, limits.roulette(depth))
             vertex = VertexInput(rows(state, index), rows(hit, index))
-            before = joint.bounce(context, model, vertex, following, passed, behind, self._others)
-        for name, rows_ in self.behind.items():
-            found = getattr(before, name)
-            rows_.index_copy_(1, lane, torch.zeros_like(behind.throughput) if found is None else found)
+            stage = self.wave.integrator.bounce
+            before = joint.bounce(stage, context, model, vertex, following, passed, behind, self._others)
+        for name, found, like in before.of_rays(vertex.state, self.plan.attached):
+            self.behind[name].index_copy_(-1, lane, torch.zeros_like(like) if found is None else found)
         self.sums.add_each(before.others)
         if asked is not None and before.chance is not None:
             asked.index_add_(0, index, before.chance)
@@ -239,13 +243,14 @@ class _Chunk:
                 continue
             lane = take(state.lane, index)
             vertex = VertexInput(rows(state, index), rows(hit, index))
-            stage, context = joint.emit if here else joint.escape, replace(self.taped.context, slide=slide)
+            integrator, context = self.wave.integrator, replace(self.taped.context, slide=slide)
+            stage = integrator.emit if here else integrator.escape
             with gathered_by(self.sums):
-                before = stage(context, vertex, take(self.radiance, lane), self._others)
-            for name, rows_ in self.behind.items():
-                found = getattr(before, name)
+                before = joint.gather(stage, context, vertex, take(self.radiance, lane), self._others)
+            for name, found, _ in before.of_rays(vertex.state, self.plan.attached):
                 if found is not None:
-                    rows_.index_copy_(1, lane, take(rows_, lane) + found)
+                    asked_ = self.behind[name]
+                    asked_.index_copy_(-1, lane, take(asked_, lane) + found)
             self.sums.add_each(before.others)
             if asked is not None and before.chance is not None:
                 asked.index_add_(0, index, before.chance)

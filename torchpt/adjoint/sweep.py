@@ -17,16 +17,17 @@ from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
 from torchpt.adjoint.sums import ChunkSums, Sums
 from torchpt.engines.kernels.chunk import Chunk, Paths, Worker
+from torchpt.engines.kernels.joint import slots_read
 from torchpt.engines.kernels.joint_kernels import JointKernels
 from torchpt.engines.kernels.kernels import Kernel
-from torchpt.engines.kernels.rows import HIT, Memory
+from torchpt.engines.kernels.rows import HIT, Memory, path_state
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Before, Behind
 from torchpt.integrators.path import slides
-from torchpt.integrators.vertex import VertexInput
+from torchpt.integrators.vertex import EXTRA, VertexInput
 from torchpt.math.gathers import gathered_by
 from torchpt.paths.walk import Counts, Observer, walk
-from torchpt.records import Hit, PathState, Shadow
+from torchpt.records import Hit, Shadow
 from torchpt.samplers import salts
 from torchpt.settings import Settings
 
@@ -34,7 +35,6 @@ __all__ = ["Sweep"]
 
 #: Vertices that are kept at once, and marks beyond them.
 KEPT, MARKS = 16, 8
-_STATE = ("o", "d", "t_max", "throughput", "radiance", "pdf", "lane", "key", "eta", "p", "n")
 
 
 @dataclass(frozen=True)
@@ -192,14 +192,13 @@ class Sweep(Worker):
 
     def _eagerly(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
         """Back through a stage by tensor operations, for what no kernel can be made of."""
-        kernels, context = self.joint, self.joint.taped
+        kernels, context, integrator = self.joint, self.joint.taped, self.wave.integrator
         plan = context.plan
         lanes = places.words[0, :count]
-        given = kernels.state.take(paths.arena, lanes, _STATE)
-        state = PathState(**{"eta": None, "p": None, "n": None, **given})  # type: ignore[arg-type]
+        state = path_state(kernels.state.take(paths.arena, lanes, kernels.state.state))
         vertex = VertexInput(state, Hit(**kernels.state.take(paths.arena, lanes, tuple(HIT))))
         lane = state.lane.numpy()
-        rows = kernels.slots.take(self._behind, lane, tuple(joint_names(plan.attached)))
+        rows = kernels.slots.take(self._behind, lane, slots_read(kernels))
 
         def clear(_: Shadow) -> Tensor:
             return rows["clear"]
@@ -207,20 +206,25 @@ class Sweep(Worker):
         before: Before
         with gathered_by(self.sums):
             if key[0] == "bounce":
-                behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"))
+                extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
+                behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
                 following = Hit(*(rows[name] for name in HIT)) if plan.attached else None
                 _, model, roulette, slide = key
                 context = context.at(salts(paths.depth, torch.device("cpu")), slide, roulette)
-                before = joint.bounce(context, model, vertex, following, clear, behind, self._tensors)
+                before = joint.bounce(
+                    integrator.bounce, context, model, vertex, following, clear, behind, self._tensors
+                )
             elif key[0] == "emit":
-                before = joint.emit(replace(context, slide=key[1]), vertex, rows["radiance"], self._tensors)
+                context = replace(context, slide=key[1])
+                before = joint.gather(integrator.emit, context, vertex, rows["radiance"], self._tensors)
             else:
-                before = joint.escape(context, vertex, rows["radiance"], self._tensors)
-        for name in ("throughput", "o", "d") if plan.attached else ("throughput",):
-            found, first = getattr(before, name), kernels.slots.first(name)
-            found = np.zeros((3, count), np.float32) if found is None else found.numpy()
-            held = self._behind.floats[first : first + 3]
-            held[:, lane] = found + held[:, lane] if added else found
+                before = joint.gather(integrator.escape, context, vertex, rows["radiance"], self._tensors)
+        for name, found, like in before.of_rays(state, plan.attached):
+            first = kernels.slots.first(name)
+            values = np.zeros(like.shape, np.float32) if found is None else found.numpy()
+            values = values.reshape(-1, count)
+            held = self._behind.floats[first : first + len(values)]
+            held[:, lane] = values + held[:, lane] if added else values
         self.sums.add_each(before.others)
 
     def _tensors(self) -> Sequence[Tensor]:
@@ -237,11 +241,3 @@ class Sweep(Worker):
             asked = [torch.from_numpy(self._behind.floats[row : row + 3, :n].copy()) for _, row in pairs]
             found = torch.autograd.grad([x for x, _ in pairs], self._tensors(), asked, allow_unused=True)
         self.sums.add_each(found)
-
-
-def joint_names(attached: bool) -> Sequence[str]:
-    """Fields of the slots that are read."""
-    return (*joint_fields, *HIT) if attached else ("radiance", "throughput", "clear")
-
-
-joint_fields = ("radiance", "throughput", "o", "d", "clear")

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
-from torchpt.integrators import LAYERS, aov, stages
+from torchpt.integrators import LAYERS, aov
 from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.search import Search
@@ -81,7 +81,7 @@ class Tensors:
 
     def __init__(self, wave: Wave, lanes: int, tally: Tally | None = None, keeps: bool = False) -> None:
         self.keeps = keeps
-        self.context, self.first, self.tally = wave.context, wave.first, Tally() if tally is None else tally
+        self.wave, self.context, self.tally = wave, wave.context, Tally() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
         self.search = Search(wave.accel, self.world, self.plan.sampler, self.plan.dtype)
         self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=wave.centre.device)
@@ -92,6 +92,8 @@ class Tensors:
             state = replace(state, eta=torch.ones_like(state.t_max))
         if lights.local(self.world.lights):
             state = replace(state, p=state.o.clone(), n=torch.zeros_like(state.o))
+        if self.wave.integrator.fields:
+            state = replace(state, extra={f.name: f.begin(state.t_max) for f in self.wave.integrator.fields})
         return Paths(state)
 
     def intersect(self, paths: Paths) -> None:
@@ -108,12 +110,12 @@ class Tensors:
     def emit(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
         if self.world.lights is not None:
-            self._gather(paths, paths.ends.emissive, stages.emit)
+            self._gather(paths, paths.ends.emissive, self.wave.integrator.emit)
 
     def escape(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
         if self.world.lights is not None and self.world.lights.environment is not None:
-            self._gather(paths, paths.ends.missed, stages.escape)
+            self._gather(paths, paths.ends.missed, self.wave.integrator.escape)
         self._end(paths, paths.ends.missed)
 
     def _gather(self, paths: Paths, index: Tensor, stage: Callable[[StageContext, VertexInput], Emission]) -> None:
@@ -134,7 +136,7 @@ class Tensors:
     def scatter(self, paths: Paths, roulette: float) -> Paths:
         """See :class:`torchpt.paths.walk.Engine`."""
         assert paths.groups is not None
-        context, bounce = self._context(paths, roulette), stages.bounce if self.first is None else self.first.bounce
+        context, bounce = self._context(paths, roulette), self.wave.bounce
         leaving: list[PathState] = []
         following: list[Hit] = []
         after = Paths(paths.state, paths.depth + 1)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
+from torchpt.integrators import stages
 from torchpt.integrators.roulette import DEEP, DEEP_CAP
 from torchpt.integrators.stages import STRATEGIES, Plan
+from torchpt.integrators.vertex import Emission, Field, StageContext, VertexInput, VertexOutput
 from torchpt.lights import WAYS
 from torchpt.spec import Choice, Flag, Scalar, Spec, Valued, parameters_of
 
@@ -86,6 +89,7 @@ class Integrator(Valued):
         layers: layers that are shown where ``film.aovs`` names none.
         lit: whether it sees the scene's lights; else its world has none.
         looped: whether the compiled loop of CPUs can run it; else it runs as tensor operations.
+        fields: what its paths carry beside the state of every path.
         strategy, rr_prob, light_choice, clamp, strict: as for ``path``, where the kind has no such parameter.
     """
 
@@ -94,6 +98,7 @@ class Integrator(Valued):
     layers: ClassVar[tuple[str, ...]] = ()
     lit: ClassVar[bool] = True
     looped: ClassVar[bool] = False
+    fields: ClassVar[Sequence[Field]] = ()
 
     strategy: str = "mis"
     rr_prob: float | None = None
@@ -115,6 +120,25 @@ class Integrator(Valued):
         specs = parameters_of(type(self))
         lengths = {key: value / unit for key, value in self.values.items() if specs[key].length and value is not None}
         return self.but(**lengths) if lengths and unit != 1.0 else self
+
+    def emit(self, context: StageContext, vertex: VertexInput) -> Emission:
+        """Return what paths gather from the emitters that they hit; a stage: a pure function of lanes."""
+        return stages.emit(context, vertex)
+
+    def escape(self, context: StageContext, vertex: VertexInput) -> Emission:
+        """Return what paths gather from the environment that they escape to; a stage."""
+        return stages.escape(context, vertex)
+
+    def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
+        """Return what surfaces of BSDF model number ``model`` make of paths; a stage."""
+        return stages.bounce(context, model, vertex)
+
+    @property
+    def own_stages(self) -> bool:
+        """Whether it carries fields or has stages of its own, for which kernels are made anew."""
+        kind, base = type(self), Integrator
+        own = any(getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce"))
+        return own or bool(self.fields)
 
     def first(self, world: World) -> FirstSurface | None:
         """What happens at first surfaces, made once a scene and differentiable in its world; None where paths go on."""

@@ -6,19 +6,20 @@ tensor functions of single vertices, so that the lane compiler can make kernels 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchpt.integrators import stages
+from torchpt.core.tree import leaves
 from torchpt.integrators.plan import Plan
-from torchpt.integrators.vertex import StageContext, VertexInput
+from torchpt.integrators.vertex import EXTRA, Emission, StageContext, VertexInput
+from torchpt.integrators.wave import Bounce
 from torchpt.records import Hit, PathState, Shadow
 
-__all__ = ["Behind", "bounce", "emit", "escape"]
+__all__ = ["Before", "Behind", "bounce", "gather"]
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,14 @@ class Behind:
         throughput: of the rays that leave.
         o: of their origins; None where no geometry is differentiated.
         d: of their directions; likewise.
+        extra: of what the integrator carries along, by name.
     """
 
     radiance: Tensor
     throughput: Tensor
     o: Tensor | None
     d: Tensor | None
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class Before:
         throughput, o, d: of the rays that came ``(3, n)``.
         chance: of :attr:`torchpt.records.Hit.chance` ``(n,)``.
         others: of the tensors that were asked for.
+        extra: of what the integrator carries along, by name.
     """
 
     throughput: Tensor | None
@@ -53,12 +57,24 @@ class Before:
     d: Tensor | None
     chance: Tensor | None
     others: tuple[Tensor | None, ...]
+    extra: Mapping[str, Tensor | None] = field(default_factory=dict)
+
+    def of_rays(self, state: PathState, attached: bool) -> Iterator[tuple[str, Tensor | None, Tensor]]:
+        """Yield what is asked of the rays that came: its name, derivatives (None: nothing), and a tensor of their shape.
+
+        ``attached``: whether geometry is differentiated.
+        """
+        for name in ("throughput", "o", "d") if attached else ("throughput",):
+            yield name, getattr(self, name), state.throughput
+        for name, found in self.extra.items():
+            yield EXTRA + name, found, state.extra[name]
 
 
 Others = Callable[[], Sequence[Tensor]]
 
 
 def bounce(
+    stage: Bounce,
     context: StageContext,
     model: int,
     vertex: VertexInput,
@@ -67,9 +83,10 @@ def bounce(
     behind: Behind,
     others: Others,
 ) -> Before:
-    """Go back through :func:`torchpt.integrators.stages.bounce`.
+    """Go back through what happens at surfaces.
 
     Args:
+        stage: what happens, such as :func:`torchpt.integrators.stages.bounce`.
         context: as of the stage, its world with leaves where derivatives are wanted.
         model: as of the stage.
         vertex: as of the stage.
@@ -85,11 +102,12 @@ def bounce(
 
     with torch.enable_grad():
         vertex, given = _given(context.plan, vertex)
-        output = stages.bounce(replace(context, search=found), model, vertex)
+        output = stage(replace(context, search=found), model, vertex)
         after, shadow = output.leaving, output.shadow
         asked = [(after.throughput, behind.throughput)]
         if behind.o is not None and behind.d is not None:
             asked += [(after.o, behind.o), (after.d, behind.d)]
+        asked += [(after.extra[name], cotangent) for name, cotangent in behind.extra.items()]
         if shadow is not None:
             passed = clear(shadow)
             if passed.requires_grad:
@@ -99,21 +117,39 @@ def bounce(
         return _back(asked, given, others)
 
 
-def emit(context: StageContext, vertex: VertexInput, radiance: Tensor, others: Others) -> Before:
-    """Go back through :func:`torchpt.integrators.stages.emit`; ``radiance``: what is asked of the samples' ``(3, n)``."""
+def gather(
+    stage: Callable[[StageContext, VertexInput], Emission],
+    context: StageContext,
+    vertex: VertexInput,
+    radiance: Tensor,
+    others: Others,
+) -> Before:
+    """Go back through light that was met by chance.
+
+    Args:
+        stage: what was met, such as :func:`torchpt.integrators.stages.emit` or :func:`torchpt.integrators.stages.escape`.
+        context: as for :func:`bounce`.
+        vertex: as of the stage.
+        radiance: what is asked of the samples' ``(3, n)``.
+        others: as for :func:`bounce`.
+    """
     with torch.enable_grad():
         vertex, given = _given(context.plan, vertex)
-        return _back([(stages.emit(context, vertex).brought, radiance)], given, others)
+        return _back([(stage(context, vertex).brought, radiance)], given, others)
 
 
-def escape(context: StageContext, vertex: VertexInput, radiance: Tensor, others: Others) -> Before:
-    """Go back through :func:`torchpt.integrators.stages.escape`, likewise."""
-    with torch.enable_grad():
-        vertex, given = _given(context.plan, vertex)
-        return _back([(stages.escape(context, vertex).brought, radiance)], given, others)
+@dataclass(frozen=True)
+class _Given:
+    """Leaves in the place of what a vertex was given; None where nothing is asked of it."""
+
+    throughput: Tensor
+    o: Tensor | None
+    d: Tensor | None
+    chance: Tensor | None
+    extra: Mapping[str, Tensor]
 
 
-def _given(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, list[Tensor | None]]:
+def _given(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _Given]:
     """Return the vertex with leaves for what may be differentiated, and these."""
 
     def leaf(x: Tensor) -> Tensor:
@@ -122,19 +158,29 @@ def _given(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, list[Tensor | 
     state, hit = vertex.state, vertex.hit
     throughput = leaf(state.throughput)
     o, d = (leaf(state.o), leaf(state.d)) if plan.attached else (None, None)
-    state = replace(state, throughput=throughput, o=state.o if o is None else o, d=state.d if d is None else d)
+    extra = {name: leaf(value) for name, value in state.extra.items() if value.is_floating_point()}
+    state = replace(
+        state,
+        throughput=throughput,
+        o=state.o if o is None else o,
+        d=state.d if d is None else d,
+        extra={**state.extra, **extra},
+    )
     chance = None if hit.chance is None else leaf(hit.chance)
-    return VertexInput(state, replace(hit, chance=chance)), [throughput, o, d, chance]
+    return VertexInput(state, replace(hit, chance=chance)), _Given(throughput, o, d, chance, extra)
 
 
-def _back(asked: list[tuple[Tensor, Tensor]], given: list[Tensor | None], others: Others) -> Before:
+def _back(asked: list[tuple[Tensor, Tensor]], given: _Given, others: Others) -> Before:
     asked = [(y, g) for y, g in asked if y.requires_grad]
-    own = [x for x in given if x is not None]
-    rest = list(others())
+    own, rest = leaves(given), list(others())
     grads: Sequence[Any] = [None] * (len(own) + len(rest))
     if asked:
         outputs, wanted = [y for y, _ in asked], [g for _, g in asked]
         grads = torch.autograd.grad(outputs, [*own, *rest], wanted, allow_unused=True)
-    found = iter(grads)
-    state = [None if x is None else next(found) for x in given]
-    return Before(*state, others=tuple(found))
+    found = {id(leaf): gradient for leaf, gradient in zip(own, grads, strict=False)}
+
+    def of(leaf: Tensor | None) -> Tensor | None:
+        return None if leaf is None else found[id(leaf)]
+
+    extra = {name: of(leaf) for name, leaf in given.extra.items()}
+    return Before(of(given.throughput), of(given.o), of(given.d), of(given.chance), tuple(grads[len(own) :]), extra)

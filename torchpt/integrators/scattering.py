@@ -156,6 +156,7 @@ def next_ray(
         lane=state.lane,
         key=state.key,
         eta=onward.eta,
+        extra=state.extra,
     )
     if state.p is None:
         return leaving

@@ -19,12 +19,49 @@ from torchpt.records import Hit, Interaction, LightSample, PathState, Shadow, Wo
 if TYPE_CHECKING:
     from torchpt.integrators.surfaces import Surface
 
-__all__ = ["DirectLight", "Drawn", "Emission", "StageContext", "VertexInput", "VertexOutput", "no_search"]
+__all__ = [
+    "EXTRA",
+    "DirectLight",
+    "Drawn",
+    "Emission",
+    "Field",
+    "StageContext",
+    "VertexInput",
+    "VertexOutput",
+    "no_search",
+]
 
 
 def no_search(state: PathState) -> Hit:
     """Stand for a search in stages that must not ask for one."""
     raise AssertionError("hits are found between stages where no geometry is differentiated")
+
+
+#: What names of fields begin with where they stand beside those of a path's state.
+EXTRA = "extra."
+
+
+@dataclass(frozen=True)
+class Field:
+    """One more number, or several, that an integrator carries along its paths; engines lay them out.
+
+    Attributes:
+        name: under which stages find it in ``state.extra``, as ``(N,)``, or ``(rows, N)`` where there are several.
+        rows: how many numbers it has.
+        start: its value where paths begin.
+        whole: whether it is int64, without derivatives; else it is of the lanes' dtype and is differentiated.
+    """
+
+    name: str
+    rows: int = 1
+    start: float = 0.0
+    whole: bool = False
+
+    def begin(self, like: Tensor) -> Tensor:
+        """Return the values of paths that begin; ``like (N,)`` tells how many, their dtype and device."""
+        shape = (len(like),) if self.rows == 1 else (self.rows, len(like))
+        dtype = torch.int64 if self.whole else like.dtype
+        return torch.full(shape, self.start, dtype=dtype, device=like.device)
 
 
 @dataclass(frozen=True)

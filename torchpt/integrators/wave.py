@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,14 +16,17 @@ from torchpt.film import Filter
 from torchpt.integrators.base import Integrator, Limits
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.stages import generate
-from torchpt.integrators.vertex import StageContext
+from torchpt.integrators.vertex import StageContext, VertexInput, VertexOutput
 from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, Streams, salts
 
 if TYPE_CHECKING:
     from torchpt.integrators.first_surface import FirstSurface
 
-__all__ = ["Wave", "camera_state", "still_of"]
+#: A stage of the surfaces of one BSDF model.
+Bounce = Callable[[StageContext, int, VertexInput], VertexOutput]
+
+__all__ = ["Bounce", "Wave", "camera_state", "still_of"]
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,11 @@ class Wave:
     def limits(self) -> Limits | None:
         """Where paths end; None where no light is carried."""
         return self.integrator.limits if self.integrator.light else None
+
+    @property
+    def bounce(self) -> Bounce:
+        """What happens at surfaces."""
+        return self.integrator.bounce if self.first is None else self.first.bounce
 
     def rays(
         self, first_pixel: int, pixels: int, first_sample: int, samples: int, plate: Plate | None = None

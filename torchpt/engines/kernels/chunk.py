@@ -242,7 +242,7 @@ class Worker:
                     kernels, model, roulette, paths.arena, after.arena, lanes, count, done, paths.depth
                 )
             else:
-                kernel = kernels.bounce(model, roulette) if self.wave.first is None else kernels.first(model)
+                kernel = kernels.bounce(model, roulette)
                 lanes = lanes if kernels.listed else None
                 calls.run(kernel, count, paths.arena, after.arena, lanes, lists=after.lists)
                 self.tally.rays += count * kernel.program.shadows

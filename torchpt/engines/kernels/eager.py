@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import torch
+from torch import Tensor
 
 from torchpt.engines.kernels.kernels import Kernels
-from torchpt.engines.kernels.rows import HIT, Memory
-from torchpt.integrators import stages
+from torchpt.engines.kernels.rows import HIT, Memory, path_state, state_values
 from torchpt.integrators.vertex import VertexInput
-from torchpt.records import Hit, PathState
+from torchpt.records import Hit
 from torchpt.samplers import salts
 
 __all__ = ["bounce_eagerly"]
-
-_STATE = tuple(field.name for field in fields(PathState))
 
 
 def bounce_eagerly(
@@ -47,13 +43,12 @@ def bounce_eagerly(
     """
     rows, lanes = kernels.state, places.words[0, :count]
     with torch.no_grad():
-        given = rows.take(source, lanes, _STATE)
-        state = PathState(**{"eta": None, "p": None, "n": None, **given})  # type: ignore[arg-type]
+        state = path_state(rows.take(source, lanes, rows.state))
         vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
         context = kernels.wave.context.at(salts(depth, torch.device("cpu")), roulette=roulette)
-        output = stages.bounce(context, model, vertex)
+        output = kernels.wave.integrator.bounce(context, model, vertex)
         after, shadow = output.leaving, output.shadow
-    values = {name: getattr(after, name) for name in _STATE}
+    values: dict[str, Tensor | None] = {**state_values(after)}
     values |= rows.take(source, lanes, ("weight",))
     if "shadow_o" in rows:
         values |= {

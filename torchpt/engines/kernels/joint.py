@@ -15,11 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.engines.kernels.layout import Layout
 from torchpt.engines.kernels.rows import HIT, Fields, Rows
 from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Before, Behind
-from torchpt.integrators.vertex import VertexInput
+from torchpt.integrators.vertex import EXTRA, VertexInput
 from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.operators.derivatives import summands
 from torchpt.lanes.sinks import Scatter, Sinks
@@ -30,7 +31,7 @@ from torchpt.records import Hit, PathState, Shadow
 if TYPE_CHECKING:
     from torchpt.engines.kernels.joint_kernels import JointKernels
 
-__all__ = ["SLOTS", "back_bounce", "back_emit", "back_escape", "report"]
+__all__ = ["SLOTS", "back_bounce", "back_emit", "back_escape", "report", "slots_of", "slots_read"]
 
 #: What lies in slots: what is asked of a sample's radiance and of its ray, how much of the light of its latest shadow ray got
 #: through, and what its next ray met.
@@ -42,6 +43,13 @@ SLOTS: Fields = {
     "clear": ((), "f"),
     **HIT,
 }
+
+
+def slots_of(layout: Layout) -> Fields:
+    """Return what lies in slots, with what is asked of the numbers that an integrator carries along."""
+    carried = layout.wave.integrator.fields
+    extra = {EXTRA + own.name: ((own.rows,) if own.rows > 1 else (), "f") for own in carried if not own.whole}
+    return {**SLOTS, **extra}
 
 
 class _Noted:
@@ -76,7 +84,8 @@ def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _given(trace)
-    behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"))
+    extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
+    behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
     following = Hit(*(rows[name] for name in HIT)) if kernels.taped.plan.attached else None
 
     def clear(_: Shadow) -> Tensor:
@@ -85,7 +94,8 @@ def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks
     noted = _Noted(tracer, kernels)
     with tracer, gathered_by(noted):
         context = kernels.taped.at(salts, slide, roulette)
-        before = joint.bounce(context, model, VertexInput(state, hit), following, clear, behind, noted.leaves)
+        stage, vertex = trace.layout.wave.integrator.bounce, VertexInput(state, hit)
+        before = joint.bounce(stage, context, model, vertex, following, clear, behind, noted.leaves)
     return _ended(trace, noted, state, before, {})
 
 
@@ -96,7 +106,8 @@ def back_emit(trace: Trace, slide: bool) -> Sinks:
     noted = _Noted(tracer, kernels)
     with tracer, gathered_by(noted):
         context = replace(kernels.taped, slide=slide)
-        before = joint.emit(context, VertexInput(state, hit), rows["radiance"], noted.leaves)
+        stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
+        before = joint.gather(stage, context, vertex, rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
 
 
@@ -106,7 +117,8 @@ def back_escape(trace: Trace) -> Sinks:
     state, hit, rows = _given(trace)
     noted = _Noted(tracer, kernels)
     with tracer, gathered_by(noted):
-        before = joint.escape(kernels.taped, VertexInput(state, hit), rows["radiance"], noted.leaves)
+        stage, vertex = trace.layout.wave.integrator.escape, VertexInput(state, hit)
+        before = joint.gather(stage, kernels.taped, vertex, rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
 
 
@@ -125,6 +137,12 @@ def report(trace: Trace) -> Sinks:
     return Sinks(scatter=[Scatter(-1, trace.node(lane), rows, slots=True)])
 
 
+def slots_read(kernels: JointKernels) -> tuple[str, ...]:
+    """Return the names of what a vertex reads of the slots."""
+    extra = tuple(name for name in slots_of(kernels) if name.startswith(EXTRA))
+    return (*SLOTS, *extra) if kernels.taped.plan.attached else ("radiance", "throughput", "clear", *extra)
+
+
 def _begun(trace: Trace) -> tuple[Any, Tracer]:
     trace.tracer.graph.derivatives = True
     return trace.layout, trace.tracer
@@ -134,10 +152,9 @@ def _given(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
     """State, hit, and what lies in the slots."""
     state, _ = trace.state()
     hit = trace.hit()
-    tracer, lane, slots = trace.tracer, trace.node(state.lane), Rows(SLOTS)
+    tracer, lane, slots = trace.tracer, trace.node(state.lane), Rows(slots_of(trace.layout))
     kernels: Any = trace.layout
-    names = tuple(SLOTS) if kernels.taped.plan.attached else ("radiance", "throughput", "clear")
-    return state, hit, slots.read(tracer, *names, place=lane)
+    return state, hit, slots.read(tracer, *slots_read(kernels), place=lane)
 
 
 def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added: dict[str, Tensor]) -> Sinks:
@@ -146,15 +163,14 @@ def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added:
     tracer, graph = trace.tracer, trace.tracer.graph
     fields: dict[str, Tensor] = {}
     with tracer:
-        for name in ("throughput", "o", "d") if kernels.taped.plan.attached else ("throughput",):
-            found = getattr(before, name)
+        for name, found, like in before.of_rays(state, kernels.taped.plan.attached):
             if found is None and added:
                 continue
-            found = torch.zeros_like(state.throughput) if found is None else found
+            found = torch.zeros_like(like) if found is None else found
             fields[name] = found + added[name] if added else found
     sinks = Sinks()
     if fields:
-        rows = tuple(Rows(SLOTS).nodes(tracer, **fields))
+        rows = tuple(Rows(slots_of(trace.layout)).nodes(tracer, **fields))
         sinks.scatter.append(Scatter(-1, trace.node(state.lane), rows, slots=True))
     columns: dict[tuple[int, int], list[int]] = {}
     for (number, index, _), gradient in zip(noted.taken, before.others, strict=False):

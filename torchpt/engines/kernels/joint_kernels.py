@@ -32,7 +32,7 @@ class JointKernels(Kernels):
         taped: what stages read where they are gone back along.
         numbers_of: which of the leaves a tensor is, by its id.
         back_eager: stages that no kernel can be made of, and why.
-        slots: rows of :data:`torchpt.engines.kernels.joint.SLOTS`.
+        slots: rows of :func:`torchpt.engines.kernels.joint.slots_of`.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class JointKernels(Kernels):
             if path is not None:
                 self._leaves.ids[id(tape)] = path, tape
         self.structure = (*self.structure, self.taped.plan.attached, tuple(paths))
-        self.slots = Rows(joint.SLOTS)
+        self.slots = Rows(joint.slots_of(self))
         self.back_eager: dict[tuple[Any, ...], str] = {}
 
     def back_kernel(self, key: tuple[Any, ...]) -> Kernel | None:

@@ -78,7 +78,8 @@ class Kernels(Layout):
         )
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
-        asked = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, self._leaves.tensors)
+        own = wave.integrator if wave.integrator.own_stages else None
+        asked = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, asked), packets, fused)
         alike = before is not None and before.structure == self.structure
         self.handed = before.handed if alike else Handed()  # pyright: ignore[reportOptionalMemberAccess]
@@ -134,10 +135,6 @@ class Kernels(Layout):
     def retire(self) -> Kernel:
         """See :func:`torchpt.engines.kernels.vertex.retire`."""
         return self._get(self.listed, vertex.retire)
-
-    def first(self, model: int) -> Kernel:
-        """See :func:`torchpt.engines.kernels.vertex.first`."""
-        return self._get(True, vertex.first, model)
 
     # -- the search by packets
 

@@ -8,6 +8,7 @@ import torch
 
 from torchpt import lights
 from torchpt.engines.kernels.rows import HIT, PASS, SHADOW, Fields, Rows
+from torchpt.integrators.vertex import EXTRA
 
 if TYPE_CHECKING:
     from torchpt.integrators.wave import Wave
@@ -81,6 +82,8 @@ def _path_fields(layout: Layout) -> Fields:
         fields["eta"] = ((), "f")
     if lights.local(world.lights):
         fields |= {"p": ((3,), "f"), "n": ((3,), "f")}
+    for own in wave.integrator.fields:
+        fields[EXTRA + own.name] = ((own.rows,) if own.rows > 1 else (), "l" if own.whole else "f")
     if wave.filter.signed:
         fields["weight"] = ((), "f")
     fields |= HIT

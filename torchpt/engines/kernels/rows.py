@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.integrators.vertex import EXTRA
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.graph import DTYPES
 from torchpt.lanes.tracing import Tracer
+from torchpt.records import PathState
 
-__all__ = ["HIT", "PASS", "SHADOW", "Fields", "Memory", "Rows"]
+__all__ = ["HIT", "PASS", "SHADOW", "Fields", "Memory", "Rows", "path_state", "state_values"]
 
 #: Shape without lanes and node type of each field.
 Fields = dict[str, tuple[tuple[int, ...], str]]
@@ -33,7 +38,24 @@ PASS: Fields = {
     "home": ((), "l"),
 }
 
+#: Fields of a path's state, those apart.
+_STATE = tuple(field.name for field in fields(PathState) if field.name != "extra")
+
 _DTYPES = {ty: dtype for dtype, ty in DTYPES.items()}
+
+
+def path_state(given: Mapping[str, Tensor]) -> PathState:
+    """Return paths from tensors by the names of rows; other names are passed over."""
+    extra = {name.removeprefix(EXTRA): value for name, value in given.items() if name.startswith(EXTRA)}
+    known: dict[str, Any] = {name: value for name, value in given.items() if name in _STATE}
+    return PathState(**known, extra=extra)
+
+
+def state_values(state: PathState) -> dict[str, Tensor]:
+    """Return tensors of paths by the names of rows."""
+    values = {name: getattr(state, name) for name in _STATE}
+    extra = {EXTRA + name: value for name, value in state.extra.items()}
+    return {name: value for name, value in values.items() if value is not None} | extra
 
 
 class Memory:
@@ -65,6 +87,11 @@ class Rows:
 
     def __contains__(self, name: str) -> bool:
         return name in self._fields
+
+    @property
+    def state(self) -> tuple[str, ...]:
+        """Names of the rows that hold a path's state."""
+        return tuple(name for name in self._fields if name in _STATE or name.startswith(EXTRA))
 
     def first(self, name: str) -> int:
         """The first row of a field."""

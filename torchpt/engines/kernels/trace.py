@@ -6,22 +6,19 @@ The functions of :mod:`~torchpt.engines.kernels.vertex`, :mod:`~torchpt.engines.
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpt.engines.kernels.layout import Layout
-from torchpt.engines.kernels.rows import HIT, Rows
+from torchpt.engines.kernels.rows import HIT, Rows, path_state, state_values
 from torchpt.lanes.sinks import Note, Scatter, Sinks
 from torchpt.lanes.tracing import Tracer
 from torchpt.records import Hit, PathState
 from torchpt.samplers import Dimension
 
 __all__ = ["Trace"]
-
-_STATE = tuple(field.name for field in fields(PathState))
 
 
 class Trace:
@@ -57,9 +54,7 @@ class Trace:
     def state(self) -> tuple[PathState, dict[str, Tensor]]:
         """The state of the paths, and what travels with them unseen by stages: the filter's ``weight``."""
         rows = self.layout.state
-        given = rows.read(self.tracer, *_STATE)
-        unseen = rows.read(self.tracer, "weight")
-        return PathState(**{"eta": None, "p": None, "n": None, **given}), unseen  # type: ignore[arg-type]
+        return path_state(rows.read(self.tracer, *rows.state)), rows.read(self.tracer, "weight")
 
     def hit(self, rows: Rows | None = None) -> Hit:
         """What the rays met."""
@@ -78,9 +73,7 @@ class Trace:
 
     def kept(self, state: PathState, unseen: dict[str, Tensor]) -> list[tuple[int, int]]:
         """The state as rows and nodes."""
-        values = {name: getattr(state, name) for name in _STATE}
-        given = {name: value for name, value in values.items() if value is not None}
-        return self.layout.state.nodes(self.tracer, **given, **unseen)
+        return self.layout.state.nodes(self.tracer, **state_values(state), **unseen)
 
     def ended(self, mask: int, lane: Tensor, radiance: Tensor, unseen: dict[str, Tensor]) -> Scatter:
         """Paths that end where the node ``mask`` holds (-1: all): their radiance goes to the slots of their samples."""

@@ -18,7 +18,7 @@ from torchpt.lanes.sinks import Pack, Scatter, Sinks
 from torchpt.records import PathState, Shadow
 from torchpt.samplers import Dimension, Draws
 
-__all__ = ["PLACE", "bounce", "emit", "escape", "first", "generate", "retire", "settle"]
+__all__ = ["PLACE", "bounce", "emit", "escape", "generate", "retire", "settle"]
 
 #: Numbers that say which samples a chunk holds: the first pixel of the picture and how many there are; the stream and point
 #: of the first sample, the first stream and how many share the samples; the crop's corner and width, the film's width.
@@ -53,6 +53,8 @@ def generate(trace: Trace, chosen: bool) -> Sinks:
             state = replace(state, eta=torch.ones_like(state.t_max))
         if "p" in layout.state:
             state = replace(state, p=state.o, n=torch.zeros_like(state.o))
+        extra = {field.name: field.begin(state.t_max) for field in wave.integrator.fields}
+        state = replace(state, extra=extra) if extra else state
     sinks = Sinks()
     if layout.fused:
         _searched(trace, sinks, state, unseen)
@@ -89,7 +91,7 @@ def emit(trace: Trace) -> Sinks:
     hit = trace.hit()
     place = trace.place()
     with tracer:
-        radiance = state.radiance + stages.emit(layout.wave.context, VertexInput(state, hit)).brought
+        radiance = state.radiance + layout.wave.integrator.emit(layout.wave.context, VertexInput(state, hit)).brought
     rows = tuple(layout.state.nodes(tracer, radiance=radiance))
     return Sinks(scatter=[Scatter(-1, trace.node(place), rows)])
 
@@ -97,9 +99,9 @@ def emit(trace: Trace) -> Sinks:
 def escape(trace: Trace) -> Sinks:
     """Light from outside, and the ends of those paths."""
     state, unseen = trace.state()
-    hit = trace.hit()
+    hit, wave = trace.hit(), trace.layout.wave
     with trace.tracer:
-        radiance = state.radiance + stages.escape(trace.layout.wave.context, VertexInput(state, hit)).brought
+        radiance = state.radiance + wave.integrator.escape(wave.context, VertexInput(state, hit)).brought
     return Sinks(scatter=[trace.ended(-1, state.lane, radiance, unseen)])
 
 
@@ -117,7 +119,7 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
     hit = trace.hit()
     with tracer:
         context = layout.wave.context.at(salts, roulette=roulette)
-        output = stages.bounce(context, model, VertexInput(state, hit))
+        output = layout.wave.bounce(context, model, VertexInput(state, hit))
     after, shadow = output.leaving, output.shadow
     if not layout.fused:
         return _with_shadow(trace, after, shadow, unseen)
@@ -129,18 +131,6 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
         after = replace(after, radiance=radiance)
     _searched(trace, sinks, after, unseen)
     return sinks
-
-
-def first(trace: Trace, model: int) -> Sinks:
-    """The first surfaces of a model, where paths end at them."""
-    wave = trace.layout.wave
-    salts = trace.salts()
-    state, unseen = trace.state()
-    hit = trace.hit()
-    assert wave.first is not None
-    with trace.tracer:
-        output = wave.first.bounce(wave.context.at(salts), model, VertexInput(state, hit))
-    return _with_shadow(trace, output.leaving, output.shadow, unseen)
 
 
 # -- the two ways in which lanes go on
