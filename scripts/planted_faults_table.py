@@ -307,11 +307,11 @@ FAULTS = (
     ),
     Fault(
         "opacity_reuses_number",
-        "integrators/search.py",
+        "engines/tensors.py",
         "integrators",
-        "Search._stopped",
-        "depth + step * PASSES",
-        "depth",
+        "Tensors.transmit",
+        "paths.depth + flight.step * PASSES",
+        "paths.depth",
         "a random dimension used again: a ray that passed one leaf passes all further ones of its opacity",
     ),
     Fault(

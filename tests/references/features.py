@@ -104,7 +104,7 @@ FEATURES: dict[str, Feature] = {
         ("world.textures.tables", "world.geometry.tangents"),
     ),
     "opacity": Feature(
-        ("integrators/search.py",), lambda scene: _material(scene, opacity=0.5), ("world.materials.opacity",), ("clear",)
+        ("integrators/transmission.py",), lambda scene: _material(scene, opacity=0.5), ("world.materials.opacity",), ("clear",)
     ),
     "constant sky": Feature(
         ("lights/kinds/constant.py",),

@@ -29,7 +29,6 @@ from torchpt.format.description import settings
 from torchpt.forward import kernels_of, make_wave
 from torchpt.integrators import stages
 from torchpt.integrators.path import partition
-from torchpt.integrators.search import Search
 from torchpt.integrators.tally import Tally
 from torchpt.integrators.vertex import VertexInput
 from torchpt.integrators.wave import Wave
@@ -93,7 +92,7 @@ class _Recorder(Tensors):
         self.states: list[PathState] = []
 
     def _gather(self, paths: Paths, index: Tensor, stage: Any) -> None:
-        kept = self.emits if stage is stages.emit else self.escapes
+        kept = self.emits if stage == self.wave.integrator.emit else self.escapes
         kept.append((_copied(paths.state), paths.met, index))
         super()._gather(paths, index, stage)
 
@@ -237,8 +236,8 @@ def _routes(worker: Worker, taken: dict[str, Tensor], lists: list[Memory], count
 
 
 def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorder) -> None:
-    worker, plan, world = Worker(kernels), wave.context.plan, wave.context.world
-    search = Search(wave.accel, world, plan.sampler, plan.dtype)
+    worker, world = Worker(kernels), wave.context.world
+    engine = Tensors(wave, 0)
     kind = "fused" if kernels.fused else "apart"
     done: set[tuple[int, bool]] = set()
     for model, state, hit, index, depth in recorder.bounces:
@@ -260,9 +259,9 @@ def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recor
                 _compare_apart(found, name, after, shadow, values)
                 continue
             if shadow is not None:
-                clear = search.clear(shadow)
+                clear = engine.clear(shadow)
                 after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
-            _compare_fused(found, name, kernels, after, search.nearest(after, depth + 1), values, on, ended)
+            _compare_fused(found, name, kernels, after, engine.hits(after, depth + 1), values, on, ended)
     for state, hit, index in recorder.emits:
         light = stages.emit(wave.context, VertexInput(rows(state, index), rows(hit, index))).brought
         here = arena(kernels, **_fields(state, hit))
@@ -329,12 +328,14 @@ def _floor(name: str) -> float:
 
 def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorder) -> None:
     """Rays from vertices on, and light: the search with the surfaces that let rays through."""
-    worker, plan, world = Worker(kernels), wave.context.plan, wave.context.world
-    search = Search(wave.accel, world, plan.sampler, plan.dtype)
+    worker, engine = Worker(kernels), Tensors(wave, 0)
     for depth, state in enumerate(recorder.states, 1):
-        hit = search.nearest(state, depth)
+        hit = engine.hits(state, depth)
         here = arena(kernels, **_fields(state, Hit(*(torch.zeros_like(hit.t) for _ in range(4)))))
-        worker.search.nearest(here, len(state.lane), depth)
+        worker.search.nearest(here, len(state.lane))
+        flying, step = len(state.lane) if kernels.passing else 0, 0
+        while flying:
+            flying, step = worker.search.transmit(here, flying, depth, step), step + 1
         taken = kernels.state.take(here, np.arange(len(state.lane)), tuple(HIT))
         for key in HIT:
             found.add("nearest", key, getattr(hit, key), taken[key], _floor(key))
@@ -352,7 +353,7 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
         taken = kernels.state.take(here, np.arange(n), ("clear", "blocked"))
         arrived = taken["clear"] if "clear" in taken else (taken["blocked"] == 0).float()
         lit = shadow.t_max > 0
-        found.add("light", "clear", search.clear(shadow)[lit], arrived[lit])
+        found.add("light", "clear", engine.clear(shadow)[lit], arrived[lit])
 
 
 def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:

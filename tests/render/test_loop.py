@@ -386,7 +386,7 @@ def test_searches_do_not_depend_on_the_packet(name):
         def found(state: Any) -> Hit:
             nothing = torch.zeros(n)
             here = arena(kernels, o=state.o, d=state.d, t_max=state.t_max, key=state.key, t=nothing)
-            worker.search.nearest(here, n, 2)
+            worker.search.nearest(here, n)
             return Hit(*kernels.state.take(here, np.arange(n), tuple(HIT)).values())
 
         order = torch.randperm(n, generator=torch.Generator().manual_seed(4))

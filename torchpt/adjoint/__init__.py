@@ -27,6 +27,7 @@ from torchpt.adjoint.function import on_tape
 from torchpt.adjoint.held import by_film, follows, suits
 from torchpt.adjoint.loop import compiled_replay
 from torchpt.adjoint.tape import tape
+from torchpt.errors import NotBuiltError
 from torchpt.forward import limited_threads
 from torchpt.forward.budget import check_memory
 from torchpt.forward.need import loaded, need_of
@@ -68,6 +69,10 @@ def gradients(
         SceneError: ``render.max_memory`` is too small for it.
         RenderError: not even a single lane fits in memory.
     """
+    integrator = settings.integrator
+    if attached and integrator.own_transmit:
+        expected = "one whose rays are held up by surfaces alone, where geometry is differentiated"
+        raise NotBuiltError("integrator.type", integrator.name, expected)
     with limited_threads(settings.render.threads):
         attached = follows(scene, wanted) if held else attached
         assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks)

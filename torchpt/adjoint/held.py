@@ -38,7 +38,6 @@ from torchpt.adjoint.tape import chunk_by_chunk
 from torchpt.engines import tensors
 from torchpt.forward.schedule import Span
 from torchpt.integrators.path import PathIntegrator
-from torchpt.integrators.search import Search
 from torchpt.integrators.wave import Wave, camera_state
 from torchpt.math.vectors import dot, normalize, take
 from torchpt.records import PathState
@@ -253,9 +252,9 @@ def _brought(wave: Wave, state: PathState) -> Tensor:
 
 def _held(still: Wave, wave: Wave, state: PathState) -> _Seen:
     """What camera rays of detached parameters meet, as a camera under a tape sees it."""
-    world, plan = still.context.world, still.context.plan
+    world = still.context.world
     with torch.no_grad():
-        hit = Search(still.accel, world, plan.sampler, plan.dtype).nearest(state, 1)
+        hit = tensors.hits(still, state)
         missed = hit.prim < 0
         at = interact(world, state.o, state.d, replace(hit, prim=hit.prim.clamp_min(0)), True)
         p, n = torch.where(missed, 0.0, at.p), torch.where(missed, 0.0, at.ng)

@@ -17,14 +17,13 @@ from torch import Tensor
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
 from torchpt.adjoint.sums import Sums
-from torchpt.engines.tensors import Paths, Tensors
+from torchpt.engines.tensors import Paths, Tensors, escaped
 from torchpt.forward.budget import Budget
 from torchpt.forward.schedule import Span
 from torchpt.forward.waves import Waves
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Behind
 from torchpt.integrators.path import Ends, partition, slides
-from torchpt.integrators.search import Search
 from torchpt.integrators.vertex import EXTRA, VertexInput
 from torchpt.math.gathers import gathered_by
 from torchpt.math.vectors import take
@@ -118,7 +117,7 @@ class _Chunk:
         self.world = self.taped.context.world
         self.tensors = [*assembly.leaves, *assembly.held]
         self.passing = assembly.passing
-        self.search = Search(self.wave.accel, self.world, self.plan.sampler, self.plan.dtype)
+        self.engine = Tensors(replace(self.wave, context=self.taped.context), 0)
 
     def run(self, pixels: Tensor) -> None:
         """Add what a loss asks, by pixels ``(3, n)``, to the sums."""
@@ -191,7 +190,7 @@ class _Chunk:
         if not self.passing:
             return None, None
         with torch.enable_grad(), gathered_by(self.sums):
-            chance = self.search.nearest(vertex.state, vertex.depth).chance
+            chance = self.engine.hits(vertex.state, vertex.depth).chance
         if chance is None or not chance.requires_grad:
             return None, None
         return chance, torch.zeros_like(chance)
@@ -218,7 +217,7 @@ class _Chunk:
 
         def passed(shadow: Shadow) -> Tensor:
             kept = next(clear)  # type: ignore[call-overload]
-            return self.search.clear(shadow) if self.passing else kept
+            return self.engine.clear(shadow) if self.passing else kept
 
         limits = self.wave.limits
         assert limits is not None
@@ -238,7 +237,7 @@ class _Chunk:
         table = self.world.lights
         if table is None:
             return
-        for index, here in ((ends.emissive, True), (ends.missed, False)):
+        for index, here in ((ends.emissive, True), (escaped(self.wave, state, ends), False)):
             if not len(index) or (not here and table.environment is None):
                 continue
             lane = take(state.lane, index)

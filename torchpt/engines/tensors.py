@@ -14,22 +14,42 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
+from torchpt.core.tree import map_leaves
 from torchpt.integrators import LAYERS, aov
 from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.plate import Plate
-from torchpt.integrators.search import Search
 from torchpt.integrators.tally import Tally
+from torchpt.integrators.transmission import PASSES, beyond, non_opaque, opacity_at
 from torchpt.integrators.vertex import Emission, StageContext, VertexInput, VertexOutput
 from torchpt.integrators.wave import Wave
 from torchpt.math.vectors import take
-from torchpt.paths.walk import Counts, Observer, walk
+from torchpt.paths.walk import Counts, Observer, find, walk
 from torchpt.records import Hit, PathState, Shadow, joined, rows
 from torchpt.samplers import salts
 
-__all__ = ["Paths", "Tensors", "brought", "layers", "radiance", "seen", "trace"]
+__all__ = ["Paths", "Tensors", "brought", "hits", "layers", "radiance", "seen", "trace"]
 
 #: Groups before lanes are sorted.
 _UNSORTED = Ends(torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int64))
+
+
+@dataclass
+class Flight:
+    """Rays on their way through what lets them pass.
+
+    Attributes:
+        lanes: of the population.
+        state: the rays, from where they go on.
+        hit: what they meet next.
+        before: ``(n,)`` how far they have come.
+        step: how many times they went on.
+    """
+
+    lanes: Tensor
+    state: PathState
+    hit: Hit
+    before: Tensor
+    step: int = 0
 
 
 @dataclass
@@ -40,6 +60,7 @@ class Paths:
         state: of the paths as they arrive.
         depth: of the vertex.
         hit: what their rays met; None where that is not known yet.
+        flight: rays that are still on their way to it; None where nothing lets rays pass.
         ends: lanes that met light by chance, once they are sorted.
         groups: number and lanes of each BSDF model that was met; None before lanes are sorted.
         pending: shadow rays from the vertex before, with the first lane that they bring light to.
@@ -52,6 +73,7 @@ class Paths:
     state: PathState
     depth: int = 1
     hit: Hit | None = None
+    flight: Flight | None = None
     ends: Ends = field(default=_UNSORTED)
     groups: list[tuple[int, Tensor]] | None = None
     pending: list[tuple[int, Shadow]] = field(default_factory=list)
@@ -83,7 +105,7 @@ class Tensors:
         self.keeps = keeps
         self.wave, self.context, self.tally = wave, wave.context, Tally() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
-        self.search = Search(wave.accel, self.world, self.plan.sampler, self.plan.dtype)
+        self.passing = self.world.materials.opacity is not None or wave.integrator.own_transmit
         self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=wave.centre.device)
 
     def spawn(self, state: PathState) -> Paths:
@@ -100,7 +122,58 @@ class Tensors:
         """See :class:`torchpt.paths.walk.Engine`."""
         self.tally.rays += len(paths.state.lane)
         if paths.hit is None:
-            paths.hit = self.search.nearest(paths.state, paths.depth)
+            state = paths.state
+            paths.hit = self._nearest(state.o, state.d, state.t_max)
+            if self.passing:
+                lanes = self._held_up(state, paths.hit)
+                before = torch.zeros_like(take(state.t_max, lanes))
+                paths.flight = Flight(lanes, rows(state, lanes), rows(paths.hit, lanes), before)
+
+    def _nearest(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
+        """Find the nearest surfaces, opaque or not."""
+        t, prim, u, v = self.wave.accel.intersect(o, d, t_max)
+        return Hit(t.to(self.plan.dtype), prim.to(torch.int64), u.to(self.plan.dtype), v.to(self.plan.dtype))
+
+    def _held_up(self, state: PathState, hit: Hit) -> Tensor:
+        """Return the lanes that the stage ``transmit`` is asked for."""
+        if self.wave.integrator.own_transmit:
+            some = state.t_max > 0
+        else:
+            some = (hit.prim >= 0) & non_opaque(self.world, hit.prim)
+        return some.nonzero().squeeze(1)
+
+    def transmit(self, paths: Paths) -> bool:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        flight = paths.flight
+        if flight is None or not len(flight.lanes):
+            return False
+        salt = salts(paths.depth + flight.step * PASSES, flight.lanes.device)
+        out = self.wave.integrator.transmit(self.context.at(salt), VertexInput(flight.state, flight.hit))
+        hit, on = paths.met, out.on.nonzero().squeeze(1)
+        if out.chance is not None:
+            chance = torch.ones_like(hit.t) if hit.chance is None else hit.chance
+            hit = replace(hit, chance=chance.index_copy(0, flight.lanes, take(chance, flight.lanes) * out.chance))
+        home, o, state = take(flight.lanes, on), take(out.o, on), rows(flight.state, on)
+        before = take(flight.before, on) + take(flight.hit.t, on)
+        if out.state is not None:
+            state, before = rows(out.state, on), torch.zeros_like(before)
+            paths.state = map_leaves(lambda all, own: all.index_copy(-1, home, own), paths.state, state)
+        behind = self._nearest(o, state.d.detach(), state.t_max)
+        # Distances are counted from where the ray began; the step over a surface is below their rounding.
+        values = {"t": behind.t + before, "prim": behind.prim, "u": behind.u, "v": behind.v}
+        paths.hit = replace(hit, **{name: getattr(hit, name).index_copy(0, home, x) for name, x in values.items()})
+        again = self._held_up(state, behind)
+        state = replace(rows(state, again), o=take(o, again))
+        lanes, before = take(home, again), take(before, again)
+        paths.flight = Flight(lanes, state, rows(behind, again), before, flight.step + 1)
+        return True
+
+    def hits(self, state: PathState, depth: int) -> Hit:
+        """Return what rays meet on their way to a vertex, behind what lets them pass; they are not counted."""
+        paths = Paths(state, depth)
+        find(self, paths)
+        self.tally.rays -= len(state.lane)
+        return paths.met
 
     def sort(self, paths: Paths) -> Counts:
         """See :class:`torchpt.paths.walk.Engine`: one sort of small keys and one transfer of the counts."""
@@ -115,7 +188,7 @@ class Tensors:
     def escape(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
         if self.world.lights is not None and self.world.lights.environment is not None:
-            self._gather(paths, paths.ends.missed, self.wave.integrator.escape)
+            self._gather(paths, escaped(self.wave, paths.state, paths.ends), self.wave.integrator.escape)
         self._end(paths, paths.ends.missed)
 
     def _gather(self, paths: Paths, index: Tensor, stage: Callable[[StageContext, VertexInput], Emission]) -> None:
@@ -128,7 +201,7 @@ class Tensors:
     def _context(self, paths: Paths, roulette: float = 0.0) -> StageContext:
         """Return what the stages of a vertex read beside their lanes."""
         slide, salt = slides(self.plan, self.world, paths.depth), salts(paths.depth, paths.state.lane.device)
-        return self.context.at(salt, slide, roulette, partial(self.search.nearest, depth=paths.depth + 1))
+        return self.context.at(salt, slide, roulette, partial(self.hits, depth=paths.depth + 1))
 
     def _input(self, paths: Paths, index: Tensor) -> VertexInput:
         return VertexInput(rows(paths.state, index), rows(paths.met, index))
@@ -161,7 +234,7 @@ class Tensors:
         whole = paths.state.radiance
         parts, done = [], 0
         for start, shadow in paths.pending:
-            paths.clear.append(self.search.clear(shadow))
+            paths.clear.append(self.clear(shadow))
             end = start + len(shadow.t_max)
             if start > done:
                 parts.append(whole[:, done:start])
@@ -172,6 +245,28 @@ class Tensors:
                 parts.append(whole[:, done:])
             paths.state = replace(paths.state, radiance=parts[0] if len(parts) == 1 else torch.cat(parts, 1))
         paths.pending.clear()
+
+    def clear(self, shadow: Shadow) -> Tensor:
+        """Return how much of the light gets through ``(n,)``: 0 or 1 where all surfaces are opaque.
+
+        Else it is the product of ``1 - opacity`` over all surfaces between the ends of the rays.
+        """
+        if self.world.materials.opacity is None:
+            return (~self.wave.accel.occluded(shadow.o, shadow.d, shadow.t_max)).to(self.plan.dtype)
+        clear = torch.ones_like(shadow.t_max)
+        o, d, t_max = shadow.o.detach(), shadow.d.detach(), shadow.t_max
+        lanes = torch.arange(len(t_max), device=t_max.device)
+        while len(lanes):
+            hit = self._nearest(o, d, t_max)
+            opacity = opacity_at(self.world, o, d, hit, 0.0)
+            clear = clear.index_copy(0, lanes, take(clear, lanes) * (1.0 - opacity))
+            on = ((hit.prim >= 0) & (opacity.detach() < 1)).nonzero().squeeze(1)
+            passed, o, d = rows(hit, on), take(o, on), take(d, on)
+            lanes, t_max = take(lanes, on), (take(t_max, on) - passed.t).clamp_min(0.0)
+            if len(lanes):
+                with torch.no_grad():
+                    o = beyond(self.world, o, d, passed)
+        return clear
 
     def terminate(self, paths: Paths, truncated: bool) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -190,6 +285,12 @@ class Tensors:
             self.radiance.scatter_(1, take(state.lane, index).expand(3, -1), take(state.radiance, index))
 
 
+def escaped(wave: Wave, state: PathState, ends: Ends) -> Tensor:
+    """Return the lanes that escape to the environment; rays that nothing carries any more bring nothing from there."""
+    index = ends.missed
+    return index[take(state.t_max, index) > 0] if wave.integrator.own_transmit else index
+
+
 def trace(wave: Wave, state: PathState, tally: Tally | None = None, observer: Observer[Paths] | None = None) -> Tensor:
     """Return the radiance ``(3, N)`` that rays bring.
 
@@ -203,6 +304,11 @@ def trace(wave: Wave, state: PathState, tally: Tally | None = None, observer: Ob
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
     return engine.radiance
+
+
+def hits(wave: Wave, state: PathState) -> Hit:
+    """Return what camera rays meet, behind what lets them pass."""
+    return Tensors(wave, 0).hits(state, 1)
 
 
 def brought(

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from torchpt.accel import Accel
 from torchpt.accel.bounds import primitive_bounds
+from torchpt.engines import tensors
 from torchpt.integrators.aov import values
 from torchpt.integrators.path import PathIntegrator, partition
-from torchpt.integrators.search import Search
 from torchpt.integrators.wave import Wave, camera_state
 from torchpt.math.frames import Frame
 from torchpt.math.vectors import dot, take
@@ -112,8 +112,8 @@ def _dark(search: _Search, black: Tensor) -> float:
     asked = places[torch.linspace(0, count - 1, min(count, ASKED), dtype=torch.float64).round().long()].to(
         wave.centre.device
     )
-    state, plan, world = _through(wave, asked), wave.context.plan, wave.context.world
-    hit = Search(wave.accel, world, plan.sampler, plan.dtype).nearest(state, 1)
+    state = _through(wave, asked)
+    hit = tensors.hits(wave, state)
     reflects = hit.prim >= 0
     with suppress(NotImplementedError):  # a model of the caller's own without an albedo
         reflects = _albedo(wave, state, hit).abs().amax(0) > 0

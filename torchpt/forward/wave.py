@@ -185,7 +185,8 @@ def looped(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
     """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
     packets = wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
-    fused = packets and wave.context.world.materials.opacity is None and wave.first is None
+    opaque = wave.context.world.materials.opacity is None and not wave.integrator.own_transmit
+    fused = packets and opaque and wave.first is None
     kernels = Kernels(wave, packets, fused, before, fixed=not scene.own_models)
     own = [
         k

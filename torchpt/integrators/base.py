@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
-from torchpt.integrators import stages
+from torchpt.integrators import stages, transmission
 from torchpt.integrators.roulette import DEEP, DEEP_CAP
 from torchpt.integrators.stages import STRATEGIES, Plan
-from torchpt.integrators.vertex import Emission, Field, StageContext, VertexInput, VertexOutput
+from torchpt.integrators.vertex import Emission, Field, StageContext, Transmission, VertexInput, VertexOutput
 from torchpt.lights import WAYS
 from torchpt.spec import Choice, Flag, Scalar, Spec, Valued, parameters_of
 
@@ -133,11 +133,23 @@ class Integrator(Valued):
         """Return what surfaces of BSDF model number ``model`` make of paths; a stage."""
         return stages.bounce(context, model, vertex)
 
+    def transmit(self, context: StageContext, vertex: VertexInput) -> Transmission:
+        """Return which rays pass what they met, or are scattered before it; a stage, taken step by step until all rays stop.
+
+        Where a kind has its own, it is asked for all rays, those that met nothing too.
+        """
+        return transmission.transmit(context, vertex)
+
+    @property
+    def own_transmit(self) -> bool:
+        """Whether something but surfaces may hold rays up."""
+        return type(self).transmit is not Integrator.transmit
+
     @property
     def own_stages(self) -> bool:
         """Whether it carries fields or has stages of its own, for which kernels are made anew."""
         kind, base = type(self), Integrator
-        own = any(getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce"))
+        own = any(getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce", "transmit"))
         return own or bool(self.fields)
 
     def first(self, world: World) -> FirstSurface | None:

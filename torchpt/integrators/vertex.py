@@ -26,6 +26,7 @@ __all__ = [
     "Emission",
     "Field",
     "StageContext",
+    "Transmission",
     "VertexInput",
     "VertexOutput",
     "no_search",
@@ -111,6 +112,25 @@ class VertexInput:
 
     state: PathState
     hit: Hit
+
+
+@dataclass(frozen=True)
+class Transmission:
+    """One step of rays through what may let them pass.
+
+    Attributes:
+        on: ``(n,)`` bool: which rays go on; the others end at what they met.
+        o: ``(3, n)`` where they go on from.
+        state: the rays as they go on, where something between surfaces scattered them: their origins, directions, densities
+            and fields may be others, and ``t_max`` 0 ends them; their throughput stays. None: they pass straight on, and
+            distances are counted from where they began.
+        chance: ``(n,)`` 1, with the derivative of the chance to stop or to pass; None: it has none.
+    """
+
+    on: Tensor
+    o: Tensor
+    state: PathState | None = None
+    chance: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 
 from torchpt.integrators.base import Limits
 
-__all__ = ["Counts", "Engine", "Observer", "Population", "walk"]
+__all__ = ["Counts", "Engine", "Observer", "Population", "find", "walk"]
 
 
 class Population(Protocol):
@@ -49,6 +49,10 @@ class Engine(Protocol[P]):
 
     def intersect(self, paths: P) -> None:
         """Find the nearest hits; nothing to do where they are known already."""
+
+    def transmit(self, paths: P) -> bool:
+        """Take one step through what lets rays pass: opacity, null, media; return whether any ray is still on its way."""
+        ...
 
     def sort(self, paths: P) -> Counts:
         """List lanes by what they met."""
@@ -95,6 +99,13 @@ class Observer(Generic[Q]):
         """Look at paths behind a vertex, once the light that was sampled there is resolved."""
 
 
+def find(engine: Engine[P], paths: P) -> None:
+    """Find what the rays of a population meet, behind what lets them pass."""
+    engine.intersect(paths)
+    while engine.transmit(paths):
+        pass
+
+
 def walk(
     engine: Engine[P], paths: P, limits: Limits, observer: Observer[P] | None = None, until: int | None = None
 ) -> None:
@@ -112,7 +123,7 @@ def walk(
         engine.terminate(paths, truncated=False)
         return
     while paths.depth != until:
-        engine.intersect(paths)
+        find(engine, paths)
         if observer.arrived(paths):
             return
         counts = engine.sort(paths)

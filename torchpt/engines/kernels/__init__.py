@@ -12,7 +12,7 @@ a chunk there is neither an operator of torch nor a barrier between threads.
 ``kernels.py``          the kernels of a render, made when they are first asked for
 ``vertex.py``           how the stages of paths are traced: camera rays, emission, bounce, ends
 ``packets.py``          the same for the search of few primitives
-``opacity.py``          the same for rays through surfaces that are not opaque
+``transmission.py``     the same for rays through what lets them pass
 ``output.py``           the same for layers and the film
 ``trace.py``            what those functions have in common: loads, stores, lists
 ``layout.py, rows.py``  what a path carries, and where

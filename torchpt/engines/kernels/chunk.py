@@ -68,6 +68,8 @@ class Paths:
         arrived: whether their hits are in the arena already.
         listed: whether lanes are in the lists already.
         shadows: whether light from the vertex before is still pending.
+        flying: how many rays are on their way through what lets them pass.
+        step: how many times they went on.
         groups: how many lanes each model has.
         places: how many lanes are in each list.
     """
@@ -79,6 +81,8 @@ class Paths:
     arrived: bool = False
     listed: bool = False
     shadows: bool = False
+    flying: int = 0
+    step: int = 0
     groups: Sequence[int] = ()
     places: Sequence[int] = ()
 
@@ -170,6 +174,7 @@ class Worker:
     def _begin(self, paths: Paths, depth: int, count: int) -> Paths:
         """Take memory for the paths of a vertex."""
         paths.depth, paths.count, paths.shadows, paths.groups = depth, count, False, ()
+        paths.flying = paths.step = 0
         paths.arrived = paths.listed = self.kernels.fused
         return paths
 
@@ -179,7 +184,16 @@ class Worker:
         """See :class:`torchpt.paths.walk.Engine`."""
         if not paths.arrived:
             self.tally.rays += paths.count
-            self.search.nearest(paths.arena, paths.count, paths.depth)
+            self.search.nearest(paths.arena, paths.count)
+            paths.flying = paths.count if self.kernels.passing else 0
+
+    def transmit(self, paths: Paths) -> bool:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        if not paths.flying:
+            return False
+        paths.flying = self.search.transmit(paths.arena, paths.flying, paths.depth, paths.step)
+        paths.step += 1
+        return paths.flying > 0
 
     def sort(self, paths: Paths) -> Counts:
         """See :class:`torchpt.paths.walk.Engine`."""

@@ -1,8 +1,8 @@
 """The kernels of a render: which there are, and how each is made once.
 
-To add a kernel: write the function that traces it (in ``vertex.py``, ``packets.py``, ``opacity.py``, ``output.py`` or a file of
-its own; it takes a :class:`~torchpt.engines.kernels.trace.Trace` and returns sinks), give it a method here, and run it where
-``chunk.py`` needs it. What a path must carry for it is a row in ``layout.py``.
+To add a kernel: write the function that traces it (in ``vertex.py``, ``packets.py``, ``transmission.py``, ``output.py`` or a
+file of its own; it takes a :class:`~torchpt.engines.kernels.trace.Trace` and returns sinks), give it a method here, and run it
+where ``chunk.py`` needs it. What a path must carry for it is a row in ``layout.py``.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import numpy as np
 import torch
 
 from torchpt.core.tree import signature
-from torchpt.engines.kernels import opacity, output, vertex
+from torchpt.engines.kernels import output, transmission, vertex
 from torchpt.engines.kernels import packets as packet_kernels
 from torchpt.engines.kernels.handed import Handed
 from torchpt.engines.kernels.layout import Layout
 from torchpt.engines.kernels.leaves import Leaves
 from torchpt.engines.kernels.programs import program_of
+from torchpt.integrators.transmission import non_opaque
 from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.program import Program, Tables, bound
 from torchpt.lanes.sinks import Sinks
@@ -91,7 +92,7 @@ class Kernels(Layout):
         self.non_opaque: np.ndarray | None = None
         if self.has_opacity and not packets:
             prims = torch.arange(sum(self.world.geometry.counts))
-            self.non_opaque = opacity.non_opaque(self.world, prims).to(torch.uint8).numpy()
+            self.non_opaque = non_opaque(self.world, prims).to(torch.uint8).numpy()
         self.seconds = 0.0
         self.eager: dict[int, str] = {}
 
@@ -149,20 +150,20 @@ class Kernels(Layout):
     # -- surfaces that are not opaque
 
     def sift(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.opacity.sift`."""
-        return self._get(False, opacity.sift)
+        """See :func:`torchpt.engines.kernels.transmission.sift`."""
+        return self._get(False, transmission.sift)
 
-    def meet(self, again: bool) -> Kernel:
-        """See :func:`torchpt.engines.kernels.opacity.meet`."""
-        return self._get(not again, opacity.meet, again)
+    def transmit(self, again: bool) -> Kernel:
+        """See :func:`torchpt.engines.kernels.transmission.transmit`."""
+        return self._get(not again, transmission.transmit, again)
 
     def begin(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.opacity.begin`."""
-        return self._get(False, opacity.begin)
+        """See :func:`torchpt.engines.kernels.transmission.begin`."""
+        return self._get(False, transmission.begin)
 
     def through(self) -> Kernel:
-        """See :func:`torchpt.engines.kernels.opacity.through`."""
-        return self._get(False, opacity.through)
+        """See :func:`torchpt.engines.kernels.transmission.through`."""
+        return self._get(False, transmission.through)
 
     # -- what leaves a chunk
 

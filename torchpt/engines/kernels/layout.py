@@ -31,6 +31,7 @@ class Layout:
         has_environment: whether something shines from outside.
         has_emitters: whether a ray may meet an emitter.
         has_opacity: whether a surface may let rays pass.
+        passing: whether rays may pass anything, surfaces or what the integrator has between them.
         listed: whether lanes are taken by lists: else all lanes of the arena are of the one model.
         numbers: tensors of the sampler.
     """
@@ -44,6 +45,7 @@ class Layout:
         self.has_environment = table is not None and table.environment is not None
         self.has_emitters = table is not None and table.row_of_prim is not None
         self.has_opacity = self.world.materials.opacity is not None
+        self.passing = self.has_opacity or wave.integrator.own_transmit
         self.listed = not fused or self.models > 1 or self.has_environment
         self.state = Rows(_path_fields(self))
         self.passed = Rows({**PASS, "clear": ((), "f"), **_key_field(wave), **HIT})

@@ -11,7 +11,7 @@ import numpy as np
 from torchpt.accel import Accel
 from torchpt.engines.kernels.calls import Calls
 from torchpt.engines.kernels.rows import Memory, Rows
-from torchpt.integrators.search import PASSES
+from torchpt.integrators.transmission import PASSES
 
 __all__ = ["ChunkSearch"]
 
@@ -25,32 +25,43 @@ class ChunkSearch:
 
     def __init__(self, calls: Calls) -> None:
         self.calls, self.kernels = calls, calls.kernels
-        self.passed = [Memory(self.kernels.passed.count) for _ in range(2)] if self.kernels.has_opacity else []
+        self.passed = [Memory(self.kernels.passed.count) for _ in range(2)] if self.kernels.passing else []
         self.sifted = Memory(1)
 
-    def nearest(self, arena: Memory, count: int, depth: int) -> None:
-        """Write the hits of the arena's rays beside them."""
+    def nearest(self, arena: Memory, count: int) -> None:
+        """Write the hits of the arena's rays beside them: the nearest surfaces, opaque or not."""
+        self._trace(arena, self.kernels.state, "o", "d", "t_max", count)
+
+    def transmit(self, arena: Memory, count: int, depth: int, step: int) -> int:
+        """Take a step through what lets rays pass.
+
+        Args:
+            arena: of the paths; hits of rays that are held up are written there.
+            count: how many paths there are, at the first step; then how many rays are on their way.
+            depth: of the vertex that they come to.
+            step: of the rays, from 0.
+
+        Returns:
+            How many rays are still on their way.
+        """
         kernels, calls = self.kernels, self.calls
-        self._trace(arena, kernels.state, "o", "d", "t_max", count)
-        if not kernels.has_opacity:
-            return
-        calls.name_salts(depth)
-        calls.clear()
-        calls.run(kernels.sift(), count, arena, arena, lists=[self.sifted])
-        some = int(calls.counters[0])
-        if not some:
-            return
-        source, target = self.passed
-        calls.clear()
-        calls.run(kernels.meet(False), some, arena, source, self.sifted)
-        step = 0
-        while left := int(calls.counters[0]):
-            step += 1
-            self._trace(source, kernels.passed, "pass_o", "pass_d", "pass_t", left)
-            calls.name_salts(depth + step * PASSES)
+        calls.name_salts(depth + step * PASSES)
+        source, target = self.passed[step % 2], self.passed[1 - step % 2]
+        if step == 0:
             calls.clear()
-            calls.run(kernels.meet(True), left, source, target, slots=arena)
-            source, target = target, source
+            calls.run(kernels.sift(), count, arena, arena, lists=[self.sifted])
+            some = int(calls.counters[0])
+            if not some:
+                return 0
+            calls.clear()
+            calls.run(kernels.transmit(False), some, arena, target, self.sifted, slots=arena)
+        else:
+            calls.clear()
+            calls.run(kernels.transmit(True), count, source, target, slots=arena)
+        left = int(calls.counters[0])
+        if left:
+            self._trace(target, kernels.passed, "pass_o", "pass_d", "pass_t", left)
+        return left
 
     def light(self, arena: Memory, count: int) -> None:
         """Write how much of the light of the arena's shadow rays arrives."""

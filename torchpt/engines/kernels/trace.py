@@ -1,7 +1,7 @@
 """A stage on its way to become a kernel: what it reads of the arena, and how its results go back.
 
 The functions of :mod:`~torchpt.engines.kernels.vertex`, :mod:`~torchpt.engines.kernels.packets`,
-:mod:`~torchpt.engines.kernels.opacity` and :mod:`~torchpt.engines.kernels.output` take a :class:`Trace` and return sinks.
+:mod:`~torchpt.engines.kernels.transmission` and :mod:`~torchpt.engines.kernels.output` take a :class:`Trace` and return sinks.
 """
 
 from __future__ import annotations

@@ -1,65 +1,69 @@
-"""Rays through surfaces that are not opaque, as kernels.
+"""Rays through what lets them pass, as kernels.
 
-Rays of paths: ``sift`` lists those that met such a surface; ``meet`` stops them by chance and sends the others on behind it,
-once from the paths' arena and then (``again``) from that of the rays on their way, until none is left. Shadow rays: ``begin``
-and ``through`` do the same with the light that is left. The loop around them is :mod:`torchpt.engines.kernels.search`.
+Rays of paths: ``sift`` lists those that something may let pass; ``transmit`` holds some up and sends the others on behind it,
+once from the paths' arena and then (``again``) from that of the rays on their way, until the walk has none left. Shadow rays:
+``begin`` and ``through`` do the same with the light that is left; the loop around them is in
+:mod:`torchpt.engines.kernels.search`.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
+from torchpt.engines.kernels.rows import path_state
 from torchpt.engines.kernels.trace import Trace
-from torchpt.integrators.search import beyond, opacity_at
+from torchpt.integrators.transmission import beyond, non_opaque, opacity_at
+from torchpt.integrators.vertex import VertexInput
 from torchpt.lanes.sinks import Note, Pack, Scatter, Sinks
-from torchpt.records import World
-from torchpt.samplers import Dimension, Draws
 
-__all__ = ["begin", "meet", "non_opaque", "sift", "through"]
-
-
-def non_opaque(world: World, prim: Tensor) -> Tensor:
-    """Which primitives ``(N,)`` may let a ray pass."""
-    assert world.materials.opacity is not None
-    slot = world.geometry.slot(prim)
-    may_pass = torch.index_select(world.materials.opacity, 0, slot) < 1
-    if world.textures.opacity is not None:
-        may_pass = may_pass | (torch.index_select(world.textures.opacity.nodes, 0, slot) >= 0)
-    return may_pass
+__all__ = ["begin", "sift", "through", "transmit"]
 
 
 def sift(trace: Trace) -> Sinks:
-    """A list of the rays that met a surface which may let them pass."""
-    prim = trace.layout.state.read(trace.tracer, "prim")["prim"]
-    with trace.tracer:
-        may_pass = non_opaque(trace.layout.world, prim) & (prim >= 0)
-    return Sinks(notes=[Note(trace.node(may_pass), 0, 0)])
+    """A list of the rays that the stage ``transmit`` is asked for."""
+    rows, tracer, layout = trace.layout.state, trace.tracer, trace.layout
+    given = rows.read(tracer, "prim", "t_max")
+    with tracer:
+        if layout.wave.integrator.own_transmit:
+            held_up = given["t_max"] > 0
+        else:
+            held_up = non_opaque(layout.world, given["prim"]) & (given["prim"] >= 0)
+    return Sinks(notes=[Note(trace.node(held_up), 0, 0)])
 
 
-def meet(trace: Trace, again: bool) -> Sinks:
-    """Which rays a surface stops by chance, and where the others go on."""
+def transmit(trace: Trace, again: bool) -> Sinks:
+    """Which rays are held up, and where the others go on; ``again``: those that are on their way."""
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
     rows = layout.passed if again else layout.state
     hit = trace.hit(rows)
-    key = rows.read(tracer, "key")["key"]
     if again:
-        o, d, t_max, before, home = rows.read(tracer, "pass_o", "pass_d", "pass_t", "before", "home").values()
+        given = rows.read(tracer, "pass_o", "pass_d", "pass_t", "before", "home", "key")
+        o, d, t_max, before, home, key = given.values()
+        at_home = layout.state.read(tracer, *layout.state.state, place=trace.node(home))
+        state = replace(path_state(at_home), o=o, d=d, t_max=t_max, key=key)
     else:
-        o, d, t_max = rows.read(tracer, "o", "d", "t_max").values()
-        before, home = None, trace.place()
+        state, before, home = trace.state()[0], None, trace.place()
     with tracer:
-        opacity = opacity_at(layout.world, o, d, hit, 1.0)
-        met = Draws(layout.plan.sampler, key, salts).one(Dimension.OPACITY) < opacity
-        on = ~met
-        behind = beyond(layout.world, o, d, hit)
+        out = layout.wave.integrator.transmit(layout.wave.context.at(salts), VertexInput(state, hit))
+        on = out.on & (state.t_max > 0) if layout.wave.integrator.own_transmit else out.on
+        met = ~on
         whole = hit.t if before is None else hit.t + before
-    onward = layout.passed.nodes(tracer, pass_o=behind, pass_d=d, pass_t=t_max, before=whole, home=home, key=key)
+        after = replace(state, o=out.o) if out.state is None else out.state
+        start = whole if out.state is None else torch.zeros_like(whole)
+    onward = layout.passed.nodes(
+        tracer, pass_o=after.o, pass_d=after.d, pass_t=after.t_max, before=start, home=home, key=state.key
+    )
     sinks = Sinks(pack=[Pack(trace.node(on), tuple(onward), 0)])
     if again:
         stopped = layout.state.nodes(tracer, t=whole, prim=hit.prim, u=hit.u, v=hit.v)
         sinks.scatter.append(Scatter(trace.node(met), trace.node(home), tuple(stopped), slots=True))
+    if out.state is not None:
+        scattered = tuple(trace.kept(out.state, {}))
+        sinks.scatter.append(Scatter(trace.node(on), trace.node(home), scattered, slots=True))
     return sinks
 
 
