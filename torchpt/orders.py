@@ -19,6 +19,7 @@ from torchpt.graphs import known
 from torchpt.images.denoiser import check_denoiser
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators import LAYERS
+from torchpt.integrators.base import Integrator
 from torchpt.integrators.layer import SurfaceLayer
 from torchpt.ranks import Group, together
 from torchpt.scene import Scene
@@ -38,7 +39,7 @@ class Common(TypedDict, total=False):
     """Arguments of :func:`render` that are the same for all pictures of a batch, for type checkers."""
 
     spp: int | None
-    integrator: str | Mapping[str, Any] | None
+    integrator: str | Mapping[str, Any] | Integrator | None
     sampler: str | Mapping[str, Any] | None
     film: Mapping[str, Any] | None
     time_limit: float | None

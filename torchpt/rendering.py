@@ -33,7 +33,7 @@ def render(
     *,
     spp: int | None = None,
     seed: int | None = None,
-    integrator: str | Mapping[str, Any] | None = None,
+    integrator: str | Mapping[str, Any] | Integrator | None = None,
     sampler: str | Mapping[str, Any] | None = None,
     film: Mapping[str, Any] | None = None,
     params: Mapping[str, Tensor] | None = None,
