@@ -12,6 +12,7 @@ from torch import Tensor
 from torchpt.forward import Progress, Rendering, render_scene
 from torchpt.graphs import opaque
 from torchpt.integrators import KINDS as INTEGRATORS
+from torchpt.integrators.base import Integrator
 from torchpt.orders import Wishes, ordered, rendered
 from torchpt.ranks import Group
 from torchpt.scene import Scene
