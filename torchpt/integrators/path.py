@@ -1,7 +1,6 @@
-"""Unidirectional path tracing with next event estimation, as a wavefront.
+"""Unidirectional path tracing with next event estimation, as a wavefront: how lanes are told apart at a vertex.
 
-camera rays -> intersect -> emission with MIS -> sort by BSDF and compact -> light sampling with shadow rays -> BSDF sampling
--> Russian roulette -> next. ``max_depth`` and ``rr_depth`` count as Mitsuba's: 1 is emission only, 2 direct light.
+``max_depth`` and ``rr_depth`` count as Mitsuba's: 1 is emission only, 2 direct light.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ __all__ = ["Ends", "PathIntegrator", "partition", "slides"]
 
 
 class PathIntegrator(Integrator):
-    """Integrators that follow paths to their :attr:`limits`, vertex by vertex, in the stage ``bounce``."""
+    """Integrators that follow paths to their :attr:`limits`, vertex by vertex."""
 
     looped = True
 

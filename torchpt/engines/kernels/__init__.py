@@ -5,7 +5,7 @@ a chunk there is neither an operator of torch nor a barrier between threads.
 
 ======================  ==============================================================================
 ``schedule.py``         which thread takes which chunk, and how samples add up to a picture: start here
-``chunk.py``            a chunk from camera rays to radiance: the order of the kernels
+``chunk.py``            the engine of a thread: the events of a walk by kernels
 ``search.py``           what rays meet, where that is asked between kernels
 ``eager.py``            a vertex by tensor operations, for models that no kernel can be made of
 ``calls.py``            how a thread calls a kernel

@@ -1,19 +1,10 @@
-"""One chunk of lanes from its camera rays to the radiance of its samples, in one thread and in memory of its own.
+"""The engine by kernels: the events of a walk on a chunk of lanes, in one thread and in memory of its own.
 
-A chunk is some thousand samples, one path a lane. Paths lie in an *arena* (:mod:`~torchpt.engines.kernels.rows`); a vertex
-takes them from one arena to the other, without those that ended. Where the search is inside of the stages (``fused``)::
-
-    generate   camera rays and their first hits; lanes listed by what they met
-    emit       light of the lanes that met an emitter: list `emissive`
-    escape     light of the lanes that met nothing, and their ends: list `missed`
-    bounce     one kernel a BSDF model, on the lanes of its list: light sample, shadow ray, BSDF sample, roulette, next hit;
-               lanes that go on are packed in the other arena and listed
-               ... from `emit` on again, until none is left or paths are long enough; then
-    retire     ends of the paths that are cut
-
-Else searches come between stages: ``generate``, then each vertex is *search* (:mod:`~torchpt.engines.kernels.search`),
-``settle`` (adds the light of the last shadow rays, lists lanes, ends paths), ``emit``, ``escape``, ``bounce``, *search of
-shadow rays*.
+A chunk is some thousand samples, one path a lane. Paths lie in an *arena* (:mod:`~torchpt.engines.kernels.rows`); `scatter`
+takes them from one arena to the other, without those that ended. Where the search is inside of the stages (``fused``), lanes
+come with their hits and are listed by what they met: `intersect` and `occlude` have nothing to do, and `sort` reads counters.
+Else rays are searched between stages (:mod:`~torchpt.engines.kernels.search`), and the kernel ``settle`` adds the light of the
+last shadow rays, lists lanes and ends paths.
 
 A path that ends writes its radiance to the slot of its sample; :mod:`~torchpt.engines.kernels.schedule` adds slots to the
 film. :mod:`~torchpt.engines.kernels.kernels` says how a kernel is added.
