@@ -9,6 +9,9 @@ ifneq ($(wildcard ../shared/assets/.),)
 export TORCHPT_ASSETS ?= $(abspath ../shared/assets)
 endif
 
+# Bytecode is kept: every worker would rewrite the asserts of all tests else, and every process compile the package.
+unexport PYTHONDONTWRITEBYTECODE
+
 SCENE ?= cornell_box
 OUT ?= $(notdir $(basename $(SCENE))).png
 ARGS ?=

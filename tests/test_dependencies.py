@@ -6,6 +6,7 @@ import ast
 import sys
 import tomllib
 from collections.abc import Collection, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -63,29 +64,31 @@ def imports(folder: str, wanted: Collection[str] = ()) -> Iterator[tuple[str, bo
             yield from ((name, id(node) in at_once) for name in tops)
 
 
-USED = set(imports("torchpt"))
+@cache
+def used() -> frozenset[tuple[str, bool]]:
+    return frozenset(imports("torchpt"))
+
+
 THROUGH_TRIMESH = {name for names in PARSERS.values() for name in names}
 
 
 def test_every_dependency_is_imported_by_the_package() -> None:
-    assert modules(PROJECT["dependencies"]) - {name for name, _ in USED} == set()
+    assert modules(PROJECT["dependencies"]) - {name for name, _ in used()} == set()
 
 
 @pytest.mark.parametrize("extra", FEATURES)
 def test_every_extra_is_imported_by_a_feature_when_it_is_asked_for(extra: str) -> None:
     wanted = modules(EXTRAS[extra])
-    assert wanted - {name for name, _ in USED} - THROUGH_TRIMESH == set()
-    assert wanted & {name for name, at_once in USED if at_once} == set()
+    assert wanted - {name for name, _ in used()} - THROUGH_TRIMESH == set()
+    assert wanted & {name for name, at_once in used() if at_once} == set()
 
 
 def test_what_developers_install_is_used() -> None:
     assert set(EXTRAS) == {*FEATURES, "sweep", "bench", "dev"}
     dev = {Requirement(text).name for text in EXTRAS["dev"]}
     wanted = modules(EXTRAS["bench"]) | modules([name for name in dev if name not in TOOLS])
-    used: set[str] = set()
-    for folder in ("scripts", "tests"):
-        used |= {name for name, _ in imports(folder, wanted)}
-    assert wanted - used == set()
+    found = {name for folder in ("scripts", "tests") for name, _ in imports(folder, wanted)}
+    assert wanted - found == set()
     for name, (file, words) in TOOLS.items():
         assert name in dev and words in (ROOT / file).read_text()
 
@@ -101,8 +104,8 @@ def test_the_launcher_of_sweeps_is_tested() -> None:
 def test_everything_imported_is_asked_for() -> None:
     everything = modules(PROJECT["dependencies"]) | {"torchpt", "omegaconf", "flip_evaluator"}
     optional = set().union(*(modules(EXTRAS[extra]) for extra in FEATURES))
-    at_once = {name for name, now in USED if now} - set(sys.stdlib_module_names)
-    later = {name for name, _ in USED} - set(sys.stdlib_module_names)
+    at_once = {name for name, now in used() if now} - set(sys.stdlib_module_names)
+    later = {name for name, _ in used()} - set(sys.stdlib_module_names)
     assert at_once - everything == set()
     assert later - everything - optional == set()
 

@@ -34,7 +34,7 @@ def refused(call: Callable[[], Any], key: str) -> None:
 
 MATRICES = [
     None, "x", torch.eye(3), [[1, 2], [3]], {"a": 1}, torch.full((4, 4), math.nan), np.full((3, 4), np.inf),
-    torch.zeros(4, 4), SPARSE, torch.eye(4, dtype=torch.complex64), torch.eye(4, device="meta"),
+    torch.zeros(4, 4), SPARSE, torch.eye(4, dtype=torch.complex64), torch.empty(4, 4, device="meta"),
 ]  # fmt: skip
 
 
