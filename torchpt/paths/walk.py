@@ -29,7 +29,7 @@ P = TypeVar("P", bound=Population)
 Q = TypeVar("Q", bound=Population, contravariant=True)
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Counts:
     """How many lanes of a population met what, known to the host: one transfer a vertex.
 
@@ -118,30 +118,32 @@ def walk(
         observer: looks on, and may end the walk.
         until: vertex at which the walk is to stop, before rays to it are searched for; None: it goes on to the ends.
     """
-    observer = observer or Observer()
-    if limits.last < paths.depth:
+    last, endless = limits.last, limits.endless
+    if last < paths.depth:
         engine.terminate(paths, truncated=False)
         return
     while paths.depth != until:
         find(engine, paths)
-        if observer.arrived(paths):
+        if observer is not None and observer.arrived(paths):
             return
         counts = engine.sort(paths)
-        if observer.sorted(paths, counts):
+        if observer is not None and observer.sorted(paths, counts):
             return
         if counts.emissive:
             engine.emit(paths)
         if counts.missed:
             engine.escape(paths)
-        observer.gathered(paths, counts)
-        if paths.depth >= limits.last:
-            engine.terminate(paths, truncated=limits.endless)
+        if observer is not None:
+            observer.gathered(paths, counts)
+        if paths.depth >= last:
+            engine.terminate(paths, truncated=endless)
             return
         if not any(counts.scatter):
             return
         paths = engine.scatter(paths, limits.roulette(paths.depth))
         engine.occlude(paths)
-        observer.left(paths)
+        if observer is not None:
+            observer.left(paths)
         if limits.first_surface:
             engine.terminate(paths, truncated=False)
             return
