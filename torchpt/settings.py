@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -272,7 +272,7 @@ def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | No
     """
     own = overrides.get("integrator")
     if isinstance(own, Integrator):  # one of the caller's own kinds, or of ours, made already
-        return replace(merge(scene, {**overrides, "integrator": None}, file), integrator=own)
+        return _merge({**scene, "integrator": None}, {**overrides, "integrator": None}, file, own)
     given = {name: _plain_mappings(blocks) for name, blocks in (("scene", scene), ("overrides", overrides))}
     return _merged.get(file, given, lambda: _merge(scene, overrides, file))
 
@@ -285,7 +285,9 @@ def _plain_mappings(blocks: Mapping[str, Any]) -> Any:
     return {name: dict(value) if isinstance(value, Mapping) else value for name, value in blocks.items()}
 
 
-def _merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None) -> Settings:
+def _merge(
+    scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None, own: Integrator | None = None
+) -> Settings:
     check_keys(overrides, BLOCKS, "", "the settings", None)
     blocks: dict[str, Any] = {}
     for block in BLOCKS:
@@ -297,7 +299,7 @@ def _merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | N
         try:
             if block == "render":
                 _open_end(raw, blocks["sampler"])
-            blocks[block] = _block(block, raw)
+            blocks[block] = own if own is not None and block == "integrator" else _block(block, raw)
         except SceneError as error:
             blame = None if _given(overrides, error.key) else file
             raise type(error)(error.key, error.value, error.expected, blame) from None

@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.integrators.base import Limits
+from torchpt.integrators.kinds.aov import Aov
 from torchpt.integrators.kinds.path import Path
 from torchpt.integrators.vertex import Emission, Field, StageContext, Transmission, VertexInput, VertexOutput
 from torchpt.math.vectors import dot
@@ -183,13 +185,14 @@ class Foggy(Path):
     def transmit(self, context: StageContext, vertex: VertexInput) -> Transmission:
         state, hit, draws = vertex.state, vertex.hit, Draws(context.plan.sampler, vertex.state.key, context.salts)
         enters, leaves = self.chord(state.o, state.d)
-        t = enters - torch.log1p(-draws.one(Dimension.OPACITY)) / self.density
-        on = (t < leaves) & (t < hit.t)
-        p = state.o + torch.where(on, t, 0.0) * state.d
-        d = uniform_sphere(draws.two(Dimension.LENS))
+        t = enters - torch.log1p(-draws.one(Dimension.DISTANCE)) / self.density
+        collides = (t < leaves) & (t < hit.t)
+        p = state.o + torch.where(collides, t, 0.0) * state.d
+        d = uniform_sphere(draws.two(Dimension.PHASE))
         # The next emitter that is met counts whole: no light is sampled from within the fog.
         turned = replace(state, o=p, d=d, pdf=torch.full_like(state.pdf, math.inf))
-        return Transmission(on, p, turned)
+        through = super().transmit(context, vertex)
+        return Transmission(collides | through.on, through.o, collides, turned)
 
     def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
         output = super().bounce(context, model, vertex)
@@ -267,3 +270,162 @@ def test_geometry_is_not_differentiated_through_fog():
     )
     with pytest.raises(torchpt.TorchptError, match=r"integrator\.type"):
         image.sum().backward()
+
+
+def test_surfaces_in_fog_let_rays_pass_by_their_opacity():
+    description = mirrored()
+    description["materials"]["veil"] = {"type": "diffuse", "reflectance": [0.2, 0.2, 0.2], "opacity": 0.5}
+    description["shapes"]["veil"] = {"type": "sphere", "center": [0, 0.8, 0], "radius": 0.5, "material": "veil"}
+    scene = torchpt.load(description, "cpu")
+    keys: Mapping[str, Any] = {"film": {"width": 12, "height": 12, "filter": "box"}, "spp": 256}
+    mean = {
+        (strategy, compile): float(
+            torchpt.render(scene, integrator=Foggy(strategy=strategy, max_depth=3), compile=compile, **keys).mean()
+        )
+        for strategy, compile in (("mis", "on"), ("mis", "off"), ("bsdf", "on"))
+    }
+    assert mean["mis", "on"] == pytest.approx(mean["mis", "off"], rel=5e-3)
+    assert mean["bsdf", "on"] == pytest.approx(mean["mis", "on"], rel=0.06)
+
+
+# ---- what stages may do, and what is refused
+
+
+class OneVertex(Path):
+    """Light that is sampled at the first surface, and no further, by the stages of a path."""
+
+    name = "one_vertex"
+
+    @property
+    def limits(self) -> Limits:
+        return Limits(2, 3, first_surface=True)
+
+
+def test_paths_may_end_at_first_surfaces_where_the_search_is_inside_of_stages():
+    description = mirrored()
+    description["shapes"]["room"] = {"type": "sphere", "radius": 0.4, "material": "wall"}
+    scene = torchpt.load(description, "cpu")
+    keys: Mapping[str, Any] = {"film": {"width": 16, "height": 16}, "spp": 2, "integrator": OneVertex()}
+    found = torchpt.render(scene, compile="on", **keys)
+    torch.testing.assert_close(found, torchpt.render(scene, compile="off", **keys), rtol=1e-4, atol=1e-6)
+
+
+class Glowing(Path):
+    """Surfaces shine by themselves, as much as they let through."""
+
+    name = "glowing"
+
+    def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
+        output = super().bounce(context, model, vertex)
+        leaving = output.leaving
+        return replace(output, leaving=replace(leaving, radiance=leaving.radiance + 0.3 * leaving.throughput))
+
+
+@pytest.mark.parametrize("compile", ENGINES)
+def test_light_that_a_stage_adds_is_differentiated(compile):
+    scene = torchpt.load(mirrored(), "cpu")
+    name, value = "materials.wall.reflectance", scene.params["materials.wall.reflectance"]
+
+    def brought(reflectance: Tensor) -> Tensor:
+        settings = {"spp": 2, "seed_grad": 0, "film": {"width": 8, "height": 8}, "compile": compile}
+        return torchpt.render(
+            scene, params={name: reflectance}, integrator=Glowing(max_depth=3, rr_depth=9), **settings
+        ).sum()
+
+    leaf = value.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(brought(leaf), leaf)
+    with torch.no_grad():
+        slope = (brought(value + 1e-2) - brought(value - 1e-2)) / 2e-2
+    assert float(gradient.sum()) == pytest.approx(float(slope), rel=2e-3)
+
+
+class Flickering(Absorbing):
+    """Emitters shine as a random number says, which a stage may draw wherever it is."""
+
+    name = "flickering"
+
+    def emit(self, context: StageContext, vertex: VertexInput) -> Emission:
+        light = super().emit(context, vertex)
+        u = Draws(context.plan.sampler, vertex.state.key, context.salts).one(Dimension.DISTANCE)
+        return replace(light, brought=light.brought * (2.0 * u))
+
+
+def test_every_stage_may_draw_numbers():
+    scene = torchpt.load(mirrored(), "cpu")
+    name = "materials.wall.reflectance"
+    found = []
+    for compile in ENGINES:
+        leaf = scene.params[name].clone().requires_grad_()
+        image = torchpt.render(
+            scene, params={name: leaf}, spp=4, seed_grad=0, film={"width": 8, "height": 8},
+            integrator=Flickering(max_depth=3), compile=compile,
+        )  # fmt: skip
+        found.append((image.detach(), *torch.autograd.grad(image.sum(), leaf)))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("compile", ENGINES)
+def test_layers_come_through_what_reads_fields(compile):
+    class Counting(Foggy):
+        name = "counting"
+        fields = (Field("collisions"),)
+
+        def transmit(self, context: StageContext, vertex: VertexInput) -> Transmission:
+            out = super().transmit(context, vertex)
+            assert out.state is not None
+            return replace(out, state=replace(out.state, extra={"collisions": vertex.state.extra["collisions"] + 1.0}))
+
+    scene, film = torchpt.load(mirrored(), "cpu"), {"width": 8, "height": 8, "aovs": ["depth"]}
+    seen = torchpt.render(scene, spp=1, film=film, integrator=Counting(), compile=compile, full=True)
+    assert bool((seen.layers["depth"] > 0).all())
+
+
+def test_what_a_class_says_is_read_anew():
+    class Changing(Absorbing):
+        name = "changing"
+
+    scene, integrator = torchpt.load(lamp(), "cpu"), Changing()
+    keys: Mapping[str, Any] = {"film": {"width": 4, "height": 4}, "spp": 1, "integrator": integrator}
+    before = torchpt.render(scene, compile="on", **keys)
+    Changing.density = 1.0
+    after = torchpt.render(scene, compile="on", **keys)
+    torch.testing.assert_close(after, torchpt.render(scene, compile="off", **keys), rtol=1e-5, atol=1e-6)
+    assert float(after.mean()) < 0.5 * float(before.mean())
+
+
+def test_a_checkpoint_knows_the_code_of_an_integrator(tmp_path):
+    class Kept(Absorbing):
+        name = "kept"
+
+    scene, file = torchpt.load(lamp(), "cpu"), str(tmp_path / "kept.ckpt")
+    keys: Mapping[str, Any] = {"film": {"width": 4, "height": 4}, "integrator": Kept(), "checkpoint": file}
+    torchpt.render(scene, spp=2, **keys)
+    Kept.density = 3.0
+    with pytest.raises(torchpt.TorchptError):
+        torchpt.render(scene, spp=4, resume=True, **keys)
+
+
+class Forgetful(Absorbing):
+    """A stage that leaves a field out."""
+
+    name = "forgetful"
+
+    def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
+        output = super().bounce(context, model, vertex)
+        return replace(output, leaving=replace(output.leaving, extra={}))
+
+
+@pytest.mark.parametrize("compile", ENGINES)
+def test_a_field_that_a_stage_leaves_out_is_named(compile):
+    scene = torchpt.load(mirrored(), "cpu")
+    with pytest.raises(torchpt.SceneError, match=r"integrator\.fields\.length"):
+        torchpt.render(scene, spp=1, film={"width": 4, "height": 4}, integrator=Forgetful(), compile=compile)
+
+
+def test_an_integrator_that_is_made_is_checked_as_one_by_name():
+    scene = torchpt.load(mirrored(), "cpu")
+    with pytest.raises(torchpt.SceneError, match="target_error"):
+        torchpt.render(scene, integrator=Aov(), target_error=0.1)
+    with pytest.raises(torchpt.SceneError, match="integrator"):
+        torchpt.render(scene, integrator=Aov)  # pyright: ignore[reportArgumentType]

@@ -79,6 +79,12 @@ def gradients(
         if settings.render.max_memory is not None:
             need = need_of(settings, scene.device, "tape", len(assembly.wave.context.world.materials.models))
             check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)
+        carried = any(not own.whole for own in integrator.fields)
+        if kind == "replay" and integrator.own_transmit and (carried or assembly.passing):
+            what = "its fields" if carried else "opacity"
+            raise NotBuiltError(
+                "adjoint", "replay", f"autograd, as {integrator.name} holds rays up and {what} is differentiated"
+            )
         sums = assembly.sums()
         # Integrators that end at the first surface have but one vertex to keep.
         if held:

@@ -177,7 +177,7 @@ class _Chunk:
         if depth < limits.last:
             for model, index in groups:
                 self._bounce(model, depth, slide, clear, state, hit, index, asked)
-        self._light(ends, slide, state, hit, asked)
+        self._light(ends, depth, slide, state, hit, asked)
         if chance is not None and asked is not None:
             found = torch.autograd.grad(chance, self.tensors, asked, allow_unused=True)
             self.sums.add_each(found)
@@ -232,7 +232,7 @@ class _Chunk:
         if asked is not None and before.chance is not None:
             asked.index_add_(0, index, before.chance)
 
-    def _light(self, ends: Ends, slide: bool, state: PathState, hit: Hit, asked: Tensor | None) -> None:
+    def _light(self, ends: Ends, depth: int, slide: bool, state: PathState, hit: Hit, asked: Tensor | None) -> None:
         """Back through light that was met by chance; what a bounce asks of the same lanes is there already."""
         table = self.world.lights
         if table is None:
@@ -242,14 +242,15 @@ class _Chunk:
                 continue
             lane = take(state.lane, index)
             vertex = VertexInput(rows(state, index), rows(hit, index))
-            integrator, context = self.wave.integrator, replace(self.taped.context, slide=slide)
+            integrator = self.wave.integrator
+            context = self.taped.context.at(salts(depth, lane.device), slide)
             stage = integrator.emit if here else integrator.escape
             with gathered_by(self.sums):
                 before = joint.gather(stage, context, vertex, take(self.radiance, lane), self._others)
             for name, found, _ in before.of_rays(vertex.state, self.plan.attached):
                 if found is not None:
-                    asked_ = self.behind[name]
-                    asked_.index_copy_(-1, lane, take(asked_, lane) + found)
+                    behind = self.behind[name]
+                    behind.index_copy_(-1, lane, take(behind, lane) + found)
             self.sums.add_each(before.others)
             if asked is not None and before.chance is not None:
                 asked.index_add_(0, index, before.chance)

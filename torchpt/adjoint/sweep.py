@@ -7,7 +7,7 @@ from the last arena to the first. Paths of more vertices than there are arenas a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -215,9 +215,10 @@ class Sweep(Worker):
                     integrator.bounce, context, model, vertex, following, clear, behind, self._tensors
                 )
             elif key[0] == "emit":
-                context = replace(context, slide=key[1])
+                context = context.at(salts(paths.depth, torch.device("cpu")), key[1])
                 before = joint.gather(integrator.emit, context, vertex, rows["radiance"], self._tensors)
             else:
+                context = context.at(salts(paths.depth, torch.device("cpu")))
                 before = joint.gather(integrator.escape, context, vertex, rows["radiance"], self._tensors)
         for name, found, like in before.of_rays(state, plan.attached):
             first = kernels.slots.first(name)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchpt import lights
 from torchpt.core.tree import map_leaves
 from torchpt.integrators import LAYERS, aov
+from torchpt.integrators.base import check_fields
 from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
@@ -153,17 +154,22 @@ class Tensors:
         if out.chance is not None:
             chance = torch.ones_like(hit.t) if hit.chance is None else hit.chance
             hit = replace(hit, chance=chance.index_copy(0, flight.lanes, take(chance, flight.lanes) * out.chance))
-        home, o, state = take(flight.lanes, on), take(out.o, on), rows(flight.state, on)
+        home, state = take(flight.lanes, on), replace(rows(flight.state, on), o=take(out.o, on))
         before = take(flight.before, on) + take(flight.hit.t, on)
-        if out.state is not None:
-            state, before = rows(out.state, on), torch.zeros_like(before)
-            paths.state = map_leaves(lambda all, own: all.index_copy(-1, home, own), paths.state, state)
-        behind = self._nearest(o, state.d.detach(), state.t_max)
+        if out.state is not None and out.scattered is not None:
+            turned, own = take(out.scattered, on), rows(out.state, on)
+            state = map_leaves(lambda new, old: torch.where(turned, new, old), own, state)
+            before = torch.where(turned, 0.0, before)
+            some = turned.nonzero().squeeze(1)
+            there, own = take(home, some), rows(own, some)
+            check_fields(self.wave.integrator, own)
+            paths.state = map_leaves(lambda all, new: all.index_copy(-1, there, new), paths.state, own)
+        behind = self._nearest(state.o, state.d.detach(), state.t_max)
         # Distances are counted from where the ray began; the step over a surface is below their rounding.
         values = {"t": behind.t + before, "prim": behind.prim, "u": behind.u, "v": behind.v}
         paths.hit = replace(hit, **{name: getattr(hit, name).index_copy(0, home, x) for name, x in values.items()})
         again = self._held_up(state, behind)
-        state = replace(rows(state, again), o=take(o, again))
+        state = rows(state, again)
         lanes, before = take(home, again), take(before, again)
         paths.flight = Flight(lanes, state, rows(behind, again), before, flight.step + 1)
         return True
@@ -216,6 +222,7 @@ class Tensors:
         start = 0
         for model, index in paths.groups:
             output = bounce(context, model, self._input(paths, index))
+            check_fields(self.wave.integrator, output.leaving)
             leaving.append(output.leaving)
             if output.following is not None:
                 following.append(output.following)
@@ -308,7 +315,8 @@ def trace(wave: Wave, state: PathState, tally: Tally | None = None, observer: Ob
 
 def hits(wave: Wave, state: PathState) -> Hit:
     """Return what camera rays meet, behind what lets them pass."""
-    return Tensors(wave, 0).hits(state, 1)
+    engine = Tensors(wave, 0)
+    return engine.hits(engine.spawn(state).state, 1)
 
 
 def brought(
@@ -354,7 +362,7 @@ def seen(wave: Wave, names: tuple[str, ...], state: PathState, slide: bool = Fal
     They are not weighted by the filter. ``slide``: whether points follow the rays and the geometry, for derivatives.
     """
     engine, layer = Tensors(wave, len(state.lane)), _Layers(wave, names, slide)
-    walk(engine, Paths(state), wave.integrator.limits, layer)
+    walk(engine, engine.spawn(state), wave.integrator.limits, layer)
     return layer.found
 
 

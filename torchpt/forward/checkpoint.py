@@ -69,6 +69,7 @@ def identity(
         "params": {name: fingerprint(value).hex() for name, value in (params or {}).items()},
         "dtype": str(dtype).removeprefix("torch."),
         "device": scene.device.type,
+        **({"integrator_code": fingerprint(settings.integrator).hex()} if settings.integrator.foreign else {}),
         **json.loads(json.dumps(settings.plain(FREE))),
     }
 

@@ -156,4 +156,5 @@ def stamp(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None,
     """Return a hash of what ranks must have in common to render one picture."""
     free = {block: {*keys} - {*DECIDED} for block, keys in FREE.items()}
     free["render"].add("device")
-    return tree.fingerprint((__version__, settings.plain(free), fingerprints(scene, params), dtype))
+    own = settings.integrator if settings.integrator.foreign else None
+    return tree.fingerprint((__version__, settings.plain(free), own, fingerprints(scene, params), dtype))

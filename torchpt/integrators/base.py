@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
+from torchpt.errors import SceneError
 from torchpt.integrators import stages, transmission
 from torchpt.integrators.roulette import DEEP, DEEP_CAP
 from torchpt.integrators.stages import STRATEGIES, Plan
@@ -19,10 +20,10 @@ if TYPE_CHECKING:
     from typing import Self
 
     from torchpt.integrators.first_surface import FirstSurface
-    from torchpt.records import World
+    from torchpt.records import PathState, World
     from torchpt.samplers import Points
 
-__all__ = ["ENDLESS", "LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits"]
+__all__ = ["ENDLESS", "LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits", "check_fields"]
 
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
 #: paths that lose nothing none comes so far (``DEEP_CAP``): only those are cut that roulette was told to leave alone.
@@ -136,9 +137,17 @@ class Integrator(Valued):
     def transmit(self, context: StageContext, vertex: VertexInput) -> Transmission:
         """Return which rays pass what they met, or are scattered before it; a stage, taken step by step until all rays stop.
 
-        Where a kind has its own, it is asked for all rays, those that met nothing too.
+        Where a kind has its own, it is asked for all rays, those that met nothing too, and asks this one which rays pass the
+        surface that they reach. Shadow rays are held up by surfaces alone: ``bounce`` weakens them by what lies between.
         """
+        if context.world.materials.opacity is None:
+            return Transmission(torch.zeros_like(vertex.hit.prim, dtype=torch.bool), vertex.state.o)
         return transmission.transmit(context, vertex)
+
+    @property
+    def foreign(self) -> bool:
+        """Whether the class is a user's own, whose code may differ under the same name."""
+        return type(self).__module__.partition(".")[0] != "torchpt"
 
     @property
     def own_transmit(self) -> bool:
@@ -155,3 +164,26 @@ class Integrator(Valued):
     def first(self, world: World) -> FirstSurface | None:
         """What happens at first surfaces, made once a scene and differentiable in its world; None where paths go on."""
         return None
+
+
+def check_fields(integrator: Integrator, state: PathState) -> None:
+    """Refuse paths that a stage left without a field that its integrator declares, or with one of another form.
+
+    Raises:
+        SceneError: names the field.
+    """
+    if not integrator.fields and not state.extra:
+        return
+    declared = {own.name: own for own in integrator.fields}
+    for name in declared.keys() | state.extra.keys():
+        own, value = declared.get(name), state.extra.get(name)
+        if own is None or value is None:
+            found = "a field that is not declared" if own is None else "left out by a stage"
+            raise SceneError(
+                f"integrator.fields.{name}", found, f"the fields of {integrator.name}: {', '.join(declared)}"
+            )
+        if value.dim() != (1 if own.rows == 1 else 2) or (own.rows > 1 and len(value) != own.rows):
+            form = "(n,)" if own.rows == 1 else f"({own.rows}, n)"
+            raise SceneError(f"integrator.fields.{name}", f"a tensor of shape {tuple(value.shape)}", form)
+        if value.is_floating_point() == own.whole:
+            raise SceneError(f"integrator.fields.{name}", value.dtype, "int64" if own.whole else "numbers of the lanes")

@@ -104,7 +104,7 @@ def bounce(
         vertex, given = _given(context.plan, vertex)
         output = stage(replace(context, search=found), model, vertex)
         after, shadow = output.leaving, output.shadow
-        asked = [(after.throughput, behind.throughput)]
+        asked = [(after.throughput, behind.throughput), (after.radiance, behind.radiance)]
         if behind.o is not None and behind.d is not None:
             asked += [(after.o, behind.o), (after.d, behind.d)]
         asked += [(after.extra[name], cotangent) for name, cotangent in behind.extra.items()]

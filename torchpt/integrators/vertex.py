@@ -50,7 +50,8 @@ class Field:
         name: under which stages find it in ``state.extra``, as ``(N,)``, or ``(rows, N)`` where there are several.
         rows: how many numbers it has.
         start: its value where paths begin.
-        whole: whether it is int64, without derivatives; else it is of the lanes' dtype and is differentiated.
+        whole: whether it is an integer of 32 bits (int64 to stages), without derivatives; else it is of the lanes' dtype and
+            is differentiated.
     """
 
     name: str
@@ -120,15 +121,16 @@ class Transmission:
 
     Attributes:
         on: ``(n,)`` bool: which rays go on; the others end at what they met.
-        o: ``(3, n)`` where they go on from.
-        state: the rays as they go on, where something between surfaces scattered them: their origins, directions, densities
-            and fields may be others, and ``t_max`` 0 ends them; their throughput stays. None: they pass straight on, and
-            distances are counted from where they began.
+        o: ``(3, n)`` where those go on from that pass straight on; their distances are counted from where they began.
+        scattered: ``(n,)`` bool: which rays something between surfaces scattered; None: none.
+        state: these rays as they go on: their origins, directions, densities and fields may be others, and ``t_max`` 0 ends
+            them; their throughput stays.
         chance: ``(n,)`` 1, with the derivative of the chance to stop or to pass; None: it has none.
     """
 
     on: Tensor
     o: Tensor
+    scattered: Tensor | None = None
     state: PathState | None = None
     chance: Tensor | None = None
 

@@ -47,8 +47,10 @@ def _canonical(value: Any) -> str:
         return f"({','.join(map(_canonical, value))})"
     if value is None or isinstance(value, bool | int | float | str | torch.dtype):
         return repr(value)
-    if isinstance(value, type):
-        return f"{value.__module__}.{value.__qualname__}"
+    if isinstance(value, type) and value.__module__.partition(".")[0] in ("torchpt", "torch", "builtins"):
+        return f"{value.__module__}.{value.__qualname__}"  # the code of others may change without its name
+    if isinstance(value, bytes):
+        return value.hex()
     raise _NotKept
 
 

@@ -204,10 +204,12 @@ class Worker:
 
     def emit(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
+        self.calls.name_salts(paths.depth)
         self._on_list(self.kernels.emit(), paths, self.kernels.emissive)
 
     def escape(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
+        self.calls.name_salts(paths.depth)
         self._on_list(self.kernels.escape(), paths, self.kernels.missed)
 
     def _on_list(self, kernel: Kernel, paths: Paths, number: int) -> None:
@@ -217,6 +219,8 @@ class Worker:
         """See :class:`torchpt.paths.walk.Engine`."""
         kernels, calls = self.kernels, self.calls
         if not paths.groups:  # not sorted: all end where they are
+            if paths.listed:  # those that had ended before are no longer here
+                paths.count, _ = calls.counted()
             paths.arena.words[kernels.state.first("prim"), : paths.count] = -1
             paths.arena.floats[kernels.state.first("t_max"), : paths.count] = 0.0
             self._settle(paths)

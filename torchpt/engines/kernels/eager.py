@@ -46,7 +46,7 @@ def bounce_eagerly(
         state = path_state(rows.take(source, lanes, rows.state))
         vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
         context = kernels.wave.context.at(salts(depth, torch.device("cpu")), roulette=roulette)
-        output = kernels.wave.integrator.bounce(context, model, vertex)
+        output = kernels.wave.bounce(context, model, vertex)
         after, shadow = output.leaving, output.shadow
     values: dict[str, Tensor | None] = {**state_values(after)}
     values |= rows.take(source, lanes, ("weight",))

@@ -8,7 +8,6 @@ it ask of the ray that left, and leaves what it asks of the ray that came.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -100,25 +99,27 @@ def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks
 
 
 def back_emit(trace: Trace, slide: bool) -> Sinks:
-    """See :func:`torchpt.integrators.joint.emit`."""
+    """See :func:`torchpt.integrators.joint.gather`."""
     kernels, tracer = _begun(trace)
+    salts = trace.salts()
     state, hit, rows = _given(trace)
     noted = _Noted(tracer, kernels)
     with tracer, gathered_by(noted):
-        context = replace(kernels.taped, slide=slide)
+        context = kernels.taped.at(salts, slide)
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
         before = joint.gather(stage, context, vertex, rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
 
 
 def back_escape(trace: Trace) -> Sinks:
-    """See :func:`torchpt.integrators.joint.escape`."""
+    """See :func:`torchpt.integrators.joint.gather`."""
     kernels, tracer = _begun(trace)
+    salts = trace.salts()
     state, hit, rows = _given(trace)
     noted = _Noted(tracer, kernels)
     with tracer, gathered_by(noted):
         stage, vertex = trace.layout.wave.integrator.escape, VertexInput(state, hit)
-        before = joint.gather(stage, kernels.taped, vertex, rows["radiance"], noted.leaves)
+        before = joint.gather(stage, kernels.taped.at(salts), vertex, rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchpt.core.tree import signature
+from torchpt.core.tree import fingerprint, signature
 from torchpt.engines.kernels import output, transmission, vertex
 from torchpt.engines.kernels import packets as packet_kernels
 from torchpt.engines.kernels.handed import Handed
@@ -79,7 +79,7 @@ class Kernels(Layout):
         )
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
-        own = wave.integrator if wave.integrator.own_stages else None
+        own = fingerprint(wave.integrator) if wave.integrator.own_stages else None
         asked = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, asked), packets, fused)
         alike = before is not None and before.structure == self.structure

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchpt.engines.kernels.rows import path_state
 from torchpt.engines.kernels.trace import Trace
+from torchpt.integrators.base import check_fields
 from torchpt.integrators.transmission import beyond, non_opaque, opacity_at
 from torchpt.integrators.vertex import VertexInput
 from torchpt.lanes.sinks import Note, Pack, Scatter, Sinks
@@ -52,8 +53,14 @@ def transmit(trace: Trace, again: bool) -> Sinks:
         on = out.on & (state.t_max > 0) if layout.wave.integrator.own_transmit else out.on
         met = ~on
         whole = hit.t if before is None else hit.t + before
-        after = replace(state, o=out.o) if out.state is None else out.state
-        start = whole if out.state is None else torch.zeros_like(whole)
+        after, start, turned = replace(state, o=out.o), whole, None
+        if out.state is not None and out.scattered is not None:
+            turned = on & out.scattered
+            ray = {
+                name: torch.where(turned, getattr(out.state, name), getattr(after, name))
+                for name in ("o", "d", "t_max")
+            }
+            after, start = replace(after, **ray), torch.where(turned, 0.0, whole)
     onward = layout.passed.nodes(
         tracer, pass_o=after.o, pass_d=after.d, pass_t=after.t_max, before=start, home=home, key=state.key
     )
@@ -61,9 +68,10 @@ def transmit(trace: Trace, again: bool) -> Sinks:
     if again:
         stopped = layout.state.nodes(tracer, t=whole, prim=hit.prim, u=hit.u, v=hit.v)
         sinks.scatter.append(Scatter(trace.node(met), trace.node(home), tuple(stopped), slots=True))
-    if out.state is not None:
+    if out.state is not None and turned is not None:
+        check_fields(layout.wave.integrator, out.state)
         scattered = tuple(trace.kept(out.state, {}))
-        sinks.scatter.append(Scatter(trace.node(on), trace.node(home), scattered, slots=True))
+        sinks.scatter.append(Scatter(trace.node(turned), trace.node(home), scattered, slots=True))
     return sinks
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchpt.engines.kernels.packets import nearest, occluded
 from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators import stages
+from torchpt.integrators.base import check_fields
 from torchpt.integrators.vertex import VertexInput
 from torchpt.lanes.sinks import Pack, Scatter, Sinks
 from torchpt.records import PathState, Shadow
@@ -87,11 +88,12 @@ def settle(trace: Trace, shadow: bool) -> Sinks:
 def emit(trace: Trace) -> Sinks:
     """Light of emitters that were met, added where the lanes are."""
     tracer, layout = trace.tracer, trace.layout
+    context = layout.wave.context.at(trace.salts())
     state, _ = trace.state()
     hit = trace.hit()
     place = trace.place()
     with tracer:
-        radiance = state.radiance + layout.wave.integrator.emit(layout.wave.context, VertexInput(state, hit)).brought
+        radiance = state.radiance + layout.wave.integrator.emit(context, VertexInput(state, hit)).brought
     rows = tuple(layout.state.nodes(tracer, radiance=radiance))
     return Sinks(scatter=[Scatter(-1, trace.node(place), rows)])
 
@@ -100,8 +102,9 @@ def escape(trace: Trace) -> Sinks:
     """Light from outside, and the ends of those paths."""
     state, unseen = trace.state()
     hit, wave = trace.hit(), trace.layout.wave
+    context = wave.context.at(trace.salts())
     with trace.tracer:
-        radiance = state.radiance + wave.integrator.escape(wave.context, VertexInput(state, hit)).brought
+        radiance = state.radiance + wave.integrator.escape(context, VertexInput(state, hit)).brought
     return Sinks(scatter=[trace.ended(-1, state.lane, radiance, unseen)])
 
 
@@ -120,6 +123,7 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
     with tracer:
         context = layout.wave.context.at(salts, roulette=roulette)
         output = layout.wave.bounce(context, model, VertexInput(state, hit))
+        check_fields(layout.wave.integrator, output.leaving)
     after, shadow = output.leaving, output.shadow
     if not layout.fused:
         return _with_shadow(trace, after, shadow, unseen)
