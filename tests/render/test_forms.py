@@ -19,9 +19,9 @@ from gradient_rooms import gradient_of, room
 from torch import Tensor
 
 import torchpt
-from torchpt.engines.kernels import calls, programs
+from torchpt.engines.kernels import calls
 from torchpt.engines.kernels.kernels import Kernel
-from torchpt.lanes import engine, shelf
+from torchpt.lanes import engine, programs, shelf
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.engine import Target
 from torchpt.lanes.form import SCALAR, VECTORS
@@ -37,14 +37,14 @@ SMALL = {"film": {"width": 16, "height": 16}, "threads": 1, "compile": "on"}
 def stages(monkeypatch) -> Iterator[dict[str, TracedStage]]:
     """Stages by the names of their machine code; all that renders ask for is traced."""
     found: dict[str, TracedStage] = {}
-    compiled = programs._compiled
+    compiled = programs.compiled
 
     def noted(stage: TracedStage) -> Any:
         program = compiled(stage)
         found[program.code] = stage
         return program
 
-    monkeypatch.setattr(programs, "_compiled", noted)
+    monkeypatch.setattr(programs, "compiled", noted)
     monkeypatch.setattr(shelf, "key_of", lambda structure: None)
     programs.forget()
     yield found

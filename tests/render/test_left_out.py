@@ -18,8 +18,8 @@ from trials import film_of
 
 import torchpt
 from torchpt.core.tree import leaves
-from torchpt.engines.kernels import programs
 from torchpt.format.description import settings
+from torchpt.lanes import programs
 from torchpt.lanes.program import Program
 
 

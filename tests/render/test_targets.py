@@ -9,9 +9,8 @@ import torch
 from few import few
 
 import torchpt
-from torchpt.engines.kernels import programs
 from torchpt.format.description import settings
-from torchpt.lanes import engine
+from torchpt.lanes import engine, programs
 from torchpt.rendering import render_scene
 
 pytestmark = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="these are x86 machines")

@@ -26,6 +26,8 @@ __all__ = ["key_of", "load", "store"]
 
 #: Largest tensor of a program's own that is written.
 _MOST = 1 << 16
+#: Whose classes are told by name: an entry belongs to a version of their code.
+_LIBRARIES = ("torchpt", "torch", "builtins")
 _PLAIN = ("uniforms", "lists", "counters", "tensors", "results", "shadows", "nodes", "sums")
 
 
@@ -47,7 +49,7 @@ def _canonical(value: Any) -> str:
         return f"({','.join(map(_canonical, value))})"
     if value is None or isinstance(value, bool | int | float | str | torch.dtype):
         return repr(value)
-    if isinstance(value, type) and value.__module__.partition(".")[0] in ("torchpt", "torch", "builtins"):
+    if isinstance(value, type) and value.__module__.partition(".")[0] in _LIBRARIES:
         return f"{value.__module__}.{value.__qualname__}"  # the code of others may change without its name
     if isinstance(value, bytes):
         return value.hex()

@@ -11,8 +11,6 @@ import pickle
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from typing import Any
 
 import llvmlite
@@ -28,6 +26,7 @@ from torchpt.errors import RenderError
 from torchpt.native import cache, compile_time
 from torchpt.native.content import code_of_function
 from torchpt.native.memory import MARGIN, room_for
+from torchpt.native.threads import share
 
 if getattr(numba_config, "DISABLE_JIT", 0):
     raise RenderError("NUMBA_DISABLE_JIT is set, and kernels are machine code that Python cannot run: unset it")
@@ -35,20 +34,20 @@ if getattr(numba_config, "DISABLE_JIT", 0):
 __all__ = ["compiled", "jit", "launch", "parallel_allowed", "part"]
 
 _lock = threading.Lock()
-_state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "pools": {}, "said": False}
+_state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "said": False}
 #: Seconds of compiling after which the user is told.
 _PATIENCE = 1.0
 
 
 def _after_fork() -> None:
-    """A child starts without its parent's OpenMP team, lock and pool threads.
+    """A child starts without its parent's OpenMP team and lock.
 
     Torch's own parallel operations would wait for that team for ever: in the child they run serially.
     """
     global _lock
     torch.set_num_threads(1)
     _lock = threading.Lock()
-    _state.update(forked=True, parallel=False, pools={})
+    _state.update(forked=True, parallel=False)
 
 
 if hasattr(os, "register_at_fork"):
@@ -181,14 +180,6 @@ def parallel_allowed() -> bool:
         return bool(_state["parallel"]) and _state["owner"] == os.getpid()
 
 
-def _pool(workers: int) -> ThreadPoolExecutor:
-    with _lock:
-        key = (os.getpid(), workers)
-        if key not in _state["pools"]:
-            _state["pools"][key] = ThreadPoolExecutor(workers, thread_name_prefix="torchpt-accel")
-        return _state["pools"][key]
-
-
 def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, args: tuple) -> None:
     """Runs a kernel over ``range(items)``.
 
@@ -212,10 +203,5 @@ def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, arg
         finally:
             numba.set_num_threads(before)
     else:
-        cuts = [items * k // threads for k in range(threads + 1)]
-        pool = _pool(threads - 1)
         compiled(serial, 0, 0, *args)
-        jobs = [pool.submit(serial, a, b, *args) for a, b in pairwise(cuts[1:])]
-        serial(0, cuts[1], *args)
-        for job in jobs:
-            job.result()
+        share(lambda first, last: serial(first, last, *args), items, threads)

@@ -1,15 +1,23 @@
-"""How many threads there are, and that their number does not matter."""
+"""How many threads there are, how they share work, and that their number does not matter."""
 
 from __future__ import annotations
 
 import functools
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import torch
 
 from torchpt.native.memory import room_for
 
-__all__ = ["settle", "start_team", "thread_count"]
+__all__ = ["settle", "share", "start_team", "thread_count"]
 
+_lock = threading.Lock()
+#: Threads that wait for work, by process and number.
+_pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 #: What torch hands over to MKL's vector mathematics.
 _FUNCTIONS = "acos asin atan cos erf erfc erfinv exp log log10 log2 sin sqrt tan tanh trunc".split()
 #: Numbers of a tensor that torch leaves to one thread.
@@ -21,6 +29,46 @@ _STACK = 12 << 20
 def thread_count(threads: int | None) -> int:
     """Threads to use: the caller's wish, else torch's own number."""
     return max(1, int(threads)) if threads else max(1, torch.get_num_threads())
+
+
+def _after_fork() -> None:
+    """A child starts without its parent's threads, and without a lock that one of them may hold."""
+    global _lock
+    _lock = threading.Lock()
+    _pools.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+def _pool(workers: int) -> ThreadPoolExecutor:
+    with _lock:
+        key = (os.getpid(), workers)
+        if key not in _pools:
+            _pools[key] = ThreadPoolExecutor(workers, thread_name_prefix="torchpt")
+        return _pools[key]
+
+
+def share(work: Callable[[int, int], object], items: int, threads: int) -> None:
+    """Call ``work(first, last)`` for parts of ``range(items)``, one for each thread; the first in the calling one.
+
+    Args:
+        work: machine code that releases the GIL.
+        items: how many there are.
+        threads: 1 runs strictly in the calling thread.
+    """
+    if threads == 1:
+        work(0, items)
+        return
+    cuts = [items * k // threads for k in range(threads + 1)]
+    pool = _pool(threads - 1)
+    jobs = [pool.submit(work, a, b) for a, b in pairwise(cuts[1:])]
+    try:
+        work(0, cuts[1])
+    finally:
+        for job in jobs:
+            job.result()
 
 
 @functools.cache

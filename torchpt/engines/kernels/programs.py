@@ -1,8 +1,7 @@
-"""Programs of a process: each stage is traced and compiled once for all scenes of one structure."""
+"""Programs of a render's stages: each is traced and compiled once for all scenes of one structure."""
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -12,24 +11,17 @@ from torchpt.engines.kernels.layout import Layout
 from torchpt.engines.kernels.leaves import Leaves
 from torchpt.engines.kernels.packets import kinds_of
 from torchpt.engines.kernels.trace import Trace
-from torchpt.lanes import bits, engine, operators, shelf  # noqa: F401  (the operators register how they are lowered)
-from torchpt.lanes.kernel import text
-from torchpt.lanes.program import Program, holds
+from torchpt.lanes import bits, operators, programs  # noqa: F401  (the operators register how they are lowered)
+from torchpt.lanes.program import Program
 from torchpt.lanes.prologue import pruned
 from torchpt.lanes.sinks import Sinks
 from torchpt.lanes.stage import TracedStage
 from torchpt.lanes.tracing import Tracer, lanes_for
 from torchpt.samplers import scrambling
 
-__all__ = ["forget", "program_of"]
+__all__ = ["program_of"]
 
 scrambling.reverse_bits.register(bits.reverse_bits)
-
-#: More programs than this are not kept.
-MOST_PROGRAMS = 512
-#: By what they were traced for, the latest last.
-_programs: dict[Any, Program] = {}
-_tracing = threading.Lock()
 
 
 def program_of(
@@ -45,27 +37,7 @@ def program_of(
         build: traces the stage.
         listed: whether the kernel takes lanes by a list.
     """
-    whole = key, structure
-    with _tracing:  # one at a time in a process: see torchpt.lanes.tracing.tracing
-        program = _programs.get(whole)
-        name = shelf.key_of(whole) if program is None else None
-        if program is None and name is not None:
-            program = shelf.load(name)
-        if program is None or not holds(program, leaves.tensors):
-            program = _compiled(_traced(leaves, layout, build, listed))
-            if name is not None:
-                shelf.store(name, program)
-        if _programs.get(whole) is not program:
-            _programs.pop(whole, None)
-            _programs[whole] = program
-            if len(_programs) > MOST_PROGRAMS:
-                del _programs[next(iter(_programs))]
-        return program
-
-
-def forget() -> None:
-    """Drop the programs of this process; those on disk stay."""
-    _programs.clear()
+    return programs.program_of((key, structure), leaves.tensors, lambda: _traced(leaves, layout, build, listed))
 
 
 def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
@@ -88,8 +60,3 @@ def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], lis
         searched=kinds_of(layout.world) if searches else None,
         sums=tuple(trace.sums),
     )
-
-
-def _compiled(stage: TracedStage) -> Program:
-    target = engine.host()
-    return Program.of(stage, engine.compiled(text(stage, target.form), target))
