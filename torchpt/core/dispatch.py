@@ -17,25 +17,29 @@ class Dispatched(Generic[P, T]):
 
     Args:
         function: what is called where no implementation takes the arguments.
+
+    Attributes:
+        function: the same.
+        implementations: those that are asked, in this order.
     """
 
     def __init__(self, function: Callable[P, T]) -> None:
-        self._function = function
-        self._others: list[Callable[..., Any]] = []
+        self.function = function
+        self.implementations: list[Callable[..., Any]] = []
         update_wrapper(self, function)
 
     def register(self, implementation: Callable[..., Any]) -> None:
         """Ask ``implementation`` first from now on; it returns NotImplemented for arguments that it leaves to others."""
-        if implementation not in self._others:
-            self._others.insert(0, implementation)
+        if implementation not in self.implementations:
+            self.implementations.insert(0, implementation)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T:
         """Call the function, or the first implementation that takes the arguments."""
-        for implementation in self._others:
+        for implementation in self.implementations:
             result = implementation(*args, **kwargs)
             if result is not NotImplemented:
                 return result
-        return self._function(*args, **kwargs)
+        return self.function(*args, **kwargs)
 
 
 def dispatched(function: Callable[P, T]) -> Dispatched[P, T]:

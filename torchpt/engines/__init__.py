@@ -4,4 +4,8 @@
 is a CPU's: stages as compiled loops over lanes, in arenas of a thread. Both serve :func:`torchpt.paths.walk.walk`, whose
 ``Engine`` is the interface, and give the same pictures but for rounding. An engine may import physics, paths, the search and
 the lane compiler; none of these imports an engine.
+
+``taken_over.py`` has the functions of physics that run otherwise where an engine does (:mod:`torchpt.core.dispatch`).
 """
+
+from torchpt.engines import taken_over  # noqa: F401  (registers)

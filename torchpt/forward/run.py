@@ -72,7 +72,7 @@ class Run:
         threads: int | None = None,
     ) -> None:
         self.start = time.perf_counter()
-        self._numba = compile_time.seconds()
+        self._others = compile_time.seconds()
         self._kernels = 0.0  # seconds of kernels that were given up
         self.loop: Loop | None = None
         self.split = None if group is None or group.size == 1 else Split(group)
@@ -399,9 +399,9 @@ class Run:
         return self.before + max(time.perf_counter() - self.begun - made - self.write_seconds(), 0.0)
 
     def compile_seconds(self) -> float:
-        """Since the start, for kernels: those of stages, and numba's of searches, also where a first call makes them."""
+        """Since the start, for kernels: those of stages, and others that a first call makes, such as those of searches."""
         made = 0.0 if self.loop is None else self.loop.kernels.seconds
-        return self._kernels + made + compile_time.seconds() - self._numba
+        return self._kernels + made + compile_time.seconds() - self._others
 
     def write_seconds(self) -> float:
         """For checkpoints."""

@@ -26,6 +26,7 @@ from torchpt.lanes.prologue import pruned
 from torchpt.lanes.sinks import Sinks, Store
 from torchpt.lanes.stage import TracedStage
 from torchpt.lanes.tracing import Tracer, lanes_for, tracing
+from torchpt.native import compile_time
 from torchpt.native.threads import share, thread_count
 
 __all__ = ["Lanewise", "lanewise"]
@@ -105,11 +106,14 @@ class Lanewise:
         if made is None or not made.serves(tables):
             if any(table.device.type != "cpu" or table.requires_grad for table in tables):
                 return NotImplemented
+            compile_time.begun()
             try:
                 made = self._make(key, args, tables)
             except Unsupported as error:
                 self.refused[key] = str(error)
                 return NotImplemented
+            finally:
+                compile_time.ended()
         return made.run(inputs, uniforms, count, thread_count(None))
 
     def _make(self, key: tuple[Any, ...], args: Sequence[Any], tables: list[Tensor]) -> _Made:

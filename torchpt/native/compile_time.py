@@ -1,4 +1,4 @@
-"""Seconds that this process has spent on compiling numba kernels, or on loading them from disk; imports no numba."""
+"""Seconds that this process has spent on kernels that any render may call, compiling them or loading them from disk."""
 
 from __future__ import annotations
 

@@ -13,13 +13,27 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from torchpt.lanes.tracing import tracing
+from torchpt.core.dispatch import dispatched
 from torchpt.math.hashing import as_int32, mix_int
 from torchpt.samplers.base import ADAPTIVE, Numbers, Points
 from torchpt.samplers.dimensions import Dimension, salt
 from torchpt.spec import Kinds
 
-__all__ = ["ADAPTIVE", "KINDS", "Dimension", "Draws", "Numbers", "Points", "Sampler", "Streams", "points_of", "salts"]
+__all__ = [
+    "ADAPTIVE",
+    "KINDS",
+    "Dimension",
+    "Draws",
+    "Numbers",
+    "Points",
+    "Sampler",
+    "Streams",
+    "draw_1d",
+    "draw_2d",
+    "draw_further",
+    "points_of",
+    "salts",
+]
 
 #: The kinds of samplers.
 KINDS: Kinds[Points] = Kinds(
@@ -103,6 +117,24 @@ class Sampler:
         )
 
 
+@dispatched
+def draw_1d(points: Points, key: Tensor, salt: Tensor) -> Tensor:
+    """Draw one number a lane, see :meth:`Points.draw_1d`."""
+    return points.draw_1d(key, salt)
+
+
+@dispatched
+def draw_2d(points: Points, key: Tensor, salt: Tensor) -> Tensor:
+    """Draw two numbers a lane, see :meth:`Points.draw_2d`."""
+    return points.draw_2d(key, salt)
+
+
+@dispatched
+def draw_further(points: Points, key: Tensor, salt: Tensor) -> Tensor:
+    """Draw the two numbers with which a set of two goes on, see :meth:`Points.draw_further`."""
+    return points.draw_further(key, salt)
+
+
 class Draws:
     """The numbers of one path vertex for a batch of lanes: ``draws.one(Dimension.ROULETTE)``, ``draws.two(...)``.
 
@@ -118,32 +150,13 @@ class Draws:
 
     def one(self, dimension: Dimension) -> Tensor:
         """``(N,)`` float32 in ``[0, 1)``."""
-        if self._by_kernel():
-            return self._drawn(1, dimension)[0]
-        return self._points.draw_1d(self._key, self._salts[int(dimension)])
+        return draw_1d(self._points, self._key, self._salts[int(dimension)])
 
     def two(self, dimension: Dimension) -> Tensor:
         """``(2, N)`` float32 in ``[0, 1)``."""
         if dimension is Dimension.LIGHT and self._points.joint:
-            return self._further(Dimension.LED_HERE)
-        if self._by_kernel():
-            return self._drawn(2, dimension)
-        return self._points.draw_2d(self._key, self._salts[int(dimension)])
-
-    def _further(self, dimension: Dimension) -> Tensor:
-        """``(2, N)``: the set of ``dimension`` goes on."""
-        if self._by_kernel():
-            return self._drawn(2, dimension, further=True)
-        return self._points.draw_further(self._key, self._salts[int(dimension)])
-
-    def _by_kernel(self) -> bool:
-        """Whether numbers come from a CPU kernel: compiled stages have the tensor form inside."""
-        return self._key.device.type == "cpu" and not tracing() and self._points.kernels() is not None
-
-    def _drawn(self, rows: int, dimension: Dimension, further: bool = False) -> Tensor:
-        from torchpt.samplers import kernels
-
-        return kernels.draw(self._points, rows, self._key, int(self._salts[int(dimension)]), further)
+            return draw_further(self._points, self._key, self._salts[int(Dimension.LED_HERE)])
+        return draw_2d(self._points, self._key, self._salts[int(dimension)])
 
 
 @lru_cache(maxsize=4096)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -88,7 +88,3 @@ class Points(ABC):
     def draw_further(self, key: Tensor, salt: Tensor | int) -> Tensor:
         """The third and fourth dimension of the set whose first two :meth:`draw_2d` gives; where ``joint`` says so."""
         raise NotImplementedError(f"sets of {self.name} points end with two dimensions")
-
-    def kernels(self) -> Any:
-        """The module of its CPU kernels, see :mod:`torchpt.samplers.kernels`; None: the tensor form runs everywhere."""
-        return None

@@ -11,17 +11,14 @@ from torchpt.engines.kernels.layout import Layout
 from torchpt.engines.kernels.leaves import Leaves
 from torchpt.engines.kernels.packets import kinds_of
 from torchpt.engines.kernels.trace import Trace
-from torchpt.lanes import bits, operators, programs  # noqa: F401  (the operators register how they are lowered)
+from torchpt.lanes import operators, programs  # noqa: F401  (the operators register how they are lowered)
 from torchpt.lanes.program import Program
 from torchpt.lanes.prologue import pruned
 from torchpt.lanes.sinks import Sinks
 from torchpt.lanes.stage import TracedStage
 from torchpt.lanes.tracing import Tracer, lanes_for
-from torchpt.samplers import scrambling
 
 __all__ = ["program_of"]
-
-scrambling.reverse_bits.register(bits.reverse_bits)
 
 
 def program_of(

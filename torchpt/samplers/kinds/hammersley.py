@@ -9,7 +9,6 @@ is a permutation of any length, so that sets of dimensions are independent and `
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,9 +40,3 @@ class Hammersley(Points):
         index = shuffle(key[1], key[2], seed)
         x = place(index.double(), to_unit(mix(mix(seed ^ X) ^ index)).double(), key[2].double())
         return torch.stack((x, to_unit(reverse_bits(scramble(index, mix(seed ^ Y))))))
-
-    def kernels(self) -> Any:
-        """See :class:`Points`."""
-        from torchpt.samplers import kernels_hammersley
-
-        return kernels_hammersley

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,9 +36,3 @@ class Independent(Points):
         """See :class:`Points`."""
         word = _word(key, salt)
         return torch.stack((to_unit(word), to_unit(mix(word ^ _SECOND))))
-
-    def kernels(self) -> Any:
-        """See :class:`Points`."""
-        from torchpt.samplers import kernels_independent
-
-        return kernels_independent

@@ -7,7 +7,6 @@ with the place in the pixel: they are the two halves of a set of four dimensions
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -59,9 +58,3 @@ class Sobol(Points):
         x = scramble(third_dimension(index), mix(seed ^ Z))
         y = scramble(fourth_dimension(index), mix(seed ^ W))
         return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))
-
-    def kernels(self) -> Any:
-        """See :class:`Points`."""
-        from torchpt.samplers import kernels_sobol
-
-        return kernels_sobol

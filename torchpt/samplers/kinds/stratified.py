@@ -7,7 +7,6 @@ as wide as that: all have the same area and are nearly square, whatever the coun
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,9 +44,3 @@ class Stratified(Points):
         first, end = (column * count / columns).floor(), ((column + 1.0) * count / columns).floor()
         rows = end - first
         return torch.stack((place(first, jitter[0] * rows, count), place(k - first, jitter[1], rows)))
-
-    def kernels(self) -> Any:
-        """See :class:`Points`."""
-        from torchpt.samplers import kernels_stratified
-
-        return kernels_stratified

@@ -11,7 +11,6 @@ A permutation of four things is an affine map of two bits, ``A d + b`` with an i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +19,7 @@ from torchpt.math.hashing import logical_shift, mix, to_unit
 from torchpt.samplers.base import Numbers, Points
 from torchpt.samplers.scrambling import X, Y, reverse_bits, scramble, second_dimension
 
-__all__ = ["DIGITS", "ZSobol"]
+__all__ = ["ZSobol"]
 
 #: Of a place on the curve. Places that share all digits above are one block, 2^24 samples with a sequence of their own.
 DIGITS = 12
@@ -84,9 +83,3 @@ class ZSobol(Points):
         x = scramble(index, mix(seed ^ X))
         y = scramble(second_dimension(index), mix(seed ^ Y))
         return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))
-
-    def kernels(self) -> Any:
-        """See :class:`Points`."""
-        from torchpt.samplers import kernels_zsobol
-
-        return kernels_zsobol

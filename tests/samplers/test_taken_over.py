@@ -1,4 +1,4 @@
-"""The CPU kernels give the bits of the tensor form, wherever a lane stands and however many threads there are."""
+"""What the lane compiler makes of samplers gives the bits of the tensor form, wherever a lane stands and on any threads."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import pytest
 import torch
 from few import few
 
+import torchpt.engines  # noqa: F401  (registers)
+from torchpt import samplers
+from torchpt.lanes.function import Lanewise
 from torchpt.samplers import KINDS, Dimension, Draws, Sampler, points_of, salts
-from torchpt.samplers.kernels import draw
 
 CPU = torch.device("cpu")
-KERNELS = [name for name in KINDS if points_of(name).kernels() is not None]
+DRAWS = {"draw_1d": samplers.draw_1d, "draw_2d": samplers.draw_2d, "draw_further": samplers.draw_further}
 NAMES = [0, 1, -1, 2**31 - 1, -(2**31), *salts(3, CPU).tolist()]
 
 
@@ -25,30 +27,39 @@ def keys(n: int, kind: str) -> torch.Tensor:
     return words.to(torch.int32)
 
 
-@pytest.mark.parametrize("kind", KERNELS)
+def drawn(name: str, kind: str, key: torch.Tensor, salt: torch.Tensor) -> torch.Tensor:
+    """By the kernel, which takes any number of lanes but none."""
+    (kernel,) = (other for other in DRAWS[name].implementations if isinstance(other, Lanewise))
+    found = kernel(points_of(kind), key, salt)
+    assert not kernel.refused
+    assert (found is NotImplemented) == (key.shape[1] == 0)
+    return DRAWS[name](points_of(kind), key, salt) if found is NotImplemented else found
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
 @pytest.mark.parametrize("n", few([0, 1, 3, 1023, 1025, 70_003], 3))
 def test_bits_are_those_of_the_tensor_form(kind, n):
     key, points = keys(n, kind), points_of(kind)
     for name in NAMES if n < 2000 else NAMES[:: len(NAMES) // 3]:
         salt = torch.tensor(name, dtype=torch.int32)
-        assert torch.equal(draw(points, 1, key, name), points.draw_1d(key, salt)[None])
-        assert torch.equal(draw(points, 2, key, name), points.draw_2d(key, salt))
+        assert torch.equal(drawn("draw_1d", kind, key, salt), points.draw_1d(key, salt))
+        assert torch.equal(drawn("draw_2d", kind, key, salt), points.draw_2d(key, salt))
         if points.joint:
-            assert torch.equal(draw(points, 2, key, name, further=True), points.draw_further(key, salt))
+            assert torch.equal(drawn("draw_further", kind, key, salt), points.draw_further(key, salt))
 
 
-@pytest.mark.parametrize("kind", KERNELS)
+@pytest.mark.parametrize("kind", list(KINDS))
 @pytest.mark.slow
 def test_place_and_threads_do_not_matter(kind):
-    key, points = keys(70_003, kind), points_of(kind)
+    key, salt = keys(200_003, kind), torch.tensor(NAMES[6], dtype=torch.int32)
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        whole = draw(points, 2, key, NAMES[6])
-        for threads in (1, 2):
+        whole = drawn("draw_2d", kind, key, salt)
+        for threads in (1, 2, 3):
             torch.set_num_threads(threads)
-            for first, size in ((0, 70_003), (0, 1), (1, 3), (5, 1024), (11, 32_769), (70_000, 3)):
-                part = draw(points, 2, key[:, first : first + size], NAMES[6])
+            for first, size in ((0, 200_003), (0, 1), (1, 3), (5, 1024), (11, 132_769), (200_000, 3)):
+                part = drawn("draw_2d", kind, key[:, first : first + size], salt)
                 assert torch.equal(part, whole[:, first : first + size])
     finally:
         torch.set_num_threads(before)
