@@ -11,6 +11,8 @@ from few import few
 from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p
 
+import torchpt.engines  # noqa: F401  (takes sampling over)
+from torchpt.lanes.function import Lanewise
 from torchpt.lights import solid_angle
 from torchpt.lights.area import inverse_pdf as planar
 from torchpt.lights.solid_angle import LEAST, MOST, OTHER, RECTANGLE, SKEW, TRIANGLE
@@ -243,10 +245,13 @@ def test_sampling_and_density_switch_together(dtype):
 def test_the_kernel_is_the_tensor_form(dtype):
     lights, row, x, u = _scatter(20_000, dtype)
     uv, angle = solid_angle.sample(lights, row, x, u)
-    other, of_other = solid_angle.tensor_sample(lights, row, x, u)
+    other, of_other = solid_angle.sample.function(lights, row, x, u)
     torch.testing.assert_close(angle, of_other, rtol=1e-6, atol=0)
     torch.testing.assert_close(uv, other, rtol=1e-6, atol=1e-7 if dtype == torch.float32 else 1e-9)
-    assert torch.equal(solid_angle.tensor_angles(lights, row, x), of_other)
+    assert torch.equal(solid_angle.angles.function(lights, row, x), of_other)
+    forms = solid_angle.sample, solid_angle.angles
+    kernels = [kernel for form in forms for kernel in form.implementations if isinstance(kernel, Lanewise)]
+    assert len(kernels) == 2 and not any(kernel.refused for kernel in kernels)
 
 
 def test_place_and_threads_do_not_matter():
@@ -275,7 +280,7 @@ def test_points_in_the_plane_and_lights_without_area_are_sampled_by_area(name):
     u = uniform(256)
     for x in spots:
         for light in ((p0, e1, e2), (p0, e1, e1 * 0.5), (p0, e1 * 0, e2), (p0, e1 * 0, e2 * 0)):
-            for form in (solid_angle.sample, solid_angle.tensor_sample):
+            for form in (solid_angle.sample, solid_angle.sample.function):
                 uv, angle = form(table(name, light), None, x.expand(3, 256), u)
                 assert not angle.any()
                 torch.testing.assert_close(uv, uniform_triangle(u) if code(name) == TRIANGLE else u)
@@ -293,7 +298,7 @@ def test_points_drawn_from_beside_an_edge_are_on_the_light(name, near):
         x = start + along * edge + away * e1.norm()
         for form, angles in (
             (solid_angle.sample, solid_angle.angles),
-            (solid_angle.tensor_sample, solid_angle.tensor_angles),
+            (solid_angle.sample.function, solid_angle.angles.function),
         ):
             uv, angle = form(table(name), None, x, u)
             assert torch.isfinite(angle).all() and (uv >= 0).all() and (uv <= 1).all()
@@ -433,7 +438,7 @@ def test_beyond_some_radii_lights_are_sampled_by_area():
     within = distance < 4 * radius[row] * (1 - 1e-9)
     expected = torch.where(within, solid_angle.angles(whole, row, x), 0.0)
     assert torch.equal(solid_angle.angles(lights, row, x), expected)
-    assert torch.equal(solid_angle.tensor_angles(lights, row, x) > 0, expected > 0)
+    assert torch.equal(solid_angle.angles.function(lights, row, x) > 0, expected > 0)
     assert 0.1 < (expected > 0).double().mean() < 0.6
 
 

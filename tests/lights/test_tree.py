@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p
 
+import torchpt.engines  # noqa: F401  (takes the walk over)
+from torchpt.lanes.function import Lanewise
 from torchpt.lights import tree
 from torchpt.lights.tree import LightTree
 
@@ -124,10 +126,13 @@ def test_the_tensor_form_is_the_kernels_reference(case):
     u = tree.fine(uniform(2, 500))
     for normal in (n, None):
         row, p, _ = tree.sample(built, x, normal, u)
-        same, q, _ = tree._walk(built, x, normal, u, None)
+        same, q, _ = tree.sample.function(built, x, normal, u)
         assert (row == same).double().mean() > 0.99  # a draw on the edge of two lights may take either
         torch.testing.assert_close(p[row == same], q[row == same], rtol=1e-4, atol=0)
-        torch.testing.assert_close(tree._walk(built, x, normal, None, row)[1], p, rtol=1e-4, atol=0)
+        torch.testing.assert_close(tree.probability.function(built, row, x, normal), p, rtol=1e-4, atol=0)
+    kernels = [k for form in (tree.sample, tree.probability) for k in form.implementations if isinstance(k, Lanewise)]
+    assert len(kernels) == 2 and not any(kernel.refused for kernel in kernels)
+    assert (built.levels > tree.STEPS) == (case == "lopsided")  # whose ways take two words
 
 
 @pytest.mark.parametrize("case", ["nine", "mixed", "coincident", "one bright"])

@@ -1,14 +1,44 @@
-"""What engines take over of the functions that physics declares: on a CPU they are kernels of the lane compiler."""
+"""What engines take over of the functions that physics declares.
+
+On a CPU those of whole tensors are kernels of the lane compiler. Two are written otherwise where a stage is traced.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
+import torch
+from torch import Tensor
+
 from torchpt import samplers
+from torchpt.integrators import transmission
+from torchpt.integrators.surfaces import opacity_map
 from torchpt.lanes import bits
 from torchpt.lanes.function import Lanewise
+from torchpt.lanes.tracing import tracing
+from torchpt.lights import solid_angle, tree
+from torchpt.records import Hit, World
 from torchpt.samplers import scrambling
+from torchpt.shapes import interact
 
 __all__: list[str] = []
 
-scrambling.reverse_bits.register(bits.reverse_bits)
 for _draw in (samplers.draw_1d, samplers.draw_2d, samplers.draw_further):
-    _draw.register(Lanewise(_draw.function, lanes=("key",), uniforms=("salt",)))
+    _draw.register(Lanewise(_draw.function, ("key",), ("salt",)))
+
+solid_angle.sample.register(Lanewise(solid_angle.sample.function, ("row", "x", "u"), detached=True))
+solid_angle.angles.register(Lanewise(solid_angle.angles.function, ("row", "x"), detached=True))
+tree.sample.register(Lanewise(tree.sample.function, ("x", "n", "u"), detached=True))
+tree.probability.register(Lanewise(tree.probability.function, ("row", "x", "n"), detached=True))
+
+scrambling.reverse_bits.register(bits.reverse_bits)
+
+
+def _times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Any:
+    if not tracing():
+        return NotImplemented
+    # In a loop over lanes each lane takes the same steps.
+    return torch.where(textured, opacity * opacity_map(world, interact(world, o, d, hit)), opacity)
+
+
+transmission.times_map.register(_times_map)

@@ -9,15 +9,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchpt.core.dispatch import dispatched
 from torchpt.integrators.surfaces import opacity_map
 from torchpt.integrators.vertex import StageContext, Transmission, VertexInput
-from torchpt.lanes.tracing import tracing
 from torchpt.math.vectors import take
 from torchpt.records import Hit, World, rows
 from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import interact, offset_origin
 
-__all__ = ["PASSES", "beyond", "non_opaque", "opacity_at", "transmit"]
+__all__ = ["PASSES", "beyond", "non_opaque", "opacity_at", "times_map", "transmit"]
 
 #: Beyond the depth of any path: names the numbers for the second, third, ... surface that a ray passes.
 PASSES = 1 << 13
@@ -32,8 +32,12 @@ def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Ten
     if world.textures.opacity is None:
         return opacity
     textured = ~missed & (take(world.textures.opacity.nodes, slot) >= 0)
-    if tracing():  # in a loop over lanes each lane takes the same steps
-        return torch.where(textured, opacity * opacity_map(world, interact(world, o, d, hit)), opacity)
+    return times_map(world, o, d, hit, opacity, textured)
+
+
+@dispatched
+def times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Tensor:
+    """Multiply opacity ``(N,)`` by that of textures in the lanes ``textured (N,)``."""
     some = textured.nonzero().squeeze(1)
     at = interact(world, take(o, some), take(d, some), rows(hit, some))
     return opacity.index_copy(0, some, take(opacity, some) * opacity_map(world, at))

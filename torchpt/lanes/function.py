@@ -36,7 +36,7 @@ BLOCK = 64
 #: Operations times lanes that repay another thread: some 50 microseconds.
 GRAIN = 3_000_000
 #: Of one function more structures than this are not kept.
-_MOST = 64
+_MOST = 32
 _TABLES = HEAD.index("tables")
 
 
@@ -52,13 +52,16 @@ class Lanewise:
         lanes: names of the parameters that are tensors ``(..., N)`` or None.
         uniforms: names of those that are small tensors whose numbers change from call to call. Tensors in all others are
             tables: laid out again where another takes their place.
+        detached: whether results have no derivatives, so that tensors under a tape are taken as well.
 
     Attributes:
         refused: why the lane compiler did not take arguments, by their structure.
     """
 
-    def __init__(self, function: Callable[..., Any], lanes: Sequence[str], uniforms: Sequence[str] = ()) -> None:
-        self._function, self._signature = function, inspect.signature(function)
+    def __init__(
+        self, function: Callable[..., Any], lanes: Sequence[str], uniforms: Sequence[str] = (), detached: bool = False
+    ) -> None:
+        self._function, self._signature, self._detached = function, inspect.signature(function), detached
         kinds = dict.fromkeys(lanes, "lane") | dict.fromkeys(uniforms, "uniform")
         self._kinds = [kinds.pop(name, "table") for name in self._signature.parameters]
         if kinds:
@@ -87,7 +90,7 @@ class Lanewise:
                 records.append(value)
                 structure.append(signature(value))
                 continue
-            if value.device.type != "cpu" or value.requires_grad:
+            if self._unfit(value):
                 return NotImplemented
             if kind == "uniform":
                 uniforms.append(value)
@@ -104,7 +107,7 @@ class Lanewise:
         tables = leaves(records)
         made = self._made.get(key)
         if made is None or not made.serves(tables):
-            if any(table.device.type != "cpu" or table.requires_grad for table in tables):
+            if any(map(self._unfit, tables)):
                 return NotImplemented
             compile_time.begun()
             try:
@@ -116,14 +119,18 @@ class Lanewise:
                 compile_time.ended()
         return made.run(inputs, uniforms, count, thread_count(None))
 
+    def _unfit(self, tensor: Tensor) -> bool:
+        return tensor.device.type != "cpu" or (tensor.requires_grad and not self._detached)
+
     def _make(self, key: tuple[Any, ...], args: Sequence[Any], tables: list[Tensor]) -> _Made:
         paths = {str(k): table for k, table in enumerate(tables)}
         whole = self._name, tuple(self._kinds), key
         program = programs.program_of(whole, paths, lambda: self._traced(args, paths))
         states = [(table, _version(table)) for table in tables]
-        results = self._results(args)
+        before = self._made.get(key)
+        results = self._results(args) if before is None else before.results
         made = _Made(program, bound(program.tables, program.steps, program.held, paths), states, results)
-        if len(self._made) >= _MOST:
+        if before is None and len(self._made) >= _MOST:
             self._made.pop(next(iter(self._made)), None)
         self._made[key] = made
         return made
@@ -200,7 +207,7 @@ class _Made:
 
     def run(self, inputs: Sequence[Tensor], uniforms: Sequence[Tensor], count: int, threads: int) -> Any:
         """Return the results for ``count`` lanes, taken by as many threads as repay."""
-        inputs, uniforms = [x.contiguous() for x in inputs], [x.contiguous() for x in uniforms]
+        inputs, uniforms = [x.detach().contiguous() for x in inputs], [x.detach().contiguous() for x in uniforms]
         outputs = [torch.empty((*shape, count), dtype=dtype) for shape, dtype in self.outputs]
         head = [0] * len(HEAD)
         head[_TABLES] = self.tables.address

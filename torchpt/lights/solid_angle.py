@@ -11,8 +11,7 @@ Where the angle is below :data:`LEAST` a light is sampled by area, which is then
 in the light up to rounding. The switch is part of :func:`angles`, and so the same for :func:`sample` and for the density of
 a direction that was found otherwise. Everything is float64 inside: the angle of a light near or edge-on cancels.
 
-On the CPU one kernel does it (:mod:`torchpt.lights.kernels_solid`); the tensor form here is the reference, and what other
-devices use.
+Nothing of it is differentiable, and engines may take it over.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchpt.lanes.tracing import tracing
+from torchpt.core.dispatch import dispatched
 from torchpt.math.angles import azimuth
 from torchpt.math.vectors import cross, dot
 from torchpt.math.warps import uniform_triangle
@@ -42,8 +41,6 @@ __all__ = [
     "sample",
     "shapes_of",
     "table_of",
-    "tensor_angles",
-    "tensor_sample",
 ]
 
 #: Codes of shapes: a triangle, a rectangle, a parallelogram that is no rectangle, anything else.
@@ -94,6 +91,8 @@ def shapes_of(table: Tensor | None) -> tuple[int, ...]:
     return tuple(code for code in (TRIANGLE, RECTANGLE, SKEW) if bool((table[:, 0] == code).any()))
 
 
+@dispatched
+@torch.no_grad()
 def sample(
     table: Tensor, row: Tensor | None, x: Tensor, u: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)
 ) -> tuple[Tensor, Tensor]:
@@ -110,23 +109,24 @@ def sample(
         The primitive's own ``(u, v)`` of the points ``(2, N)``, and as :func:`angles` the solid angles ``(N,)``: where they
         are 0 the point was drawn by area. Rows of other shapes keep ``u``.
     """
-    if x.device.type == "cpu" and not tracing():
-        from torchpt.lights import kernels_solid
+    shape, near, a, e, f = _seen(table, row, x)
+    w = u.double()
+    uv, angle = _of_shapes(shapes, shape, a, e, f, w)
+    angle = torch.where(near, angle, 0.0)
+    by_area = torch.where(shape == TRIANGLE, uniform_triangle(w), w) if TRIANGLE in shapes else w
+    return torch.where(angle > 0, uv, by_area).to(u.dtype), angle.to(x.dtype)
 
-        return kernels_solid.sample(table, row, x, u)
-    return tensor_sample(table, row, x, u, shapes)
 
-
+@dispatched
+@torch.no_grad()
 def angles(table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)) -> Tensor:
     """Solid angles ``(N,)`` by which :func:`sample` draws from these lights at ``x``, 0 where it draws by area.
 
     From behind a light fills the same angle; it is the caller who knows which side emits.
     """
-    if x.device.type == "cpu" and not tracing():
-        from torchpt.lights import kernels_solid
-
-        return kernels_solid.angles(table, row, x)
-    return tensor_angles(table, row, x, shapes)
+    shape, near, a, e, f = _seen(table, row, x)
+    angle = _of_shapes(shapes, shape, a, e, f, torch.zeros_like(a[:2]))[1]
+    return torch.where(near, angle, 0.0).to(x.dtype)
 
 
 def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
@@ -143,29 +143,6 @@ def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
     seen = value > 0
     solid = angle * torch.where(seen, by_area / torch.where(seen, value, 1.0), 0.0)
     return torch.where(angle > 0, solid, by_area)
-
-
-@torch.no_grad()
-def tensor_sample(
-    table: Tensor, row: Tensor | None, x: Tensor, u: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)
-) -> tuple[Tensor, Tensor]:
-    """:func:`sample` by tensor operations."""
-    shape, near, a, e, f = _seen(table, row, x)
-    w = u.double()
-    uv, angle = _of_shapes(shapes, shape, a, e, f, w)
-    angle = torch.where(near, angle, 0.0)
-    by_area = torch.where(shape == TRIANGLE, uniform_triangle(w), w) if TRIANGLE in shapes else w
-    return torch.where(angle > 0, uv, by_area).to(u.dtype), angle.to(x.dtype)
-
-
-@torch.no_grad()
-def tensor_angles(
-    table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)
-) -> Tensor:
-    """:func:`angles` by tensor operations."""
-    shape, near, a, e, f = _seen(table, row, x)
-    angle = _of_shapes(shapes, shape, a, e, f, torch.zeros_like(a[:2]))[1]
-    return torch.where(near, angle, 0.0).to(x.dtype)
 
 
 def _seen(table: Tensor, row: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

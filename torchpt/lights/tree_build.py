@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from torchpt.lights.kernels_tree import WIDTH
+from torchpt.lights.tree import WIDTH
 from torchpt.native.jit import jit
 
 __all__ = ["build"]
@@ -153,7 +153,7 @@ def build(lights, cos_o, ids, nodes, child, full, trail, depth):
         lights: ``(K, 12)`` float64 groups of one; an axis is as long as the intensity times ``(1 + cos_o) / 2``.
         cos_o: ``(K,)`` cosine of the cone of axes.
         ids: ``(L,)`` the lights that shine; reordered.
-        nodes: ``(max(L - 1, 1), F, 8)`` float32 zeros, filled with the fields of :mod:`torchpt.lights.kernels_tree`.
+        nodes: ``(max(L - 1, 1), F, 8)`` float32 zeros, filled: :data:`torchpt.lights.tree.FIELDS`.
         child: ``(nodes, 8)`` int32, filled: a node, or ``~light``.
         full: ``(nodes,)`` int32, filled: how many children.
         trail: ``(K,)`` int64, filled: three bits for each step from the root, the first lowest.
