@@ -65,7 +65,7 @@ def find_llvm() -> str | None:
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         return given
-    for version in range(25, 15, -1):  # older ones abort the process
+    for version in range(25, 15, -1):  # older ones abort the process: 15 has no fmaximum for AVX-512
         for name in (
             f"/usr/lib/x86_64-linux-gnu/libLLVM-{version}.so",
             f"/usr/lib/x86_64-linux-gnu/libLLVM.so.{version}.1",

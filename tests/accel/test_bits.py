@@ -96,8 +96,6 @@ def test_bits_do_not_depend_on_the_rays_beside():
 
 
 SCRIPT = """
-import sys
-sys.path.insert(0, {tests!r})
 from test_bits import KINDS, Wide, check, sphere_mesh, triangles
 g = triangles(*sphere_mesh(12))
 accel = Wide(g, 1)
@@ -119,9 +117,10 @@ print(*(name in code for name in ("zmm", "ymm", "xmm")))
 def test_shorter_vectors_give_the_same_bits(cpu, features, registers, tmp_path):
     settings = {"NUMBA_CPU_NAME": cpu, "NUMBA_CPU_FEATURES": features, "TORCHPT_CACHE": str(tmp_path)}
     root = Path(__file__).resolve().parents[2]
+    path = os.pathsep.join([str(root), *sys.path])  # with the helpers beside tests
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT.format(tests=str(Path(__file__).parent))],
-        env={**os.environ, "PYTHONPATH": str(root), **settings}, capture_output=True, text=True, timeout=600,
+        [sys.executable, "-c", SCRIPT],
+        env={**os.environ, "PYTHONPATH": path, **settings}, capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.split() == registers

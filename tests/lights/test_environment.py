@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from mitsuba_scene import convert, load_mitsuba
 from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p, coarse, estimate, film_of, shoot, spread, z_limit
 
 import torchpt
 from torchpt.errors import AssetError, SceneError
+from torchpt.format.description import settings
 from torchpt.lights.kinds.envmap import EnvironmentMap
 from torchpt.math.distributions import Discrete
 
@@ -257,28 +259,16 @@ def test_bad_maps_and_parameters(quadrants, tmp_path):
             torchpt.render(scene, params={f"lights.sky.{name}": value}, spp=1)
 
 
-def test_against_mitsuba(quadrants):
+@pytest.mark.mitsuba
+def test_against_mitsuba(quadrants, tmp_path):
     """Block means and their chi-square, under a rotation about a skew axis, all materials lit by the map."""
-    mi = pytest.importorskip("mitsuba")
-    import sys
-
-    sys.path.insert(0, str(Path(__file__).parent.parent.parent / "scripts"))
-    try:
-        import mitsuba_scene
-    finally:
-        sys.path.pop(0)
-    from torchpt.format.description import settings
-
-    mi.set_variant("llvm_ad_rgb" if "llvm_ad_rgb" in mi.variants() else "scalar_rgb")
+    mitsuba = load_mitsuba("scalar_rgb")
     turn = [{"rotate": {"axis": [1, 2, 3], "angle": 70}}, {"scale": [-1, 1, 1]}]
     scene = torchpt.load(under({"type": "envmap", "path": str(quadrants), "scale": 1.5, "transform": turn}), "cpu")
     wishes = {"film": {"filter": "box"}, "integrator": {"type": "path", "max_depth": 4, "rr_depth": 5}}
     given = settings(scene.description, wishes)
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        theirs = mi.load_dict(mitsuba_scene.convert(mi, scene, given, Path(folder)))
-        pictures = [torch.from_numpy(np.array(mi.render(theirs, spp=64, seed=k))).double() for k in range(12)]
+    theirs = mitsuba.load_dict(convert(mitsuba, scene, given, tmp_path))
+    pictures = [torch.from_numpy(np.array(mitsuba.render(theirs, spp=64, seed=k))).double() for k in range(12)]
     b, vb = spread([picture[..., :3] for picture in pictures])
     a, va = spread([shoot(scene, 32, 90 + k, "sobol", {"max_depth": 4, "rr_depth": 5}).image for k in range(12)])
     # A block that shows but one colour of the map varies by rounding alone.

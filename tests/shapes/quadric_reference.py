@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["CASES", "TRANSFORMS", "inside", "trace"]
+__all__ = ["CASES", "TRANSFORMS", "inside", "thickness", "trace"]
 
 _WIDE = np.longdouble
 TRANSFORMS: dict[str, list[dict[str, Any]]] = {
@@ -118,6 +118,17 @@ def inside(case: dict[str, Any], matrix: np.ndarray, p: np.ndarray) -> np.ndarra
     centre, form, level, _, _ = _terms(case)
     q = _inverse(matrix) @ (p.astype(_WIDE) - matrix[:3, 3:].astype(_WIDE)) - centre[:, None]
     return ((form[:, None] * q * q).sum(0) + level).astype(float)
+
+
+def thickness(case: dict[str, Any], matrix: np.ndarray, p: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """Return how long lines through points ``p (3, N)`` along unit ``n (3, N)`` are within the side's surface: ``(N,)``."""
+    centre, form, level, _, _ = _terms(case)
+    inverse = _inverse(matrix)
+    q, e = inverse @ (p.astype(_WIDE) - matrix[:3, 3:].astype(_WIDE)) - centre[:, None], inverse @ n.astype(_WIDE)
+    form = form[:, None].astype(_WIDE)
+    a, b, c = (form * e * e).sum(0), 2 * (form * q * e).sum(0), (form * q * q).sum(0) + level
+    inner = np.sqrt(np.maximum(b * b - 4 * a * c, 0)) / np.where(a > 0, a, 1)
+    return np.where(a > 0, inner, np.inf).astype(float)  # along a cone's axis there is no end
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
