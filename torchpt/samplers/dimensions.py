@@ -20,9 +20,9 @@ class Dimension(IntEnum):
     BSDF = 5  # 2D, direction
     ROULETTE = 6  # 1D
     OPACITY = 7  # 1D, whether a surface is met
+    LED_HERE = 8  # no number of its own: by which the vertex was reached, BSDF of the one before or PIXEL
     DISTANCE = 9  # 1D, how far a ray comes in what lies between surfaces
     PHASE = 10  # 2D, where that scatters it to
-    LED_HERE = 8  # no number of its own: by which the vertex was reached, BSDF of the one before or PIXEL
 
 
 #: More than there are dimensions, so that a new one leaves the numbers of the others as they were.
