@@ -129,7 +129,7 @@ def test_progress_may_end_it_early(threads):
 def test_an_error_in_a_task_ends_the_render(monkeypatch, threads):
     scene = torchpt.load("cornell_box", "cpu")
     film = film_of(64)
-    whole = rendered(scene, 4, film)
+    whole, before = rendered(scene, 4, film), set(threading.enumerate())
     kept = Worker.trace
 
     def fails(self: Worker, chunk: Chunk) -> Tally:
@@ -143,12 +143,12 @@ def test_an_error_in_a_task_ends_the_render(monkeypatch, threads):
         with pytest.raises(RuntimeError, match="out of order"), few_lanes(500):
             rendered(scene, 4, film, threads=threads)
         assert time.monotonic() - begin < 30
-    assert not [t for t in threading.enumerate() if t.name.startswith("torchpt")]  # no thread of the pool is left
+    assert set(threading.enumerate()) <= before  # no thread of the render is left
     assert same(rendered(scene, 4, film, threads=threads), whole)
 
 
 def test_an_error_in_a_callback_ends_the_render():
-    scene = torchpt.load("cornell_box", "cpu")
+    scene, before = torchpt.load("cornell_box", "cpu"), set(threading.enumerate())
 
     def fails(progress: Progress) -> bool:
         raise KeyboardInterrupt
@@ -156,7 +156,7 @@ def test_an_error_in_a_callback_ends_the_render():
     for threads in (1, 2):
         with pytest.raises(KeyboardInterrupt):
             rendered(scene, 64, film_of(64), on_progress=fails, threads=threads)
-    assert not [t for t in threading.enumerate() if t.name.startswith("torchpt")]
+    assert set(threading.enumerate()) <= before
 
 
 def test_renders_side_by_side():
