@@ -1,4 +1,4 @@
-"""What engines take over of the functions that physics declares.
+"""Functions that physics declares and that engines take over.
 
 On a CPU those of whole tensors are kernels of the lane compiler. Two are written otherwise where a stage is traced.
 """

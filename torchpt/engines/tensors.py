@@ -84,7 +84,7 @@ class Paths:
 
     @property
     def met(self) -> Hit:
-        """What the rays met, which is known by now."""
+        """Return what the rays met, which is known by now."""
         assert self.hit is not None
         return self.hit
 

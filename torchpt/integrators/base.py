@@ -1,4 +1,4 @@
-"""What an integrator is: its settings, what it asks of the stages, and where its paths end."""
+"""Integrators: a kind's settings, what it asks of the stages, and where its paths end."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ SAMPLES: dict[str, Spec] = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Where paths end.
+    """Limits of paths.
 
     Attributes:
         max_depth: vertices at most; -1: only roulette ends them.
@@ -66,7 +66,7 @@ class Limits:
 
     @property
     def endless(self) -> bool:
-        """Whether roulette alone is to end paths."""
+        """Return True where roulette alone is to end paths."""
         return self.max_depth < 0
 
     @property
@@ -109,11 +109,11 @@ class Integrator(Valued):
 
     @property
     def limits(self) -> Limits:
-        """Where paths end."""
+        """Return where paths end."""
         return Limits(2, 3)
 
     def plan(self, sampler: Points, dtype: torch.dtype, tape: bool = False, attached: bool = False) -> Plan:
-        """What it asks of the stages."""
+        """Return what it asks of the stages."""
         return Plan(sampler, self.strategy, self.rr_prob, dtype, tape, attached)
 
     def counted_in(self, unit: float) -> Self:
@@ -146,23 +146,23 @@ class Integrator(Valued):
 
     @property
     def foreign(self) -> bool:
-        """Whether the class is a user's own, whose code may differ under the same name."""
+        """Return True for a class of a user's own, whose code may differ under the same name."""
         return type(self).__module__.partition(".")[0] != "torchpt"
 
     @property
     def own_transmit(self) -> bool:
-        """Whether something but surfaces may hold rays up."""
+        """Return True where something but surfaces may hold rays up."""
         return type(self).transmit is not Integrator.transmit
 
     @property
     def own_stages(self) -> bool:
-        """Whether it carries fields or has stages of its own, for which kernels are made anew."""
+        """Return True where it carries fields or has stages of its own, for which kernels are made anew."""
         kind, base = type(self), Integrator
         own = any(getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce", "transmit"))
         return own or bool(self.fields)
 
     def first(self, world: World) -> FirstSurface | None:
-        """What happens at first surfaces, made once a scene and differentiable in its world; None where paths go on."""
+        """Return what happens at first surfaces, made once a scene and differentiable in its world; None: paths go on."""
         return None
 
 

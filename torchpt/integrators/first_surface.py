@@ -12,7 +12,7 @@ __all__ = ["FirstSurface", "FirstSurfaceIntegrator"]
 
 
 class FirstSurface(ABC):
-    """What happens at first surfaces.
+    """Events at first surfaces.
 
     Implementations are frozen dataclasses: kernels read their tensors as tables, and are made anew where another field differs.
     """
@@ -22,7 +22,7 @@ class FirstSurface(ABC):
         return self
 
     def shadows(self, world: World) -> bool:
-        """Whether :meth:`bounce` gives shadow rays for any model."""
+        """Return True where :meth:`bounce` gives shadow rays for any model."""
         return world.lights is not None
 
     @abstractmethod

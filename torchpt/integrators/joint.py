@@ -24,7 +24,7 @@ __all__ = ["Before", "Behind", "bounce", "gather"]
 
 @dataclass(frozen=True)
 class Behind:
-    """What a loss asks of what n paths hand on: its derivatives, ``(3, n)`` each.
+    """Derivatives of a loss by what n paths hand on, ``(3, n)`` each.
 
     Attributes:
         radiance: with respect to the radiance that they bring.

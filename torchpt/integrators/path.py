@@ -25,7 +25,7 @@ class PathIntegrator(Integrator):
 
 
 def slides(plan: Plan, world: World, depth: int) -> bool:
-    """Whether points at a vertex slide along their rays; see :func:`torchpt.shapes.interact`.
+    """Return True where points at a vertex slide along their rays; see :func:`torchpt.shapes.interact`.
 
     Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64 the camera's
     point is found anew, since the search rounds it to float32. Where a delta sends a ray on, its next point slides along it as

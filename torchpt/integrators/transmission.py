@@ -1,4 +1,4 @@
-"""What lets rays pass: surfaces that are not opaque let a ray through by chance, and shadow rays in part.
+"""Let rays pass: surfaces that are not opaque let a ray through by chance, and shadow rays in part.
 
 Passing is no vertex of a path: the direction, the place it was drawn from and the depth stay. Scenes without opacity have none
 of this.

@@ -68,7 +68,7 @@ class Field:
 
 @dataclass(frozen=True)
 class StageContext:
-    """What does not change from lane to lane.
+    """Inputs of a stage that do not change from lane to lane.
 
     A wave has one for all of its vertices; :meth:`at` adds what belongs to a depth.
 
@@ -104,7 +104,7 @@ class StageContext:
 
 @dataclass(frozen=True)
 class VertexInput:
-    """What a stage reads of its lanes.
+    """Inputs of a stage by lane.
 
     Attributes:
         state: of the paths as they arrive.
@@ -189,7 +189,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class VertexOutput:
-    """What surfaces of one BSDF model make of the paths that met them.
+    """Results of a vertex on surfaces of one BSDF model.
 
     Attributes:
         leaving: the paths with their next rays; of those that ended ``t_max`` is 0.

@@ -31,7 +31,7 @@ __all__ = ["Bounce", "Wave", "camera_state", "still_of"]
 
 @dataclass(frozen=True)
 class Wave:
-    """What a render fixes for all of its waves.
+    """All that a render fixes for its waves.
 
     Attributes:
         context: what stages read beside their lanes.
@@ -57,12 +57,12 @@ class Wave:
 
     @property
     def limits(self) -> Limits | None:
-        """Where paths end; None where no light is carried."""
+        """Return where paths end; None where no light is carried."""
         return self.integrator.limits if self.integrator.light else None
 
     @property
     def bounce(self) -> Bounce:
-        """What happens at surfaces."""
+        """Return what happens at surfaces: a stage."""
         return self.integrator.bounce if self.first is None else self.first.bounce
 
     def rays(
@@ -93,7 +93,7 @@ class Wave:
         return generate(self.context.plan, self.camera, self.filter, x, y, key, salts(0, self.centre.device))
 
     def weight(self, state: PathState) -> Tensor:
-        """What the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""
+        """Return what the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""
         draws = Draws(self.context.plan.sampler, state.key, salts(0, self.centre.device))
         return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.context.plan.dtype)
 

@@ -32,7 +32,7 @@ _machines: dict[Target, Any] = {}
 
 @dataclass(frozen=True)
 class Target:
-    """What kernels are made for.
+    """A machine that kernels are made for.
 
     Attributes:
         cpu: LLVM's name of it.
@@ -124,7 +124,7 @@ def kept(key: str) -> Function | None:
 
 
 def identity() -> str:
-    """What this machine's code depends on beside a stage."""
+    """Return what this machine's code depends on beside a stage."""
     return _named(host())
 
 

@@ -11,7 +11,7 @@ __all__ = ["SCALAR", "VECTORS", "Form"]
 
 @dataclass(frozen=True)
 class Form:
-    """How a kernel holds lanes.
+    """A form in which kernels hold lanes.
 
     Results are the same bits in any form: whatever is rounded once is said in the graph (:mod:`torchpt.lanes.fusing`), and
     each lane is computed by the same operations.

@@ -199,7 +199,7 @@ class _Made:
         self.grain = max(GRAIN // work // BLOCK, 1)
 
     def serves(self, tables: list[Tensor]) -> bool:
-        """Whether its tables are those of these tensors, as they are now."""
+        """Return True where its tables are those of these tensors, as they are now."""
         return all(
             table is known and _version(table) == version
             for table, (known, version) in zip(tables, self.states, strict=True)
@@ -268,7 +268,7 @@ def _stores(tracer: Tracer, results: Sequence[Tensor]) -> list[Store]:
 
 
 def _version(tensor: Tensor) -> object:
-    """Which of its contents a tensor has; of inference tensors that cannot be known."""
+    """Return which of its contents a tensor has; of inference tensors that cannot be known."""
     return object() if tensor.is_inference() else tensor._version
 
 

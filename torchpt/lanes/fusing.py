@@ -1,4 +1,4 @@
-"""Which products are rounded once together with a sum: the graph decides, so that no compiler does.
+"""Fuse products with sums, rounded once: the graph decides which, so that no compiler does.
 
 A compiler that may fuse as it likes fuses otherwise at another width, in another version and on another machine.
 """

@@ -1,4 +1,4 @@
-"""What happened along paths: one observer keeps every event, for a path that is printed and for samples that are lost.
+"""Explain what happened along paths: one observer keeps every event, for a path that is printed and for samples that are lost.
 
 Where a sample is not finite it is traced again, and the first value that is not finite names the cause: stage by stage what
 goes into a sample is looked at (light that was met, light that was sampled, what the path carries on), and only where one of
@@ -31,27 +31,27 @@ class Legible(Population, Protocol):
 
     @property
     def state(self) -> PathState:
-        """Of the paths as they arrive."""
+        """Return the paths as they arrive."""
         ...
 
     @property
     def met(self) -> Hit:
-        """What their rays met."""
+        """Return what their rays met."""
         ...
 
     @property
     def emissions(self) -> Sequence[tuple[Tensor, Emission]]:
-        """Light that lanes met here by chance."""
+        """Return the light that lanes met here by chance."""
         ...
 
     @property
     def outputs(self) -> Sequence[tuple[int, Tensor, VertexOutput]]:
-        """Of the vertex before: number of the BSDF model, lanes of the wave, what its surfaces made of them."""
+        """Return, of the vertex before, number of the BSDF model, lanes of the wave, what its surfaces made of them."""
         ...
 
     @property
     def clear(self) -> Sequence[Tensor]:
-        """How much gets through of the light that was sampled at the vertex before, model by model."""
+        """Return how much gets through of the light that was sampled at the vertex before, model by model."""
         ...
 
 
@@ -70,7 +70,7 @@ class Left:
 
 @dataclass(frozen=True)
 class Met:
-    """What rays met at a vertex.
+    """Hits of rays at a vertex.
 
     Attributes:
         depth: of the vertex, from 1.
@@ -205,7 +205,7 @@ class Fault:
 
     @property
     def name(self) -> str:
-        """What samples are counted by."""
+        """Return the name that samples are counted by."""
         return self.cause if self.cause == "not repeated" else f"{'nan' if self.nan else 'infinite'} {self.cause}"
 
 
@@ -258,7 +258,7 @@ class _Watch(Explainer):
 
     @property
     def full(self) -> bool:
-        """Whether every lane has its fault."""
+        """Return True where every lane has its fault."""
         return None not in self.faults
 
     def arrived(self, paths: Legible) -> bool:

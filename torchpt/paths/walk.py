@@ -21,7 +21,7 @@ class Population(Protocol):
 
     @property
     def depth(self) -> int:
-        """Which vertex it is, from 1: the first that a camera ray meets."""
+        """Return the number of the vertex, from 1: the first that a camera ray meets."""
         ...
 
 
@@ -31,7 +31,7 @@ Q = TypeVar("Q", bound=Population, contravariant=True)
 
 @dataclass(slots=True)
 class Counts:
-    """How many lanes of a population met what, known to the host: one transfer a vertex.
+    """Numbers of lanes of a population by what they met, known to the host: one transfer a vertex.
 
     Attributes:
         scatter: lanes by BSDF model.
@@ -45,7 +45,7 @@ class Counts:
 
 
 class Engine(Protocol[P]):
-    """Who runs the events of paths. Verbs take whole populations; none returns a tensor to the walk."""
+    """An engine runs the events of paths. Verbs take whole populations; none returns a tensor to the walk."""
 
     def intersect(self, paths: P) -> None:
         """Find the nearest hits; nothing to do where they are known already."""
@@ -79,7 +79,7 @@ class Engine(Protocol[P]):
 
 
 class Observer(Generic[Q]):
-    """Who looks on: replays keep populations, layers read the first surface, a debugger prints one path.
+    """An observer looks on: replays keep populations, layers read the first surface, a debugger prints one path.
 
     The first two may return True, which ends the walk there.
     """

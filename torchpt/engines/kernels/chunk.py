@@ -79,7 +79,7 @@ class Paths:
 
 
 class Worker:
-    """What one thread needs to take chunks through their paths: the engine of its walks.
+    """The engine of one thread: takes chunks through their paths.
 
     Args:
         kernels: of the render.

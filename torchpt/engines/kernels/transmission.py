@@ -36,7 +36,7 @@ def sift(trace: Trace) -> Sinks:
 
 
 def transmit(trace: Trace, again: bool) -> Sinks:
-    """Which rays are held up, and where the others go on; ``again``: those that are on their way."""
+    """Hold rays up, or send them on; ``again``: those that are on their way."""
     layout, tracer = trace.layout, trace.tracer
     salts = trace.salts()
     rows = layout.passed if again else layout.state
