@@ -75,7 +75,7 @@ _PREFERRED = ' "prefer-vector-width"="512" "min-legal-vector-width"="512"'
 
 
 def _begin(body: Body) -> None:
-    """Return the lines that a turn begins with: its lanes (``%mask``), and where in the arena those of a list are (``%place``)."""
+    """Return the lines that a turn begins with: its lanes (``%mask``), and their places in the arena (``%place``)."""
     body.declarations.add("declare i64 @llvm.smin.i64(i64, i64)")
     left = body.op("sub i64 %n, %i")
     few = body.op(f"call i64 @llvm.smin.i64(i64 {left}, i64 {body.width})")
