@@ -75,7 +75,7 @@ _PREFERRED = ' "prefer-vector-width"="512" "min-legal-vector-width"="512"'
 
 
 def _begin(body: Body) -> None:
-    """Return the lines that a turn begins with: its lanes (``%mask``), and their places in the arena (``%place``)."""
+    """Begin a turn of the loop: its lanes (``%mask``), and their places in the arena (``%place``)."""
     body.declarations.add("declare i64 @llvm.smin.i64(i64, i64)")
     left = body.op("sub i64 %n, %i")
     few = body.op(f"call i64 @llvm.smin.i64(i64 {left}, i64 {body.width})")
@@ -87,7 +87,7 @@ def _begin(body: Body) -> None:
 
 
 def _enter(body: Body, stage: TracedStage, needed: list[int]) -> None:
-    """Return the lines that read the arguments before the loop."""
+    """Read the arguments before the loop."""
     graph, sinks = stage.graph, stage.sinks
     words = [(name, "i64" if name == "stride" else "ptr") for name in HEAD]
     words += [(f"uniform{k}", "ptr") for k in range(len(stage.uniforms))]
