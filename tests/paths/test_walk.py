@@ -34,16 +34,15 @@ class Noted:
         self.verbs: list[str] = []
         self.passes, self.left = passes, passes
 
-    def intersect(self, paths: Toy) -> None:
+    def intersect(self, paths: Toy) -> bool:
         self.verbs.append(f"intersect {paths.depth}")
         self.left = self.passes
+        return self.left > 0
 
     def transmit(self, paths: Toy) -> bool:
-        if not self.left:
-            return False
         self.verbs.append("transmit")
         self.left -= 1
-        return True
+        return self.left > 0
 
     def sort(self, paths: Toy) -> Counts:
         self.verbs.append("sort")

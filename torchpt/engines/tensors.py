@@ -119,7 +119,7 @@ class Tensors:
             state = replace(state, extra={f.name: f.begin(state.t_max) for f in self.wave.integrator.fields})
         return Paths(state)
 
-    def intersect(self, paths: Paths) -> None:
+    def intersect(self, paths: Paths) -> bool:
         """See :class:`torchpt.paths.walk.Engine`."""
         self.tally.rays += len(paths.state.lane)
         if paths.hit is None:
@@ -129,6 +129,7 @@ class Tensors:
                 lanes = self._held_up(state, paths.hit)
                 before = torch.zeros_like(take(state.t_max, lanes))
                 paths.flight = Flight(lanes, rows(state, lanes), rows(paths.hit, lanes), before)
+        return paths.flight is not None
 
     def _nearest(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
         """Find the nearest surfaces, opaque or not."""

@@ -47,8 +47,9 @@ class Counts:
 class Engine(Protocol[P]):
     """An engine runs the events of paths. Verbs take whole populations; none returns a tensor to the walk."""
 
-    def intersect(self, paths: P) -> None:
-        """Find the nearest hits; nothing to do where they are known already."""
+    def intersect(self, paths: P) -> bool:
+        """Find the nearest hits; return whether any ray is still on its way. Nothing to do where hits are known already."""
+        ...
 
     def transmit(self, paths: P) -> bool:
         """Take one step through what lets rays pass: opacity, null, media; return whether any ray is still on its way."""
@@ -101,9 +102,9 @@ class Observer(Generic[Q]):
 
 def find(engine: Engine[P], paths: P) -> None:
     """Find what the rays of a population meet, behind what lets them pass."""
-    engine.intersect(paths)
-    while engine.transmit(paths):
-        pass
+    if engine.intersect(paths):
+        while engine.transmit(paths):
+            pass
 
 
 def walk(
@@ -123,7 +124,9 @@ def walk(
         engine.terminate(paths, truncated=False)
         return
     while paths.depth != until:
-        find(engine, paths)
+        if engine.intersect(paths):
+            while engine.transmit(paths):
+                pass
         if observer is not None and observer.arrived(paths):
             return
         counts = engine.sort(paths)

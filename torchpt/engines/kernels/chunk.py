@@ -171,17 +171,17 @@ class Worker:
 
     # -- the events of a walk
 
-    def intersect(self, paths: Paths) -> None:
+    def intersect(self, paths: Paths) -> bool:
         """See :class:`torchpt.paths.walk.Engine`."""
-        if not paths.arrived:
-            self.tally.rays += paths.count
-            self.search.nearest(paths.arena, paths.count)
-            paths.flying = paths.count if self.kernels.passing else 0
+        if paths.arrived:
+            return False
+        self.tally.rays += paths.count
+        self.search.nearest(paths.arena, paths.count)
+        paths.flying = paths.count if self.kernels.passing else 0
+        return self.kernels.passing
 
     def transmit(self, paths: Paths) -> bool:
         """See :class:`torchpt.paths.walk.Engine`."""
-        if not paths.flying:
-            return False
         paths.flying = self.search.transmit(paths.arena, paths.flying, paths.depth, paths.step)
         paths.step += 1
         return paths.flying > 0
@@ -204,15 +204,14 @@ class Worker:
 
     def emit(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
-        self.calls.name_salts(paths.depth)
         self._on_list(self.kernels.emit(), paths, self.kernels.emissive)
 
     def escape(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`."""
-        self.calls.name_salts(paths.depth)
         self._on_list(self.kernels.escape(), paths, self.kernels.missed)
 
     def _on_list(self, kernel: Kernel, paths: Paths, number: int) -> None:
+        self.calls.name_salts(paths.depth)
         self.calls.run(kernel, paths.places[number], paths.arena, paths.arena, paths.lists[number])
 
     def terminate(self, paths: Paths, truncated: bool) -> None:
