@@ -429,3 +429,12 @@ def test_an_integrator_that_is_made_is_checked_as_one_by_name():
         torchpt.render(scene, integrator=Aov(), target_error=0.1)
     with pytest.raises(torchpt.SceneError, match="integrator"):
         torchpt.render(scene, integrator=Aov)  # pyright: ignore[reportArgumentType]
+
+
+def test_fields_that_cannot_be_are_refused_where_they_are_declared():
+    with pytest.raises(TypeError, match="twice"):
+        type("Twice", (Path,), {"fields": (Field("a"), Field("a", 3))})
+    with pytest.raises(ValueError, match="whole"):
+        Field("count", start=0.5, whole=True)
+    with pytest.raises(ValueError, match="rows"):
+        Field("nothing", rows=0)

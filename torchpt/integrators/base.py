@@ -107,6 +107,11 @@ class Integrator(Valued):
     clamp: float | None = None
     strict: bool = False
 
+    def __init_subclass__(cls) -> None:
+        names = [own.name for own in cls.fields]
+        if len(set(names)) < len(names):
+            raise TypeError(f"{cls.__name__} declares a field twice: {', '.join(names)}")
+
     @property
     def limits(self) -> Limits:
         """Return where paths end."""

@@ -52,12 +52,19 @@ class Field:
         start: its value where paths begin.
         whole: whether it is an integer of 32 bits (int64 to stages), without derivatives; else it is of the lanes' dtype and
             is differentiated.
+
+    Raises:
+        ValueError: no rows, or a start that is not whole where the field is.
     """
 
     name: str
     rows: int = 1
     start: float = 0.0
     whole: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or (self.whole and self.start != int(self.start)):
+            raise ValueError(f"the field {self.name}: rows >= 1, and a whole start where it is whole")
 
     def begin(self, like: Tensor) -> Tensor:
         """Return the values of paths that begin; ``like (N,)`` tells how many, their dtype and device."""
