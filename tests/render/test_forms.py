@@ -122,7 +122,7 @@ SCENES = {
     "cornell_box": {"generate", "emit", "bounce"},
     "cornell_spheres": {"generate", "emit", "bounce"},
     "veach_mis": {"generate", "emit", "bounce"},
-    "shapes_and_maps": {"generate", "settle", "emit", "escape", "bounce", "meet", "sift"},
+    "shapes_and_maps": {"generate", "settle", "emit", "escape", "bounce", "transmit", "sift"},
     "env_teapot": {"generate", "settle", "escape", "bounce"},
     "many_lights": {"generate", "settle", "emit", "bounce"},
 }
