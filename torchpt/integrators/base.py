@@ -98,7 +98,7 @@ class Integrator(Valued):
     light: ClassVar[bool] = True
     layers: ClassVar[tuple[str, ...]] = ()
     lit: ClassVar[bool] = True
-    looped: ClassVar[bool] = False
+    looped: ClassVar[bool] = True
     fields: ClassVar[Sequence[Field]] = ()
 
     strategy: str = "mis"

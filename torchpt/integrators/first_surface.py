@@ -36,8 +36,6 @@ class FirstSurface(ABC):
 class FirstSurfaceIntegrator(Integrator):
     """Integrators whose radiance is what :meth:`first` says of the first surface, and what shines there by itself."""
 
-    looped = True
-
     @property
     def limits(self) -> Limits:
         """See :class:`Integrator`."""

@@ -21,8 +21,6 @@ __all__ = ["Ends", "PathIntegrator", "partition", "slides"]
 class PathIntegrator(Integrator):
     """Integrators that follow paths to their :attr:`limits`, vertex by vertex."""
 
-    looped = True
-
 
 def slides(plan: Plan, world: World, depth: int) -> bool:
     """Return True where points at a vertex slide along their rays; see :func:`torchpt.shapes.interact`.

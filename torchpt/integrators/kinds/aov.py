@@ -13,4 +13,3 @@ class Aov(Integrator):
     name = "aov"
     light = False
     layers = ("albedo",)
-    looped = True
