@@ -109,7 +109,7 @@ def test_an_observer_sees_each_vertex_and_may_end_the_walk() -> None:
         def sorted(self, paths: Toy, counts: Counts) -> bool:
             return self.note("sorted", paths)
 
-        def gathered(self, paths: Toy, counts: Counts) -> None:
+        def gathered(self, paths: Toy) -> None:
             self.note("gathered", paths)
 
         def left(self, paths: Toy) -> None:

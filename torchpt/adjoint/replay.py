@@ -171,8 +171,7 @@ class _Chunk:
         ends, groups = partition(self.world, hit)
         chance, asked = self._chance(vertex)
         hit = replace(hit, chance=chance)
-        limits = self.wave.limits
-        assert limits is not None
+        limits = self.wave.integrator.limits
         clear = iter(vertex.clear)
         if depth < limits.last:
             for model, index in groups:
@@ -219,8 +218,7 @@ class _Chunk:
             kept = next(clear)  # type: ignore[call-overload]
             return self.engine.clear(shadow) if self.passing else kept
 
-        limits = self.wave.limits
-        assert limits is not None
+        limits = self.wave.integrator.limits
         with gathered_by(self.sums):
             context = self.taped.context.at(salts(depth, lane.device), slide, limits.roulette(depth))
             vertex = VertexInput(rows(state, index), rows(hit, index))

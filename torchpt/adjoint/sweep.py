@@ -89,7 +89,6 @@ class Sweep(Worker):
         self._levels: list[Paths] = []
         self._behind = Memory(kernels.slots.count)
         self._results = Memory(1)
-        self._spare = self._rooms
         self._start = 1
 
     def run(self, chunk: Chunk, pixels: Tensor, whole: Sums | None) -> ChunkSums:
@@ -116,7 +115,7 @@ class Sweep(Worker):
         """See :class:`Worker`: the first vertices of a part are all kept, of those behind two take turns."""
         number = depth - self._start
         if number >= KEPT:
-            return self._spare[number % 2]
+            return self._rooms[number % 2]
         if number == len(self._levels):
             self._levels.append(self._room())
         return self._levels[number]
@@ -152,8 +151,7 @@ class Sweep(Worker):
 
     def _vertex(self, paths: Paths) -> None:
         kernels, calls, depth = self.joint, self.calls, paths.depth
-        limits = self.wave.limits
-        assert limits is not None
+        limits = self.wave.integrator.limits
         slide = slides(kernels.taped.plan, kernels.world, depth)
         calls.name_salts(depth)
         if depth < limits.last:

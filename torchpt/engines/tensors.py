@@ -13,7 +13,6 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchpt import lights
 from torchpt.core.tree import map_leaves
 from torchpt.integrators import LAYERS, aov
 from torchpt.integrators.base import check_fields
@@ -110,14 +109,8 @@ class Tensors:
         self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=wave.centre.device)
 
     def spawn(self, state: PathState) -> Paths:
-        """Start paths with rays; what only some scenes ask of a path is added here."""
-        if any(model.refracts for model in self.world.materials.models):
-            state = replace(state, eta=torch.ones_like(state.t_max))
-        if lights.local(self.world.lights):
-            state = replace(state, p=state.o.clone(), n=torch.zeros_like(state.o))
-        if self.wave.integrator.fields:
-            state = replace(state, extra={f.name: f.begin(state.t_max) for f in self.wave.integrator.fields})
-        return Paths(state)
+        """Start paths with rays."""
+        return Paths(self.wave.begun(state))
 
     def intersect(self, paths: Paths) -> bool:
         """See :class:`torchpt.paths.walk.Engine`."""
@@ -178,8 +171,7 @@ class Tensors:
     def hits(self, state: PathState, depth: int) -> Hit:
         """Return what rays meet on their way to a vertex, behind what lets them pass; they are not counted."""
         paths = Paths(state, depth)
-        find(self, paths)
-        self.tally.rays -= len(state.lane)
+        find(Tensors(self.wave, 0), paths)
         return paths.met
 
     def sort(self, paths: Paths) -> Counts:

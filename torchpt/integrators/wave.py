@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchpt import lights
 from torchpt.accel import Accel
 from torchpt.cameras import Camera
 from torchpt.film import Filter
@@ -91,6 +92,17 @@ class Wave:
         key = self.sampler.key(y * self.camera.resolution[0] + x, sample, streams)
         x, y = (a.to(self.context.plan.dtype) for a in (x, y))
         return generate(self.context.plan, self.camera, self.filter, x, y, key, salts(0, self.centre.device))
+
+    def begun(self, state: PathState) -> PathState:
+        """Return rays with what only some scenes and integrators ask of a path that begins."""
+        world = self.context.world
+        if any(model.refracts for model in world.materials.models):
+            state = replace(state, eta=torch.ones_like(state.t_max))
+        if lights.local(world.lights):
+            state = replace(state, p=state.o.clone(), n=torch.zeros_like(state.o))
+        if self.integrator.fields:
+            state = replace(state, extra={own.name: own.begin(state.t_max) for own in self.integrator.fields})
+        return state
 
     def weight(self, state: PathState) -> Tensor:
         """Return what the filter weighs the samples with ``(N,)``; after the paths are traced, since no stage needs to know."""

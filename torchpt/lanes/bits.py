@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from torch import Tensor
-from torch.utils._python_dispatch import _disable_current_modes
 
 from torchpt.lanes.operators.nodes import apply
 from torchpt.lanes.tracing import tracer_of
@@ -18,7 +17,6 @@ def reverse_bits(x: Tensor) -> Any:
     tracer = tracer_of(x)
     if tracer is None:
         return NotImplemented
-    with _disable_current_modes():
-        out = x.clone()  # a trace asks for what is done, not for what comes out
+    out = x.clone()  # a trace asks for what is done, not for what comes out
     apply(tracer, out, lambda node: tracer.graph.node("bitreverse", "i", node), x)
     return out

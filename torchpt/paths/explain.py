@@ -19,7 +19,7 @@ from torchpt.integrators.lost import Place
 from torchpt.integrators.vertex import Emission, VertexOutput
 from torchpt.integrators.wave import Wave
 from torchpt.math.vectors import take
-from torchpt.paths.walk import Counts, Observer, Population
+from torchpt.paths.walk import Observer, Population
 from torchpt.records import Hit, PathState, World
 from torchpt.samplers import Streams
 
@@ -154,7 +154,7 @@ class Explainer(Observer[Legible]):
         self.keep(Met(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.met))
         return False
 
-    def gathered(self, paths: Legible, counts: Counts) -> None:
+    def gathered(self, paths: Legible) -> None:
         """See :class:`Observer`."""
         for index, light in paths.emissions:
             prim = take(paths.met.prim, index)

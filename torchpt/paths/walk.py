@@ -93,7 +93,7 @@ class Observer(Generic[Q]):
         """Look at paths that are about to gather light and to scatter."""
         return False
 
-    def gathered(self, paths: Q, counts: Counts) -> None:
+    def gathered(self, paths: Q) -> None:
         """Look at paths that have the light that they met by chance."""
 
     def left(self, paths: Q) -> None:
@@ -124,9 +124,7 @@ def walk(
         engine.terminate(paths, truncated=False)
         return
     while paths.depth != until:
-        if engine.intersect(paths):
-            while engine.transmit(paths):
-                pass
+        find(engine, paths)
         if observer is not None and observer.arrived(paths):
             return
         counts = engine.sort(paths)
@@ -137,7 +135,7 @@ def walk(
         if counts.missed:
             engine.escape(paths)
         if observer is not None:
-            observer.gathered(paths, counts)
+            observer.gathered(paths)
         if paths.depth >= last:
             engine.terminate(paths, truncated=endless)
             return

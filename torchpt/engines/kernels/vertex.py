@@ -50,12 +50,7 @@ def generate(trace: Trace, chosen: bool) -> Sinks:
         state = stages.generate(layout.plan, wave.camera, wave.filter, x, y, key, salts)
         if wave.filter.signed:
             unseen["weight"] = wave.filter.weight(Draws(layout.plan.sampler, key, salts).two(Dimension.PIXEL))
-        if "eta" in layout.state:
-            state = replace(state, eta=torch.ones_like(state.t_max))
-        if "p" in layout.state:
-            state = replace(state, p=state.o, n=torch.zeros_like(state.o))
-        extra = {field.name: field.begin(state.t_max) for field in wave.integrator.fields}
-        state = replace(state, extra=extra) if extra else state
+        state = wave.begun(state)
     sinks = Sinks()
     if layout.fused:
         _searched(trace, sinks, state, unseen)
