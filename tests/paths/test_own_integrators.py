@@ -20,7 +20,8 @@ from torchpt.integrators.kinds.aov import Aov
 from torchpt.integrators.kinds.path import Path
 from torchpt.integrators.vertex import Emission, Field, StageContext, Transmission, VertexInput, VertexOutput
 from torchpt.math.vectors import dot
-from torchpt.math.warps import uniform_sphere
+from torchpt.math.warps import cosine_hemisphere, uniform_sphere
+from torchpt.records import BsdfSample
 from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import interact
 
@@ -175,7 +176,7 @@ class Foggy(Path):
     radius: ClassVar[float] = 1.5
 
     def chord(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """Where rays enter the ball and leave it, in units of ``d``; twice the same where they miss it."""
+        """Return where rays enter the ball and leave it, in units of ``d``; twice the same where they miss it."""
         a, b, c = dot(d, d), dot(o, d), dot(o, o) - self.radius**2
         root = (b * b - a * c).clamp_min(0.0).sqrt()
         return ((-b - root) / a).clamp_min(0.0), ((-b + root) / a).clamp_min(0.0)
@@ -387,6 +388,38 @@ def test_a_field_that_a_stage_leaves_out_is_named(compile):
     scene = torchpt.load(mirrored(), "cpu")
     with pytest.raises(torchpt.SceneError, match=r"integrator\.fields\.length"):
         torchpt.render(scene, spp=1, film={"width": 4, "height": 4}, integrator=Forgetful(), compile=compile)
+
+
+class Bessel(torchpt.Bsdf):
+    """Diffuse, with an operator that no kernel knows."""
+
+    name = "bessel"
+
+    def eval_pdf(self, parameters: Mapping[str, Tensor], wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+        pdf = wi[2].clamp_min(0.0) / math.pi
+        return (torch.special.bessel_j0(wi[2]) * pdf).expand(3, -1), pdf
+
+    def sample(self, parameters: Mapping[str, Tensor], wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        wi = cosine_hemisphere(u)
+        value, pdf = self.eval_pdf(parameters, wo, wi)
+        return BsdfSample(wi, pdf, value / pdf)
+
+    def albedo(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        return torch.ones(3, 1)
+
+
+def test_fields_are_carried_past_models_that_no_kernel_can_be_made_of():
+    """A render by kernels takes those vertices by tensor operations."""
+    description = {**mirrored(), "materials": {"wall": {"type": "bessel"}}}
+    description["shapes"]["lamp"]["material"] = "wall"
+    scene = torchpt.load(description, "cpu", bsdfs={"bessel": Bessel()})
+    keys: Mapping[str, Any] = {"spp": 2, "film": {"width": 8, "height": 8}}
+    found = torchpt.render(scene, integrator=Absorbing(max_depth=4), compile="on", full=True, **keys)
+    assert "bessel_j0" in found.eager[0]
+    plain = torchpt.render(scene, integrator=Absorbing(max_depth=4), compile="off", **keys)
+    assert float(torch.isclose(found.image, plain, rtol=1e-3, atol=1e-5).all(-1).float().mean()) > 0.98
+    with pytest.raises(torchpt.SceneError, match=r"integrator\.fields\.length"):
+        torchpt.render(scene, integrator=Forgetful(), compile="on", **keys)
 
 
 def test_an_integrator_that_is_made_is_checked_as_one_by_name():

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.engines.kernels.rows import HIT, Memory, path_state, state_values
+from torchpt.integrators.base import check_fields
 from torchpt.integrators.vertex import VertexInput
 from torchpt.records import Hit
 from torchpt.samplers import salts
@@ -25,7 +26,7 @@ def bounce_eagerly(
     start: int,
     depth: int,
 ) -> int:
-    """What the kernel of a bounce does where the search is no part of it.
+    """Do what the kernel of a bounce does where the search is no part of it.
 
     Args:
         kernels: of the render.
@@ -47,6 +48,7 @@ def bounce_eagerly(
         vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
         context = kernels.wave.context.at(salts(depth, torch.device("cpu")), roulette=roulette)
         output = kernels.wave.bounce(context, model, vertex)
+        check_fields(kernels.wave.integrator, output.leaving)
         after, shadow = output.leaving, output.shadow
     values: dict[str, Tensor | None] = {**state_values(after)}
     values |= rows.take(source, lanes, ("weight",))
