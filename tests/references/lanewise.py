@@ -50,7 +50,7 @@ _WHOLE = {"lane", "key", "prim"}  # equal or not
 
 @dataclass
 class Differences:
-    """How many values were compared, and how many of them are off, by kernel and field."""
+    """Numbers of values that were compared, and of those that are off, by kernel and field."""
 
     values: dict[tuple[str, str], int] = field(default_factory=dict)
     off: dict[tuple[str, str], int] = field(default_factory=dict)
@@ -119,7 +119,7 @@ def prepared(scene: torchpt.Scene, wishes: Mapping[str, Any]) -> tuple[Wave, Any
 
 
 def waves(wave: Wave, pixels: int, samples: int) -> _Recorder:
-    """What the stages of a wave were given."""
+    """Return what the stages of a wave were given."""
     recorder = _Recorder(wave, pixels * samples)
     with torch.no_grad():
         walk(recorder, recorder.spawn(wave.rays(0, pixels, 0, samples)), wave.integrator.limits)
@@ -216,7 +216,7 @@ def run_bounce(
 
 
 def _routes(worker: Worker, taken: dict[str, Tensor], lists: list[Memory], counts: list[int]) -> None:
-    """Whether the lists name each lane where it belongs: exactly, for the hits that the kernel itself found."""
+    """Check that the lists name each lane where it belongs: exactly, for the hits that the kernel itself found."""
     kernels = worker.kernels
     hit = Hit(*(taken[name] for name in HIT))
     ends, groups = partition(kernels.world, hit)
@@ -242,7 +242,7 @@ def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recor
     done: set[tuple[int, bool]] = set()
     for model, state, hit, index, depth in recorder.bounces:
         # What the render itself asks for, and the other form once.
-        natural = wave.limits is not None and depth >= wave.limits.rr_depth
+        natural = wave.integrator.light and depth >= wave.integrator.limits.rr_depth
         for roulette in (natural, not natural):
             if roulette is not natural and (model, roulette) in done:
                 continue

@@ -15,7 +15,6 @@ from torchpt.engines.kernels.schedule import Loop
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
 from torchpt.forward import kept, looped
-from torchpt.integrators.path import PathIntegrator
 from torchpt.rendering import Rendering, render_scene
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
@@ -87,14 +86,6 @@ def test_on_is_refused_away_from_a_cpu():
     with pytest.raises(SceneError, match=r"render.compile: .* auto or off \(kernels run on a CPU; .* on cuda:0\)"):
         looped(on, device, torch.float32)
     assert not looped(auto, device, torch.float32) and looped(on, torch.device("cpu"), torch.float32)
-
-
-def test_on_is_refused_by_an_integrator_without_kernels(monkeypatch, passes):
-    monkeypatch.setattr(PathIntegrator, "looped", False)
-    scene = torchpt.load("cornell_box", device="cpu")
-    with pytest.raises(SceneError, match=r"render.compile: .* \(there are no kernels for the integrator path\)"):
-        run(scene, 1, "on")
-    assert run(scene, 1, "auto").complete and not passes
 
 
 def test_a_cpu_needs_no_compiler_of_the_system(monkeypatch):

@@ -82,7 +82,7 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
 
 
 def _in_order(task: Callable[[Chunk], ChunkSums], chunks: Sequence[Chunk], threads: int) -> Iterator[ChunkSums]:
-    """What a task gives for chunks, in their order, by some threads."""
+    """Yield what a task gives for chunks, in their order, by some threads."""
     if threads == 1:
         yield from map(task, chunks)
         return
@@ -110,7 +110,7 @@ def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
 
 
 def _threads(kernels: JointKernels, settings: Settings) -> int:
-    """How many threads there are, fewer where the arenas of all would take more than half of ``render.max_memory``."""
+    """Return how many threads there are, fewer where the arenas of all would take more than half of ``render.max_memory``."""
     threads, limit = torch.get_num_threads(), settings.render.max_memory
     if limit is None:
         return threads
@@ -120,9 +120,9 @@ def _threads(kernels: JointKernels, settings: Settings) -> int:
 
 
 def _looped(assembly: Assembly, settings: Settings) -> bool:
-    """Whether kernels may be made: on a CPU, in float32, without weights of modules and without derivatives by opacity."""
+    """Return True where kernels may be made: on a CPU, in float32, without derivatives by weights of modules or opacity."""
     wave = assembly.wave
     plan = wave.context.plan
     if wave.centre.device.type != "cpu" or plan.dtype != torch.float32 or settings.render.compile == "off":
         return False
-    return wave.integrator.looped and not assembly.held and not assembly.passing
+    return not assembly.held and not assembly.passing

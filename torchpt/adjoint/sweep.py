@@ -75,7 +75,7 @@ class Keeper(Observer[Paths]):
 
 
 class Sweep(Worker):
-    """What one thread needs to go back along chunks.
+    """The engine of one thread that goes back along chunks.
 
     Args:
         kernels: of the backward pass.
@@ -190,8 +190,8 @@ class Sweep(Worker):
 
     def _eagerly(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
         """Back through a stage by tensor operations, for what no kernel can be made of."""
-        kernels, context, integrator = self.joint, self.joint.taped, self.wave.integrator
-        plan = context.plan
+        kernels, integrator, salt = self.joint, self.wave.integrator, salts(paths.depth, torch.device("cpu"))
+        plan = kernels.taped.plan
         lanes = places.words[0, :count]
         state = path_state(kernels.state.take(paths.arena, lanes, kernels.state.state))
         vertex = VertexInput(state, Hit(**kernels.state.take(paths.arena, lanes, tuple(HIT))))
@@ -208,16 +208,13 @@ class Sweep(Worker):
                 behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
                 following = Hit(*(rows[name] for name in HIT)) if plan.attached else None
                 _, model, roulette, slide = key
-                context = context.at(salts(paths.depth, torch.device("cpu")), slide, roulette)
+                context = kernels.taped.at(salt, slide, roulette)
                 before = joint.bounce(
                     integrator.bounce, context, model, vertex, following, clear, behind, self._tensors
                 )
-            elif key[0] == "emit":
-                context = context.at(salts(paths.depth, torch.device("cpu")), key[1])
-                before = joint.gather(integrator.emit, context, vertex, rows["radiance"], self._tensors)
             else:
-                context = context.at(salts(paths.depth, torch.device("cpu")))
-                before = joint.gather(integrator.escape, context, vertex, rows["radiance"], self._tensors)
+                stage = integrator.emit if key[0] == "emit" else integrator.escape
+                before = joint.gather(stage, kernels.taped.at(salt, *key[1:]), vertex, rows["radiance"], self._tensors)
         for name, found, like in before.of_rays(state, plan.attached):
             first = kernels.slots.first(name)
             values = np.zeros(like.shape, np.float32) if found is None else found.numpy()

@@ -332,18 +332,16 @@ class _Layers(Observer[Paths]):
     """Reads layers off first surfaces, and ends the walk there."""
 
     def __init__(self, wave: Wave, names: tuple[str, ...], slide: bool) -> None:
-        self.wave, self.names, self.slide = wave, names, slide
+        self.names, self.context, self.centre = names, replace(wave.context, slide=slide), wave.centre
         self.found: dict[str, Tensor] = {}
 
     def sorted(self, paths: Paths, counts: Counts) -> bool:
         """See :class:`Observer`."""
-        context, centre = self.wave.context, self.wave.centre
-        state, hit, dtype = paths.state, paths.met, context.plan.dtype
-        n, device = len(state.lane), centre.device
-        self.found = {k: torch.zeros(len(LAYERS[k].channels), n, dtype=dtype, device=device) for k in self.names}
+        state, hit = paths.state, paths.met
+        self.found = {k: state.d.new_zeros(len(LAYERS[k].channels), len(state.lane)) for k in self.names}
         for model, index in paths.groups or ():
             o, d, met = take(state.o, index), take(state.d, index), rows(hit, index)
-            here = aov.values(self.names, context.world, model, o, d, met, centre, dtype, context.pixel, self.slide)
+            here = aov.values(self.names, self.context, model, o, d, met, self.centre)
             for name, value in here.items():
                 self.found[name].scatter_(1, index.expand(len(value), -1), value)
         return True

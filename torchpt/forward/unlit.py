@@ -17,11 +17,10 @@ from torch import Tensor
 from torchpt.accel import Accel
 from torchpt.accel.bounds import primitive_bounds
 from torchpt.engines import tensors
-from torchpt.integrators.aov import values
 from torchpt.integrators.path import PathIntegrator, partition
 from torchpt.integrators.wave import Wave, camera_state
 from torchpt.math.frames import Frame
-from torchpt.math.vectors import dot, take
+from torchpt.math.vectors import dot
 from torchpt.records import Geometry, Hit, Lights, PathState, rows
 from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
@@ -39,7 +38,7 @@ RAYS, SIGHTS = 512, 8
 
 @dataclass(frozen=True)
 class Unlit:
-    """What a picture lacks.
+    """Light that a picture lacks.
 
     Attributes:
         reason: why its error is not known; "" where it is.
@@ -104,9 +103,9 @@ def _dark(search: _Search, black: Tensor) -> float:
 
     Shadows of direct light are black, and known to be: each sample asked a light for what it would bring.
     """
-    places, limits = black.nonzero()[:, 0], search.wave.limits
+    places, integrator = black.nonzero()[:, 0], search.integrator
     count = len(places)
-    if not count or limits is None or 0 <= limits.max_depth <= 2:
+    if not count or not integrator.light or 0 <= integrator.limits.max_depth <= 2:
         return 0.0
     wave = search.wave
     asked = places[torch.linspace(0, count - 1, min(count, ASKED), dtype=torch.float64).round().long()].to(
@@ -116,7 +115,7 @@ def _dark(search: _Search, black: Tensor) -> float:
     hit = tensors.hits(wave, state)
     reflects = hit.prim >= 0
     with suppress(NotImplementedError):  # a model of the caller's own without an albedo
-        reflects = _albedo(wave, state, hit).abs().amax(0) > 0
+        reflects = tensors.seen(wave, ("albedo",), state)["albedo"].abs().amax(0) > 0
     on = reflects.nonzero()[:, 0]
     if not len(on) or not _in_sight(wave, rows(state, on), rows(hit, on)):
         return 0.0
@@ -134,18 +133,8 @@ def _through(wave: Wave, places: Tensor) -> PathState:
     return camera_state(o.expand_as(d), d, key)
 
 
-def _albedo(wave: Wave, state: PathState, hit: Hit) -> Tensor:
-    """The albedo ``(3, n)`` of the surfaces that rays meet; 0 where they miss."""
-    found, plan, world = torch.zeros_like(state.d), wave.context.plan, wave.context.world
-    for model, index in partition(world, hit)[1]:
-        met, o, d = rows(hit, index), take(state.o, index), take(state.d, index)
-        here = values(("albedo",), world, model, o, d, met, wave.centre, plan.dtype, wave.context.pixel)
-        found.scatter_(1, index.expand(3, -1), here["albedo"])
-    return found
-
-
 def _in_sight(wave: Wave, state: PathState, hit: Hit) -> bool:
-    """Whether anything can be seen from the surfaces that camera rays meet, or light passes them.
+    """Return True where anything can be seen from the surfaces that camera rays meet, or light passes them.
 
     Else, as behind a single ball in the sun, no path goes on, and what the lights were asked for is all there is.
     """
@@ -181,7 +170,7 @@ def _deltas(lights: Lights) -> list[tuple[int, str]]:
 
 
 def _hidden(search: _Search, names: Names, lights: Lights, row: int, kind: str) -> str:
-    """Why no path finds a light that no ray meets by chance; "" where one may.
+    """Return why no path finds a light that no ray meets by chance; "" where one may.
 
     A path takes its light at a surface that the light shines on directly, and only where that scatters: polished ones have
     no direction to spare for it.

@@ -119,7 +119,7 @@ def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, T
 
 
 def points_of(sampler: Described) -> Points:
-    """Where the points lie, of the settings of a sampler."""
+    """Return where the points lie, of the settings of a sampler."""
     return sampler.kind(**{key: value for key, value in sampler.values.items() if key not in ADAPTIVE})
 
 
@@ -135,7 +135,7 @@ def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:
 
 
 def _first(scene: Scene, integrator: Integrator, world: World, own: bool) -> FirstSurface | None:
-    """What happens at first surfaces; kept with the scene, unless the world is not the scene's ``own``."""
+    """Return what happens at first surfaces; kept with the scene, unless the world is not the scene's ``own``."""
     if not own or torch.is_grad_enabled():
         return integrator.first(world)
     keeper = kept(scene)
@@ -158,7 +158,7 @@ def _dark(scene: Scene, world: World, own: bool) -> World:
 
 
 def _pixel_of(world: World, camera: Camera) -> Tensor | None:
-    """What textures filtered by the pixel's footprint need of the camera; None where there are none."""
+    """Return what textures filtered by the pixel's footprint need of the camera; None where there are none."""
     return camera.pixel() if world.textures.filtered else None
 
 
@@ -175,8 +175,6 @@ def looped(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool
         missing = f"kernels run on a CPU; this scene is on {device}"
     elif dtype != torch.float32:
         missing = f"kernels compute in float32; this render is in {str(dtype).removeprefix('torch.')}"
-    elif not settings.integrator.looped:
-        missing = f"there are no kernels for the integrator {settings.integrator.name}"
     if missing and settings.render.compile == "on":
         raise SceneError("render.compile", "on", f"auto or off ({missing})")
     return not missing
@@ -201,7 +199,7 @@ def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kerne
 
 
 def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
-    """How a render of the scene would run: as the compiled loop, and how that searches, or as tensor operations."""
+    """Tell how a render of the scene would run: as the compiled loop, and how that searches, or as tensor operations."""
     with torch.no_grad():
         if not looped(settings, scene.device, torch.float32):
             return {"stages": "eager, by tensor operations"}

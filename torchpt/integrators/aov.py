@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from torchpt.integrators import LAYERS
 from torchpt.integrators.layer import Seen, SurfaceLayer
 from torchpt.integrators.surfaces import texture_point_at
+from torchpt.integrators.vertex import StageContext
 from torchpt.math.vectors import dot
-from torchpt.records import Hit, World
+from torchpt.records import Hit
 from torchpt.shapes import interact
 
 __all__ = ["surface_layer", "values", "weighted"]
@@ -25,22 +25,18 @@ def surface_layer(name: str) -> type[SurfaceLayer]:
 
 
 def values(
-    names: tuple[str, ...],
-    world: World,
-    model: int,
-    o: Tensor,
-    d: Tensor,
-    hit: Hit,
-    centre: Tensor,
-    dtype: torch.dtype,
-    pixel: Tensor | None,
-    slide: bool = False,
+    names: tuple[str, ...], context: StageContext, model: int, o: Tensor, d: Tensor, hit: Hit, centre: Tensor
 ) -> dict[str, Tensor]:
-    """The layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of one model."""
-    at = interact(world, o, d, hit, slide)
-    if slide:
+    """Return the layers ``names``, each ``(C, n)``, where rays ``o, d`` hit surfaces of BSDF model number ``model``.
+
+    ``centre``: see :class:`torchpt.integrators.wave.Wave`.
+    """
+    world = context.world
+    at = interact(world, o, d, hit, context.slide)
+    if context.slide:
         hit = replace(hit, t=dot(at.p - o, d))
-    seen = Seen(world, model, d, hit, at, texture_point_at(world, model, at, pixel), centre, dtype)
+    point = texture_point_at(world, model, at, context.pixel)
+    seen = Seen(world, model, d, hit, at, point, centre, context.plan.dtype)
     found = {name: surface_layer(name).values(seen) for name in names}
     return found if hit.chance is None else {name: value * hit.chance for name, value in found.items()}
 

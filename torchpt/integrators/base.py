@@ -89,7 +89,6 @@ class Integrator(Valued):
         light: whether it estimates radiance; else the picture shows layers.
         layers: layers that are shown where ``film.aovs`` names none.
         lit: whether it sees the scene's lights; else its world has none.
-        looped: whether the compiled loop of CPUs can run it; else it runs as tensor operations.
         fields: what its paths carry beside the state of every path.
         strategy, rr_prob, light_choice, clamp, strict: as for ``path``, where the kind has no such parameter.
     """
@@ -98,7 +97,6 @@ class Integrator(Valued):
     light: ClassVar[bool] = True
     layers: ClassVar[tuple[str, ...]] = ()
     lit: ClassVar[bool] = True
-    looped: ClassVar[bool] = True
     fields: ClassVar[Sequence[Field]] = ()
 
     strategy: str = "mis"

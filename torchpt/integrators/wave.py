@@ -14,7 +14,7 @@ from torchpt import lights
 from torchpt.accel import Accel
 from torchpt.cameras import Camera
 from torchpt.film import Filter
-from torchpt.integrators.base import Integrator, Limits
+from torchpt.integrators.base import Integrator
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.stages import generate
 from torchpt.integrators.vertex import StageContext, VertexInput, VertexOutput
@@ -55,11 +55,6 @@ class Wave:
     crop: tuple[int, int, int, int]
     centre: Tensor
     first: FirstSurface | None = None
-
-    @property
-    def limits(self) -> Limits | None:
-        """Return where paths end; None where no light is carried."""
-        return self.integrator.limits if self.integrator.light else None
 
     @property
     def bounce(self) -> Bounce:

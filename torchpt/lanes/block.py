@@ -243,15 +243,15 @@ class Block:
         self.declarations.add(f"declare void @{name}({vector}, ptr, i32, {self.each('i1')})")
         self.do(f"call void @{name}({vector} {value}, ptr {pointer}, i32 1, {self.each('i1')} {mask})")
 
-    def compress(self, element: str, value: str, mask: str) -> str:
-        """The elements where the mask holds, moved together; what follows them is left open."""
+    def compress(self, element: str, value: str, mask: str, rest: str = "poison") -> str:
+        """Return the elements where the mask holds, moved together; ``rest``, of the same type, lies behind them."""
         vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.experimental.vector.compress.{suffix}"
         self.declarations.add(f"declare {vector} @{name}({vector}, {self.each('i1')}, {vector})")
-        return self.op(f"call {vector} @{name}({vector} {value}, {self.each('i1')} {mask}, {vector} poison)")
+        return self.op(f"call {vector} @{name}({vector} {value}, {self.each('i1')} {mask}, {vector} {rest})")
 
     def count(self, mask: str) -> str:
-        """How many lanes of a mask hold: an i64."""
+        """Count the lanes where a mask holds: an i64."""
         word = f"i{self.width}"
         self.declarations.add(f"declare {word} @llvm.ctpop.{word}({word})")
         bits = self.op(f"bitcast {self.each('i1')} {mask} to {word}")

@@ -162,11 +162,8 @@ class _Vectors(SinkLines):
         self._count(pack.counter, mask)
 
     def _packed(self, value: str, mask: str) -> str:
-        """As :meth:`Block.compress`, with zeros behind."""
-        name = f"llvm.experimental.vector.compress.{self.block.suffix('i32')}"
-        vector, truth = self.block.each("i32"), self.block.each("i1")
-        self.block.declarations.add(f"declare {vector} @{name}({vector}, {truth}, {vector})")
-        return self.block.op(f"call {vector} @{name}({vector} {value}, {truth} {mask}, {vector} zeroinitializer)")
+        """Return integers where the mask holds, moved together, with zeros behind."""
+        return self.block.compress("i32", value, mask, "zeroinitializer")
 
     def _note(self, note: Note, mask: str, places: str) -> None:
         together = self._packed(places, mask)  # zeros behind: whatever reads on past the end reads a place

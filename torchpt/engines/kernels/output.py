@@ -11,16 +11,14 @@ __all__ = ["deposit", "layers"]
 
 
 def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
-    """What the first surfaces are, where they are of a model."""
+    """Write what the first surfaces of a model are."""
     from torchpt.integrators import aov
 
-    layout, wave = trace.layout, trace.layout.wave
+    wave = trace.layout.wave
     state, unseen = trace.state()
     hit = trace.hit()
     with trace.tracer:
-        values = aov.values(
-            names, layout.world, model, state.o, state.d, hit, wave.centre, layout.plan.dtype, wave.context.pixel
-        )
+        values = aov.values(names, wave.context, model, state.o, state.d, hit, wave.centre)
         if "weight" in unseen:
             values = aov.weighted(values, unseen["weight"])
     nodes = [node for name in names for node in trace.tracer.nodes(values[name])]

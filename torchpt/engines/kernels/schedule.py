@@ -43,7 +43,7 @@ Block = tuple[Plate, int, int, int, int]
 
 @dataclass
 class Share:
-    """What a task brought beside its samples.
+    """Results of a task beside its samples.
 
     Attributes:
         tally: rays and paths.
@@ -61,7 +61,7 @@ class Share:
 
 
 def _next(shares: SimpleQueue[Share | BaseException]) -> Share | BaseException | None:
-    """What comes next; None after a while."""
+    """Return what comes next; None after a while."""
     try:
         return shares.get(timeout=PATIENCE)
     except Empty:
@@ -99,7 +99,7 @@ class Loop:
         self._halt = threading.Event()
 
     def run(self, spans: Sequence[tuple[Plate, int, int]], each: Callable[[Share | None], bool]) -> bool:
-        """Takes samples of every pixel of plates.
+        """Take samples of every pixel of plates.
 
         Args:
             spans: plates, with the first sample and how many are to be taken.
@@ -120,7 +120,7 @@ class Loop:
         ]
 
     def take(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
-        """Takes blocks; ``each`` and what is returned are those of :meth:`run`."""
+        """Take blocks; ``each`` and what is returned are those of :meth:`run`."""
         while blocks and not self._halt.is_set():
             blocks = self._round(blocks, each)
             if blocks:
@@ -128,11 +128,11 @@ class Loop:
         return not self._halt.is_set()
 
     def take_rest(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
-        """Takes blocks for which there was no memory, by fewer threads or lanes; else as :meth:`take`."""
+        """Take blocks for which there was no memory, by fewer threads or lanes; else as :meth:`take`."""
         return self.take(self._smaller(blocks), each)
 
     def _round(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> list[Block]:
-        """Takes blocks on threads; returns what of them memory did not suffice for."""
+        """Take blocks on threads; return what of them memory did not suffice for."""
         todo, shares = deque(blocks), SimpleQueue[Share | BaseException]()
         # Tasks never run in this thread: it looks after signals.
         crew = self._crew(min(self.threads, len(blocks)), todo, shares)
@@ -237,7 +237,7 @@ class Loop:
         self._halt.set()
 
     def task(self, plate: Plate, start: int, size: int, first: int, count: int) -> Share:
-        """Takes a block, in a thread of its own."""
+        """Take a block, in a thread of its own."""
         share = Share(Tally())
         sample = first
         try:
@@ -272,7 +272,7 @@ class Loop:
 
     def _chunk(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
         """A chunk into the films: all of it, or nothing where memory runs out."""
-        names, light = tuple(plate.layers), self.kernels.wave.limits is not None
+        names, light = tuple(plate.layers), self.kernels.wave.integrator.light
         rays = worker.layers(chunk, names) if names else 0
         for film in plate.layers.values():
             self.kernels.deposit(film.channels, False)
@@ -314,7 +314,7 @@ class Loop:
     def _deposit(
         self, worker: Worker, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None
     ) -> int:
-        """Adds samples to a film in their order; returns how many were not finite."""
+        """Add samples to a film in their order; return how many were not finite."""
         made = self.kernels.deposit(channels, clamp is not None)
         kernel = made.program
         counters = np.zeros(1, np.int64)
@@ -341,6 +341,6 @@ class Loop:
         return int(counters[0])
 
     def _lost(self, used: np.ndarray, chunk: Chunk) -> Lost:
-        """Which samples of a chunk are not finite, of the radiance ``(3, samples * pixels)`` of all."""
+        """Return which samples of a chunk are not finite, of the radiance ``(3, samples * pixels)`` of all."""
         radiance = torch.from_numpy(used).view(3, chunk.samples, chunk.pixels)
         return Lost.of(radiance, chunk.first_pixel, chunk.first_sample, self.kernels.wave.crop, chunk.plate)
