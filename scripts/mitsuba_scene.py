@@ -196,7 +196,7 @@ def nearest(scene: Scene | str) -> Scene:
 
 
 def replacements(scene: Scene | str) -> dict[str, str]:
-    """What :func:`nearest` replaces, by dotted name: what stands there instead."""
+    """Return what :func:`nearest` replaces, by dotted name: what stands there instead."""
     return _replaced(read_description(scene) if isinstance(scene, str) else scene.description)[1]
 
 
@@ -212,7 +212,7 @@ def _replaced(description: Description) -> tuple[Description, dict[str, str]]:
 
 
 def lets_pass(scene: Scene) -> bool:
-    """Whether light passes some surface as if it were not there: in Mitsuba that is a bounce."""
+    """Return True where light passes some surface as if it were not there: in Mitsuba that is a bounce."""
     slots = [slot for part in scene.built.parts for slot in part.material.all()]
     return any(slot.model.name == "null" or slot.opacity != 1.0 for slot in slots)
 

@@ -187,7 +187,7 @@ def test_the_samples_bracket_the_times(speed: float, monkeypatch: pytest.MonkeyP
 
 
 def row(ratio: float, multijitter: float = 0.02) -> dict[str, Any]:
-    """What :func:`bench_error.measured` gives of a scene, but for the turns."""
+    """Return what :func:`bench_error.measured` gives of a scene, but for the turns."""
     times = (0.25, 1.1, 4.4, 17.5)
     points = {bench_error.OURS: [power_law(t, ratio * 0.02) for t in times]}
     points |= {

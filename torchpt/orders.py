@@ -102,7 +102,7 @@ class Order:
 
     @property
     def taped(self) -> bool:
-        """Whether the picture is to carry gradients."""
+        """Return True where the picture is to carry gradients."""
         return torch.is_grad_enabled() and bool(self.wanted or self.scene.weights())
 
     def noted(self) -> Order:
@@ -146,7 +146,7 @@ def check_names(call: str, wishes: Collection[str], own: Collection[str] = ()) -
 
 
 def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
-    """What the arguments of ``render`` ask for.
+    """Return what the arguments of ``render`` ask for.
 
     Raises:
         SceneError: one that is not accepted.
@@ -273,7 +273,7 @@ def _check_types(scene: Scene, full: Any, wishes: Mapping[str, Any]) -> None:
 
 
 def _same(wish: str | torch.device, own: torch.device) -> bool:
-    """Whether a wish for a device names the one that a scene is on."""
+    """Return True where a wish for a device names the one that a scene is on."""
     try:
         device = torch.device(wish)
     except RuntimeError:

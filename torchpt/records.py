@@ -94,7 +94,7 @@ class QuadricTable:
 
 @dataclass(frozen=True)
 class Quadrics:
-    """What lanes gather of a quadric beside ``LaneGeometry.p0, e1, e2``: one column a quadric."""
+    """Numbers that lanes gather of a quadric beside ``LaneGeometry.p0, e1, e2``: one column a quadric."""
 
     kinds: tuple[type[Quadric], ...]  # the surfaces among them; static
     code: Tensor | None  # (Q,) int64 index into `kinds`; None where there is but one
@@ -158,7 +158,7 @@ class Lights:
 
 @dataclass(frozen=True)
 class LaneGeometry:
-    """Where surfaces lie, as the lanes gather it: P primitives, and I copies (see :class:`Copies`)."""
+    """Places of surfaces, as the lanes gather them: P primitives, and I copies (see :class:`Copies`)."""
 
     kinds: tuple[type[Primitive], ...]  # those that there are, in the order of KINDS; static
     counts: tuple[int, int, int, int, int]  # as in Geometry; static: lanes read `ends`
@@ -192,7 +192,7 @@ class LaneGeometry:
         return torch.where(copy > 0, copy + (self.ends[4] - 1), prim)
 
     def of(self, kind: type[Primitive], prim: Tensor) -> Tensor:
-        """Which of ``prim (N,)`` are of a kind that the scene has: ``(N,)`` bool."""
+        """Return which of ``prim (N,)`` are of a kind that the scene has: ``(N,)`` bool."""
         number = KINDS.index(kind.name)
         after = prim >= self.ends[number - 1] if number else prim >= 0
         return after & (prim < self.ends[number]) if any(self.counts[number + 1 :]) else after
@@ -207,7 +207,7 @@ class LaneGeometry:
 
 @dataclass(frozen=True)
 class LaneMaterials:
-    """What surfaces are made of: M models, and for each its materials as rows of its parameters."""
+    """Materials of surfaces: M models, and for each its materials as rows of its parameters."""
 
     row: Tensor  # (P + I,) int64 row in the parameters of its model
     key: Tensor  # (P + I + 1,) uint8, shifted by one so that a miss reads the first: how lanes are sorted, see path.partition
@@ -228,7 +228,7 @@ class LaneTextures:
 
     @property
     def filtered(self) -> bool:
-        """Whether any averages over a pixel's footprint."""
+        """Return True where any averages over a pixel's footprint."""
         return any(table.filtered for table in self.tables)
 
 
@@ -244,7 +244,7 @@ class World:
 
 @dataclass(frozen=True)
 class Hit:
-    """What the search found."""
+    """Hits of rays, as the search found them."""
 
     t: Tensor  # (N,) in units of |d|
     prim: Tensor  # (N,) int64, -1 for a miss; of a copy beyond P, see Copies
@@ -284,7 +284,7 @@ class BsdfSample:
 
 @dataclass(frozen=True)
 class SplitSumMaterial:
-    """What split-sum shading knows of surfaces, see :mod:`torchpt.ibl`.
+    """Properties of surfaces for split-sum shading, see :mod:`torchpt.ibl`.
 
     Attributes:
         diffuse: colour of the diffuse part ``(3, N)``: base colour by ``1 - metallic``.

@@ -129,7 +129,7 @@ def _file(value: Any) -> str:
 
 
 class Render(Valued):
-    """How the work is done; none of it but ``spp`` and ``seed`` changes what the picture converges to."""
+    """Settings of how the work is done; none of them but ``spp`` and ``seed`` changes what the picture converges to."""
 
     parameters: ClassVar = {
         "spp": Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take"),
@@ -211,12 +211,12 @@ class Settings:
 
     @property
     def adaptive(self) -> bool:
-        """Whether samples go where the error is."""
+        """Return True where samples go where the error is."""
         return bool(self.sampler.values.get("adaptive", False))
 
     @property
     def pilots(self) -> bool:
-        """Whether one pixel of a block is sampled twice; ``auto``: where something asks for it."""
+        """Return True where one pixel of a block is sampled twice; ``auto``: where something asks for it."""
         if not self.integrator.light or "variance" in self.film.aovs:
             return False
         asked = self.adaptive or self.render.target_error is not None
@@ -224,7 +224,7 @@ class Settings:
 
     @property
     def light_choice(self) -> str:
-        """How a light is chosen; where no light is sampled it does not matter."""
+        """Return how a light is chosen; where no light is sampled it does not matter."""
         return self.integrator.light_choice
 
     def plain(self, without: Mapping[str, Collection[str]] = MappingProxyType({})) -> dict[str, Any]:
@@ -317,7 +317,7 @@ def _merge(
 
 
 def _check_pilots(settings: Settings, file: str | None) -> None:
-    """Raises where what is asked for takes pilots and there can be none, or where every pixel is sampled twice anyway."""
+    """Raise where what is asked for takes pilots and there can be none, or where every pixel is sampled twice anyway."""
     film, render = settings.film, settings.render
     adaptive, variance = settings.adaptive, "variance" in film.aovs
     for key, wanted in (("sampler.adaptive", adaptive), ("render.target_error", render.target_error is not None)):
@@ -337,7 +337,7 @@ def _check_pilots(settings: Settings, file: str | None) -> None:
 
 
 def _open_end(raw: Mapping[str, Any], sampler: Described) -> None:
-    """Raises where something else than ``spp`` is to end a render whose points depend on their number."""
+    """Raise where something else than ``spp`` is to end a render whose points depend on their number."""
     for name in ("time_limit", "target_error"):
         if sampler.kind.needs_count and raw.get(name) is not None:
             free = ", ".join(kind for kind in SAMPLERS if not SAMPLERS[kind].needs_count)
@@ -348,7 +348,7 @@ def _open_end(raw: Mapping[str, Any], sampler: Described) -> None:
 
 
 def _given(overrides: Mapping[str, Any], key: str) -> bool:
-    """Whether the override names the key that is wrong."""
+    """Return True where the override names the key that is wrong."""
     value: Any = overrides
     for part in key.split(".")[:3]:
         if not isinstance(value, Mapping) or value.get(part) is None:

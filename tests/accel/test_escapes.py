@@ -71,7 +71,7 @@ def directions(rng, vertices, faces, o, n):
 
 
 def escapes(name, place, count):
-    """How many of ``count`` rays from inside miss, by either search."""
+    """Return how many of ``count`` rays from inside miss, by either search."""
     vertices, faces = MESHES[name]()
     scale = 1000.0 if any(place) else 1.0  # float32 is 1/64 apart there: no triangle may collapse
     vertices = (vertices * scale + np.array(place)).astype(np.float32)

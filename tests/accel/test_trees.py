@@ -116,7 +116,7 @@ def test_no_other_tree_over_the_same_binary_one_costs_less(seed: int) -> None:
 
     @functools.cache
     def least(node: int, places: int) -> float:
-        """What is below a node, as so many children at most."""
+        """Return what is below a node, as so many children at most."""
         start, stop, left = spans[node]
         area, best = half_area(nodes[node]), np.inf
         if stop - start <= WIDTH:

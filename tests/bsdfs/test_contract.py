@@ -109,7 +109,7 @@ def towards(angle: float, below: bool = False, azimuth: float = AZIMUTH) -> Tens
 
 
 def refracted(wo: Tensor, eta: float) -> Tensor | None:
-    """Where Snell sends a ray that comes from ``wo (3, 1)``; None where all is reflected."""
+    """Return where Snell sends a ray that comes from ``wo (3, 1)``; None where all is reflected."""
     ratio = 1 / eta if float(wo[2]) > 0 else eta
     cos2 = 1 - ratio**2 * (1 - float(wo[2]) ** 2)
     if cos2 <= 0:

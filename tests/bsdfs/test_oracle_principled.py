@@ -64,7 +64,7 @@ def model_of(values: dict[str, Any]) -> Principled:
 def fixed_rates(
     self: Principled, parameters: Parameters, wo: Tensor, facet: Facet, front: Tensor | None = None
 ) -> Probabilities:
-    """How Mitsuba chooses a lobe: by the parameters, and by Fresnel's reflectance where the main lobes share."""
+    """Return how Mitsuba chooses a lobe: by the parameters, and by Fresnel's reflectance where the main lobes share."""
     none = torch.zeros_like(wo[2])
     metallic, through = (parameters.get(name) for name in ("metallic", "spec_trans"))
     metallic, through = none if metallic is None else metallic, none if through is None else through
@@ -92,7 +92,7 @@ def pairs_for(values: dict[str, Any], seed: int) -> tuple[Tensor, Tensor]:
 
 
 def causes(wo: Tensor, wi: Tensor, gloss: float) -> dict[str, Tensor]:
-    """Where Mitsuba's float32 loses digits, and ours does not: see the test below."""
+    """Return where Mitsuba's float32 loses digits, and ours does not: see the test below."""
     grazing = torch.minimum(wo[2].abs(), wi[2].abs()) < 1e-2
     h = wo + wi
     off = (h[0] ** 2 + h[1] ** 2) / (h**2).sum(0)

@@ -39,7 +39,7 @@ shapes: {ball: {type: sphere, emission: 1}}
 
 
 def texts() -> Iterator[tuple[str, str]]:
-    """Where a command may stand, and the text."""
+    """Return where a command may stand, and the text."""
     for name in ("HELP", "HELP_RENDER", "HELP_ORBIT", "HELP_INFO", "HELP_COMPARE", "HELP_CONVERGE", "HELP_STRESS"):
         yield f"cli.{name}", getattr(cli, name)
     for page in PAGES:
@@ -49,7 +49,7 @@ def texts() -> Iterator[tuple[str, str]]:
 
 
 def spans(where: str, text: str) -> Iterator[str]:
-    """What a text shows as commands: lines of blocks, and what stands between backticks, perhaps over two lines."""
+    """Return what a text shows as commands: lines of blocks, and what stands between backticks, perhaps over two lines."""
     if where.endswith(".md"):
         blocks = re.findall(r"^```sh\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
         text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
@@ -101,7 +101,7 @@ def quick(command: str) -> bool:
 
 
 def marks(command: str) -> list[pytest.MarkDecorator]:
-    """What a command needs: time, or a package that may not be there."""
+    """Return what a command needs: time, or a package that may not be there."""
     long = any(word in command for word in ("converge", "stress", "--multirun")) or not quick(command)
     needs = pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed (extra `denoise`)")
     return [pytest.mark.slow] * long + [needs] * ("denoise=true" in command)

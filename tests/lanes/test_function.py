@@ -44,7 +44,7 @@ def tables(rows: int = 5, degree: int = 2) -> Curve:
 
 @pytest.fixture
 def traced(monkeypatch) -> list[int]:
-    """How often a stage was compiled."""
+    """Count how often a stage was compiled."""
     made, compiled = [0], programs.compiled
 
     def counting(*args: Any) -> Any:

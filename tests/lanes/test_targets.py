@@ -57,7 +57,7 @@ def plain(x: Tensor, d: Tensor, i: Tensor, b: Tensor, u: Tensor) -> list[Tensor]
 
 
 def fused(x: Tensor, d: Tensor, i: Tensor, b: Tensor, u: Tensor) -> list[Tensor]:
-    """What has products that are rounded once with a sum, also where no instruction does that."""
+    """Compute products that are rounded once with a sum, also where no instruction does that."""
     names = "sin cos tan atan exp exp2 expm1 tanh sinh cosh sigmoid".split()
     found = [getattr(torch, name)(v) for name in names for v in (x[0], d[0])]
     found += [getattr(torch, name)(v.abs()) for name in ("log", "log10", "log1p") for v in (x[1], d[1])]

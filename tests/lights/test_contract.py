@@ -395,7 +395,7 @@ def test_a_lane_does_not_ask_how_many_there_are(name, dtype):
 
 
 def bad_values(described: spec.Spec) -> list[Any]:
-    """What a parameter refuses, as it would be written."""
+    """Return what a parameter refuses, as it would be written."""
     if isinstance(described, spec.Color | spec.Scalar | spec.Texels):
         low, high = described.low, described.high
         bad = [described.above] if described.above is not None else [] if low is None else [low - 1.0]

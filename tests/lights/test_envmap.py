@@ -119,7 +119,7 @@ def cells_of(d: Tensor, bands: int, width: int, turn: Tensor) -> Tensor:
 
 
 def shares(map: envmap.EnvironmentMap, mis: bool, turn: Tensor, bands: int, width: int, fine: int) -> Tensor:
-    """What the density says each of the cells gets: a midpoint rule."""
+    """Return what the density says each of the cells gets: a midpoint rule."""
     z = 1.0 - (torch.arange(bands * fine, dtype=torch.float64) + 0.5) * (2.0 / (bands * fine))
     phi = (torch.arange(width * fine, dtype=torch.float64) + 0.5) * (2 * math.pi / (width * fine))
     z, phi = (a.reshape(-1) for a in torch.meshgrid(z, phi, indexing="ij"))

@@ -83,7 +83,7 @@ def points(count: int) -> tuple[Tensor, Tensor]:
 
 
 def brought(lights: dict[str, Tensor], x: Tensor, n: Tensor) -> Tensor:
-    """What each light brings to each point ``(N, K)`` from its centre: I cos cos / d^2, in float64."""
+    """Return what each light brings to each point ``(N, K)`` from its centre: I cos cos / d^2, in float64."""
     light = {name: value.double() for name, value in lights.items()}
     to = (0.5 * (light["low"] + light["high"]))[:, None, :] - x.double()[:, :, None]
     square = (to * to).sum(0)

@@ -41,7 +41,7 @@ PLAIN: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Feature:
-    """What a scene may have.
+    """A feature of scenes.
 
     Attributes:
         files: of the package that nothing else needs, relative to it.

@@ -359,7 +359,7 @@ def test_parameters_of_scenes_that_require_gradients():
 
 @pytest.fixture
 def counted(monkeypatch):
-    """How often worlds, search structures, tables of kernels and programs are made."""
+    """Count how often worlds, search structures, tables of kernels and programs are made."""
     made = {"worlds": 0, "trees": 0, "tables": [], "programs": 0}
 
     def counting(room, name, key):

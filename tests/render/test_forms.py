@@ -103,7 +103,7 @@ class Twice:
 
 
 def spans(sinks: Sinks, count: int, before: np.ndarray, after: np.ndarray) -> Iterator[tuple[int, int, int, int]]:
-    """Where a kernel writes: which memory (0: its target, from 3 on: lists), row, first place and that after the last."""
+    """Return where a kernel writes: memory (0: its target, from 3 on: lists), row, first place and that after the last."""
     shift = 0 if sinks.shift is None else int(before[sinks.shift])
     for row, _ in sinks.write:
         yield 0, row, shift, shift + count

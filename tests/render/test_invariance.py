@@ -193,7 +193,7 @@ def scene_of(tmp_path) -> Callable[[str], torchpt.Scene]:
 
 
 def slow(name: str, mode: str) -> list[pytest.MarkDecorator]:
-    """Where kernels take long to compile, or one of a kind is left that shows the same."""
+    """Mark jobs whose kernels take long to compile, or of which one of a kind is left that shows the same."""
     rows = ("many lights", "textures and normal maps", "strategy light", "some materials", "preview", "environment map",
             "searched by a tree", "parallel projection", "lens of six blades", "filter mitchell")  # fmt: skip
     others = name.startswith(("sampler ", "filter ", "strategy ")) and name not in ("sampler sobol", "filter mitchell")

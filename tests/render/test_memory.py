@@ -301,7 +301,7 @@ def test_under_a_limit_of_addresses_the_bits_are_the_same_or_it_is_one_line(mode
 
 
 def measured(wish: str, more: str = "{}") -> tuple[str, int]:
-    """What a render of a process of its own says, and bytes that it held above import at most."""
+    """Return what a render of a process of its own says, and bytes that it held above import at most."""
     text = f"""
 import torchpt
 from torchpt.native.memory import Meter

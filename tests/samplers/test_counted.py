@@ -38,7 +38,7 @@ def two(kind: str, key: Tensor, name: tuple[int, Dimension]) -> Tensor:
 
 
 def one_in_each(u: Tensor, count: int) -> bool:
-    """Whether each of ``count`` equal intervals holds one of as many numbers, which are cut to 24 bits."""
+    """Return True where each of ``count`` equal intervals holds one of as many numbers, which are cut to 24 bits."""
     level, k = (u.double() * 2**24).long().sort(-1).values, torch.arange(count)
     return bool(((level >= (k << 24) // count) & (level * count < (k + 1) << 24)).all())
 

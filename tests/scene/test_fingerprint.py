@@ -280,7 +280,7 @@ def other(value: Any) -> Any:
 
 
 def variants(value: Any, key: str, seen: set[str]) -> Iterator[tuple[str, bool, Any]]:
-    """What is like a record but for one number or word: the place, whether it counts, the record; one for each place."""
+    """Return what is like a record but for one number or word: the place, whether it counts, the record; one for each place."""
     if is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             inner = f"{key}.{type(value).__name__}.{field.name}"

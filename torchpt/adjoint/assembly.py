@@ -26,7 +26,7 @@ __all__ = ["Assembly"]
 
 
 class Assembly:
-    """What the waves of a backward pass read, as a function of parameters.
+    """Tensors that the waves of a backward pass read, as functions of parameters.
 
     Args:
         scene: whose.
@@ -91,7 +91,7 @@ class Assembly:
 
     @property
     def passing(self) -> bool:
-        """Whether it is differentiated by what lets rays pass surfaces."""
+        """Return True where it is differentiated by what lets rays pass surfaces."""
         world = self.taped.context.world
         opacity, maps = world.materials.opacity, world.textures.opacity
         if opacity is None:

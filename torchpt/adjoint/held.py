@@ -57,7 +57,7 @@ Count = Callable[[Tensor], Tensor]
 
 
 def suits(scene: Scene, settings: Settings, wanted: Iterable[str]) -> bool:
-    """Whether gradients by the parameters ``wanted`` are taken in this form.
+    """Return True where gradients by the parameters ``wanted`` are taken in this form.
 
     The camera moves, no surface does, and every ray ends at the first one: what lets some rays pass has no place to be held at.
     """
@@ -69,7 +69,7 @@ def suits(scene: Scene, settings: Settings, wanted: Iterable[str]) -> bool:
 
 
 def follows(scene: Scene, wanted: Iterable[str]) -> bool:
-    """Whether directions follow surfaces in it: where mirrors and glass send on the camera's ray, or the others ask for it."""
+    """Return True where directions follow surfaces in it: those behind mirrors and glass, or where others ask for it."""
     owners = [*scene.built.parts, *scene.built.copies]
     bent = any(material.model.delta for owner in owners for material in owner.material.all())
     return bent or attached(scene, [name for name in wanted if not name.startswith("camera.")])
@@ -113,7 +113,7 @@ def by_film(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -
 
 @dataclass(frozen=True)
 class _Seen:
-    """What is seen at places of the film, held where it is."""
+    """Surfaces that are seen at places of the film, held where they are."""
 
     state: PathState  # camera rays that follow the camera to the points
     x: Tensor  # (N,) where on the film, in pixels, differentiable
@@ -136,7 +136,7 @@ def interior(still: Wave, wave: Wave, span: Span) -> Tensor:
 
 
 def borders(still: Wave, wave: Wave, upright: bool, span: Span, samples: int, asked: Tensor, count: Count) -> Tensor:
-    """What moves through borders of pixels is worth, ``(3, N)``: values are 0, derivatives are not.
+    """Return what moves through borders of pixels is worth, ``(3, N)``: values are 0, derivatives are not.
 
     Args:
         still: a wave of detached parameters.
@@ -168,7 +168,7 @@ def borders_of(still: Wave) -> tuple[tuple[bool, int], ...]:
 
 
 def splats(still: Wave, wave: Wave, span: Span, samples: int, asked: Tensor, count: Count) -> Tensor:
-    """What places all over the film are worth ``(3, N)``, for filters that end without a jump.
+    """Return what places all over the film are worth ``(3, N)``, for filters that end without a jump.
 
     Each path counts in all pixels that see its place: what the derivatives of neighbouring filters have in common cancels.
 
@@ -199,13 +199,13 @@ def splats(still: Wave, wave: Wave, span: Span, samples: int, asked: Tensor, cou
 
 
 def cells(still: Wave) -> int:
-    """How many cells of a pixel's size there are that any pixel sees."""
+    """Return how many cells of a pixel's size there are that any pixel sees."""
     _, _, width, height = still.crop
     return (width + 2 * _beyond(still)) * (height + 2 * _beyond(still))
 
 
 def _beyond(still: Wave) -> int:
-    """How many pixels a filter reaches beyond its own."""
+    """Return how many pixels a filter reaches beyond its own."""
     return math.ceil(still.filter.radius - 0.5)
 
 
@@ -221,7 +221,7 @@ def _filter(still: Wave, away: Tensor) -> Tensor:
 
 
 def _of_pixel(asked: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
-    """What is asked ``(3, N)`` of pixels; nothing beyond the picture."""
+    """Return what is asked ``(3, N)`` of pixels; nothing beyond the picture."""
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < asked.shape[1] // width)
     return torch.where(inside, take(asked, torch.where(inside, row * width + column, 0)), 0.0)
 
@@ -251,7 +251,7 @@ def _brought(wave: Wave, state: PathState) -> Tensor:
 
 
 def _held(still: Wave, wave: Wave, state: PathState) -> _Seen:
-    """What camera rays of detached parameters meet, as a camera under a tape sees it."""
+    """Return what camera rays of detached parameters meet, as a camera under a tape sees it."""
     world = still.context.world
     with torch.no_grad():
         hit = tensors.hits(still, state)

@@ -171,7 +171,7 @@ def _pictures(
     full: bool,
     wishes: Common,
 ) -> Iterator[_Picture]:
-    """What is asked for, picture by picture, those of a scene together; ``several``: scenes are one under other parameters."""
+    """Return the orders, picture by picture, those of a scene together; ``several``: scenes are one under other parameters."""
     like: dict[str, Any] = {}
     editions: WeakKeyDictionary[Scene, dict[str, int]] = WeakKeyDictionary()
     for s, each in enumerate(scenes):
@@ -204,7 +204,7 @@ def _ordered(
     full: bool,
     wishes: Common,
 ) -> Order:
-    """What is asked for of one picture."""
+    """Return the order of one picture."""
     if isinstance(camera, Tensor):
         if "camera.to_world" in params:
             raise SceneError("params.camera.to_world", "a pose", "none where cameras are poses")

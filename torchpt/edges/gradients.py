@@ -43,13 +43,13 @@ class Samples(Protocol):
 
 
 def concerns(scene: Scene, names: Iterable[str]) -> bool:
-    """Whether any of the parameters moves edges."""
+    """Return True where any of the parameters moves edges."""
     return any(scene.spec(name).moves in (Moves.SURFACES, Moves.SHADOWS) for name in names)
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """What a backward pass knows of edges.
+    """The edges of a backward pass.
 
     Attributes:
         scene: whose edges.
@@ -76,7 +76,7 @@ class Boundary:
     ranks: Group | None = None
 
     def gradients(self, samples: Iterable[Samples], wanted: Iterable[str]) -> list[Tensor | None]:
-        """What samples add to the gradients of ``wanted``; None for those that move no edges."""
+        """Return what samples add to the gradients of ``wanted``; None for those that move no edges."""
         sums = {name: torch.zeros_like(t) for name, t in self.moving.items()}
         tensors = self.still.tensors()
         for found in samples:
@@ -158,7 +158,7 @@ def boundary_of(
     cotangent: Tensor,
     ranks: Group | None = None,
 ) -> Boundary | None:
-    """What a backward pass knows of edges; None where none of the parameters moves any.
+    """Return what a backward pass knows of edges; None where none of the parameters moves any.
 
     Args:
         scene: whose.
@@ -199,7 +199,7 @@ def add_gradients(
     held: bool = False,
     ranks: Group | None = None,
 ) -> list[Tensor | None]:
-    """What moving edges add to the gradients of ``wanted``; None for those that move none.
+    """Return what moving edges add to the gradients of ``wanted``; None for those that move none.
 
     Args:
         scene: whose.

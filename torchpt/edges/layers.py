@@ -104,7 +104,7 @@ def _gradients(
 
 
 def _interior(asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], worth: Tensor) -> tuple[Tensor, ...]:
-    """What the values at first surfaces bring, a chunk of pixels at a time."""
+    """Return what the values at first surfaces bring, a chunk of pixels at a time."""
     scene, settings = asked.scene, asked.settings
     plain = {name: value.detach() for name, value in params.items()}
     with torch.no_grad():

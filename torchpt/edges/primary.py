@@ -125,7 +125,7 @@ class Primary:
         return o.expand_as(d), d
 
     def _share(self, held: Held, mate: Tensor, p: Tensor, s: Tensor, step: Tensor, o: Tensor, d: Tensor) -> Tensor:
-        """How much of each edge counts ``(N,)``: nothing where it is hidden, a part where others lie on it."""
+        """Return how much of each edge counts ``(N,)``: nothing where it is hidden, a part where others lie on it."""
         n = p.shape[1]
         t, prim = self.traced.nearest(o, d)
         away = p - o[:, :n]

@@ -39,7 +39,7 @@ class Traced:
         return self.wave.sampler.key(sample, torch.full_like(sample, row))
 
     def nearest(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
-        """How far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none."""
+        """Return how far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none."""
         t, prim, _, _ = self.wave.accel.intersect(o, d, torch.full_like(d[0], FOREVER, dtype=torch.float32))
         return t.double(), prim.long()
 

@@ -81,7 +81,7 @@ class Spot:
         return kind.eval(surface.parameters, surface.wo, local) * weight
 
     def scattered(self, wi: Tensor, key: Tensor, depth: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Where light that comes from ``wi`` goes on: origins, unit directions, and ``f cos_s / cos_g |cos_g(wo)| / pdf``."""
+        """Return rays by which light from ``wi`` goes on: origins, unit directions, ``f cos_s / cos_g |cos_g(wo)| / pdf``."""
         o, d, weight = torch.zeros_like(wi), wi.clone(), torch.zeros_like(wi)
         world, plan = self.traced.wave.context.world, self.traced.wave.context.plan
 
@@ -104,7 +104,7 @@ class Spot:
 
 
 def met(traced: Traced, o: Tensor, d: Tensor) -> Spot:
-    """Where rays ``(3, N)`` meet surfaces; ``d`` of any length."""
+    """Return where rays ``(3, N)`` meet surfaces; ``d`` of any length."""
     world, dtype = traced.wave.context.world, traced.dtype
     d = (d / (d * d).sum(0).sqrt()).to(dtype)
     o = o.to(dtype)

@@ -62,7 +62,7 @@ class State:
 def identity(
     scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
 ) -> dict[str, Any]:
-    """What a render is of: where two have the same, one goes on from the other's checkpoint."""
+    """Return what a render is of: where two have the same, one goes on from the other's checkpoint."""
     return {
         "torchpt": __version__,
         "scene": fingerprints(scene),
@@ -101,7 +101,7 @@ class Keeper:
             raise OutputError(self.path, "is there already; render.resume=true goes on from it, or remove it first")
 
     def due(self) -> bool:
-        """Whether it is time for another."""
+        """Return True where it is time for another."""
         return time.perf_counter() - self._last >= max(EVERY, PATIENCE * self._took)
 
     def write(self, state: State) -> None:
@@ -209,7 +209,7 @@ def _said(problem: Exception) -> str:
 
 
 def _differences(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
-    """Where two nests of plain values differ: dotted key, and both values in JSON."""
+    """Return where two nests of plain values differ: dotted key, and both values in JSON."""
     if isinstance(a, dict) and isinstance(b, dict):
         for name in dict.fromkeys((*a, *b)):
             yield from _differences(a.get(name), b.get(name), f"{key}.{name}" if key else name)

@@ -41,5 +41,5 @@ _scenes: WeakKeyDictionary[Scene, Kept] = WeakKeyDictionary()
 
 
 def kept(scene: Scene) -> Kept:
-    """What is kept for a scene, as long as the scene is; views of it share it."""
+    """Return what is kept for a scene, as long as the scene is; views of it share it."""
     return _scenes.setdefault(scene.origin, Kept())

@@ -295,7 +295,7 @@ class _Story:
         )
 
     def _ended(self) -> str:
-        """How the path did."""
+        """Return how the path did."""
         last = next(event for event in reversed(self.events) if not isinstance(event, Shone))
         if isinstance(last, Met) and float(last.state.t_max) > 0.0:
             return "escaped" if int(last.hit.prim) < 0 else "max_depth"

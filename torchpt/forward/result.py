@@ -87,7 +87,7 @@ class Rendering:
 
     @property
     def seconds(self) -> float:
-        """What it took, from reading the scene to writing the picture: the sum of the six above."""
+        """Return what it took, from reading the scene to writing the picture: the sum of the six above."""
         prepared = self.load_seconds + self.build_seconds + self.compile_seconds
         return prepared + self.render_seconds + self.denoise_seconds + self.write_seconds
 
@@ -98,7 +98,7 @@ class Rendering:
 
     @property
     def _open(self) -> bool:
-        """Whether anything but ``render.spp`` has a say in how many samples a pixel gets."""
+        """Return True where anything but ``render.spp`` has a say in how many samples a pixel gets."""
         if self.settings is None:
             return False
         render = self.settings.render
@@ -152,7 +152,7 @@ class Rendering:
             write_denoised(beside(path), self, film)
 
     def header(self) -> dict[str, str | int | float]:
-        """What the header of an EXR file says of it, by name; :func:`torchpt.read_header` reads it back."""
+        """Return what the header of an EXR file says of it, by name; :func:`torchpt.read_header` reads it back."""
         from torchpt import __version__
 
         low, high = self.relmse_interval or (None, None)

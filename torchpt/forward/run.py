@@ -244,7 +244,7 @@ class Run:
             self._keep(last=True)
 
     def _adapts(self) -> bool:
-        """Whether pilots say from now on where samples go."""
+        """Return True where pilots say from now on where samples go."""
         return self.twice is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
 
     def _adapt(self) -> None:
@@ -302,7 +302,7 @@ class Run:
             self.warned = True
 
     def _state(self) -> State:
-        """Where the render is."""
+        """Return where the render is."""
         looked = self.twice is not None and self.twice.looked == self._mean()  # whoever goes on looks once more
         counted, light = self._unlooked if looked else self._counted()
         facts = {"taken": self.taken, "seconds": self.seconds_of_sampling(), "cut": int(self.cut), **counted}
@@ -310,7 +310,7 @@ class Run:
         return State(facts, arrays | {"light": light})
 
     def _counted(self) -> tuple[dict[str, Any], Tensor]:
-        """What is counted beside the films, by name, and the light before and after the clamp."""
+        """Return what is counted beside the films, by name, and the light before and after the clamp."""
         counts = {"done": self.done, "rays": self.tally.rays, "truncated": self.tally.truncated}
         return {**counts, "lost": self.lost.plain()}, self.light.clone()
 

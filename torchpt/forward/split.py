@@ -94,7 +94,7 @@ class Split:
         return seconds, error_there if known else None
 
     def due(self, due: bool) -> bool:
-        """Whether the first rank is to write a checkpoint."""
+        """Return True where the first rank is to write a checkpoint."""
         return bool(self.group.decide("a checkpoint", due)[0])
 
     def places(self, own: Tensor) -> Tensor:
@@ -102,7 +102,7 @@ class Split:
         return self.group.first(own)
 
     def state(self, own: State | None, like: State) -> State | None:
-        """What the first rank read from a checkpoint, which is ``like`` a state of this render; None: nothing."""
+        """Return what the first rank read from a checkpoint, which is ``like`` a state of this render; None: nothing."""
         text = "" if own is None else json.dumps(own.facts)
         sent = bytes(self.group.first(torch.tensor(list(text.encode()), dtype=torch.uint8)).tolist())
         if not sent:

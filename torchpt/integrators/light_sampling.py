@@ -126,7 +126,7 @@ def _shadow_ray(
 
 
 def leaning(world: World, model: int) -> bool:
-    """Whether the shading normals of a model's surfaces may differ from the geometric ones."""
+    """Return True where the shading normals of a model's surfaces may differ from the geometric ones."""
     textures = world.materials.textures[model]
     return world.geometry.normals is not None or (
         textures is not None and (textures.normal is not None or textures.bump is not None)

@@ -64,7 +64,7 @@ class Lost:
 
     @property
     def count(self) -> int:
-        """How many there were."""
+        """Return how many there were."""
         return self.nan + self.infinite
 
     def add(self, other: Lost) -> None:
@@ -81,7 +81,7 @@ class Lost:
 
     @staticmethod
     def read(facts: dict[str, Any]) -> Lost:
-        """What :meth:`plain` made.
+        """Return what :meth:`plain` made.
 
         Raises:
             ValueError: something that it does not make.

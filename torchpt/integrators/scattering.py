@@ -28,7 +28,7 @@ __all__ = ["Onward", "attach", "carry_on", "draw", "next_ray", "scatter"]
 
 @dataclass(frozen=True)
 class Onward:
-    """What paths carry on, after roulette."""
+    """Quantities that paths carry on, after roulette."""
 
     alive: Tensor  # (n,) bool
     throughput: Tensor  # (3, n)

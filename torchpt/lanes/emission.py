@@ -238,7 +238,7 @@ def _remainder(block: Block, ty: str, a: str, b: str) -> str:
 
 
 def _against(block: Block, ty: str, r: str, b: str) -> str:
-    """Whether a remainder of floats has another sign than the divisor."""
+    """Return whether a remainder of floats has another sign than the divisor."""
     zero = block.constant(ty, 0.0)
     other = block.op(f"xor {block.each('i1')} {block.compare('olt', ty, r, zero)}, {block.compare('olt', ty, b, zero)}")
     return block.op(f"and {block.each('i1')} {other}, {block.compare('une', ty, r, zero)}")
@@ -278,7 +278,7 @@ def _scalar(block: Block, ty: str, pointer: str, place: int) -> str:
 
 
 def _search(block: Block, ty: str, value: str, extra: tuple[int, str, bool]) -> str:
-    """How many entries of a sorted table are below a value (or not above it): a function with a loop of its own."""
+    """Count the entries of a sorted table below a value (or not above it), by a function with a loop of its own."""
     table, element, right = extra
     name = f"@sorted_{element}_{'right' if right else 'left'}"
     vector = block.vector(element)
@@ -309,7 +309,7 @@ def _iota(block: Block, ty: str) -> str:
 
 
 def _place(block: Body, ty: str) -> str:
-    """Where in the arena the lane is."""
+    """Return where in the arena the lane is."""
     return "%place" if block.listed else _iota(block, ty)
 
 

@@ -78,7 +78,7 @@ def host() -> Target:
 
 
 def counts() -> tuple[int, int]:
-    """How many kernels this process compiled, and how many it loaded from disk."""
+    """Return how many kernels this process compiled, and how many it loaded from disk."""
     return _state["compiled"], _state["loaded"]
 
 

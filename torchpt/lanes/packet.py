@@ -181,7 +181,7 @@ class _Search(Block):
         return value
 
     def _near_ball(self, kind: str) -> None:
-        """Goes on to the exact test where any ray comes near the sphere, by float32 and a bound of its rounding.
+        """Go on to the exact test where any ray comes near the sphere, by float32 and a bound of its rounding.
 
         The perpendicular from the centre to the ray errs by less than ``2^-20 (|f| + |c|)``, with ``f`` from the centre ``c``
         to the origin: a few roundings of terms that large, the centre's own included.

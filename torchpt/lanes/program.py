@@ -178,7 +178,7 @@ def bound(
 
 
 def holds(program: Program, leaves: Mapping[str, Tensor]) -> bool:
-    """Whether the numbers that a trace relied on are the same for other leaves."""
+    """Return True where the numbers that a trace relied on are the same for other leaves."""
     if not program.guards:
         return True
     tensor = replayed(program.steps, program.held, leaves)

@@ -77,7 +77,7 @@ def load(key: str) -> Program | None:
 
 
 def store(key: str, program: Program) -> None:
-    """Writes a program, where it can be written."""
+    """Write a program, where it can be written."""
     try:
         facts = {
             "code": program.code,

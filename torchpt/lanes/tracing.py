@@ -45,7 +45,7 @@ _active: list[Tracer] = []
 
 
 def handles(*names: str) -> Callable[[Handler], Handler]:
-    """Registers ``handler(tracer, out, *args, **kwargs)``, which tells what ``out`` is made of."""
+    """Register ``handler(tracer, out, *args, **kwargs)``, which tells what ``out`` is made of."""
 
     def register(handler: Handler) -> Handler:
         for name in names:
@@ -69,7 +69,7 @@ def lanes_for(tables: Iterable[Tensor]) -> int:
 
 
 def tracing() -> bool:
-    """Whether a stage is being traced in this process: then tensor forms are wanted, not calls of kernels."""
+    """Return True where a stage is being traced in this process: then tensor forms are wanted, not calls of kernels."""
     return bool(_active)
 
 
@@ -172,11 +172,11 @@ class Tracer(TorchDispatchMode):
     # -- what handlers use
 
     def is_traced(self, tensor: Tensor) -> bool:
-        """Whether a tensor depends on lanes or on inputs."""
+        """Return True where a tensor depends on lanes or on inputs."""
         return id(tensor) in self._values
 
     def lane_axis(self, shape: Iterable[int]) -> int | None:
-        """Which axis holds the lanes; None where none does."""
+        """Return which axis holds the lanes; None where none does."""
         axes = [axis for axis, size in enumerate(shape) if size and size % self.lanes == 0]
         if len(axes) > 1:
             raise Unsupported(f"a tensor of shape {tuple(shape)} with lanes on two axes")
@@ -229,7 +229,7 @@ class Tracer(TorchDispatchMode):
         return value
 
     def source(self, tensor: Tensor) -> Source:
-        """Where a tensor without lanes comes from."""
+        """Return where a tensor without lanes comes from."""
         source = self._sources.get(id(tensor))
         if source is None:
             source = self._sources[id(tensor)] = Source("held", len(self.held))

@@ -57,7 +57,7 @@ SQUARE = 1e-6
 
 
 def table_of(codes: Sequence[int], p0: Tensor, e1: Tensor, e2: Tensor, near: float = NEAR) -> Tensor | None:
-    """What :func:`sample` reads of lights.
+    """Return what :func:`sample` reads of lights.
 
     Args:
         codes: of the rows' shapes: :data:`TRIANGLE`, :data:`RECTANGLE` (which may be sheared) or :data:`OTHER`.

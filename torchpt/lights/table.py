@@ -168,7 +168,7 @@ def _textured(
 
 
 def emitted(lights: Lights, x: Tensor, at: Interaction, wi: Tensor, n: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """What emitters that were hit send back along ``wi``.
+    """Return what emitters that were hit send back along ``wi``.
 
     Args:
         lights: the table.

@@ -117,7 +117,7 @@ def fine(u: Tensor) -> Tensor:
 @dispatched
 @torch.no_grad()
 def sample(tree: LightTree, x: Tensor, n: Tensor | None, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Draws lights for points.
+    """Draw lights for points.
 
     Args:
         tree: the lights.

@@ -87,7 +87,7 @@ def _bin(lights, i, axis, low, scale):
 
 @jit()
 def _split(lights, ids, start, stop, bins, suffix):
-    """Reorders a range of lights so that its two parts cost least; returns where the second starts."""
+    """Reorder a range of lights so that its two parts cost least; return where the second starts."""
     best, best_axis, best_cut, best_low, best_scale = _INF, -1, 0, 0.0, 0.0
     for axis in range(3):
         low, high = _INF, -_INF
@@ -147,7 +147,7 @@ def _cone(lights, cos_o, ids, start, stop):
 
 @jit()
 def build(lights, cos_o, ids, nodes, child, full, trail, depth):
-    """Builds the tree.
+    """Build the tree.
 
     Args:
         lights: ``(K, 12)`` float64 groups of one; an axis is as long as the intensity times ``(1 + cos_o) / 2``.

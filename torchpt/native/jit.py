@@ -154,7 +154,7 @@ def _most_threads() -> int:
 
 
 def _probe() -> bool:
-    """Whether numba's threading layer lets several Python threads call parallel kernels (starts the layer)."""
+    """Return True where numba's threading layer lets several Python threads call parallel kernels (starts the layer)."""
     if _most_threads() < 2 or getattr(numba_config, "THREADING_LAYER", "") == "workqueue":
         return False
     try:
@@ -167,7 +167,7 @@ def _probe() -> bool:
 
 
 def parallel_allowed() -> bool:
-    """Whether ``prange`` kernels may run here.
+    """Return True where ``prange`` kernels may run here.
 
     Only in the process that first asked, never after a fork (GNU OpenMP kills forked children that use it), and never
     under numba's ``workqueue`` layer, which aborts when two Python threads enter it.
@@ -181,7 +181,7 @@ def parallel_allowed() -> bool:
 
 
 def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, args: tuple) -> None:
-    """Runs a kernel over ``range(items)``.
+    """Run a kernel over ``range(items)``.
 
     Args:
         serial: compiled ``(first, last, *args)``, releases the GIL.

@@ -73,7 +73,7 @@ def share(work: Callable[[int, int], object], items: int, threads: int) -> None:
 
 @functools.cache
 def settle() -> None:
-    """Calls the vector functions once, before several threads do.
+    """Call the vector functions once, before several threads do.
 
     MKL finds out at its first call which code suits the processor. Two threads that find it out together may compute half a
     tensor by less exact code: then the same render gave other bits now and then.
@@ -85,7 +85,7 @@ def settle() -> None:
 
 
 def start_team() -> None:
-    """Starts torch's threads for the calling one while there is memory for them; where there is not, it renders alone.
+    """Start torch's threads for the calling one while there is memory for them; where there is not, it renders alone.
 
     OpenMP ends the process where it cannot start a thread, which it does at the first large tensor, however late that is.
     """

@@ -189,7 +189,7 @@ CAUSES = {
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a sample is not finite.
+    """The reason why a sample is not finite.
 
     Attributes:
         cause: a key of :data:`CAUSES`.

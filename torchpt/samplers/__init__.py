@@ -88,7 +88,7 @@ class Sampler:
 
     @property
     def points(self) -> Points:
-        """Where the points lie."""
+        """Return where the points lie."""
         return points_of(self.kind)
 
     @property
@@ -103,7 +103,7 @@ class Sampler:
         return self.points.key(self.numbers(pixel.device), pixel, group, point)
 
     def numbers(self, device: torch.device) -> Numbers:
-        """What :meth:`Points.key` needs of the sampler."""
+        """Return what :meth:`Points.key` needs of the sampler."""
         seeds = [
             mix_int(mix_int(mix_int(self.seed) ^ as_int32(self.seed >> 32)) + g)
             for g in range(self.randomizations + SPARE)

@@ -55,7 +55,7 @@ class Points(ABC):
     joint: ClassVar[bool] = False
 
     def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
-        """What tells a sample from all others, ``(rows, N)`` int32: a pixel's seed, a point's index, how many there are.
+        """Return what tells a sample from all others, ``(rows, N)`` int32: a pixel's seed, a point's index, how many there are.
 
         The seed is a bijection of the pixel's index for each (seed, stream), so no two pixels share a sequence. The
         third row is there only where ``rows`` says so.

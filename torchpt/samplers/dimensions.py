@@ -10,7 +10,7 @@ __all__ = ["STREAMS", "Dimension", "salt"]
 
 
 class Dimension(IntEnum):
-    """What a number is drawn for. ``PIXEL`` and ``LENS`` are drawn once a path, the others at every vertex."""
+    """The use of a random number. ``PIXEL`` and ``LENS`` are drawn once a path, the others at every vertex."""
 
     PIXEL = 0  # 2D, place within the pixel's filter
     LENS = 1  # 2D, place on the aperture

@@ -59,11 +59,11 @@ class Calls:
         self.counters[:] = 0
 
     def counted(self) -> tuple[int, list[int]]:
-        """How many lanes are in the arena, and how many in each list."""
+        """Return how many lanes are in the arena, and how many in each list."""
         return int(self.counters[0]), self.counters[1 : self.kernels.models + 3].tolist()
 
     def name_salts(self, depth: int) -> None:
-        """Which depth's random dimensions kernels draw from."""
+        """Set the depth whose random dimensions kernels draw from."""
         known = self._salts.get(depth)
         if known is None:
             known = self._salts[depth] = salts(depth, torch.device("cpu")).contiguous()

@@ -115,13 +115,13 @@ class Worker:
         self.search.kernels = kernels
 
     def trace(self, chunk: Chunk) -> Tally:
-        """Fills ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
+        """Fill ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
         self.tally = Tally()
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
         return self.tally
 
     def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
-        """Fills ``shown`` with layers of the first surfaces, channel after channel; returns how many rays it took."""
+        """Fill ``shown`` with layers of the first surfaces, channel after channel; return how many rays it took."""
         count = chunk.pixels * chunk.samples
         channels = sum(len(LAYERS[name].channels) for name in names)
         if self.shown is None or len(self.shown.words) != channels:

@@ -43,7 +43,7 @@ class Handed:
             return {key: table for key, (state, table) in self._tables.items() if leaves.has(key[0], state)}
 
     def results(self, leaves: Leaves) -> dict[Name, Tensor]:
-        """What steps of prologues came to on a render's tensors, those that were taken, by name."""
+        """Return what steps of prologues came to on a render's tensors, those that were taken, by name."""
         found: dict[Name, Tensor] = {}
         with self._lock:
             for states, results in self._results.values():

@@ -124,7 +124,7 @@ def back_escape(trace: Trace) -> Sinks:
 
 
 def report(trace: Trace) -> Sinks:
-    """What the rays and shadow rays of an arena met, for the vertex before."""
+    """Write what the rays and shadow rays of an arena met, for the vertex before."""
     layout, tracer = trace.layout, trace.tracer
     lane = layout.state.read(tracer, "lane")["lane"]
     hit = layout.state.read(tracer, *HIT)

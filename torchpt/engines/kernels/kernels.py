@@ -97,7 +97,7 @@ class Kernels(Layout):
         self.eager: dict[int, str] = {}
 
     def probe(self, numbers: Iterable[int]) -> dict[int, str]:
-        """Which of the models' stages no kernel can be made of, and why."""
+        """Return which of the models' stages no kernel can be made of, and why."""
         reasons = {}
         for number in numbers:
             try:

@@ -42,6 +42,6 @@ class Leaves:
         }
 
     def has(self, path: str, state: State) -> bool:
-        """Whether a tensor is one that was read before, with the same numbers."""
+        """Return True where a tensor is one that was read before, with the same numbers."""
         tensor, version = self.states[path]
         return tensor is state[0] and version == state[1]

@@ -34,7 +34,7 @@ def nearest(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Hit:
 
 
 def occluded(tracer: Tracer, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-    """Whether shadow rays are blocked ``(N,)``."""
+    """Return which shadow rays are blocked ``(N,)``."""
     node = tracer.graph.node("occluded", "b", *_ray(tracer, o, d, t_max))
     return tracer.lane(torch.zeros(tracer.lanes, dtype=torch.bool), lambda _: node)
 
@@ -55,7 +55,7 @@ def find(trace: Trace, passed: bool) -> Sinks:
 
 
 def block(trace: Trace) -> Sinks:
-    """Which shadow rays are blocked."""
+    """Write which shadow rays are blocked."""
     rows, tracer = trace.layout.state, trace.tracer
     blocked = occluded(tracer, *rows.read(tracer, "shadow_o", "shadow_d", "shadow_t").values())
     with tracer:

@@ -73,7 +73,7 @@ class Together(Generic[T]):
                 self._start()
 
     def next(self, wait: bool) -> tuple[Job[T], Share | BaseException] | None:
-        """What a block came to, and of which render; None where nothing came, after a while where it waits."""
+        """Return what a block came to, and of which render; None where nothing came, after a while where it waits."""
         try:
             job, share = self._done.get(timeout=PATIENCE) if wait else self._done.get_nowait()
         except Empty:

@@ -57,11 +57,11 @@ class Trace:
         return path_state(rows.read(self.tracer, *rows.state)), rows.read(self.tracer, "weight")
 
     def hit(self, rows: Rows | None = None) -> Hit:
-        """What the rays met."""
+        """Return what the rays met."""
         return Hit(**(rows or self.layout.state).read(self.tracer, *HIT))
 
     def place(self) -> Tensor:
-        """Where in the arena each lane is."""
+        """Return where in the arena each lane is."""
         numbers = torch.zeros(self.tracer.lanes, dtype=torch.int64)
         return self.tracer.lane(numbers, lambda _: self.tracer.graph.node("place", "l"))
 

@@ -93,7 +93,7 @@ def begin(trace: Trace) -> Sinks:
 
 
 def through(trace: Trace) -> Sinks:
-    """How much light a surface lets through, and where the shadow rays go on that still carry some."""
+    """Let light through a surface in part, and send the shadow rays on that still carry some."""
     layout, tracer = trace.layout, trace.tracer
     hit = trace.hit(layout.passed)
     o, d, t_max, home, clear = layout.passed.read(tracer, "pass_o", "pass_d", "pass_t", "home", "clear").values()

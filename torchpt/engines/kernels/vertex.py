@@ -60,7 +60,7 @@ def generate(trace: Trace, chosen: bool) -> Sinks:
 
 
 def settle(trace: Trace, shadow: bool) -> Sinks:
-    """What the lanes of the arena met: light of their shadow rays, lists of lanes by model, ends of paths."""
+    """Settle what the lanes of the arena met: light of their shadow rays, lists of lanes by model, ends of paths."""
     tracer, rows = trace.tracer, trace.layout.state
     state, unseen = trace.state()
     prim = rows.read(tracer, "prim")["prim"]
