@@ -217,7 +217,7 @@ class Settings:
     @property
     def pilots(self) -> bool:
         """Return True where one pixel of a block is sampled twice; ``auto``: where something asks for it."""
-        if not self.integrator.light or "variance" in self.film.aovs:
+        if not self.integrator.light or self.integrator.splats or "variance" in self.film.aovs:
             return False
         asked = self.adaptive or self.render.target_error is not None
         return asked if self.render.pilots == "auto" else bool(self.render.pilots)
@@ -329,8 +329,14 @@ def _check_pilots(settings: Settings, file: str | None) -> None:
         if not settings.integrator.light:
             expected = f"an integrator that carries light, not {settings.integrator.name}"
             raise SceneError(key, value, expected, file)
+        if settings.integrator.splats:
+            expected = f"an integrator whose samples light their own pixels alone, not {settings.integrator.name}"
+            raise SceneError(key, value, expected, file)
         if variance:
             raise SceneError("film.aovs", list(film.aovs), f"no variance beside {key}", file)
+    if settings.integrator.splats and render.pilots is True:
+        expected = "auto or false where samples light other pixels than their own; film.aovs=[variance] tells the error"
+        raise SceneError("render.pilots", True, expected, file)
     if variance and render.pilots is True:
         expected = "auto or false where film.aovs asks for variance: every pixel is sampled by two streams then"
         raise SceneError("render.pilots", True, expected, file)

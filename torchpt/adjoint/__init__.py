@@ -73,6 +73,9 @@ def gradients(
     if attached and integrator.own_transmit:
         expected = "one whose rays are held up by surfaces alone, where geometry is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
+    if (attached or held) and integrator.splats:
+        expected = "one whose samples light their own pixels alone, where geometry or the camera is differentiated"
+        raise NotBuiltError("integrator.type", integrator.name, expected)
     with limited_threads(settings.render.threads):
         attached = follows(scene, wanted) if held else attached
         assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks)

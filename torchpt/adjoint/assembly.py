@@ -132,4 +132,5 @@ def _over(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
     """A wave with other tensors; stages run as tensor operations."""
     context = wave.context
     world, pixel, camera, first = map_leaves(change, (context.world, context.pixel, wave.camera, wave.first))
-    return replace(wave, context=replace(context, world=world, pixel=pixel), camera=camera, first=first)
+    context = replace(context, world=world, pixel=pixel, camera=None if context.camera is None else camera)
+    return replace(wave, context=context, camera=camera, first=first)

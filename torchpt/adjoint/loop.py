@@ -42,7 +42,9 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
         return
     wave = assembly.wave
     packets = wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
-    kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets)
+    splats = wave.integrator.splats
+    cotangent = (asked.float() / settings.render.spp).contiguous() if splats else None
+    kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets, cotangent)
     models = wave.context.world.materials.models
     kernels.eager = kernels.probe([k for k, model in enumerate(models) if any(model is x for x in scene.own_models)])
     threads = _threads(kernels, settings)

@@ -8,7 +8,7 @@ from marks on the way, so that memory does not grow with depth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -24,7 +24,7 @@ from torchpt.forward.waves import Waves
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Behind
 from torchpt.integrators.path import Ends, partition, slides
-from torchpt.integrators.vertex import EXTRA, VertexInput
+from torchpt.integrators.vertex import EXTRA, Splat, VertexInput
 from torchpt.math.gathers import gathered_by
 from torchpt.math.vectors import take
 from torchpt.paths.walk import Observer, walk
@@ -48,6 +48,7 @@ class Vertex:
     state: PathState
     hit: Hit
     clear: list[Tensor] = field(default_factory=list)
+    splat_clear: list[Tensor] = field(default_factory=list)
 
 
 class Keeper(Observer[Paths]):
@@ -62,7 +63,7 @@ class Keeper(Observer[Paths]):
     def left(self, paths: Paths) -> None:
         """See :class:`Observer`."""
         assert self._now is not None
-        self._now.clear = paths.clear
+        self._now.clear, self._now.splat_clear = paths.clear, paths.splat_clear
 
     def arrived(self, paths: Paths) -> bool:
         """See :class:`Observer`."""
@@ -96,7 +97,7 @@ def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) ->
 def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:
     """The sums of a chunk."""
     sums = assembly.sums()
-    _Chunk(assembly, settings, span, sums).run(asked[:, span[0] : span[0] + span[1]])
+    _Chunk(assembly, settings, span, sums).run(asked)
     return sums
 
 
@@ -120,7 +121,9 @@ class _Chunk:
         self.engine = Tensors(replace(self.wave, context=self.taped.context), 0)
 
     def run(self, pixels: Tensor) -> None:
-        """Add what a loss asks, by pixels ``(3, n)``, to the sums."""
+        """Add what a loss asks, by pixels of the picture ``(3, H W)``, to the sums."""
+        self.picture = pixels
+        pixels = pixels[:, self.span[0] : self.span[0] + self.span[1]]
         with torch.no_grad():
             start = self.wave.rays(*self.span)
             radiance, keeper = self._trace(start, 1, None, None)
@@ -150,7 +153,7 @@ class _Chunk:
         keeper, engine = Keeper(), Tensors(self.wave, self.span[1] * self.span[3])
         paths = engine.spawn(state) if depth == 1 else Paths(state, depth, hit)
         walk(engine, paths, self.wave.integrator.limits, keeper, end)
-        return engine.radiance, keeper
+        return engine.brought(), keeper
 
     # -- back
 
@@ -172,10 +175,10 @@ class _Chunk:
         chance, asked = self._chance(vertex)
         hit = replace(hit, chance=chance)
         limits = self.wave.integrator.limits
-        clear = iter(vertex.clear)
+        clear, splat_clear = iter(vertex.clear), iter(vertex.splat_clear)
         if depth < limits.last:
             for model, index in groups:
-                self._bounce(model, depth, slide, clear, state, hit, index, asked)
+                self._bounce(model, depth, slide, clear, splat_clear, state, hit, index, asked)
         self._light(ends, depth, slide, state, hit, asked)
         if chance is not None and asked is not None:
             found = torch.autograd.grad(chance, self.tensors, asked, allow_unused=True)
@@ -199,7 +202,8 @@ class _Chunk:
         model: int,
         depth: int,
         slide: bool,
-        clear: object,
+        clear: Iterator[Tensor],
+        splat_clear: Iterator[Tensor],
         state: PathState,
         hit: Hit,
         index: Tensor,
@@ -215,15 +219,21 @@ class _Chunk:
         )
 
         def passed(shadow: Shadow) -> Tensor:
-            kept = next(clear)  # type: ignore[call-overload]
+            kept = next(clear)
             return self.engine.clear(shadow) if self.passing else kept
+
+        def landed(splat: Splat) -> tuple[Tensor, Tensor]:
+            kept = next(splat_clear)
+            through = self.engine.clear(splat.light) if self.passing else kept
+            cotangent = self.picture.to(through.dtype) / self.settings.render.spp
+            return joint.splatted(self.settings.integrator.clamp, cotangent, splat, through)
 
         limits = self.wave.integrator.limits
         with gathered_by(self.sums):
             context = self.taped.context.at(salts(depth, lane.device), slide, limits.roulette(depth))
             vertex = VertexInput(rows(state, index), rows(hit, index))
             stage = self.wave.integrator.bounce
-            before = joint.bounce(stage, context, model, vertex, following, passed, behind, self._others)
+            before = joint.bounce(stage, context, model, vertex, following, passed, behind, self._others, landed)
         for name, found, like in before.of_rays(vertex.state, self.plan.attached):
             self.behind[name].index_copy_(-1, lane, torch.zeros_like(like) if found is None else found)
         self.sums.add_each(before.others)

@@ -24,7 +24,7 @@ from torchpt.engines.kernels.rows import HIT, Memory, path_state
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Before, Behind
 from torchpt.integrators.path import slides
-from torchpt.integrators.vertex import EXTRA, VertexInput
+from torchpt.integrators.vertex import EXTRA, Splat, VertexInput
 from torchpt.math.gathers import gathered_by
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.records import Hit, Shadow
@@ -135,6 +135,7 @@ class Sweep(Worker):
             paths.arena.words[:, :count] = mark.words
             paths.arrived = True
         walk(self, paths, self.wave.integrator.limits, keeper, end)
+        self.mark_lost()
         return keeper
 
     # -- back
@@ -201,6 +202,10 @@ class Sweep(Worker):
         def clear(_: Shadow) -> Tensor:
             return rows["clear"]
 
+        def landed(splat: Splat) -> tuple[Tensor, Tensor]:
+            assert kernels.cotangent is not None
+            return joint.splatted(integrator.clamp, kernels.cotangent, splat, rows["splat_clear"])
+
         before: Before
         with gathered_by(self.sums):
             if key[0] == "bounce":
@@ -210,7 +215,7 @@ class Sweep(Worker):
                 _, model, roulette, slide = key
                 context = kernels.taped.at(salt, slide, roulette)
                 before = joint.bounce(
-                    integrator.bounce, context, model, vertex, following, clear, behind, self._tensors
+                    integrator.bounce, context, model, vertex, following, clear, behind, self._tensors, landed
                 )
             else:
                 stage = integrator.emit if key[0] == "emit" else integrator.escape

@@ -11,11 +11,14 @@ from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
 from torchpt.adjoint.sums import Sums
 from torchpt.engines import tensors
+from torchpt.film.splats import Splats
 from torchpt.forward.budget import Budget
 from torchpt.forward.schedule import BYTES_PER_LANE, Span, budget_of
 from torchpt.forward.waves import Waves
+from torchpt.integrators.clamp import clamp_scale
 from torchpt.math.gathers import gathered_by
 from torchpt.math.threads import one_thread
+from torchpt.math.vectors import take
 from torchpt.native.memory import Meter
 from torchpt.settings import Settings
 
@@ -49,10 +52,18 @@ def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> N
     wave = assembly.taped
 
     def part(span: Span) -> tuple[Tensor, Tensor]:
-        radiance = tensors.radiance(wave, *span)
+        splats: list[Splats] = []
+        radiance = tensors.radiance(wave, *span, splats=splats)
         share = asked_of(settings, radiance.detach(), asked[:, span[0] : span[0] + span[1]].to(radiance.dtype))
         # What is not finite must not meet its share of 0.
-        return torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0), share
+        values = torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0)
+        if not wave.integrator.splats:
+            return values, share
+        other, clamp = [one.value for one in splats], settings.integrator.clamp
+        other = [value if clamp is None else value * clamp_scale(value, clamp) for value in other]
+        pixels = torch.cat([values.new_zeros(0, dtype=torch.int64), *(one.pixel for one in splats)])
+        wanted = take(asked, pixels).to(share.dtype) / settings.render.spp
+        return torch.cat((values.flatten(1), *other), 1), torch.cat((share.flatten(1), wanted), 1)
 
     chunk_by_chunk(assembly, settings, sums, part, wave.crop[2] * wave.crop[3], settings.render.spp)
 

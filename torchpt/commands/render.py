@@ -151,7 +151,8 @@ def described(job: Job) -> tuple[Any, Any]:
 def knowing(wishes: Any) -> Any:
     """Settings of a picture that a command writes: ``render.pilots: auto`` is true there, as its summary tells the error."""
     render = wishes.render
-    return replace(wishes, render=render.but(pilots=True)) if render.pilots == "auto" else wishes
+    able = render.pilots == "auto" and not wishes.integrator.splats
+    return replace(wishes, render=render.but(pilots=True)) if able else wishes
 
 
 def _keeping(interrupt: Interrupt, work: Callable[[], Any]) -> Any:

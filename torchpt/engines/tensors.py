@@ -6,6 +6,7 @@ The readable reference for kernels. Each verb is a few operations on all lanes o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,13 +15,14 @@ import torch
 from torch import Tensor
 
 from torchpt.core.tree import map_leaves
+from torchpt.film.splats import LARGEST, Splats
 from torchpt.integrators import LAYERS, aov
-from torchpt.integrators.base import check_fields
+from torchpt.integrators.base import check_fields, check_output
 from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
 from torchpt.integrators.transmission import PASSES, beyond, non_opaque, opacity_at
-from torchpt.integrators.vertex import Emission, StageContext, VertexInput, VertexOutput
+from torchpt.integrators.vertex import Emission, Splat, StageContext, VertexInput, VertexOutput
 from torchpt.integrators.wave import Wave
 from torchpt.math.vectors import take
 from torchpt.paths.walk import Counts, Observer, find, walk
@@ -65,6 +67,8 @@ class Paths:
         groups: number and lanes of each BSDF model that was met; None before lanes are sorted.
         pending: shadow rays from the vertex before, with the first lane that they bring light to.
         clear: how much of their light gets through ``(n,)``, one for each of ``pending``, once they are traced.
+        splats: light from the vertex before to other pixels, with the lanes of the wave that it comes from.
+        splat_clear: how much of it gets through, likewise.
         emissions: light that lanes met here by chance, where an engine keeps it.
         outputs: of the vertex before: number of the BSDF model, lanes of the wave, and what its surfaces made of them, where an
             engine keeps it.
@@ -78,6 +82,8 @@ class Paths:
     groups: list[tuple[int, Tensor]] | None = None
     pending: list[tuple[int, Shadow]] = field(default_factory=list)
     clear: list[Tensor] = field(default_factory=list)
+    splats: list[tuple[Tensor, Splat]] = field(default_factory=list)
+    splat_clear: list[Tensor] = field(default_factory=list)
     emissions: list[tuple[Tensor, Emission]] = field(default_factory=list)
     outputs: list[tuple[int, Tensor, VertexOutput]] = field(default_factory=list)
 
@@ -99,6 +105,8 @@ class Tensors:
 
     Attributes:
         radiance: ``(3, lanes)`` what ended paths brought.
+        splats: what they brought to other pixels.
+        lost: lanes with splats that are not finite.
     """
 
     def __init__(self, wave: Wave, lanes: int, tally: Tally | None = None, keeps: bool = False) -> None:
@@ -107,6 +115,8 @@ class Tensors:
         self.plan, self.world = wave.context.plan, wave.context.world
         self.passing = self.world.materials.opacity is not None or wave.integrator.own_transmit
         self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=wave.centre.device)
+        self.splats: list[Splats] = []
+        self.lost: list[Tensor] = []
 
     def spawn(self, state: PathState) -> Paths:
         """Start paths with rays."""
@@ -215,12 +225,15 @@ class Tensors:
         start = 0
         for model, index in paths.groups:
             output = bounce(context, model, self._input(paths, index))
-            check_fields(self.wave.integrator, output.leaving)
+            check_output(self.wave.integrator, output)
             leaving.append(output.leaving)
             if output.following is not None:
                 following.append(output.following)
             if output.shadow is not None:
                 after.pending.append((start, output.shadow))
+                self.tally.rays += len(index)
+            if output.splat is not None:
+                after.splats.append((take(paths.state.lane, index), output.splat))
                 self.tally.rays += len(index)
             if self.keeps:
                 after.outputs.append((model, take(paths.state.lane, index), output))
@@ -245,6 +258,24 @@ class Tensors:
                 parts.append(whole[:, done:])
             paths.state = replace(paths.state, radiance=parts[0] if len(parts) == 1 else torch.cat(parts, 1))
         paths.pending.clear()
+        for lane, splat in paths.splats:
+            paths.splat_clear.append(self.clear(splat.light))
+            self._splat(lane, splat, paths.splat_clear[-1])
+
+    def _splat(self, lane: Tensor, splat: Splat, clear: Tensor) -> None:
+        """Note the light of splats that gets through; a sample with one that is not finite is lost."""
+        value = splat.light.radiance * clear
+        finite = (value.detach().abs() < LARGEST).all(0)
+        comes = (splat.pixel >= 0) & (clear.detach() != 0)
+        on = (comes & finite).nonzero().squeeze(1)
+        self.splats.append(Splats(take(lane, on), take(splat.pixel, on), take(value, on)))
+        self.lost.append(take(lane, (comes & ~finite).nonzero().squeeze(1)))
+
+    def brought(self) -> Tensor:
+        """Return the radiance ``(3, lanes)`` of all paths, which ended; NaN where a splat of theirs is not finite."""
+        for lane in self.lost:
+            self.radiance = self.radiance.index_fill(1, lane, math.nan)
+        return self.radiance
 
     def clear(self, shadow: Shadow) -> Tensor:
         """Return how much of the light gets through ``(n,)``: 0 or 1 where all surfaces are opaque.
@@ -291,7 +322,13 @@ def escaped(wave: Wave, state: PathState, ends: Ends) -> Tensor:
     return index[take(state.t_max, index) > 0] if wave.integrator.own_transmit else index
 
 
-def trace(wave: Wave, state: PathState, tally: Tally | None = None, observer: Observer[Paths] | None = None) -> Tensor:
+def trace(
+    wave: Wave,
+    state: PathState,
+    tally: Tally | None = None,
+    observer: Observer[Paths] | None = None,
+    splats: list[Splats] | None = None,
+) -> Tensor:
     """Return the radiance ``(3, N)`` that rays bring.
 
     Args:
@@ -299,11 +336,14 @@ def trace(wave: Wave, state: PathState, tally: Tally | None = None, observer: Ob
         state: camera rays, or such as begin elsewhere; N lanes without radiance.
         tally: counts what it takes.
         observer: looks on, and finds what stages returned in populations.
+        splats: gets what they bring to other pixels; None: nobody asks.
     """
     engine = Tensors(wave, len(state.lane), tally, observer is not None)
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
-    return engine.radiance
+    if splats is not None:
+        splats += engine.splats
+    return engine.brought()
 
 
 def hits(wave: Wave, state: PathState) -> Hit:
@@ -313,19 +353,29 @@ def hits(wave: Wave, state: PathState) -> Hit:
 
 
 def brought(
-    wave: Wave, state: PathState, tally: Tally | None = None, observer: Observer[Paths] | None = None
+    wave: Wave,
+    state: PathState,
+    tally: Tally | None = None,
+    observer: Observer[Paths] | None = None,
+    splats: list[Splats] | None = None,
 ) -> Tensor:
     """Return the radiance ``(3, N)`` of camera rays weighted by the filter; arguments as of :func:`trace`."""
-    found = trace(wave, state, tally, observer)
+    found = trace(wave, state, tally, observer, splats)
     return found * wave.weight(state) if wave.filter.signed else found
 
 
 def radiance(
-    wave: Wave, first_pixel: int, pixels: int, first_sample: int, samples: int, plate: Plate | None = None
+    wave: Wave,
+    first_pixel: int,
+    pixels: int,
+    first_sample: int,
+    samples: int,
+    plate: Plate | None = None,
+    splats: list[Splats] | None = None,
 ) -> Tensor:
     """Return the radiance ``(3, samples, pixels)`` of consecutive pixels of a plate, weighted by the filter."""
     state = wave.rays(first_pixel, pixels, first_sample, samples, plate)
-    return brought(wave, state).view(3, samples, pixels)
+    return brought(wave, state, splats=splats).view(3, samples, pixels)
 
 
 class _Layers(Observer[Paths]):

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.film.splats import SplatSums
 from torchpt.math.threads import mean_all
 
 __all__ = ["RELMSE_FLOOR", "Film"]
@@ -23,19 +24,34 @@ class Film:
         randomizations: independent sequences that share the samples, see :mod:`torchpt.samplers`.
         device: where the lanes live.
         channels: C, three for radiance.
+        splats: whether samples also bring light to other pixels than their own. A pixel's mean is that of its own samples then,
+            and what came from elsewhere over the mean number of samples of all pixels.
+
+    Attributes:
+        splats: sums of that light; None where there is none.
     """
 
-    def __init__(self, width: int, height: int, randomizations: int, device: torch.device, channels: int = 3) -> None:
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        randomizations: int,
+        device: torch.device,
+        channels: int = 3,
+        splats: bool = False,
+    ) -> None:
         self.width, self.height, self.randomizations, self.channels = width, height, randomizations, channels
         pixels = width * height
         self._first = torch.zeros(channels, pixels, dtype=torch.float64, device=device)
         self._sums = torch.zeros(randomizations, channels, pixels, dtype=torch.float64, device=device)
         self._counts = torch.zeros(randomizations, pixels, dtype=torch.int64, device=device)
+        self.splats = SplatSums(pixels, randomizations, device) if splats else None
 
     @staticmethod
-    def bytes_of(pixels: int, randomizations: int, channels: int = 3) -> int:
-        """What a film of so many pixels takes."""
-        return 8 * pixels * (channels + randomizations * (channels + 1))
+    def bytes_of(pixels: int, randomizations: int, channels: int = 3, splats: bool = False) -> int:
+        """Return what a film of so many pixels takes."""
+        own = 8 * pixels * (channels + randomizations * (channels + 1))
+        return own + (SplatSums.bytes_of(pixels, randomizations) if splats else 0)
 
     def add(self, radiance: Tensor, first_pixel: int, first_sample: int) -> None:
         """Add samples ``(C, S, n)`` of ``n`` consecutive pixels, ``S`` consecutive samples each."""
@@ -61,21 +77,35 @@ class Film:
             changed.append((self._counts[group, pixels], self._counts[group, pixels] + len(own)))
         return changed
 
+    def part(self, pixels: int) -> Film:
+        """Return an empty film for some of its pixels, whose samples may send splats to all of them."""
+        part = Film(pixels, 1, self.randomizations, self._sums.device, self.channels)
+        if self.splats is not None:
+            part.splats = SplatSums(self.width * self.height, self.randomizations, self._sums.device)
+        return part
+
+    def stream(self, sample: Tensor) -> Tensor:
+        """Return which stream samples ``(k,)`` of a pixel, by their numbers, belong to."""
+        return sample % self.randomizations
+
     def taken(self, places: Tensor) -> Film:
-        """Some of its pixels as a film of their own."""
-        part = Film(len(places), 1, self.randomizations, self._sums.device, len(self._first))
+        """Return some of its pixels as a film of their own, with no splats yet."""
+        part = self.part(len(places))
         part._first, part._sums = self._first[:, places].contiguous(), self._sums[:, :, places].contiguous()
         part._counts = self._counts[:, places].contiguous()
         return part
 
     def put(self, places: Tensor, part: Film) -> None:
-        """What :meth:`taken` took, after more samples."""
+        """Hold what :meth:`taken` took, after more samples, and add their splats."""
         self._first[:, places], self._sums[:, :, places] = part._first, part._sums
         self._counts[:, places] = part._counts
+        if self.splats is not None and part.splats is not None:
+            self.splats.join(part.splats.state())
 
     def state(self) -> dict[str, Tensor]:
-        """All that it holds, by name."""
-        return {"sums": self._sums, "counts": self._counts, "first": self._first}
+        """Return all that it holds, by name."""
+        own = {"sums": self._sums, "counts": self._counts, "first": self._first}
+        return own if self.splats is None else {**own, "splats": self.splats.state()}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Hold what another film of this size held, as :meth:`state` said.
@@ -93,14 +123,27 @@ class Film:
         """Samples of each pixel ``(pixels,)`` int64."""
         return self._counts.sum(0)
 
+    def _mean(self) -> Tensor:
+        """Return means of the pixels ``(C, pixels)``."""
+        mean = self._sums.sum(0) / self._counts.sum(0).clamp_min(1)
+        if self.splats is not None:
+            mean += self.splats.values().sum(0) / _samples(self._counts.sum(0))
+        return mean
+
+    def _stream(self, k: int) -> Tensor:
+        """Return means of the pixels by one stream ``(C, pixels)``."""
+        mean = self._sums[k] / self._counts[k].clamp_min(1)
+        if self.splats is not None:
+            mean += self.splats.values()[k] / _samples(self._counts[k])
+        return mean
+
     def values(self) -> Tensor:
-        """Means of the pixels ``(pixels, C)`` float64; those without samples are black."""
-        return (self._sums.sum(0) / self._counts.sum(0).clamp_min(1)).T.contiguous()
+        """Return means of the pixels ``(pixels, C)`` float64; those without samples are black."""
+        return self._mean().T.contiguous()
 
     def streams(self) -> list[Tensor]:
-        """Means of each stream ``(pixels, C)`` float64."""
-        parts = zip(self._sums, self._counts, strict=True)
-        return [(total / count.clamp_min(1)).T.contiguous() for total, count in parts]
+        """Return means of each stream ``(pixels, C)`` float64."""
+        return [self._stream(k).T.contiguous() for k in range(self.randomizations)]
 
     @property
     def sums(self) -> Tensor:
@@ -122,7 +165,7 @@ class Film:
 
     def mean(self) -> Tensor:
         """The picture ``(H, W, C)`` in float64; pixels without samples are black."""
-        return self._picture(self._sums.sum(0) / self._counts.sum(0).clamp_min(1))
+        return self._picture(self._mean())
 
     def first(self) -> Tensor:
         """The first sample of each pixel ``(H, W, C)``: for what has no average."""
@@ -142,11 +185,11 @@ class Film:
         # One randomization at a time: a large film has room for no more.
         mean = torch.zeros_like(self._first)
         for k in filled:
-            mean += self._sums[k] / self._counts[k]
+            mean += self._stream(k)
         mean /= len(filled)
         spread = torch.zeros_like(mean)
         for k in filled:
-            spread += (self._sums[k] / self._counts[k] - mean).square_()
+            spread += (self._stream(k) - mean).square_()
         spread /= len(filled) - 1
         return self._picture(spread / len(filled))
 
@@ -156,3 +199,9 @@ class Film:
         if variance is None:
             return None
         return float(mean_all(variance / (self.mean() ** 2 + RELMSE_FLOOR)))
+
+
+def _samples(counts: Tensor) -> Tensor:
+    """Return the mean number of samples of pixels, 1 where there are none."""
+    mean = counts.double().mean()
+    return torch.where(mean > 0, mean, 1.0)

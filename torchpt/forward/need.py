@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from torchpt.film import Film
 from torchpt.forward.schedule import BYTES_PER_LANE, streams_of
 from torchpt.forward.wave import surface_layers
 from torchpt.settings import Settings
@@ -77,7 +78,9 @@ def need_of(settings: Settings, device: torch.device, how: str, models: int, row
     _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
     pixels = width * height
     channels = [len(layer.channels) for layer in surface_layers(settings).values()]
-    films = 24 + 32 * streams_of(settings) + sum(16 * c + 8 for c in channels)
+    films = Film.bytes_of(1, streams_of(settings), splats=settings.integrator.splats) + sum(
+        16 * c + 8 for c in channels
+    )
     picture = PICTURE
     if "variance" in settings.film.aovs:
         picture = VARIANCE

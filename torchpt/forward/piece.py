@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from torchpt.engines import tensors
 from torchpt.errors import RenderError
+from torchpt.film.splats import Splats
 from torchpt.forward.schedule import Span
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.lost import Lost
@@ -31,11 +32,13 @@ class Piece:
         tally: rays and paths.
         lost: samples that were not finite.
         writes: places, and what they are to hold then.
+        splats: the same of sums of splats: these, places in their last axis, values.
     """
 
     tally: Tally = field(default_factory=Tally)
     lost: Lost = field(default_factory=Lost)
     writes: list[tuple[Tensor, Tensor]] = field(default_factory=list)
+    splats: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list)
 
     def write(self) -> None:
         """Put it into the films. Nothing is allocated; and as it says what places hold, not what is added, it can be repeated.
@@ -52,6 +55,8 @@ class Piece:
         try:
             for place, value in self.writes:
                 place.copy_(value)
+            for sums, place, value in self.splats:
+                sums.index_copy_(2, place, value)
         except Exception as error:
             if not ran_out(error):
                 raise
@@ -71,18 +76,27 @@ def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
     piece = Piece()
     first, pixels, sample, samples = span
     if wave.integrator.light:
-        radiance = tensors.brought(wave, wave.rays(*span, plate), piece.tally).view(3, samples, pixels)
+        splats: list[Splats] = []
+        brought = tensors.brought(wave, wave.rays(*span, plate), piece.tally, splats=splats)
+        radiance = brought.view(3, samples, pixels)
         finite = torch.isfinite(radiance).all(0)
         if not bool(finite.all()):
             piece.lost = Lost.of(radiance, first, sample, wave.crop, plate)
             radiance = torch.where(finite, radiance, 0.0)
         clamp = wave.integrator.clamp
         if clamp is not None:
-            clamped = radiance * clamp_scale(radiance, clamp)
-            sums = torch.stack((radiance.double().sum(), clamped.double().sum()))
-            piece.writes.append((light, light + sums))
-            radiance = clamped
+            before = radiance.double().sum() + sum(one.value.double().sum() for one in splats)
+            radiance = radiance * clamp_scale(radiance, clamp)
+            splats = [replace(one, value=one.value * clamp_scale(one.value, clamp)) for one in splats]
+            after = radiance.double().sum() + sum(one.value.double().sum() for one in splats)
+            piece.writes.append((light, light + torch.stack((before, after))))
         piece.writes += plate.film.after(radiance, first, sample)
+        if plate.film.splats is not None and splats:
+            lane, pixel, value = (
+                torch.cat([getattr(one, name) for one in splats], -1) for name in ("lane", "pixel", "value")
+            )
+            stream = plate.film.stream(sample + lane // pixels)
+            piece.splats.append(plate.film.splats.after(stream, pixel, value))
     if plate.layers:
         piece.tally.rays += pixels * samples
         for name, values in tensors.layers(wave, tuple(plate.layers), *span, plate).items():

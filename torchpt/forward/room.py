@@ -18,7 +18,9 @@ PICTURES = 80
 SMALL = 2**28
 
 
-def check_room(width: int, height: int, streams: int, layers: Sequence[int], device: torch.device) -> None:
+def check_room(
+    width: int, height: int, streams: int, layers: Sequence[int], device: torch.device, splats: bool = False
+) -> None:
     """Refuse a film that would end the process, before a byte of it is touched.
 
     Args:
@@ -27,12 +29,15 @@ def check_room(width: int, height: int, streams: int, layers: Sequence[int], dev
         streams: randomizations of the picture's samples.
         layers: how many channels each layer has.
         device: where the films lie.
+        splats: whether samples light other pixels than their own.
 
     Raises:
         SceneError: it takes more memory than there is.
     """
     pixels = width * height
-    needed = Film.bytes_of(pixels, streams) + sum(Film.bytes_of(pixels, 1, channels) for channels in layers)
+    needed = Film.bytes_of(pixels, streams, splats=splats) + sum(
+        Film.bytes_of(pixels, 1, channels) for channels in layers
+    )
     needed += PICTURES * pixels
     if needed < SMALL:
         return

@@ -116,8 +116,9 @@ class Run:
     def _begin(self) -> None:
         """Nothing is sampled yet."""
         device, streams = self.device, self.wave.sampler.streams
-        check_room(self.width, self.height, streams.count, [len(x.channels) for x in self.seen.values()], device)
-        film = Film(self.width, self.height, streams.count, device)
+        splats, channels = self.integrator.splats, [len(x.channels) for x in self.seen.values()]
+        check_room(self.width, self.height, streams.count, channels, device, splats)
+        film = Film(self.width, self.height, streams.count, device, splats=splats)
         layers = {
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
         }

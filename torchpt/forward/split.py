@@ -131,7 +131,7 @@ class Split:
         sent = torch.cat([value.reshape(-1).view(torch.int64) for value in own.state().values()])
         for rank, values in enumerate(self.group.gather(sent)):
             places = dealt(whole.width * whole.height, rank, self.group.size).to(sent.device)
-            part = Film(len(places), 1, whole.randomizations, sent.device, whole.channels)
+            part = whole.part(len(places))
             state, first = {}, 0
             for name, value in part.state().items():
                 state[name] = values[first : first + value.numel()].view(value.dtype).view(value.shape)

@@ -21,6 +21,7 @@ from torchpt.forward.waves import say_once
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
+from torchpt.integrators.plan import Plan
 from torchpt.integrators.vertex import StageContext
 from torchpt.integrators.wave import Wave
 from torchpt.records import World
@@ -68,14 +69,15 @@ def make_wave(
     points = points_of(settings.sampler)
     plan = integrator.plan(points, dtype, tape, attached)
     camera = _camera(scene, settings, params, dtype)
+    crop = film.crop or (0, 0, film.width, film.height)
     return Wave(
-        context=StageContext(plan, world, _pixel_of(world, camera)),
+        context=_context(plan, world, camera, crop, integrator),
         integrator=integrator,
         accel=accel,
         camera=camera,
         filter=_filter(film.filter.kind, tuple(film.filter.values.items()), scene.device),
         sampler=Sampler(points, settings.render.seed, streams_of(settings), spp, film.width),
-        crop=film.crop or (0, 0, film.width, film.height),
+        crop=crop,
         centre=scene.space.shift,
         first=_first(scene, integrator, world, own) if like is None else like.first,
     )
@@ -114,7 +116,7 @@ def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, T
     if not wave.integrator.lit:
         world = replace(world, lights=None)
     camera = scene.camera(settings.film, scene.merged(params), wave.context.plan.dtype)
-    context = replace(wave.context, world=world, pixel=_pixel_of(world, camera))
+    context = _context(wave.context.plan, world, camera, wave.crop, wave.integrator)
     return replace(wave, context=context, camera=camera, first=None if wave.first is None else wave.first.again(world))
 
 
@@ -157,6 +159,14 @@ def _dark(scene: Scene, world: World, own: bool) -> World:
     return keeper.dark[1]
 
 
+def _context(
+    plan: Plan, world: World, camera: Camera, crop: tuple[int, int, int, int], integrator: Integrator
+) -> StageContext:
+    """Return what the stages of a render read beside their lanes."""
+    context = StageContext(plan, world, _pixel_of(world, camera))
+    return replace(context, camera=camera, crop=crop) if integrator.splats else context
+
+
 def _pixel_of(world: World, camera: Camera) -> Tensor | None:
     """Return what textures filtered by the pixel's footprint need of the camera; None where there are none."""
     return camera.pixel() if world.textures.filtered else None
@@ -184,7 +194,7 @@ def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kerne
     """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
     packets = wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.own_transmit
-    fused = packets and opaque and wave.first is None
+    fused = packets and opaque and wave.first is None and not wave.integrator.splats
     kernels = Kernels(wave, packets, fused, before, fixed=not scene.own_models)
     own = [
         k

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from torchpt.records import PathState, World
     from torchpt.samplers import Points
 
-__all__ = ["ENDLESS", "LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits", "check_fields"]
+__all__ = ["ENDLESS", "LIGHT_CHOICE", "SAMPLES", "STRATEGY", "Integrator", "Limits", "check_fields", "check_output"]
 
 #: Where ``max_depth`` is -1 roulette ends the paths; after this many vertices they are ended, and counted. Of a million million
 #: paths that lose nothing none comes so far (``DEEP_CAP``): only those are cut that roulette was told to leave alone.
@@ -90,6 +90,7 @@ class Integrator(Valued):
         layers: layers that are shown where ``film.aovs`` names none.
         lit: whether it sees the scene's lights; else its world has none.
         fields: what its paths carry beside the state of every path.
+        splats: whether its surfaces send light to other pixels than a sample's own.
         strategy, rr_prob, light_choice, clamp, strict: as for ``path``, where the kind has no such parameter.
     """
 
@@ -98,6 +99,7 @@ class Integrator(Valued):
     layers: ClassVar[tuple[str, ...]] = ()
     lit: ClassVar[bool] = True
     fields: ClassVar[Sequence[Field]] = ()
+    splats: ClassVar[bool] = False
 
     strategy: str = "mis"
     rr_prob: float | None = None
@@ -162,11 +164,22 @@ class Integrator(Valued):
         """Return True where it carries fields or has stages of its own, for which kernels are made anew."""
         kind, base = type(self), Integrator
         own = any(getattr(kind, name) is not getattr(base, name) for name in ("emit", "escape", "bounce", "transmit"))
-        return own or bool(self.fields)
+        return own or bool(self.fields) or self.splats
 
     def first(self, world: World) -> FirstSurface | None:
         """Return what happens at first surfaces, made once a scene and differentiable in its world; None: paths go on."""
         return None
+
+
+def check_output(integrator: Integrator, output: VertexOutput) -> None:
+    """Refuse what a stage made of surfaces where it is not what its integrator declares.
+
+    Raises:
+        SceneError: names the field, see :func:`check_fields`, or ``splats``.
+    """
+    check_fields(integrator, output.leaving)
+    if output.splat is not None and not integrator.splats:
+        raise SceneError("integrator.splats", False, f"true, as {integrator.name} returns some")
 
 
 def check_fields(integrator: Integrator, state: PathState) -> None:

@@ -14,12 +14,15 @@ import torch
 from torch import Tensor
 
 from torchpt.core.tree import leaves
+from torchpt.film.splats import LARGEST
+from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.plan import Plan
-from torchpt.integrators.vertex import EXTRA, Emission, StageContext, VertexInput
+from torchpt.integrators.vertex import EXTRA, Emission, Splat, StageContext, VertexInput
 from torchpt.integrators.wave import Bounce
+from torchpt.math.vectors import take
 from torchpt.records import Hit, PathState, Shadow
 
-__all__ = ["Before", "Behind", "bounce", "gather"]
+__all__ = ["Before", "Behind", "bounce", "gather", "splatted"]
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ def bounce(
     clear: Callable[[Shadow], Tensor],
     behind: Behind,
     others: Others,
+    splat: Callable[[Splat], tuple[Tensor, Tensor]] | None = None,
 ) -> Before:
     """Go back through what happens at surfaces.
 
@@ -94,6 +98,7 @@ def bounce(
         clear: how much of the light of shadow rays gets through.
         behind: what is asked of what the vertex hands on.
         others: tensors whose derivatives are wanted too, asked for after the stage ran.
+        splat: says what splats bring to other pixels ``(3, n)``, differentiable, and the cotangents of these.
     """
 
     def found(_: PathState) -> Hit:
@@ -114,6 +119,8 @@ def bounce(
                 asked.append((shadow.radiance * passed, behind.radiance))
             else:
                 asked.append((shadow.radiance, behind.radiance * passed))
+        if output.splat is not None and splat is not None:
+            asked.append(splat(output.splat))
         return _back(asked, given, others)
 
 
@@ -136,6 +143,22 @@ def gather(
     with torch.enable_grad():
         vertex, given = _given(context.plan, vertex)
         return _back([(stage(context, vertex).brought, radiance)], given, others)
+
+
+def splatted(clamp: float | None, cotangent: Tensor, splat: Splat, clear: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what splats bring to pixels ``(3, n)``, differentiable, and its cotangents.
+
+    Args:
+        clamp: bound on what one brings.
+        cotangent: ``(3, H W)`` of the picture, over the samples of a pixel.
+        splat: of n lanes.
+        clear: ``(n,)`` how much of its light gets through.
+    """
+    value = splat.light.radiance * clear
+    with torch.no_grad():
+        counts = (splat.pixel >= 0) & (value.abs() < LARGEST).all(0)
+        asked = torch.where(counts, take(cotangent, splat.pixel.clamp_min(0)), 0.0)
+    return value if clamp is None else value * clamp_scale(value, clamp), asked
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from torchpt.integrators.plan import Plan
 from torchpt.records import Hit, Interaction, LightSample, PathState, Shadow, World
 
 if TYPE_CHECKING:
+    from torchpt.cameras import Camera
     from torchpt.integrators.surfaces import Surface
 
 __all__ = [
@@ -25,17 +26,25 @@ __all__ = [
     "Drawn",
     "Emission",
     "Field",
+    "Splat",
     "StageContext",
     "Transmission",
     "VertexInput",
     "VertexOutput",
     "no_search",
+    "no_shadow",
 ]
 
 
 def no_search(state: PathState) -> Hit:
     """Stand for a search in stages that must not ask for one."""
     raise AssertionError("hits are found between stages where no geometry is differentiated")
+
+
+def no_shadow(state: PathState) -> Shadow:
+    """Return shadow rays for the lanes of paths that bring no light."""
+    nothing = torch.zeros_like(state.o)
+    return Shadow(nothing, nothing, torch.zeros_like(state.t_max), nothing)
 
 
 #: What names of fields begin with where they stand beside those of a path's state.
@@ -88,6 +97,8 @@ class StageContext:
         slide: whether points slide along their rays, see :func:`torchpt.shapes.interact`.
         roulette: the most that roulette lets paths survive with; 0: it does not play.
         search: finds the hits of rays that leave; called only where ``plan.attached``.
+        camera: that took the picture; None for an integrator without splats.
+        crop: ``(x, y, width, height)`` of the picture on the camera's film; likewise.
     """
 
     plan: Plan
@@ -97,6 +108,8 @@ class StageContext:
     slide: bool = False
     roulette: float = 0.0
     search: Callable[[PathState], Hit] = no_search
+    camera: Camera | None = None
+    crop: tuple[int, int, int, int] | None = None
 
     def at(
         self,
@@ -195,6 +208,21 @@ class Drawn:
 
 
 @dataclass(frozen=True)
+class Splat:
+    """Light that a vertex sends to pixels other than its sample's own.
+
+    A pixel of a picture of N pixels gets what comes to it, over the samples a pixel. The pixel has no derivative.
+
+    Attributes:
+        pixel: ``(n,)`` int64: of the picture, counted row by row; -1: none.
+        light: shadow rays whose light it is; those with ``t_max`` 0 pass everything.
+    """
+
+    pixel: Tensor
+    light: Shadow
+
+
+@dataclass(frozen=True)
 class VertexOutput:
     """Results of a vertex on surfaces of one BSDF model.
 
@@ -203,6 +231,7 @@ class VertexOutput:
         following: what these rays met, where that had to be found already.
         shadow: shadow rays whose light is still to be added; None where no light is sampled.
         at: the points.
+        splat: light to other pixels; None where there is none. Only of integrators that say that they have ``splats``.
         surface: with its material; None where nobody asked for it.
         direct: the light that was sampled; None where none was.
         drawn: the direction that the BSDF gave; None where paths end here.
@@ -219,3 +248,4 @@ class VertexOutput:
     drawn: Drawn | None = None
     carried: Tensor | None = None
     chance: Tensor | None = None
+    splat: Splat | None = None

@@ -17,12 +17,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from torchpt.engines.kernels.calls import Calls
 from torchpt.engines.kernels.eager import bounce_eagerly
 from torchpt.engines.kernels.kernels import Kernel, Kernels
 from torchpt.engines.kernels.rows import Memory
 from torchpt.engines.kernels.search import ChunkSearch
+from torchpt.film.splats import LARGEST, Splats
 from torchpt.integrators import LAYERS
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
@@ -89,6 +91,7 @@ class Worker:
         slots: radiance of the chunk's samples.
         shown: layers of the chunk's samples, once they were asked for.
         tally: rays and paths of the chunk.
+        splats: what its samples bring to other pixels.
     """
 
     def __init__(self, kernels: Kernels, halt: threading.Event | None = None) -> None:
@@ -98,6 +101,8 @@ class Worker:
         self.slots = self.calls.slots
         self.shown: Memory | None = None
         self.tally = Tally()
+        self.splats: list[Splats] = []
+        self._lost: list[np.ndarray] = []  # samples with splats that are not finite
         self._rooms = [self._room() for _ in range(2)]
 
     def _room(self) -> Paths:
@@ -118,7 +123,13 @@ class Worker:
         """Fill ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
         self.tally = Tally()
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
+        self.mark_lost()
         return self.tally
+
+    def mark_lost(self) -> None:
+        """Make samples NaN, all of whose paths ended, where a splat of theirs is not finite."""
+        for lanes in self._lost:
+            self.slots.floats[:3, lanes] = np.nan
 
     def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
         """Fill ``shown`` with layers of the first surfaces, channel after channel; return how many rays it took."""
@@ -148,6 +159,7 @@ class Worker:
         """Start the paths of a chunk at the camera; where the search is inside of the stages with their first hits."""
         self.start(chunk)
         kernels, calls = self.kernels, self.calls
+        self.splats, self._lost = [], []
         count, places = chunk.pixels * chunk.samples, None if chunk.plate is None else chunk.plate.places
         paths, source = self._begin(self.room(1), 1, count), self.room(1).arena
         calls.clear()
@@ -259,9 +271,32 @@ class Worker:
 
     def occlude(self, paths: Paths) -> None:
         """See :class:`torchpt.paths.walk.Engine`; the light itself is added where lanes are listed."""
-        paths.shadows = "shadow_o" in self.kernels.state
+        rows = self.kernels.state
+        paths.shadows = "shadow_o" in rows
+        if "splat_o" in rows:
+            self._splat(paths)
         if paths.shadows:
             self.search.light(paths.arena, paths.count)
+
+    def _splat(self, paths: Paths) -> None:
+        """Note the light of splats that gets through; a sample with one that is not finite is lost."""
+        rows, floats, words, n = self.kernels.state, paths.arena.floats, paths.arena.words, paths.count
+        splat, shadow = (slice(rows.first(f"{name}_o"), rows.first(f"{name}_radiance")) for name in ("splat", "shadow"))
+        own = words[shadow, :n].copy()  # the search reads rays in the rows of shadow rays
+        words[shadow, :n] = words[splat, :n]
+        self.search.light(paths.arena, n)
+        words[shadow, :n] = own
+        clear = floats[rows.first("clear"), :n] if "clear" in rows else words[rows.first("blocked"), :n] == 0
+        floats[rows.first("splat_clear"), :n] = clear
+        pixel, first = words[rows.first("splat_pixel"), :n], rows.first("splat_radiance")
+        value = floats[first : first + 3, :n] * floats[rows.first("splat_clear"), :n]
+        comes, finite = (pixel >= 0) & (clear != 0), (np.abs(value) < LARGEST).all(0)
+        lane, on = words[rows.first("lane"), :n].astype(np.int64), comes & finite
+        parts = lane[on], pixel[on].astype(np.int64), value[:, on]
+        self.splats.append(Splats(*(torch.from_numpy(part) for part in parts)))
+        lost = comes & ~finite
+        if lost.any():
+            self._lost.append(lane[lost])
 
 
 class _Layers(Observer[Paths]):

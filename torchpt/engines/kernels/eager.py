@@ -7,9 +7,9 @@ from torch import Tensor
 
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.engines.kernels.rows import HIT, Memory, path_state, state_values
-from torchpt.integrators.base import check_fields
-from torchpt.integrators.vertex import VertexInput
-from torchpt.records import Hit
+from torchpt.integrators.base import check_output
+from torchpt.integrators.vertex import Splat, VertexInput, no_shadow
+from torchpt.records import Hit, Shadow
 from torchpt.samplers import salts
 
 __all__ = ["bounce_eagerly"]
@@ -48,16 +48,17 @@ def bounce_eagerly(
         vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
         context = kernels.wave.context.at(salts(depth, torch.device("cpu")), roulette=roulette)
         output = kernels.wave.bounce(context, model, vertex)
-        check_fields(kernels.wave.integrator, output.leaving)
-        after, shadow = output.leaving, output.shadow
+        check_output(kernels.wave.integrator, output)
+        after, none = output.leaving, no_shadow(output.leaving)
+        shadow = none if output.shadow is None else output.shadow
+        splat = Splat(torch.full_like(after.lane, -1), none) if output.splat is None else output.splat
     values: dict[str, Tensor | None] = {**state_values(after)}
     values |= rows.take(source, lanes, ("weight",))
-    if "shadow_o" in rows:
-        values |= {
-            "shadow_o": after.o if shadow is None else shadow.o,
-            "shadow_d": after.d if shadow is None else shadow.d,
-            "shadow_t": torch.zeros_like(after.t_max) if shadow is None else shadow.t_max,
-            "shadow_radiance": torch.zeros_like(after.o) if shadow is None else shadow.radiance,
-        }
+    values |= {f"shadow_{name}": value for name, value in _named(shadow).items()}
+    values |= {f"splat_{name}": value for name, value in _named(splat.light).items()} | {"splat_pixel": splat.pixel}
     rows.put(target, start, values)
-    return 0 if shadow is None else count
+    return count * (int(output.shadow is not None) + int(output.splat is not None))
+
+
+def _named(light: Shadow) -> dict[str, Tensor]:
+    return {"o": light.o, "d": light.d, "t": light.t_max, "radiance": light.radiance}

@@ -19,7 +19,7 @@ from torchpt.engines.kernels.rows import HIT, Fields, Rows
 from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Before, Behind
-from torchpt.integrators.vertex import EXTRA, VertexInput
+from torchpt.integrators.vertex import EXTRA, Splat, VertexInput
 from torchpt.lanes.graph import Unsupported
 from torchpt.lanes.operators.derivatives import summands
 from torchpt.lanes.sinks import Scatter, Sinks
@@ -42,13 +42,15 @@ SLOTS: Fields = {
     "clear": ((), "f"),
     **HIT,
 }
+#: With splats: how much of the light of the latest one got through.
+_SPLAT: Fields = {"splat_clear": ((), "f")}
 
 
 def slots_of(layout: Layout) -> Fields:
     """Return what lies in slots, with what is asked of the numbers that an integrator carries along."""
     carried = layout.wave.integrator.fields
     extra = {EXTRA + own.name: ((own.rows,) if own.rows > 1 else (), "f") for own in carried if not own.whole}
-    return {**SLOTS, **extra}
+    return {**SLOTS, **extra, **(_SPLAT if layout.wave.integrator.splats else {})}
 
 
 class _Noted:
@@ -90,11 +92,16 @@ def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks
     def clear(_: Shadow) -> Tensor:
         return rows["clear"]
 
+    integrator, cotangent = trace.layout.wave.integrator, kernels.cotangent
+
+    def landed(splat: Splat) -> tuple[Tensor, Tensor]:
+        return joint.splatted(integrator.clamp, cotangent, splat, rows["splat_clear"])
+
     noted = _Noted(tracer, kernels)
     with tracer, gathered_by(noted):
         context = kernels.taped.at(salts, slide, roulette)
-        stage, vertex = trace.layout.wave.integrator.bounce, VertexInput(state, hit)
-        before = joint.bounce(stage, context, model, vertex, following, clear, behind, noted.leaves)
+        vertex = VertexInput(state, hit)
+        before = joint.bounce(integrator.bounce, context, model, vertex, following, clear, behind, noted.leaves, landed)
     return _ended(trace, noted, state, before, {})
 
 
@@ -129,18 +136,19 @@ def report(trace: Trace) -> Sinks:
     lane = layout.state.read(tracer, "lane")["lane"]
     hit = layout.state.read(tracer, *HIT)
     light = layout.state.read(tracer, "clear", "blocked")
-    slots = Rows(SLOTS)
+    splat = layout.state.read(tracer, *_SPLAT)
+    slots = Rows(slots_of(layout))
     with tracer:
         clear = light["clear"] if "clear" in light else torch.zeros(tracer.lanes)
         if "blocked" in light and "clear" not in light:
             clear = (light["blocked"] == 0).to(torch.float32)
-    rows = tuple(slots.nodes(tracer, clear=clear, **hit))
+    rows = tuple(slots.nodes(tracer, clear=clear, **hit, **splat))
     return Sinks(scatter=[Scatter(-1, trace.node(lane), rows, slots=True)])
 
 
 def slots_read(kernels: JointKernels) -> tuple[str, ...]:
     """Return the names of what a vertex reads of the slots."""
-    extra = tuple(name for name in slots_of(kernels) if name.startswith(EXTRA))
+    extra = tuple(name for name in slots_of(kernels) if name.startswith(EXTRA) or name in _SPLAT)
     return (*SLOTS, *extra) if kernels.taped.plan.attached else ("radiance", "throughput", "clear", *extra)
 
 

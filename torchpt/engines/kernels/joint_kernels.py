@@ -27,6 +27,7 @@ class JointKernels(Kernels):
         plain: tensors that are differentiated, as the wave has them.
         tapes: their leaves.
         packets: see :class:`~torchpt.engines.kernels.layout.Layout`.
+        cotangent: ``(3, H W)`` float32 of the picture, over the samples of a pixel: what splats read.
 
     Attributes:
         taped: what stages read where they are gone back along.
@@ -36,9 +37,16 @@ class JointKernels(Kernels):
     """
 
     def __init__(
-        self, wave: Wave, taped: Wave, plain: Sequence[Tensor], tapes: Sequence[Tensor], packets: bool
+        self,
+        wave: Wave,
+        taped: Wave,
+        plain: Sequence[Tensor],
+        tapes: Sequence[Tensor],
+        packets: bool,
+        cotangent: Tensor | None = None,
     ) -> None:
-        super().__init__(still_of(wave), packets, False)
+        super().__init__(still_of(wave), packets, False, cotangent=cotangent)
+        self.cotangent = cotangent
         self.taped = taped.context
         self.plain, self.tapes = tuple(plain), tuple(tapes)
         self.numbers_of = {id(tape): number for number, tape in enumerate(tapes)}

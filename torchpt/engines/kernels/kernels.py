@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchpt.core.tree import fingerprint, signature
 from torchpt.engines.kernels import output, transmission, vertex
@@ -51,6 +52,7 @@ class Kernels(Layout):
         fused: see there.
         before: kernels of another render, whose tables are taken over where they are made of the same tensors.
         fixed: whether a world says the same of itself as long as it is the same one; models of the caller's own may not.
+        cotangent: see :class:`~torchpt.engines.kernels.joint_kernels.JointKernels`.
 
     Attributes:
         eager: models whose stage does what no kernel can, and what that is; they run as tensor operations.
@@ -62,7 +64,13 @@ class Kernels(Layout):
     """
 
     def __init__(
-        self, wave: Wave, packets: bool, fused: bool, before: Kernels | None = None, fixed: bool = False
+        self,
+        wave: Wave,
+        packets: bool,
+        fused: bool,
+        before: Kernels | None = None,
+        fixed: bool = False,
+        cotangent: Tensor | None = None,
     ) -> None:
         super().__init__(wave, packets, fused)
         self._leaves = Leaves(
@@ -74,12 +82,13 @@ class Kernels(Layout):
                 "centre": wave.centre,
                 "pixel": wave.context.pixel,
                 "first": wave.first,
+                "cotangent": cotangent,
             },
             None if before is None else before._leaves,
         )
         same = fixed and before is not None and before.world is self.world
         self._of_world = before._of_world if same else signature(self.world)  # pyright: ignore[reportOptionalMemberAccess]
-        own = fingerprint(wave.integrator) if wave.integrator.own_stages else None
+        own = (fingerprint(wave.integrator), wave.context.crop) if wave.integrator.own_stages else None
         asked = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, asked), packets, fused)
         alike = before is not None and before.structure == self.structure

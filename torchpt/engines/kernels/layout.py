@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from torchpt import lights
-from torchpt.engines.kernels.rows import HIT, PASS, SHADOW, Fields, Rows
+from torchpt.engines.kernels.rows import HIT, PASS, SHADOW, SPLAT, Fields, Rows
 from torchpt.integrators.vertex import EXTRA
 
 if TYPE_CHECKING:
@@ -89,7 +89,10 @@ def _path_fields(layout: Layout) -> Fields:
     if wave.filter.signed:
         fields["weight"] = ((), "f")
     fields |= HIT
-    if not layout.fused and (world.lights is not None if wave.first is None else wave.first.shadows(world)):
+    if wave.integrator.splats:
+        fields |= SPLAT
+    shadows = world.lights is not None if wave.first is None else wave.first.shadows(world)
+    if not layout.fused and (shadows or wave.integrator.splats):
         fields |= SHADOW
         if layout.has_opacity:
             fields["clear"] = ((), "f")

@@ -17,7 +17,7 @@ from torchpt.lanes.graph import DTYPES
 from torchpt.lanes.tracing import Tracer
 from torchpt.records import PathState
 
-__all__ = ["HIT", "PASS", "SHADOW", "Fields", "Memory", "Rows", "path_state", "state_values"]
+__all__ = ["HIT", "PASS", "SHADOW", "SPLAT", "Fields", "Memory", "Rows", "path_state", "state_values"]
 
 #: Shape without lanes and node type of each field.
 Fields = dict[str, tuple[tuple[int, ...], str]]
@@ -29,6 +29,15 @@ SHADOW: Fields = {
     "shadow_d": ((3,), "f"),
     "shadow_t": ((), "f"),
     "shadow_radiance": ((3,), "f"),
+}
+#: Fields of light to another pixel: its shadow ray, and how much of it gets through.
+SPLAT: Fields = {
+    "splat_pixel": ((), "l"),
+    "splat_o": ((3,), "f"),
+    "splat_d": ((3,), "f"),
+    "splat_t": ((), "f"),
+    "splat_radiance": ((3,), "f"),
+    "splat_clear": ((), "f"),
 }
 PASS: Fields = {
     "pass_o": ((3,), "f"),

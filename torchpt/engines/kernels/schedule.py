@@ -17,6 +17,7 @@ from torchpt.engines.kernels.chunk import LANES, Chunk, Worker
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.errors import RenderError
 from torchpt.film import Film
+from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
@@ -285,6 +286,7 @@ class Loop:
         with needing("the sums of a film"):
             if light:
                 self._radiance(worker, chunk, plate, share)
+                self._splats(worker, chunk, plate.film, share)
             if names:
                 self._layers(worker, chunk, plate)
         share.tally.rays += rays
@@ -302,6 +304,20 @@ class Loop:
         before = float(np.where(finite, used, 0.0).sum(dtype=np.float64))
         self._deposit(worker, values, chunk, plate.film, 3, self.clamp)
         share.light = share.light[0] + before, share.light[1] + float(np.ascontiguousarray(used).sum(dtype=np.float64))
+
+    def _splats(self, worker: Worker, chunk: Chunk, film: Film, share: Share) -> None:
+        """Add what a chunk's samples bring to other pixels."""
+        before = after = 0.0
+        for splats in worker.splats:
+            assert film.splats is not None
+            value = splats.value
+            if self.clamp is not None:
+                before += float(value.sum(dtype=torch.float64))
+                value = value * clamp_scale(value, self.clamp)
+                after += float(value.sum(dtype=torch.float64))
+            stream = film.stream(chunk.first_sample + splats.lane // chunk.pixels)
+            film.splats.add(stream, splats.pixel, value)
+        share.light = share.light[0] + before, share.light[1] + after
 
     def _layers(self, worker: Worker, chunk: Chunk, plate: Plate) -> None:
         assert worker.shown is not None

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchpt.engines.kernels.packets import nearest, occluded
 from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators import stages
-from torchpt.integrators.base import check_fields
-from torchpt.integrators.vertex import VertexInput
+from torchpt.integrators.base import check_output
+from torchpt.integrators.vertex import Splat, VertexInput, no_shadow
 from torchpt.lanes.sinks import Pack, Scatter, Sinks
 from torchpt.records import PathState, Shadow
 from torchpt.samplers import Dimension, Draws
@@ -118,10 +118,10 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
     with tracer:
         context = layout.wave.context.at(salts, roulette=roulette)
         output = layout.wave.bounce(context, model, VertexInput(state, hit))
-        check_fields(layout.wave.integrator, output.leaving)
+        check_output(layout.wave.integrator, output)
     after, shadow = output.leaving, output.shadow
     if not layout.fused:
-        return _with_shadow(trace, after, shadow, unseen)
+        return _with_shadow(trace, after, shadow, output.splat, unseen)
     sinks = Sinks(shadows=int(shadow is not None))
     if shadow is not None:
         blocked = occluded(tracer, shadow.o, shadow.d, shadow.t_max)
@@ -144,16 +144,29 @@ def _searched(trace: Trace, sinks: Sinks, state: PathState, unseen: dict[str, Te
     sinks.pack.append(Pack(on, tuple(rows), 0, tuple(notes)))
 
 
-def _with_shadow(trace: Trace, state: PathState, shadow: Shadow | None, unseen: dict[str, Tensor]) -> Sinks:
+def _with_shadow(
+    trace: Trace, state: PathState, shadow: Shadow | None, splat: Splat | None, unseen: dict[str, Tensor]
+) -> Sinks:
     """Search later: all lanes are kept, with the shadow rays that are still to be searched."""
     tracer, rows = trace.tracer, trace.layout.state
-    sinks = Sinks(shift=0, write=trace.kept(state, unseen), shadows=int(shadow is not None))
+    sinks = Sinks(shift=0, write=trace.kept(state, unseen), shadows=int(shadow is not None) + int(splat is not None))
     if "shadow_o" not in rows:
         return sinks
     with tracer:
-        if shadow is None:
-            nothing = torch.zeros_like(state.o)
-            shadow = Shadow(nothing, nothing, torch.zeros_like(state.t_max), nothing)
+        shadow = no_shadow(state) if shadow is None else shadow
+    if "splat_o" in rows:
+        if splat is None:
+            with tracer:
+                splat = Splat(torch.full_like(state.lane, -1), no_shadow(state))
+        light = splat.light
+        sinks.write += rows.nodes(
+            tracer,
+            splat_pixel=splat.pixel,
+            splat_o=light.o,
+            splat_d=light.d,
+            splat_t=light.t_max,
+            splat_radiance=light.radiance,
+        )
     sinks.write += rows.nodes(
         tracer,
         shadow_o=shadow.o,
