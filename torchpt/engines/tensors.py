@@ -21,7 +21,7 @@ from torchpt.integrators.base import check_fields, check_output
 from torchpt.integrators.path import Ends, partition, slides
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
-from torchpt.integrators.transmission import PASSES, beyond, non_opaque, opacity_at
+from torchpt.integrators.transmission import beyond, non_opaque, opacity_at
 from torchpt.integrators.vertex import Emission, Splat, StageContext, VertexInput, VertexOutput
 from torchpt.integrators.wave import Wave
 from torchpt.math.vectors import take
@@ -152,7 +152,7 @@ class Tensors:
         flight = paths.flight
         if flight is None or not len(flight.lanes):
             return False
-        salt = salts(paths.depth + flight.step * PASSES, flight.lanes.device)
+        salt = salts(paths.depth, flight.lanes.device, flight.step)
         out = self.wave.integrator.transmit(self.context.at(salt), VertexInput(flight.state, flight.hit))
         hit, on = paths.met, out.on.nonzero().squeeze(1)
         if out.chance is not None:

@@ -17,10 +17,7 @@ from torchpt.records import Hit, World, rows
 from torchpt.samplers import Dimension, Draws
 from torchpt.shapes import interact, offset_origin
 
-__all__ = ["PASSES", "beyond", "non_opaque", "opacity_at", "times_map", "transmit"]
-
-#: Beyond the depth of any path: names the numbers for the second, third, ... surface that a ray passes.
-PASSES = 1 << 13
+__all__ = ["beyond", "non_opaque", "opacity_at", "times_map", "transmit"]
 
 
 def opacity_at(world: World, o: Tensor, d: Tensor, hit: Hit, miss: float) -> Tensor:

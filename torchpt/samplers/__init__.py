@@ -160,6 +160,6 @@ class Draws:
 
 
 @lru_cache(maxsize=4096)
-def salts(depth: int, device: torch.device) -> Tensor:
-    """The dimensions' names at path vertex ``depth``: ``(len(Dimension),)`` int32; 0 is the camera."""
-    return torch.tensor([salt(d, depth) for d in Dimension], dtype=torch.int32, device=device)
+def salts(depth: int, device: torch.device, step: int = 0) -> Tensor:
+    """Return the names ``(len(Dimension),)`` int32 of all dimensions at a vertex, or at a step on the way (:func:`salt`)."""
+    return torch.tensor([salt(d, depth, step) for d in Dimension], dtype=torch.int32, device=device)

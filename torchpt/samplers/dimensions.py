@@ -29,8 +29,19 @@ class Dimension(IntEnum):
 STREAMS = 16
 
 
-def salt(dimension: Dimension, depth: int) -> int:
-    """A signed 32-bit constant that names ``dimension`` at path vertex ``depth``."""
+#: Vertices between the numbers of one step on the way to a vertex and those of the next: only the numbers of paths that are
+#: longer meet those of steps.
+STEPS = 1 << 13
+
+
+def salt(dimension: Dimension, depth: int, step: int = 0) -> int:
+    """Return a signed 32-bit constant that names a random number.
+
+    Args:
+        dimension: its use.
+        depth: of the path vertex; 0 is the camera.
+        step: of the ray on its way to the vertex, through what lets rays pass.
+    """
     if dimension is Dimension.LED_HERE:
         dimension, depth = (Dimension.BSDF, depth - 1) if depth > 1 else (Dimension.PIXEL, 0)
-    return mix_int(0x9E3779B9 * (1 + depth * STREAMS + int(dimension)))
+    return mix_int(0x9E3779B9 * (1 + (depth + step * STEPS) * STREAMS + int(dimension)))

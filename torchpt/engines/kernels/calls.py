@@ -45,7 +45,7 @@ class Calls:
         self.slots = Memory(3)
         self._prepared: dict[int, tuple[Any, Any, int, tuple[tuple[int, str], ...], range]] = {}
         self._keep: list[Kernel] = []
-        self._salts: dict[int, Any] = {}
+        self._salts: dict[tuple[int, int], Any] = {}
         self._uniforms = {"place": self.place.ctypes.data}
 
     def serve(self, kernels: Kernels, halt: threading.Event) -> None:
@@ -62,11 +62,11 @@ class Calls:
         """Return how many lanes are in the arena, and how many in each list."""
         return int(self.counters[0]), self.counters[1 : self.kernels.models + 3].tolist()
 
-    def name_salts(self, depth: int) -> None:
-        """Set the depth whose random dimensions kernels draw from."""
-        known = self._salts.get(depth)
+    def name_salts(self, depth: int, step: int = 0) -> None:
+        """Set the vertex, or the step on the way there, whose random dimensions kernels draw from."""
+        known = self._salts.get((depth, step))
         if known is None:
-            known = self._salts[depth] = salts(depth, torch.device("cpu")).contiguous()
+            known = self._salts[depth, step] = salts(depth, torch.device("cpu"), step)
         self._uniforms["salts"] = known.data_ptr()
 
     def run(

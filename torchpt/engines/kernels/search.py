@@ -11,7 +11,6 @@ import numpy as np
 from torchpt.accel import Accel
 from torchpt.engines.kernels.calls import Calls
 from torchpt.engines.kernels.rows import Memory, Rows
-from torchpt.integrators.transmission import PASSES
 
 __all__ = ["ChunkSearch"]
 
@@ -45,7 +44,7 @@ class ChunkSearch:
             How many rays are still on their way.
         """
         kernels, calls = self.kernels, self.calls
-        calls.name_salts(depth + step * PASSES)
+        calls.name_salts(depth, step)
         source, target = self.passed[step % 2], self.passed[1 - step % 2]
         if step == 0:
             calls.clear()
