@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: relMSE is the mean of ``(x - ref)^2 / (ref^2 + FLOOR)`` over pixels and channels, as ``torchpt.film.RELMSE_FLOOR`` has it.
+#: relMSE is the mean of ``(x - ref)^2 / (ref^2 + FLOOR)`` over pixels and channels, as ``torchpt.images.metrics.FLOOR`` has it.
 FLOOR = 1e-2
 #: Scenes of few primitives, and of meshes or many lights.
 SIMPLE = ("cornell_box", "veach_mis", "material_row", "cornell_transmissive")

@@ -20,8 +20,8 @@ from mitsuba_scene import comparable, convert, find_llvm, load_mitsuba
 from torch import Tensor
 
 import torchpt
-from torchpt.film import RELMSE_FLOOR
 from torchpt.format.description import settings
+from torchpt.images.metrics import relative
 from torchpt.rendering import render_scene
 from torchpt.scene import Scene
 
@@ -103,9 +103,8 @@ def compare(mitsuba: Any, name: str, arguments: argparse.Namespace) -> dict[str,
         }
     more = torch.stack([contenders["torchpt sobol"](10_000 + seed) for seed in range(arguments.reference)])
     reference, variance = more.mean(0), more.var(0) / len(more)
-    scale = reference.square() + RELMSE_FLOOR
     errors = {
-        who: ((pictures - reference).square() / scale).mean((1, 2, 3)) - (variance / scale).mean()
+        who: relative((pictures - reference).square() - variance, reference).mean((1, 2, 3))
         for who, pictures in found.items()
     }
     return {who: (float(e.mean()), float(e.std() / math.sqrt(len(e)))) for who, e in errors.items()}

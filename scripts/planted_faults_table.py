@@ -507,8 +507,8 @@ FAULTS = (
         "images/metrics.py",
         "images reports",
         "_relative",
-        "ref**2 + floor",
-        "x**2 + floor",
+        "relative((x - ref).square(), ref, floor)",
+        "relative((x - ref).square(), x, floor)",
         "a statistic wrong: relMSE is relative to the picture, so that fireflies count little and dark pictures much",
     ),
     # -- renders, ranks, batches

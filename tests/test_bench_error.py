@@ -17,7 +17,7 @@ from bench_figures import Point, Reference, at_time, better, between, samples_in
 from bench_workers import Contender, Turn
 from few import few
 
-from torchpt.film import RELMSE_FLOOR
+from torchpt.images.metrics import FLOOR
 
 MULTIJITTER = bench_error.REFEREE
 
@@ -71,7 +71,7 @@ def test_the_variance_of_the_reference_is_subtracted() -> None:
     """A reference no better than the pictures doubles the squares, not the error."""
     mean = np.linspace(0.5, 2.5, 48 * 48 * 3).reshape(48, 48, 3)
     own, other = (Reference.of(list(noisy(4, mean, 0.2, seed))) for seed in (1, 2))
-    scale = mean**2 + RELMSE_FLOOR
+    scale = mean**2 + FLOOR
     truth = float((0.1**2 / scale).mean())
     picture = noisy(1, mean, 0.1, 3)[0]
     assert own.relmse(picture, scale) == pytest.approx(truth, rel=0.1)
@@ -89,7 +89,7 @@ def test_the_variance_of_the_reference_is_subtracted() -> None:
 def test_the_deviation_knows_of_the_reference() -> None:
     """Over many references the error varies no more than it says, nor much less; most of it the reference makes."""
     mean = np.full((16, 16, 3), 1.0)
-    scale = mean**2 + RELMSE_FLOOR
+    scale = mean**2 + FLOOR
     found = []
     for seed in range(200):
         reference = Reference.of(list(noisy(6, mean, 0.3, 3 * seed)))
@@ -107,7 +107,7 @@ def test_the_deviation_knows_of_the_reference() -> None:
 def test_pictures_of_the_reference_are_held_against_the_others() -> None:
     """Each tells the variance of one picture without bias, and their spread how sure the mean of them is."""
     mean = np.full((16, 16, 3), 1.0)
-    scale, found = mean**2 + RELMSE_FLOOR, []
+    scale, found = mean**2 + FLOOR, []
     for seed in range(300):
         pictures = noisy(5, mean, 0.1, seed)
         pictures[:, 0, 0] += (
@@ -131,7 +131,7 @@ def test_references_without_one_picture_are_those_of_the_others() -> None:
 
 
 def test_both_sides_are_divided_by_the_same() -> None:
-    assert bench_figures.FLOOR == RELMSE_FLOOR
+    assert bench_figures.FLOOR == FLOOR
     a, b = (Reference(np.full((2, 2, 3), value), np.zeros((2, 2, 3))) for value in (1.0, 3.0))
     assert np.array_equal(scale_of(a, b), np.full((2, 2, 3), 4.01)) and np.array_equal(scale_of(a, b), scale_of(b, a))
 

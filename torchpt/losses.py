@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-__all__ = ["l1", "l2", "relmse", "smape", "unbiased_relmse", "unbiased_squared_error"]
+from torchpt.images.metrics import FLOOR, relative, symmetric
 
-_FLOOR = 1e-2
+__all__ = ["l1", "l2", "relmse", "smape", "unbiased_relmse", "unbiased_squared_error"]
 
 
 def _same(*pictures: Tensor) -> None:
@@ -48,19 +48,19 @@ def l1(image: Tensor, target: Tensor) -> Tensor:
     return (image - target).abs().mean()
 
 
-def relmse(image: Tensor, target: Tensor, floor: float = _FLOOR) -> Tensor:
+def relmse(image: Tensor, target: Tensor, floor: float = FLOOR) -> Tensor:
     """Mean of ``(x - t)² / (t² + floor)`` (Rousselle et al. 2011, section 4.2): dark pixels count as much as bright ones.
 
     The target is the denominator, so this is quadratic in the picture.
     """
     _same(image, target)
-    return ((image - target).square() / (target.square() + floor)).mean()
+    return relative((image - target).square(), target, floor).mean()
 
 
-def smape(image: Tensor, target: Tensor, floor: float = _FLOOR) -> Tensor:
+def smape(image: Tensor, target: Tensor, floor: float = FLOOR) -> Tensor:
     """Mean of ``|x - t| / (|x| + |t| + floor)``: bounded, so that fireflies count little; of noisy pictures it is biased."""
     _same(image, target)
-    return ((image - target).abs() / (image.abs() + target.abs() + floor)).mean()
+    return symmetric(image, target, floor).mean()
 
 
 def unbiased_squared_error(a: Tensor, b: Tensor, target: Tensor) -> Tensor:
@@ -73,7 +73,7 @@ def unbiased_squared_error(a: Tensor, b: Tensor, target: Tensor) -> Tensor:
     return ((a - target) * (b - target)).mean()
 
 
-def unbiased_relmse(a: Tensor, b: Tensor, target: Tensor, scale: Tensor | None = None, floor: float = _FLOOR) -> Tensor:
+def unbiased_relmse(a: Tensor, b: Tensor, target: Tensor, scale: Tensor | None = None, floor: float = FLOOR) -> Tensor:
     """Mean of ``(a - t)(b - t) / (s² + floor)`` of two renders of one scene with different seeds.
 
     Args:
@@ -87,4 +87,4 @@ def unbiased_relmse(a: Tensor, b: Tensor, target: Tensor, scale: Tensor | None =
     """
     scale = target if scale is None else scale
     _same(a, b, target, scale)
-    return ((a - target) * (b - target) / (scale.detach().square() + floor)).mean()
+    return relative((a - target) * (b - target), scale.detach(), floor).mean()

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchpt.film import RELMSE_FLOOR, Film, filter_of
+from torchpt.film import Film, filter_of
+from torchpt.images.metrics import FLOOR
 
 CPU = torch.device("cpu")
 
@@ -45,7 +46,7 @@ def test_mean_and_variance_are_those_of_the_randomizations():
     variance = film.variance()
     assert variance is not None
     torch.testing.assert_close(variance, (groups.var(0) / 4).T.reshape(2, 3, 3))
-    assert film.relmse() == pytest.approx(float((variance / (film.mean() ** 2 + RELMSE_FLOOR)).mean()))
+    assert film.relmse() == pytest.approx(float((variance / (film.mean() ** 2 + FLOOR)).mean()))
     torch.testing.assert_close(film.first(), samples[:, 0].double().T.reshape(2, 3, 3))
 
 

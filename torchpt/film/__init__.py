@@ -15,13 +15,12 @@ import torch
 from torchpt.film.base import Filter
 from torchpt.film.known_error import KnownError
 from torchpt.film.pilots import Pilots, pilots_of
-from torchpt.film.sums import RELMSE_FLOOR, Film
+from torchpt.film.sums import Film
 from torchpt.spec import Kinds
 from torchpt.spec.declared import values_of
 
 __all__ = [
     "FILTERS",
-    "RELMSE_FLOOR",
     "Film",
     "Filter",
     "KnownError",

@@ -25,9 +25,9 @@ import torch
 from torch import Tensor
 
 from torchpt.film.pilots import Pilots
-from torchpt.film.sums import RELMSE_FLOOR
 from torchpt.film.tail import FEWEST as TAIL
 from torchpt.film.tail import heavy_tail
+from torchpt.images.metrics import relative
 from torchpt.math.threads import sum_all
 
 __all__ = [
@@ -98,7 +98,7 @@ def error_at(a: Tensor, b: Tensor, near: Tensor) -> Tensor:
         near: what lies around.
     """
     radiance = torch.stack((a, b, near)).median(0).values
-    return (a - b).square() / 2 / (radiance.square() + RELMSE_FLOOR)
+    return relative((a - b).square() / 2, radiance)
 
 
 def error_by_pilots(pilots: Pilots, a: Tensor, b: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ def to_look_at(picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor) -> tuple[T
     suspects = _suspects(picture)
     rest = ~torch.isin(pilots.places, suspects)
     low = torch.minimum(a, b).clamp_min(0.0)
-    doubt = ((a - b).square() / (low.square() + RELMSE_FLOOR)).mean(1) * rest
+    doubt = relative((a - b).square(), low).mean(1) * rest
     count = min(again_counts(len(rest), len(pilots))[1], int(rest.sum()))
     return suspects, pilots.places[doubt.topk(count).indices.sort().values]
 
@@ -210,7 +210,7 @@ def known_error(
     if again is not None:
         at = torch.isin(places, again.places[again.suspects :])  # in the order of the pilots, both
         radiance = torch.maximum(again.mean[again.suspects :].abs(), ((a[at] + b[at]) / 2 / BRIGHTER).abs())
-        share[at] = (a[at] - b[at]).square() / 2 / (radiance.square() + RELMSE_FLOOR)
+        share[at] = relative((a[at] - b[at]).square() / 2, radiance)
     share = share.mean(1)[rest] * first
     if not len(share):
         return None
@@ -231,7 +231,7 @@ def _first_part(a: Tensor, b: Tensor, spare: Tensor | None) -> float:
     """
     if spare is None:
         return 1.0
-    scale = 1.0 / (((a + b) / 2).square() + RELMSE_FLOOR)
+    scale = relative(1.0, (a + b) / 2)
     both, second = (float(sum_all((x * scale).clamp_max(1.0))) for x in ((a - b).square(), spare))
     return 2.0 * min(max(1.0 - second / both, 1 / 3), 0.5) if both > 0.0 else 1.0
 
@@ -248,7 +248,7 @@ def _neighbours(picture: Tensor, places: Tensor) -> Tensor:
 def _standing_out(values: Tensor, others: Tensor) -> Tensor:
     """By how much ``values (n, C)`` exceed the second brightest of ``others (8, n, C)``, relative to their mean ``(n,)``."""
     second = others.topk(2, 0).values[1]
-    return ((values - second).clamp_min(0.0).square() / (others.mean(0).square() + RELMSE_FLOOR)).mean(1)
+    return relative((values - second).clamp_min(0.0).square(), others.mean(0)).mean(1)
 
 
 def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
@@ -260,10 +260,9 @@ def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
         spare: its variance.
     """
     radiance, apart = torch.maximum(mean.abs(), values.abs() / BRIGHTEST), values - mean
-    below = radiance.square() + RELMSE_FLOOR
-    share = (apart.square() - spare) / below
+    share = relative(apart.square() - spare, radiance)
     # To the first order in the mean: channels move together, so their deviations add up.
-    slope = (2 * apart.abs() + 2 * radiance * share.abs()) / below
+    slope = relative(2 * apart.abs() + 2 * radiance * share.abs(), radiance)
     return float(sum_all(share.mean(1))), float(sum_all((slope * spare.sqrt()).mean(1).square()))
 
 

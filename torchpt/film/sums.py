@@ -7,12 +7,10 @@ import torch
 from torch import Tensor
 
 from torchpt.film.splats import SplatSums
+from torchpt.images.metrics import relative
 from torchpt.math.threads import mean_all
 
-__all__ = ["RELMSE_FLOOR", "Film"]
-
-#: relMSE is the mean of ``(x - ref)^2 / (ref^2 + RELMSE_FLOOR)`` over pixels and channels.
-RELMSE_FLOOR = 1e-2
+__all__ = ["Film"]
 
 
 class Film:
@@ -198,7 +196,7 @@ class Film:
         variance = self.variance()
         if variance is None:
             return None
-        return float(mean_all(variance / (self.mean() ** 2 + RELMSE_FLOOR)))
+        return float(mean_all(relative(variance, self.mean())))
 
 
 def _samples(counts: Tensor) -> Tensor:

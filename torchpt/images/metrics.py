@@ -4,7 +4,8 @@ All take linear RGB ``(H, W, 3)`` of one size, on any device and of any floating
 relmse_trimmed smape flip`` take radiance as it is; ``psnr`` and ``ssim`` are about values from 0 to ``peak``, so hand them
 what a screen shows (``torchpt.images.colour.display``). Where a picture holds a value that is not finite, so does the result.
 
-`error_map` says where the error lies; :data:`MAPS` names the measures that have one.
+`error_map` says where the error lies; :data:`MAPS` names the measures that have one. `relative` and `symmetric` are the
+formulas value by value, for whoever has another numerator, such as a loss or an estimate of a variance.
 """
 
 from __future__ import annotations
@@ -15,9 +16,41 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["MAPS", "METRICS", "error_map", "flip", "mse", "psnr", "relmse", "relmse_trimmed", "smape", "ssim"]
+__all__ = [
+    "FLOOR",
+    "MAPS",
+    "METRICS",
+    "TRIMMED",
+    "error_map",
+    "flip",
+    "mse",
+    "psnr",
+    "relative",
+    "relmse",
+    "relmse_trimmed",
+    "smape",
+    "ssim",
+    "symmetric",
+    "trimmed",
+]
 
-_FLOOR = 1e-2
+#: What the denominators of relMSE and SMAPE hold beside radiance, so that black pixels stay finite.
+FLOOR = 1e-2
+#: Share of the pixels that :func:`relmse_trimmed` leaves out.
+TRIMMED = 1e-3
+
+
+def relative(squared: Tensor | float, radiance: Tensor, floor: float = FLOOR) -> Tensor:
+    """Return squared errors over ``radiance² + floor``, value by value: relMSE is their mean.
+
+    Rousselle et al. 2011, *Adaptive Sampling and Reconstruction using Greedy Error Minimization*, section 4.2. Differentiable.
+    """
+    return squared / (radiance.square() + floor)
+
+
+def symmetric(image: Tensor, reference: Tensor, floor: float = FLOOR) -> Tensor:
+    """Return ``|x - ref| / (|x| + |ref| + floor)``, value by value: SMAPE is their mean. Differentiable."""
+    return (image - reference).abs() / (image.abs() + reference.abs() + floor)
 
 
 def _pair(image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
@@ -28,17 +61,16 @@ def _pair(image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
 
 def _squared(image: Tensor, reference: Tensor) -> Tensor:
     x, ref = _pair(image, reference)
-    return (x - ref) ** 2
+    return (x - ref).square()
 
 
-def _relative(image: Tensor, reference: Tensor, floor: float = _FLOOR) -> Tensor:
+def _relative(image: Tensor, reference: Tensor, floor: float = FLOOR) -> Tensor:
     x, ref = _pair(image, reference)
-    return (x - ref) ** 2 / (ref**2 + floor)
+    return relative((x - ref).square(), ref, floor)
 
 
-def _symmetric(image: Tensor, reference: Tensor, floor: float = _FLOOR) -> Tensor:
-    x, ref = _pair(image, reference)
-    return (x - ref).abs() / (x.abs() + ref.abs() + floor)
+def _symmetric(image: Tensor, reference: Tensor, floor: float = FLOOR) -> Tensor:
+    return symmetric(*_pair(image, reference), floor)
 
 
 def mse(image: Tensor, reference: Tensor) -> float:
@@ -50,7 +82,7 @@ def mse(image: Tensor, reference: Tensor) -> float:
     return float(_squared(image, reference).mean())
 
 
-def relmse(image: Tensor, reference: Tensor, floor: float = _FLOOR) -> float:
+def relmse(image: Tensor, reference: Tensor, floor: float = FLOOR) -> float:
     """Relative mean squared error: the mean of ``(x - ref)² / (ref² + floor)`` (Rousselle et al. 2011, section 4.2).
 
     A few bright outliers carry it; where the reference is black it is ``x² / floor``.
@@ -58,7 +90,7 @@ def relmse(image: Tensor, reference: Tensor, floor: float = _FLOOR) -> float:
     return float(_relative(image, reference, floor).mean())
 
 
-def relmse_trimmed(image: Tensor, reference: Tensor, share: float = 1e-3, floor: float = _FLOOR) -> float:
+def relmse_trimmed(image: Tensor, reference: Tensor, share: float = TRIMMED, floor: float = FLOOR) -> float:
     """`relmse` without the ``share`` of pixels that are furthest off.
 
     A pixel's error is the mean of its channels' ``(x - ref)² / (ref² + floor)``. Of N pixels the ``⌊share N⌋`` with the
@@ -79,11 +111,16 @@ def relmse_trimmed(image: Tensor, reference: Tensor, share: float = 1e-3, floor:
     errors = _relative(image, reference, floor).mean(-1).flatten()
     if not torch.isfinite(errors).all():
         return float(errors.mean())
+    return float(errors[trimmed(errors, share)].mean())
+
+
+def trimmed(errors: Tensor, share: float = TRIMMED) -> Tensor:
+    """Return where the smallest of ``errors (N,)`` stand, in rising order: all but the ``⌊share N⌋`` largest."""
     left_out = math.floor(share * errors.numel() * (1 + 1e-12))  # 0.001 of 3,000 are 3, whatever the product rounds to
-    return float(errors.sort().values[: errors.numel() - left_out].mean())
+    return errors.argsort()[: errors.numel() - left_out]
 
 
-def smape(image: Tensor, reference: Tensor, floor: float = _FLOOR) -> float:
+def smape(image: Tensor, reference: Tensor, floor: float = FLOOR) -> float:
     """Symmetric mean absolute percentage error, 0..1: the mean of ``|x - ref| / (|x| + |ref| + floor)``.
 
     Vogels et al. 2018, *Denoising with Kernel Prediction and Asymmetric Loss Functions*, equation 3. Unlike `relmse` it is

@@ -22,7 +22,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.reports.reference import FLOOR, Truth
+from torchpt.images.metrics import relative
+from torchpt.reports.reference import Truth
 from torchpt.reports.statistics import f_tail, t_quantile
 
 __all__ = ["SIGNIFICANCE", "Verdict", "bias_of", "tiles"]
@@ -117,14 +118,12 @@ def _compared(own: Tensor, reference: Tensor, known: Tensor, freedom: float, mor
     count, rounding = len(own), (_ROUNDING * reference.abs()).square()
     if more > 0:
         total = (1.0 + more) * known + rounding
-        return _Side(
-            own.mean(0) - reference, total, torch.full_like(total, freedom), 1.0 / (reference.square() + FLOOR)
-        )
+        return _Side(own.mean(0) - reference, total, torch.full_like(total, freedom), relative(1.0, reference))
     spread = own.var(0) / count + rounding
     total = spread + known
     freedoms = total.square() / (spread.square() / (count - 1.0) + known.square() / freedom).clamp_min(1e-300)
     freedoms = freedoms.clamp_min(min(count - 1.0, freedom))  # never less; black in all, it would be 0 of 0
-    return _Side(own.mean(0) - reference, total, freedoms, 1.0 / (reference.square() + FLOOR))
+    return _Side(own.mean(0) - reference, total, freedoms, relative(1.0, reference))
 
 
 def _of_squares(side: _Side) -> list[float]:

@@ -18,8 +18,6 @@ from torchpt.reports.reference import Truth
 
 __all__ = ["error_map", "measures", "mse", "relmse", "relmse_trimmed"]
 
-_TRIMMED = 1e-3
-
 
 def error_map(image: Tensor, truth: Truth) -> Tensor:
     """``(x - r)² / (r² + 0.01)``, the mean of the channels: ``(H, W)``."""
@@ -36,8 +34,7 @@ def relmse_trimmed(image: Tensor, truth: Truth) -> float:
     found, own = error_map(image, truth).flatten(), (truth.variance * truth.weight).mean(-1).flatten()
     if not torch.isfinite(found).all():
         return math.nan
-    kept = found.argsort()[: found.numel() - math.floor(_TRIMMED * found.numel() * (1 + 1e-12))]
-    return float((found - own)[kept].mean())
+    return float((found - own)[metrics.trimmed(found)].mean())
 
 
 def mse(image: Tensor, truth: Truth) -> float:

@@ -12,12 +12,10 @@ from torch import Tensor
 
 from torchpt.errors import AssetError
 from torchpt.images import colour, read_layers
+from torchpt.images.metrics import relative
 from torchpt.reports.store import Run
 
-__all__ = ["FLOOR", "Truth", "from_file", "from_runs"]
-
-#: What relative errors add to the reference's square (Rousselle et al. 2011, section 4.2).
-FLOOR = 1e-2
+__all__ = ["Truth", "from_file", "from_runs"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class Truth:
     @cached_property
     def weight(self) -> Tensor:
         """Of a squared error that becomes relative: ``1 / (ref² + 0.01)``."""
-        return 1.0 / (self.image.square() + FLOOR)
+        return relative(1.0, self.image)
 
     def shown(self, film: Any) -> Tensor:
         """As a screen shows it; the latest is kept."""
