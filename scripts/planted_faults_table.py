@@ -68,8 +68,8 @@ FAULTS = (
         "math/transforms.py",
         "math format",
         "compose",
-        "OPERATIONS[name](argument, f'{index}.{name}') @ total",
-        "total @ OPERATIONS[name](argument, f'{index}.{name}')",
+        "OPERATIONS[name](argument, f'{index}.{name}', device) @ total",
+        "total @ OPERATIONS[name](argument, f'{index}.{name}', device)",
         "a shape that is turned and then moved is moved and then turned",
     ),
     # -- bsdfs

@@ -269,6 +269,16 @@ def test_a_tape_is_for_one_backward_pass() -> None:
         torchpt.render(scene).sum().backward()
 
 
+def test_a_size_that_is_a_tensor_beside_an_empty_transform() -> None:
+    radius = wanted(0.5)
+    shapes = {"ball": {"type": "sphere", "radius": radius, "transform": []}}
+    scene = torchpt.load(
+        {"camera": {"type": "perspective", "origin": [0, 0, 4], "target": [0, 0, 0]}, "shapes": shapes}, "cpu"
+    )
+    (gradient,) = torch.autograd.grad(scene.params["shapes.ball.to_world"].sum(), radius)
+    assert float(gradient) == pytest.approx(3.0)
+
+
 COPIES = {"pickle": lambda scene: pickle.loads(pickle.dumps(scene)), "deepcopy": copy.deepcopy}
 
 

@@ -32,7 +32,7 @@ from torchpt.cameras import opencv
 from torchpt.cameras.opencv import PinholeMatrices
 from torchpt.cameras.pinhole import FOV_AXES
 from torchpt.errors import SceneError
-from torchpt.math.tensor_transforms import placed
+from torchpt.math.transforms import affine
 from torchpt.spec import Refused
 from torchpt.taped import in_transform
 
@@ -132,7 +132,7 @@ def from_opengl(
     pose = _pose(matrix)
     block: Block = {
         "type": "perspective",
-        "to_world": placed(pose[:, :3] * pose.new_tensor([-1.0, 1.0, -1.0]), pose[:, 3]),
+        "to_world": affine(pose[:, :3] * pose.new_tensor([-1.0, 1.0, -1.0]), pose[:, 3]),
     }
     if K is None:
         angle = _tensor(fov, "fov", ())
@@ -153,7 +153,7 @@ def to_opengl(
     """A scene's camera with OpenGL's axes. Arguments and errors as :func:`to_opencv`."""
     inner, turn, move = _seen(scene, params, film, dtype)
     width, height = scene.film_size(film)
-    matrix = placed(turn.T * turn.new_tensor([1.0, -1.0, -1.0]), -(turn.T @ move))
+    matrix = affine(turn.T * turn.new_tensor([1.0, -1.0, -1.0]), -(turn.T @ move))
     halves = inner.new_tensor([width, height]) * 0.5
     fov = torch.atan2(halves, torch.stack((inner[0, 0], inner[1, 1]))) * (360.0 / math.pi)
     return OpenGLCamera(matrix.to(dtype), inner.to(dtype), fov.to(dtype), (width, height))
@@ -196,9 +196,9 @@ def to_kornia(
 
     inner, turn, move = _seen(scene, params, film, dtype)
     inner = _moved(inner, -0.5)
-    whole = placed(inner, torch.zeros_like(move))
+    whole = affine(inner, torch.zeros_like(move))
     size = [torch.tensor([side], device=turn.device) for side in scene.film_size(film)]
-    return PinholeCamera(whole[None].to(dtype), placed(turn, move)[None].to(dtype), size[1], size[0])
+    return PinholeCamera(whole[None].to(dtype), affine(turn, move)[None].to(dtype), size[1], size[0])
 
 
 def from_pytorch3d(
@@ -231,7 +231,7 @@ def from_pytorch3d(
         focal, point = focal * half, point.new_tensor([wide, tall]) * 0.5 - point * half
     zero = torch.zeros_like(focal[0])
     inner = (focal[0], zero, point[0], zero, focal[1], point[1], zero, zero, torch.ones_like(zero))
-    pose = placed(turn, -(turn @ move))
+    pose = affine(turn, -(turn @ move))
     return {"type": "perspective", "to_world": pose, "K": torch.stack(inner).reshape(3, 3), "size": [wide, tall]}
 
 

@@ -17,15 +17,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchpt.math.transforms import affine, constant
 from torchpt.math.vectors import normalize
 from torchpt.spec import Refused, reading
 
 __all__ = [
     "K_WORDS",
+    "USUAL",
     "PinholeMatrices",
     "angles",
     "calibration",
     "extrinsics",
+    "numbers_of",
     "pose",
     "rotation",
     "size",
@@ -34,6 +37,8 @@ __all__ = [
 
 #: OpenCV's axes in ours, which are left, up, ahead.
 _TURN = np.diag([-1.0, -1.0, 1.0])
+#: A number of a pinhole that ``K`` says is left out where it is this one.
+USUAL = {"principal_point_offset_x": 0.0, "principal_point_offset_y": 0.0, "pixel_aspect": 1.0}
 #: What is accepted of ``K``.
 K_WORDS = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy > 0"
 
@@ -94,12 +99,9 @@ def calibration(value: Any) -> NDArray[np.float64]:
     return found
 
 
-def pose(turn: NDArray[np.float64], move: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera to world ``(4, 4)`` in our axes, from OpenCV's ``R`` and ``t``."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn.T @ _TURN
-    matrix[:3, 3] = -turn.T @ move
-    return matrix
+def pose(turn: Any, move: Any) -> Any:
+    """Return camera to world ``(4, 4)`` in our axes, from OpenCV's ``R (3, 3)`` and ``t (3,)``: arrays, or tensors."""
+    return affine(turn.T @ constant(_TURN, turn), -turn.T @ move)
 
 
 def extrinsics(to_world: Tensor) -> tuple[Tensor, Tensor]:
@@ -109,10 +111,21 @@ def extrinsics(to_world: Tensor) -> tuple[Tensor, Tensor]:
     return turn, -(turn @ to_world[:3, 3])
 
 
+def numbers_of(matrix: Any, picture: tuple[int, int]) -> dict[str, Any]:
+    """Return ``K (3, 3)`` of a ``picture (width, height)`` as a pinhole's numbers: of an array, or a tensor on its tape."""
+    (width, height), fx, fy = picture, matrix[0, 0], matrix[1, 1]
+    taped = isinstance(fx, Tensor)
+    half = torch.atan2(fx.new_tensor(0.5 * width), fx) if taped else math.atan2(0.5 * width, fx)
+    return {
+        "fov": half * (2.0 * 180.0 / math.pi),
+        "principal_point_offset_x": 0.5 - matrix[0, 2] / width,
+        "principal_point_offset_y": 0.5 - matrix[1, 2] / height,
+        "pixel_aspect": fy / fx,
+    }
+
+
 def angles(matrix: NDArray[np.float64], picture: tuple[int, int]) -> dict[str, float | str]:
-    """``K`` of a ``picture (width, height)`` as a pinhole's parameters; those that are as usual are left out."""
-    (fx, fy), (cx, cy), (width, height) = matrix.diagonal()[:2], matrix[:2, 2], picture
-    found = {"fov": math.degrees(2.0 * math.atan2(0.5 * width, fx)), "fov_axis": "x"}
-    offset = {"principal_point_offset_x": 0.5 - cx / width, "principal_point_offset_y": 0.5 - cy / height}
-    found |= {key: float(value) for key, value in offset.items() if value != 0.0}
-    return found if fx == fy else {**found, "pixel_aspect": float(fy / fx)}
+    """Return ``K`` of a ``picture (width, height)`` as a pinhole's parameters; those that are as usual are left out."""
+    found = {key: float(value) for key, value in numbers_of(matrix, picture).items()}
+    rest = {key: found[key] for key, usual in USUAL.items() if found[key] != usual}
+    return {"fov": found["fov"], "fov_axis": "x", **rest}

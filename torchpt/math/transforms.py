@@ -1,5 +1,8 @@
 """Affine transforms as float64 ``(4, 4)`` matrices that act on column vectors, built from a scene file's lists.
 
+Each operation is one formula. Without a device it makes an array of numbers, which are checked; with one it makes a tensor
+there, on the tape of the tensors that stand among its arguments. Those are known to be right: they were read as numbers before.
+
 The camera convention is Mitsuba's: in its own frame a camera looks along +z with +y up and +x to the *left* of the
 picture, so that image right is ``(target - origin) x up`` in the right-handed world.
 """
@@ -11,15 +14,19 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchpt.errors import SceneError
 
 __all__ = [
     "OPERATIONS",
     "WITHIN",
+    "affine",
     "apply_points",
     "compose",
+    "constant",
     "is_rigid",
     "is_singular",
     "is_usable",
@@ -28,11 +35,15 @@ __all__ = [
     "rotate",
     "scale",
     "similarity_scale",
+    "tensor_of",
     "translate",
     "uv_matrix",
 ]
 
 Matrix = NDArray[np.float64]
+#: An array of numpy, or a tensor.
+Array = Any
+Device = torch.device | None
 
 #: What errors say of a matrix that is not usable.
 WITHIN = "it and its inverse finite in float32 (up to 3.4e38)"
@@ -42,16 +53,62 @@ _LARGEST = float(np.finfo(np.float32).max)
 _PARALLEL = 1e-6  # sine of the angle between up and the viewing direction
 
 
+def tensor_of(value: Any, device: torch.device) -> Tensor:
+    """Return numbers, and lists of them, with tensors anywhere among them, as one float64 tensor on a device."""
+    if isinstance(value, Tensor):
+        return value.to(device, torch.float64)
+    if isinstance(value, list | tuple):
+        return torch.stack([tensor_of(item, device) for item in value])
+    return torch.as_tensor(np.asarray(value, np.float64), device=device)
+
+
+def constant(values: Any, like: Array) -> Array:
+    """Return numbers as what ``like`` is: an array, or a tensor of its type on its device."""
+    return like.new_tensor(values) if isinstance(like, Tensor) else np.asarray(values, np.float64)
+
+
+def affine(linear: Array, origin: Array) -> Array:
+    """Return ``(4, 4)`` of a linear part ``(3, 3)`` and a translation ``(3,)``, both arrays or both tensors."""
+    xp = _library(linear)
+    rows = xp.concatenate((linear, origin[:, None]), 1)
+    return xp.concatenate((rows, constant([[0.0, 0.0, 0.0, 1.0]], linear)), 0)
+
+
+def _library(value: Array) -> Any:
+    """Return the library of an array, numpy or torch: what is called of it here both call alike."""
+    return torch if isinstance(value, Tensor) else np
+
+
+def _scaled(vector: Array) -> Array:
+    """Return a vector over its largest entry, which has no gradient; 0 as it is."""
+    largest = abs(vector).max()
+    if isinstance(largest, Tensor):
+        largest = largest.detach()
+    return vector / largest if largest > 0 else vector
+
+
+def _unit(vector: Array) -> Array:
+    """Return a vector other than 0 at length 1."""
+    scaled = _scaled(vector)
+    return scaled / _library(vector).linalg.norm(scaled)
+
+
 def _number(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
-def _vector(value: Any, key: str, expected: str = "three finite numbers [x, y, z]") -> Matrix:
-    if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 3:
+def _vector(
+    value: Any, key: str, device: Device, expected: str = "three finite numbers [x, y, z]", spread: bool = False
+) -> Array:
+    """Return three numbers; with ``spread`` one may stand for all of them."""
+    if device is not None:
+        return tensor_of(value, device).expand(3)
+    items = [value] * 3 if spread and _number(value) else value
+    if not isinstance(items, Sequence | np.ndarray) or isinstance(items, str) or len(items) != 3:
         raise SceneError(key, value, expected)
-    if not all(_number(item) for item in value):
+    if not all(_number(item) for item in items):
         raise SceneError(key, value, expected)
-    vector = np.array([_float(item) for item in value])
+    vector = np.array([_float(item) for item in items])
     if not np.isfinite(vector).all():
         raise SceneError(key, value, expected)
     return vector
@@ -118,43 +175,49 @@ def apply_points(matrix: Matrix, points: Matrix) -> Matrix:
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def translate(offset: Any, key: str = "translate") -> Matrix:
-    """A translation by ``[x, y, z]``."""
-    matrix = np.eye(4)
-    matrix[:3, 3] = _vector(offset, key)
-    return matrix
+def translate(offset: Any, key: str = "translate", device: Device = None) -> Array:
+    """Return a translation by ``[x, y, z]``."""
+    origin = _vector(offset, key, device)
+    return affine(constant(np.eye(3), origin), origin)
 
 
-def scale(factor: Any, key: str = "scale") -> Matrix:
-    """A scale by one number or by ``[x, y, z]``; a zero has no inverse and is an error."""
+def scale(factor: Any, key: str = "scale", device: Device = None) -> Array:
+    """Return a scale by one number or by ``[x, y, z]``; a zero has no inverse and is an error."""
     expected = "a non-zero number or three of them"
-    factors = np.full(3, _float(factor)) if _number(factor) else _vector(factor, key, expected)
-    if not np.isfinite(factors).all() or not factors.all():
+    factors = _vector(factor, key, device, expected, spread=True)
+    if not factors.all():
         raise SceneError(key, factor, expected)
-    return np.diag([*factors, 1.0])
+    xp = _library(factors)
+    return affine(xp.diag(factors), xp.zeros_like(factors))
 
 
-def rotate(argument: Any, key: str = "rotate") -> Matrix:
-    """A rotation ``{axis: [x, y, z], angle: degrees}``, counter-clockwise about the axis (Rodrigues' formula)."""
+def rotate(argument: Any, key: str = "rotate", device: Device = None) -> Array:
+    """Return a rotation ``{axis: [x, y, z], angle: degrees}``, counter-clockwise about the axis (Rodrigues' formula)."""
     _check_keys(argument, ("axis", "angle"), key)
-    axis = _vector(argument["axis"], f"{key}.axis", "a non-zero axis [x, y, z]")
-    largest = np.abs(axis).max()
-    if largest == 0:
+    axis = _vector(argument["axis"], f"{key}.axis", device, "a non-zero axis [x, y, z]")
+    if not axis.any():
         raise SceneError(f"{key}.axis", argument["axis"], "a non-zero axis [x, y, z]")
     angle = argument["angle"]
-    if not _number(angle) or not np.isfinite(_float(angle)):
+    if device is not None:
+        angle = tensor_of(angle, device)
+    elif not _number(angle) or not np.isfinite(_float(angle)):
         raise SceneError(f"{key}.angle", angle, "a finite number of degrees")
-    axis = axis / largest
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turn = np.deg2rad(_float(angle) % 360.0)
-    matrix = np.eye(4)
-    matrix[:3, :3] += np.sin(turn) * cross + (1.0 - np.cos(turn)) * (cross @ cross)
-    return matrix
+    else:
+        angle = _float(angle)
+    xp = _library(axis)
+    x, y, z = _unit(axis)
+    none = xp.zeros_like(x)
+    cross = xp.stack((none, -z, y, z, none, -x, -y, x, none)).reshape(3, 3)
+    turn = xp.deg2rad(angle % 360.0)
+    turned = xp.sin(turn) * cross + (1.0 - xp.cos(turn)) * (cross @ cross)
+    return affine(constant(np.eye(3), axis) + turned, xp.zeros_like(axis))
 
 
-def matrix4(rows: Any, key: str = "matrix") -> Matrix:
-    """An affine ``(4, 4)`` matrix from four rows of four numbers, the last one ``[0, 0, 0, 1]``."""
+def matrix4(rows: Any, key: str = "matrix", device: Device = None) -> Array:
+    """Return an affine ``(4, 4)`` matrix from four rows of four numbers, the last one ``[0, 0, 0, 1]``."""
+    if device is not None:
+        matrix = tensor_of(rows, device)
+        return affine(matrix[:3, :3], matrix[:3, 3])  # the last row is no number of the scene
     expected = "four rows of four finite numbers, the last one [0, 0, 0, 1]"
     try:
         entries = [list(row) for row in rows]
@@ -170,39 +233,35 @@ def matrix4(rows: Any, key: str = "matrix") -> Matrix:
     return matrix
 
 
-def look_at(origin: Any, target: Any, up: Any = (0.0, 1.0, 0.0), key: str = "look_at") -> Matrix:
-    """The frame at ``origin`` whose +z points to ``target``, with ``up`` in its yz half-plane (as Mitsuba's look_at).
+def look_at(origin: Any, target: Any, up: Any = (0.0, 1.0, 0.0), key: str = "look_at", device: Device = None) -> Array:
+    """Return the frame at ``origin`` whose +z points to ``target``, with ``up`` in its yz half-plane (as Mitsuba's look_at).
 
     Raises:
         SceneError: ``target`` coincides with ``origin``, or ``up`` is zero or parallel to the viewing direction.
     """
-    eye, goal = _vector(origin, _join(key, "origin")), _vector(target, _join(key, "target"))
-    above = _vector(up, _join(key, "up"))
-    direction = goal - eye
-    if not direction.any():
+    eye, goal = _vector(origin, _join(key, "origin"), device), _vector(target, _join(key, "target"), device)
+    above = _vector(up, _join(key, "up"), device)
+    away = goal - eye
+    if not away.any():
         raise SceneError(
             _join(key, "target"), target, "a point other than the origin (to the 16 digits that numbers keep)"
         )
-    direction = direction / np.abs(direction).max()
-    direction /= np.linalg.norm(direction)
-    largest = np.abs(above).max()
-    left = np.cross(above / largest, direction) if largest > 0 else np.zeros(3)
-    if np.linalg.norm(left) <= _PARALLEL:
+    xp, direction = _library(eye), _unit(away)
+    left = xp.linalg.cross(_scaled(above), direction)
+    length = xp.linalg.norm(left)
+    if length <= _PARALLEL:
         raise SceneError(_join(key, "up"), up, "a direction that is not parallel to target - origin")
-    left /= np.linalg.norm(left)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([left, np.cross(direction, left), direction], axis=1)
-    matrix[:3, 3] = eye
-    return matrix
+    left = left / length
+    return affine(xp.stack((left, xp.linalg.cross(direction, left), direction), 1), eye)
 
 
-def _look_at_operation(argument: Any, key: str) -> Matrix:
+def _look_at_operation(argument: Any, key: str, device: Device) -> Array:
     _check_keys(argument, ("origin", "target", "up"), key, optional=("up",))
-    return look_at(argument["origin"], argument["target"], argument.get("up", (0.0, 1.0, 0.0)), key)
+    return look_at(argument["origin"], argument["target"], argument.get("up", (0.0, 1.0, 0.0)), key, device)
 
 
-#: The operations of a transform list, by name: ``(argument, key) -> (4, 4)``.
-OPERATIONS: dict[str, Callable[[Any, str], Matrix]] = {
+#: The operations of a transform list, by name: ``(argument, key, device) -> (4, 4)``.
+OPERATIONS: dict[str, Callable[[Any, str, Device], Array]] = {
     "translate": translate,
     "scale": scale,
     "rotate": rotate,
@@ -211,11 +270,12 @@ OPERATIONS: dict[str, Callable[[Any, str], Matrix]] = {
 }
 
 
-def compose(operations: Any) -> Matrix:
-    """One ``(4, 4)`` matrix from a list of single-key mappings, applied in the order listed.
+def compose(operations: Any, device: Device = None) -> Array:
+    """Return one ``(4, 4)`` matrix from a list of single-key mappings, applied in the order listed.
 
     Args:
         operations: e.g. ``[{"scale": 2}, {"rotate": {"axis": [0, 1, 0], "angle": 30}}, {"translate": [0, 1, 0]}]``.
+        device: None: an array of numbers; else a float64 tensor there, of operations that were read before.
 
     Raises:
         SceneError: an entry that is malformed or singular (its ``key`` is relative to the list, e.g. ``1.rotate.axis``), or
@@ -224,7 +284,7 @@ def compose(operations: Any) -> Matrix:
     names = ", ".join(OPERATIONS)
     if not isinstance(operations, list | tuple):
         raise SceneError("", operations, f"a list of {names}, each like {{translate: [0, 1, 0]}}")
-    total = np.eye(4)
+    total: Array = np.eye(4) if device is None else torch.eye(4, dtype=torch.float64, device=device)
     for index, entry in enumerate(operations):
         if not isinstance(entry, Mapping) or len(entry) != 1:
             raise SceneError(str(index), entry, f"a mapping with one of the operations {names}")
@@ -232,8 +292,8 @@ def compose(operations: Any) -> Matrix:
         if name not in OPERATIONS:
             raise SceneError(f"{index}.{name}", argument, f"one of the operations {names}")
         with np.errstate(over="ignore", invalid="ignore"):
-            total = OPERATIONS[name](argument, f"{index}.{name}") @ total
-    if not is_usable(total):
+            total = OPERATIONS[name](argument, f"{index}.{name}", device) @ total
+    if device is None and not is_usable(total):
         raise SceneError("", operations, f"operations whose product can be inverted, {WITHIN}")
     return total
 

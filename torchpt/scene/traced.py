@@ -13,22 +13,20 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchpt.cameras.opencv import angles
-from torchpt.cameras.traced import angles_of, pose_of
+from torchpt.cameras.opencv import USUAL, angles, numbers_of
+from torchpt.cameras.poses import POSES, posed
 from torchpt.errors import SceneError
 from torchpt.format.description import Description
 from torchpt.format.tensors import Key, Tensors
-from torchpt.math.tensor_transforms import compose, tensor_of
+from torchpt.math.transforms import tensor_of
 from torchpt.scene.build import Built
 from torchpt.shapes.base import Place, Size
 from torchpt.spec import parameters_of
 from torchpt.spec.declared import Described
+from torchpt.spec.reading import transform
 
 __all__ = ["corners_in", "traced", "widened"]
 
-_POSES = ("origin", "target", "up", "to_world", "R", "t")
-#: A number of a pinhole that ``K`` says is left out where it is this one.
-_PLAIN = {"principal_point_offset_x": 0.0, "principal_point_offset_y": 0.0, "pixel_aspect": 1.0}
 _EXPECTED = (
     "numbers without gradients (detach() them): no parameter of the scene is made of them, or none with the value that they "
     "have; scene.params lists what is differentiable"
@@ -46,7 +44,7 @@ def widened(description: Description, tensors: Tensors) -> Description:
     if not any(key[0] == "K" for key in tensors.under("camera")):
         return description
     values = {**camera.values, **angles(camera["K"], camera["size"])}
-    values |= {key: plain for key, plain in _PLAIN.items() if values[key] is None}
+    values |= {key: usual for key, usual in USUAL.items() if values[key] is None}
     return replace(description, camera=Described(camera.kind, values, camera.given))
 
 
@@ -128,7 +126,7 @@ def _made(key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     elif block == "shapes" and len(key) > 2:
         yield from _shape(str(key[1]), key, read)
     elif block == "lights" and len(key) > 2 and key[2] == "transform":
-        yield f"lights.{key[1]}.to_world", compose(read.tensors.at(key), read.device)
+        yield f"lights.{key[1]}.to_world", transform(read.tensors.at(key), read.device)
     elif block == "lights" and len(key) > 2:
         name = _dotted(key)
         yield from _named(key, f"{name.removesuffix('.data')}.texels" if key[2] == "data" else name, read)
@@ -148,11 +146,11 @@ def _named(key: Key, name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
 def _camera(name: str, read: _Reading) -> Iterator[tuple[str, Tensor]]:
     camera = read.description.camera
     specs = parameters_of(camera.kind)
-    if name in _POSES:
-        yield "camera.to_world", pose_of(read.tensors.raw["camera"], read.device)
+    if name in POSES:
+        yield "camera.to_world", posed(read.tensors.raw["camera"], read.device)
     elif name == "K":
         inner = tensor_of(read.tensors.at(("camera", "K")), read.device)
-        yield from ((f"camera.{number}", value) for number, value in angles_of(inner, camera["size"]).items())
+        yield from ((f"camera.{number}", value) for number, value in numbers_of(inner, camera["size"]).items())
     elif name in specs and specs[name].traced:
         yield f"camera.{name}", read.at(("camera", name))
 
@@ -178,7 +176,7 @@ def _pose_of(name: str, shape: Described, read: _Reading) -> Tensor:
     """A shape's pose: its own size and place, then its transform."""
     written, device = read.tensors.raw["shapes"][name], read.device
     operations, specs = written.get("transform"), parameters_of(shape.kind)
-    pose = torch.eye(4, dtype=torch.float64, device=device) if operations is None else compose(operations, device)
+    pose = transform([] if operations is None else operations, device)
     sizes = {key: tensor_of(shape[key], device) for key, spec in specs.items() if isinstance(spec, Size | Place)}
     sizes |= {key: tensor_of(written[key], device) for key in sizes if written.get(key) is not None}
     return pose @ shape.kind.own({**shape.values, **sizes}) if sizes else pose

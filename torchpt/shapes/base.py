@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpt import spec
-from torchpt.math import tensor_transforms
+from torchpt.math.transforms import affine, constant, tensor_of
 from torchpt.spec import Color, Flag, Other, Pose, Refused, Spec
 
 __all__ = ["BOTTOM", "TOP", "UPRIGHT", "Place", "Shape", "Size", "Surface", "Triangles", "placed"]
@@ -156,14 +155,9 @@ class Shape:
 
 def placed(origin: Sequence[Any], size: Sequence[Any], turn: Matrix) -> Any:
     """A scale, then a rotation ``(3, 3)``, then a move, as ``(4, 4)``: a tensor where any of the six numbers is one."""
-    tensors = [number for number in (*origin, *size) if isinstance(number, Tensor)]
-    if tensors:
-        own = [torch.stack([torch.as_tensor(number).to(tensors[0]) for number in three]) for three in (origin, size)]
-        return tensor_transforms.placed(torch.from_numpy(turn).to(tensors[0]) * own[1], own[0])
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn * size
-    matrix[:3, 3] = origin
-    return matrix
+    device = next((number.device for number in (*origin, *size) if isinstance(number, Tensor)), None)
+    place, factors = (np.array(three) if device is None else tensor_of([*three], device) for three in (origin, size))
+    return affine(constant(turn, factors) * factors, place)
 
 
 #: z to y, by a turn about x: the axis of what turns about one lies along its surfaces' z.

@@ -10,7 +10,9 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchpt.errors import SceneError
 from torchpt.math import transforms
@@ -101,12 +103,13 @@ def text(value: Any) -> str:
     return value
 
 
-def transform(value: Any) -> NDArray[np.float64]:
-    """A list of operations, or a matrix, as one ``(4, 4)``, see :func:`torchpt.math.transforms.compose`."""
-    if isinstance(value, np.ndarray) or (isinstance(value, list) and value and isinstance(value[0], list | np.ndarray)):
-        return matrix(value)
+def transform(value: Any, device: torch.device | None = None) -> Any:
+    """Return a list of operations, or a matrix, as one ``(4, 4)``; both as :func:`torchpt.math.transforms.compose` has them."""
+    rows = list | np.ndarray | Tensor
+    if isinstance(value, np.ndarray | Tensor) or (isinstance(value, list) and value and isinstance(value[0], rows)):
+        return matrix(value) if device is None else transforms.matrix4(value, "", device)
     try:
-        return transforms.compose(value)
+        return transforms.compose(value, device)
     except SceneError as error:
         raise within(error) from None
 

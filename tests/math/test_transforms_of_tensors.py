@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.cameras import opencv, poses, traced
-from torchpt.math import tensor_transforms, transforms
+from torchpt.cameras import opencv, poses
+from torchpt.math import transforms
 from torchpt.shapes import KINDS
 from torchpt.shapes.base import Place, Size
 from torchpt.spec import parameters_of
@@ -42,7 +42,7 @@ def of_tensors(value: Any) -> Any:
 def test_operations(name: str) -> None:
     expected = torch.from_numpy(transforms.compose(LISTS[name]))
     for given in (LISTS[name], of_tensors(LISTS[name])):
-        assert torch.allclose(tensor_transforms.compose(given, CPU), expected, rtol=1e-12, atol=1e-13)
+        assert torch.allclose(transforms.compose(given, CPU), expected, rtol=1e-12, atol=1e-13)
 
 
 def test_derivatives_of_operations() -> None:
@@ -53,7 +53,7 @@ def test_derivatives_of_operations() -> None:
             {"scale": factor},
             {"translate": [offset[0], 2.0, offset[2]]},
         ]
-        return tensor_transforms.compose(steps, CPU)
+        return transforms.compose(steps, CPU)
 
     inputs = [of_tensors(DRAWN[k]) for k in (0, 1, 2)] + [of_tensors(35.0), of_tensors(DRAWN[4]), of_tensors(DRAWN[5])]
     assert torch.autograd.gradcheck(composed, [x.requires_grad_() for x in inputs], eps=1e-6, atol=1e-6)
@@ -94,12 +94,12 @@ def test_poses_of_cameras(given: dict[str, Any]) -> None:
     read = {key: None if value is None else tuple(value) if value.ndim == 1 else value for key, value in values.items()}
     expected = torch.from_numpy(poses.pose_of(read | ({"t": given["t"]} if "t" in given else {}), frozenset(given)))
     for written in (given, of_tensors(given)):
-        assert torch.allclose(traced.pose_of({"type": "perspective", **written}, CPU), expected, rtol=1e-12, atol=1e-13)
+        assert torch.allclose(poses.posed({"type": "perspective", **written}, CPU), expected, rtol=1e-12, atol=1e-13)
 
 
 def test_calibrations() -> None:
     inner = np.array([[70.0, 0, 29.5], [0, 55.0, 27.25], [0, 0, 1]])
     expected = opencv.angles(inner, (64, 48))
-    found = traced.angles_of(of_tensors(inner), (64, 48))
+    found = opencv.numbers_of(of_tensors(inner), (64, 48))
     assert {**found, "fov_axis": "x"} == pytest.approx(expected)
     assert found.keys() | {"fov_axis"} == expected.keys()
