@@ -105,7 +105,8 @@ OPERATIONS: list[tuple[str, Callable[..., torch.Tensor]]] = [
     ("", lambda a, b, u: power_heuristic(a[0].abs(), b[0].abs())),
     ("", lambda a, b, u: torch.cat((concentric_disk(u), uniform_sphere(u), uniform_cone(u, u[2])))),
     ("", lambda a, b, u: one_minus_cos(u)),
-    ("", lambda a, b, u: CHOICE.sample(u[0]).float()),
+    ("", lambda a, b, u: CHOICE.draw(u[0])[0].float()),
+    ("", lambda a, b, u: CHOICE.draw(u[0])[1].float()),
 ]
 #: What moves numbers or makes constants, without arithmetic (scatters here have distinct indices), and operators of ours
 #: that tests of their own hold to the bit: tests/samplers/test_kernels.py, tests/accel.

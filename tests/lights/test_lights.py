@@ -145,7 +145,7 @@ def test_lights_are_chosen_by_power():
     power = areas * table.radiance[0]
     expected = 0.99 * power / power.sum() + 0.01 / 3  # a hundredth is even, see Discrete
     torch.testing.assert_close(table.choice.pmf, expected)
-    row = table.choice.sample(torch.rand(N, generator=G))
+    row = table.choice.draw(torch.rand(N, generator=G))[0]
     counts = torch.bincount(row, minlength=3).double()
     expected = N * expected
     assert chi_square_p(float(((counts - expected) ** 2 / expected).sum()), 2) > SIGNIFICANCE

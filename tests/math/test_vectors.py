@@ -95,13 +95,22 @@ def shares(weights: torch.Tensor) -> torch.Tensor:
 def test_discrete_choice_follows_its_weights():
     weights = torch.tensor([0.0, 1.0, 0.0, 3.0, 2.0, 0.0])
     choice = Discrete.of(weights, torch.float32)
-    drawn = choice.sample(torch.rand(120_000, generator=G))
+    drawn = choice.draw(torch.rand(120_000, generator=G))[0]
     counts = torch.bincount(drawn, minlength=6).double()
     assert not counts[weights == 0].any()
     expected = 120_000 * shares(weights)
     some = weights > 0
     assert chi_square_p(float(((counts - expected)[some] ** 2 / expected[some]).sum()), 2) > SIGNIFICANCE
     torch.testing.assert_close(choice.pmf, shares(weights).float())
+
+
+def test_what_a_choice_leaves_is_the_place_in_its_interval():
+    choice = Discrete.of(torch.tensor([0.0, 1.0, 0.0, 3.0, 2.0]), torch.float64)
+    u = torch.rand(10_000, generator=G, dtype=torch.float64)
+    outcome, rest = choice.draw(u)
+    low = torch.cat((torch.zeros(1), choice.cdf))[outcome]
+    torch.testing.assert_close(low + rest * choice.pmf[outcome], u, rtol=0, atol=1e-14)
+    assert choice.draw(torch.tensor([0.0, 1.0]))[1].tolist() == [0.0, 1.0]
 
 
 def test_a_million_tiny_weights_do_not_collapse():
@@ -112,11 +121,11 @@ def test_a_million_tiny_weights_do_not_collapse():
     drawn = torch.searchsorted(choice.cdf, u, right=True)  # float64 u: each outcome exactly once
     assert (drawn - torch.arange(n)).abs().max() <= 1
     assert float(choice.pmf.double().sum()) == pytest.approx(1, abs=1e-6)
-    assert int(choice.sample(torch.tensor([1 - 2**-24]))) >= n - 2
+    assert int(choice.draw(torch.tensor([1 - 2**-24]))[0]) >= n - 2
     # One a million times brighter takes its share beside 1e5 dim ones (STIFF_CASES 62).
     weights = torch.ones(100_001)
     weights[50_000] = 1e6
-    drawn = Discrete.of(weights, torch.float32).sample(torch.rand(100_000, generator=G))
+    drawn = Discrete.of(weights, torch.float32).draw(torch.rand(100_000, generator=G))[0]
     share, expected = float((drawn == 50_000).double().mean()), float(shares(weights)[50_000])
     assert abs(share - expected) < 4 * math.sqrt(expected * (1 - expected) / 1e5)
 
@@ -127,7 +136,7 @@ def test_no_outcome_is_too_rare_for_a_draw_of_24_bits():
     weights[500] = 1e12
     choice = Discrete.of(weights, torch.float32)
     u = torch.arange(1 << 16).float() / (1 << 16) + 2.0**-20
-    drawn = torch.bincount(choice.sample(u), minlength=1000).double() / (1 << 16)
+    drawn = torch.bincount(choice.draw(u)[0], minlength=1000).double() / (1 << 16)
     # One over the probability is what a sampled light weighs: what is never drawn must have none.
     assert (drawn > 0).sum() > 400
     assert float(choice.pmf.min()) > 2.0**-24 * 100
@@ -138,7 +147,7 @@ def test_extreme_weights(weights):
     w = torch.tensor(weights)
     choice = Discrete.of(w, torch.float32)
     u = torch.tensor([0.0, 2**-24, 0.5, 1 - 2**-24])
-    drawn = choice.sample(u)
+    drawn = choice.draw(u)[0]
     assert ((drawn >= 0) & (drawn < len(w))).all()
     if w.any():
         assert (w[drawn] > 0).all()

@@ -86,12 +86,12 @@ def draw(choice: Discrete | ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> t
         n: normals ``(3, N)`` as :func:`torchpt.lights.tree.sample` takes them, or None.
     """
     if isinstance(choice, Discrete):
-        row, rest = _by_power(choice, u)
+        row, rest = choice.draw(u)
         return row, take(choice.pmf, row), rest
     if choice.beside is None:
         return _near(choice, u, x, n)
     beside, first = choice.beside, choice.tree.count
-    outcome, left = _by_power(beside, u)
+    outcome, left = beside.draw(u)
     row, p, rest = _near(choice, left, x, n)
     near = outcome == 0
     rest = torch.where(near, rest, left)
@@ -106,7 +106,7 @@ def _near(choice: ByTree, u: Tensor, x: Tensor, n: Tensor | None) -> tuple[Tenso
     share = choice.share
     apart = u < share
     row, _, rest = tree.sample(choice.tree, x, n, ((u - share) / (1.0 - share)).clamp_min(0.0))
-    other, left = _by_power(choice.even, (u / share).clamp_max(1.0 - 2.0**-53))
+    other, left = choice.even.draw((u / share).clamp_max(1.0 - 2.0**-53))
     row, rest = torch.where(apart, other, row), torch.where(apart, left, rest)
     return row, _chance(choice, row, x, n), rest
 
@@ -118,13 +118,6 @@ def _chance(choice: ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:
         return p
     share = choice.share.to(p.dtype)
     return p * (1.0 - share) + take(choice.even.pmf, row) * share
-
-
-def _by_power(choice: Discrete, u: Tensor) -> tuple[Tensor, Tensor]:
-    row = choice.sample(u)
-    low = torch.where(row > 0, take(choice.cdf, (row - 1).clamp_min(0)), 0.0)
-    width = take(choice.cdf, row) - low
-    return row, ((u - low) / torch.where(width > 0, width, 1.0)).clamp(0.0, 1.0)
 
 
 def probability(choice: Discrete | ByTree, row: Tensor, x: Tensor, n: Tensor | None) -> Tensor:

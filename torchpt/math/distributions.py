@@ -47,9 +47,15 @@ class Discrete:
         cdf[last:] = 1.0
         return Discrete(cdf, w.to(dtype))
 
-    def sample(self, u: Tensor) -> Tensor:
-        """Outcomes ``(N,)`` int64 for ``u`` in ``[0, 1]``; one of probability 0 is never drawn."""
-        return torch.searchsorted(self.cdf, u.double().clamp_max(1.0 - 2.0**-53), right=True)
+    def draw(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return outcomes ``(N,)`` int64 for ``u (N,)`` in ``[0, 1]``, and what is left of ``u``, float64 in ``[0, 1]``.
+
+        One of probability 0 is never drawn. What is left is uniform whatever was chosen.
+        """
+        outcome = torch.searchsorted(self.cdf, u.double().clamp_max(1.0 - 2.0**-53), right=True)
+        low = torch.where(outcome > 0, take(self.cdf, (outcome - 1).clamp_min(0)), 0.0)
+        width = take(self.cdf, outcome) - low
+        return outcome, ((u - low) / torch.where(width > 0, width, 1.0)).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True)
