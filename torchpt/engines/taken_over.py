@@ -17,8 +17,8 @@ from torchpt.lanes import bits
 from torchpt.lanes.function import Lanewise
 from torchpt.lanes.tracing import tracing
 from torchpt.lights import solid_angle, tree
+from torchpt.math import hashing
 from torchpt.records import Hit, World
-from torchpt.samplers import scrambling
 from torchpt.shapes import interact
 
 __all__: list[str] = []
@@ -31,7 +31,7 @@ solid_angle.angles.register(Lanewise(solid_angle.angles.function, ("row", "x"), 
 tree.sample.register(Lanewise(tree.sample.function, ("x", "n", "u"), detached=True))
 tree.probability.register(Lanewise(tree.probability.function, ("row", "x", "n"), detached=True))
 
-scrambling.reverse_bits.register(bits.reverse_bits)
+hashing.reverse_bits.register(bits.reverse_bits)
 
 
 def _times_map(world: World, o: Tensor, d: Tensor, hit: Hit, opacity: Tensor, textured: Tensor) -> Any:

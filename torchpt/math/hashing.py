@@ -7,8 +7,12 @@ from __future__ import annotations
 
 from torch import Tensor
 
-__all__ = ["M0", "M1", "as_int32", "logical_shift", "mix", "mix_int", "to_unit"]
+from torchpt.core.dispatch import dispatched
 
+__all__ = ["HALVES", "M0", "M1", "as_int32", "logical_shift", "mix", "mix_int", "reverse_bits", "to_unit"]
+
+#: Steps that reverse 32 bits: a shift, and the bits of the lower halves of pairs that are so far apart.
+HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
 M0, M1 = 0x7FEB352D, 0x846CA68B - (1 << 32)
 
 
@@ -20,6 +24,14 @@ def as_int32(x: int) -> int:
 def logical_shift(x: Tensor, bits: int) -> Tensor:
     """Right shift that feeds in zeros; torch's own is arithmetic on int32."""
     return (x >> bits) & ((1 << (32 - bits)) - 1)
+
+
+@dispatched
+def reverse_bits(x: Tensor) -> Tensor:
+    """Reverse the 32 bits of int32 lanes, or the low 32 bits of int64 that have no others."""
+    for shift, mask in HALVES:
+        x = ((x >> shift) & mask) | ((x & mask) << shift)
+    return x
 
 
 def mix(x: Tensor) -> Tensor:

@@ -18,8 +18,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torchpt.core.dispatch import dispatched
-from torchpt.math.hashing import as_int32, logical_shift
+from torchpt.math.hashing import HALVES, as_int32, logical_shift, reverse_bits
 
 __all__ = ["W", "X", "Y", "Z", "fourth_dimension", "reverse_bits", "scramble", "second_dimension", "third_dimension"]
 
@@ -29,15 +28,6 @@ _K0, _K1, _K2 = 0x3D20ADEA, 0x05526C56, 0x53A22864
 #: Low bits of the digits of base 4 whose number is 0, 1 or 2 modulo 3.
 _FIRST, _SECOND, _THIRD = 0x41041041, 0x04104104, 0x10410410
 _STAYS = as_int32(3 * _FIRST)
-_HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
-
-
-@dispatched
-def reverse_bits(x: Tensor) -> Tensor:
-    """Reverse the 32 bits of int32 lanes."""
-    for shift, mask in _HALVES:
-        x = ((x >> shift) & mask) | ((x & mask) << shift)
-    return x
 
 
 def scramble(x: Tensor, seed: Tensor) -> Tensor:
@@ -51,7 +41,7 @@ def scramble(x: Tensor, seed: Tensor) -> Tensor:
 
 def second_dimension(index: Tensor) -> Tensor:
     """Bit-reversed second Sobol' coordinate of point ``index``."""
-    for shift, mask in reversed(_HALVES):
+    for shift, mask in reversed(HALVES):
         index = index ^ ((index >> shift) & mask)
     return index
 
@@ -69,7 +59,7 @@ def fourth_dimension(index: Tensor) -> Tensor:
 
 def _shifted(index: Tensor) -> Tensor:
     """``p(x + 1)`` with coefficients of two bits each."""
-    for shift, mask in reversed(_HALVES[1:]):
+    for shift, mask in reversed(HALVES[1:]):
         index = index ^ ((index >> shift) & mask)
     return index
 
