@@ -7,6 +7,8 @@ the first row is the pole +y, the last one -y. Between them a map is interpolate
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,7 +16,7 @@ from torch import Tensor
 from torchpt.errors import SceneError
 from torchpt.math.angles import azimuth
 
-__all__ = ["checked", "coordinates", "corners", "directions", "look_up", "solid_angles"]
+__all__ = ["Cell", "angles", "checked", "coordinates", "corners", "directions", "look_up", "solid_angles"]
 
 
 def checked(map: Tensor, key: str = "map") -> Tensor:
@@ -53,10 +55,46 @@ def solid_angles(height: int, width: int) -> Tensor:
     return rows * (2.0 * math.pi / width)
 
 
+def angles(d: Tensor | Sequence[Tensor], least: float) -> tuple[Tensor, Tensor]:
+    """Return longitude in ``[0, 2 pi]`` and angle from +y, each ``(N,)``, of unit directions: three of ``(N,)``.
+
+    Not by acos, which near the poles knows an angle only to a square root of the rounding. ``least`` above 0 is what the
+    square of the sine of the second counts at least: derivatives are finite at the poles too.
+    """
+    across = torch.addcmul(d[0] * d[0], d[2], d[2]).clamp_min(least).sqrt()
+    return azimuth(-d[2], d[0]), azimuth(d[1], across)
+
+
 def coordinates(d: Tensor) -> tuple[Tensor, Tensor]:
     """``(u, v)``, each ``(N,)`` in ``[0, 1]``, of unit directions ``(3, N)``; finite derivatives at the poles too."""
-    across = torch.addcmul(d[0] * d[0], d[2], d[2]).clamp_min(1e-14).sqrt()
-    return azimuth(-d[2], d[0]) * (0.5 / math.pi), azimuth(d[1], across) * (1.0 / math.pi)
+    around, down = angles(d, 1e-14)
+    return around * (0.5 / math.pi), down * (1.0 / math.pi)
+
+
+class Cell(NamedTuple):
+    """Where points fall on maps, each ``(N,)``: the upper left one of four texels, and how far from it to the others."""
+
+    row: Tensor
+    column: Tensor
+    x: Tensor
+    y: Tensor
+
+    @staticmethod
+    def of(x: Tensor, y: Tensor, height: int | Tensor, width: int | Tensor) -> Cell:
+        """Return the cells of points ``x, y (N,)`` in texels from the first one's centre; sizes may differ by lane.
+
+        The first column follows the last one. The last row has none below it: what lies there is at the lower end of a cell.
+        """
+        column, row = x.detach().floor(), y.detach().floor().clamp_min(0.0)
+        row = row.clamp_max(height - 2) if isinstance(height, int) else torch.minimum(row, (height - 2).to(row.dtype))
+        x, y, column = x - column, y - row, column.to(torch.int64)
+        return Cell(row.to(torch.int64), torch.where(column < 0, width - 1, column), x, y)
+
+    def texels(self, width: int | Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the indices ``(N,)`` of the four in rows one after another: two of the upper row, two of the lower one."""
+        left, right = self.column, torch.where(self.column == width - 1, 0, self.column + 1)
+        top = self.row * width
+        return top + left, top + right, top + width + left, top + width + right
 
 
 def corners(
@@ -67,19 +105,9 @@ def corners(
     Returns:
         Indices ``(N,)`` int64 into the rows one after another, and weights ``(N,)`` that sum to 1.
     """
-    x, y = u * width - 0.5, (v * (height - 1)).clamp_min(0.0)
-    j, i = x.detach().floor(), y.detach().floor()
-    # The last row has none below it: v = 1 reads it by its whole share of the two.
-    i = i.clamp_max(height - 2) if isinstance(height, int) else torch.minimum(i, (height - 2).to(i.dtype))
-    fx, fy = x - j, y - i
-    top = i.to(torch.int64) * width
-    left = torch.remainder(j.to(torch.int64), width)
-    right = torch.remainder(left + 1, width)
-    gx, gy = 1.0 - fx, 1.0 - fy
-    return (
-        (top + left, top + right, top + width + left, top + width + right),
-        (gy * gx, gy * fx, fy * gx, fy * fx),
-    )
+    at = Cell.of(u * width - 0.5, (v * (height - 1)).clamp_min(0.0), height, width)
+    x, y = 1.0 - at.x, 1.0 - at.y
+    return at.texels(width), (y * x, y * at.x, at.y * x, at.y * at.x)
 
 
 def look_up(map: Tensor, d: Tensor) -> Tensor:

@@ -24,11 +24,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from torchpt.ibl.equirect import Cell, angles
 from torchpt.images.given import TEXELS, check_source, texels_of
 from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.math.angles import azimuth
@@ -166,45 +167,24 @@ def _grid(weights: Tensor, floor: Tensor) -> Grid:
     return Grid(Cells.of(weights), floor, (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype))
 
 
-class _Place(NamedTuple):
-    """Where directions fall, each ``(N,)``: the upper left texel of a cell, and how far into the cell."""
-
-    row: Tensor
-    column: Tensor
-    x: Tensor
-    y: Tensor
-
-
-def _place(map: EnvironmentMap, d: Tensor) -> _Place:
+def _place(map: EnvironmentMap, d: Tensor) -> Cell:
     """The cells of unit directions ``(3, N)`` of the world."""
     local = [dot(map.turn[k][:, None], d) for k in range(3)]
-    square = torch.addcmul(local[0] * local[0], local[2], local[2])
-    radius = square.clamp_min(torch.finfo(d.dtype).tiny).sqrt()
-    # Not by acos, which near the poles knows an angle only to a square root of the rounding.
+    around, down = angles(local, torch.finfo(d.dtype).tiny)
     tall, wide = map.size[0].to(d.dtype), map.size[1].to(d.dtype)
-    y = azimuth(local[1], radius) * ((tall - 1.0) * (1.0 / math.pi))
-    x = azimuth(-local[2], local[0]) * (wide * (0.5 / math.pi)) - 0.5
-    row = torch.minimum(y.detach().floor().clamp_min(0.0), tall - 2.0)
-    column = torch.minimum(x.detach().floor().clamp_min(-1.0), wide - 1.0)
-    x, y = x - column, (y - row).clamp_max(1.0)
-    column = column.to(torch.int64)
-    return _Place(row.to(torch.int64), torch.where(column < 0, map.size[1] - 1, column), x, y)
+    y = down * ((tall - 1.0) * (1.0 / math.pi))
+    x = around * (wide * (0.5 / math.pi)) - 0.5
+    at = Cell.of(x, y, map.size[0], map.size[1])
+    return at._replace(y=at.y.clamp_max(1.0))
 
 
 #: Colours ``(3, N)`` of a cell's texels: two of the upper row, two of the lower one.
 _Corners = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def _corners(map: EnvironmentMap, row: Tensor, column: Tensor) -> _Corners:
-    width = map.size[1]
-    right = torch.where(column == width - 1, 0, column + 1)
-    first = row * width
-    return (
-        take(map.texels, first + column),
-        take(map.texels, first + right),
-        take(map.texels, first + width + column),
-        take(map.texels, first + width + right),
-    )
+def _corners(map: EnvironmentMap, at: Cell) -> _Corners:
+    a, b, c, d = (take(map.texels, texel) for texel in at.texels(map.size[1]))
+    return a, b, c, d
 
 
 def _mix(corners: tuple[Tensor, Tensor, Tensor, Tensor], x: Tensor, y: Tensor) -> Tensor:
@@ -219,7 +199,7 @@ def _values(grid: Grid, corners: _Corners) -> tuple[Tensor, Tensor, Tensor, Tens
     return a, b, c, d
 
 
-def _density(map: EnvironmentMap, grid: Grid, at: _Place, corners: _Corners) -> Tensor:
+def _density(map: EnvironmentMap, grid: Grid, at: Cell, corners: _Corners) -> Tensor:
     step = math.pi / (map.size[0] - 1).to(at.y.dtype)
     y = at.y.detach()
     # A difference of cosines as a product, which does not cancel.
@@ -230,19 +210,19 @@ def _density(map: EnvironmentMap, grid: Grid, at: _Place, corners: _Corners) -> 
 def radiance(map: EnvironmentMap, d: Tensor) -> Tensor:
     """Radiance ``(3, N)`` from unit directions ``d (3, N)``."""
     at = _place(map, d)
-    return _mix(_corners(map, at.row, at.column), at.x, at.y) * map.scale
+    return _mix(_corners(map, at), at.x, at.y) * map.scale
 
 
 def pdf(map: EnvironmentMap, d: Tensor, mis: bool) -> Tensor:
     """Density ``(N,)`` in solid angle with which :func:`sample` draws unit directions ``d (3, N)``; detached."""
     at = _place(map, d.detach())
-    return _density(map, map.grid(mis), at, _corners(map, at.row, at.column))
+    return _density(map, map.grid(mis), at, _corners(map, at))
 
 
 def environment(map: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
     """:func:`radiance` and :func:`pdf` in one look-up."""
     at = _place(map, d)
-    corners = _corners(map, at.row, at.column)
+    corners = _corners(map, at)
     return _mix(corners, at.x, at.y) * map.scale, _density(map, map.grid(mis), at, corners)
 
 
@@ -260,7 +240,7 @@ def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, T
     """
     grid = map.grid(mis)
     row, column, rest = grid.cells.sample(u)
-    corners = _corners(map, row, column)
+    corners = _corners(map, Cell(row, column, rest[0], rest[1]))
     with torch.no_grad():
         a, b, c, d = _values(grid, corners)
         down = invert_linear(rest[1], a + b, c + d)
