@@ -263,6 +263,12 @@ def test_smooth_normals_of_degenerate_faces_are_finite(size: float) -> None:
     np.testing.assert_allclose(normals, [[0, 0, 1]] * 5)
 
 
+def test_smooth_normals_where_faces_face_each_other_are_those_of_no_face() -> None:
+    vertices = np.array([[0.1, 0.2, 0.3], [1.3, 0.1, 0.7], [0.2, 0.9, -0.4], [2.0, 1.0, 1.0]])
+    normals = smooth_normals(vertices, np.array([[0, 1, 2], [0, 2, 1], [0, 0, 3]]))
+    np.testing.assert_array_equal(normals, [[0, 0, 1]] * 4)
+
+
 # --- malformed files
 
 VERTICES = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"

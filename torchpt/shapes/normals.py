@@ -20,8 +20,11 @@ def _length(a: Tensor) -> Tensor:
     return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
 
 
-def smooth_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Unit normals ``(3, V)`` for vertices ``(3, V)`` and faces ``(F, 3)``; zero where no face has area."""
+def smooth_normals(vertices: Tensor, faces: Tensor, least: float = 0.0) -> Tensor:
+    """Return unit normals ``(3, V)`` for vertices ``(3, V)`` and faces ``(F, 3)``; zero where no face has area.
+
+    Zero too where faces face each other, so that the sum of their normals by angle is no longer than ``least``.
+    """
     corner = [vertices.index_select(1, faces[:, k]) for k in range(3)]
     normal = normalize(cross(corner[1] - corner[0], corner[2] - corner[0]))
     total = torch.zeros_like(vertices)
@@ -30,4 +33,4 @@ def smooth_normals(vertices: Tensor, faces: Tensor) -> Tensor:
         b = normalize(corner[(k + 2) % 3] - corner[k])
         angle = 2.0 * in_pieces(torch.atan2, _length(a - b), _length(a + b))
         total = total.index_add(1, faces[:, k], normal * angle)
-    return normalize(total)
+    return normalize(total if least == 0.0 else torch.where(_length(total) > least, total, 0.0))
