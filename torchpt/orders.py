@@ -305,11 +305,12 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
     def given_by(*tensors: Tensor) -> dict[str, Tensor]:
         return dict(zip(names, tensors, strict=True))
 
-    def forward(*tensors: Tensor) -> Tensor:
+    def forward(*tensors: Tensor) -> tuple[Tensor]:
         made.append(render(given_by(*tensors)))
-        return made[-1].image
+        return (made[-1].image,)
 
-    def backward_pass(cotangent: Tensor, *tensors: Tensor) -> list[Tensor | None]:
+    def backward_pass(cotangents: tuple[Tensor, ...], *tensors: Tensor) -> list[Tensor | None]:
+        cotangent = cotangents[0].reshape(-1, 3).T  # (3, H W)
         order.check_unchanged(AFTER)
         with together(ranks, "the loss", lambda: cotangent.detach().cpu().contiguous().numpy().tobytes()):
             return gradients(cotangent, *tensors)
@@ -341,14 +342,14 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         return edges.Asked(scene, again(), wanted, dtype, edges_taken())
 
     tensors = tuple(params[name] for name in names)
-    image = adjoint.on_tape(forward, backward_pass, tensors, scene.weights())
+    (image,) = on_tape(forward, backward_pass, tensors, scene.weights())
     rendering = made[-1]
     made.clear()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
     layers = edges.followed(settings)
     if layers:
         values = {name: rendering.layers[name] for name in layers}
-        rendering.layers |= edges.on_tape(values, tensors, asked, given_by)
+        rendering.layers |= edges.differentiable(values, tensors, asked, given_by)
     return replace(rendering, image=image)
 
 

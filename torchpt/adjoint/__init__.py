@@ -1,7 +1,6 @@
 """How gradients are taken: an argument of ``render``, not another integrator; and what of a render they go through.
 
 =================  ==============================================================================
-``function.py``    a picture on autograd's tape; its backward pass is ``gradients`` below
 ``assembly.py``    from parameters to what waves read, differentiated once a backward pass
 ``loop.py``        ``replay``, the default, by kernels over threads: start here
 ``sweep.py``       a chunk of that: paths traced again, and gone back along vertex by vertex
@@ -23,7 +22,6 @@ from torch import Tensor
 
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.attachment import attached
-from torchpt.adjoint.function import on_tape
 from torchpt.adjoint.held import by_film, follows, suits
 from torchpt.adjoint.loop import compiled_replay
 from torchpt.adjoint.tape import tape
@@ -36,7 +34,7 @@ from torchpt.ranks import Group
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
-__all__ = ["attached", "gradients", "on_tape", "suits"]
+__all__ = ["attached", "gradients", "suits"]
 
 
 def gradients(

@@ -9,7 +9,7 @@ first surfaces, their interior included; ``missing`` says what is left out.
 from __future__ import annotations
 
 from torchpt.edges.gradients import add_gradients, concerns
-from torchpt.edges.layers import Asked, followed, on_tape
+from torchpt.edges.layers import Asked, differentiable, followed
 from torchpt.edges.missing import left_out, without_gradient
 
-__all__ = ["Asked", "add_gradients", "concerns", "followed", "left_out", "on_tape", "without_gradient"]
+__all__ = ["Asked", "add_gradients", "concerns", "differentiable", "followed", "left_out", "without_gradient"]

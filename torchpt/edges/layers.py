@@ -17,7 +17,7 @@ from torchpt.integrators.layer import SurfaceLayer
 from torchpt.scene import Scene
 from torchpt.settings import Settings
 
-__all__ = ["Asked", "followed", "on_tape"]
+__all__ = ["Asked", "differentiable", "followed"]
 
 #: Lanes of a chunk of the interior.
 LANES = 1 << 15
@@ -48,13 +48,13 @@ def followed(settings: Settings) -> tuple[str, ...]:
     return tuple(name for name, kind in kinds.items() if issubclass(kind, SurfaceLayer) and kind.averaged)
 
 
-def on_tape(
+def differentiable(
     layers: Mapping[str, Tensor],
     tensors: tuple[Tensor, ...],
     asked: Callable[[], Asked],
     given: Callable[..., dict[str, Tensor]],
 ) -> dict[str, Tensor]:
-    """The layers as functions of ``tensors``.
+    """Return the layers as functions of ``tensors`` that autograd can go back through.
 
     Args:
         layers: as they were rendered, by name.
