@@ -19,7 +19,7 @@ from torchpt.errors import AssetError
 from torchpt.files import is_regular, read_regular
 from torchpt.meshes.gltf_schema import BLOCKS, ROOT, Wrong, check
 
-__all__ = ["Document"]
+__all__ = ["Document", "Rules"]
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -179,6 +179,42 @@ class Document:
             raise AssetError(self.path, f"{where} has an index outside 0..{len(values) - 1}")
         found = self._rows(rows["bufferView"], rows.get("byteOffset", 0), count, component, width, where)
         values[at.astype(np.int64)] = found
+
+
+class Rules:
+    """What objects of a document come to: reads their numbers.
+
+    Args:
+        document: whose they are.
+        what: what errors call the one that is read.
+    """
+
+    def __init__(self, document: Document, what: str) -> None:
+        self.document, self.what = document, what
+
+    def number(self, block: dict[str, Any], key: str, default: float, high: float, low: float = 0.0) -> float:
+        """Return a number of the file, in a range.
+
+        Raises:
+            AssetError: it is none, or lies outside.
+        """
+        value = block.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise self.wrong(f"{key} {str(value)[:40]!r} is no number in {low:g}..{high:g}")
+        return float(value)
+
+    def numbers(
+        self, block: dict[str, Any], key: str, default: tuple[float, ...], high: float = 1.0, low: float = 0.0
+    ) -> tuple[float, ...]:
+        """Return as many numbers as the default has; see :meth:`number`."""
+        values = block.get(key, default)
+        if not isinstance(values, list | tuple) or len(values) != len(default):
+            raise self.wrong(f"{key} {str(values)[:40]!r} is not {len(default)} numbers")
+        return tuple(self.number({key: value}, key, 0.0, high, low) for value in values)
+
+    def wrong(self, problem: str) -> AssetError:
+        """Return the error that names the object."""
+        return AssetError(self.document.path, f"{self.what}: {problem}")
 
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:

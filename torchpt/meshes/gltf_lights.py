@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
 from torchpt.lights import KINDS as LIGHTS
-from torchpt.meshes.gltf_document import Document
+from torchpt.meshes.gltf_document import Document, Rules
 from torchpt.meshes.mesh_part import FileCamera, FileLight
 from torchpt.spec import parameters_of
 
@@ -56,26 +56,25 @@ def light_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float6
     if not 0 < length < np.inf:
         raise rules.wrong("its node leaves it no direction (scaled to nothing, or not finite)")
     direction = direction / length
-    return FileLight(name, rules.kind, position, direction / np.linalg.norm(direction), rules.numbers())
+    return FileLight(name, rules.kind, position, direction / np.linalg.norm(direction), rules.values())
 
 
-class _Rules:
+class _Rules(Rules):
     """One light."""
 
     def __init__(self, document: Document, index: int, block: dict[str, Any]) -> None:
-        self.document, self.index, self.block = document, index, block
+        super().__init__(document, f"{PUNCTUAL}: light {index}")
+        self.block = block
         self.kind = str(block.get("type"))
         if self.kind not in _TYPES:
             raise self.wrong(f"type {self.kind[:40]!r}, expected point, spot or directional")
         self.parameters = parameters_of(LIGHTS[self.kind])
 
-    def numbers(self) -> dict[str, float | tuple[float, ...]]:
-        """What a scene file's light of its type has beside its place."""
-        color = self.block.get("color", (1.0, 1.0, 1.0))
-        if not isinstance(color, list | tuple) or len(color) != 3:
-            raise self.wrong(f"color {str(color)[:40]!r} is not 3 numbers")
-        intensity = self.number("intensity", self.block.get("intensity", 1.0))
-        amount = tuple(self.number("color", value) * intensity for value in color)
+    def values(self) -> dict[str, float | tuple[float, ...]]:
+        """Return what a scene file's light of its type has beside its place."""
+        color = self.numbers(self.block, "color", (1.0, 1.0, 1.0), _MOST)
+        intensity = self.number(self.block, "intensity", 1.0, _MOST)
+        amount = tuple(value * intensity for value in color)
         if max(amount) > _MOST:
             raise self.wrong(f"color times intensity is above {_MOST:g}")
         key = "intensity" if "intensity" in self.parameters else "irradiance"
@@ -83,8 +82,8 @@ class _Rules:
 
     def cone(self) -> dict[str, float]:
         cone = self.block.get("spot", {})
-        inner = self.number("innerConeAngle", cone.get("innerConeAngle", 0.0))
-        outer = self.number("outerConeAngle", cone.get("outerConeAngle", math.pi / 4.0))
+        inner = self.number(cone, "innerConeAngle", 0.0, _MOST)
+        outer = self.number(cone, "outerConeAngle", math.pi / 4.0, _MOST)
         if not 0.0 < outer <= 0.5 * math.pi + 1e-6:  # a right angle in float32 is a little more than one
             raise self.wrong(f"outerConeAngle {outer:g} is not above 0 and at most pi / 2")
         if inner >= outer:
@@ -92,14 +91,6 @@ class _Rules:
         cutoff = math.degrees(outer)
         beam = min(max(math.degrees(inner), _NARROWEST), cutoff)
         return {"cutoff_angle": cutoff, "beam_width": beam}
-
-    def number(self, key: str, value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= _MOST:
-            raise self.wrong(f"{key} {str(value)[:40]!r} is no number in 0..{_MOST:g}")
-        return float(value)
-
-    def wrong(self, problem: str) -> AssetError:
-        return AssetError(self.document.path, f"{PUNCTUAL}: light {self.index}: {problem}")
 
 
 def camera_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float64]) -> FileCamera | None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torchpt.errors import AssetError
 from torchpt.images import EncodedImage, has_alpha
 from torchpt.meshes.file_texture import image_texture, plain_scale
-from torchpt.meshes.gltf_document import Document
+from torchpt.meshes.gltf_document import Document, Rules
 from torchpt.meshes.mesh_part import FileMaterial, Rgb
 from torchpt.meshes.mtl_material import coat_gloss
 
@@ -83,11 +83,12 @@ class Materials:
         return self.images[number]
 
 
-class _Rules:
+class _Rules(Rules):
     """One material, and the names of what was left out."""
 
     def __init__(self, materials: Materials, block: dict[str, Any], number: Any) -> None:
-        self.materials, self.block, self.index = materials, block, number
+        super().__init__(materials.document, f"materials {number}")
+        self.materials, self.block = materials, block
         self.extensions: dict[str, Any] = block.get("extensions", {})
         self.ignored = [str(name) for name in self.extensions if name not in MATERIAL_EXTENSIONS]
         self.base: Rgb = _WHITE
@@ -230,7 +231,7 @@ class _Rules:
         self.ignored += [
             f"{key}: {str(name)[:80]}" for name in info.get("extensions", {}) if name != "KHR_texture_transform"
         ]
-        document = self.materials.document
+        document = self.document
         texture = document.item("textures", info.get("index"))
         if "source" not in texture:
             kinds = ", ".join(str(name)[:80] for name in texture.get("extensions", {})) or "no source"
@@ -260,22 +261,3 @@ class _Rules:
             nearest=sampler.get("magFilter") == _NEAREST,
             uv_transform=transform,
         )
-
-    def number(self, block: dict[str, Any], key: str, default: float, high: float, low: float = 0.0) -> float:
-        """A number of the file, in a range."""
-        value = block.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise self.wrong(f"{key} {str(value)[:40]!r} is no number in {low:g}..{high:g}")
-        return float(value)
-
-    def numbers(
-        self, block: dict[str, Any], key: str, default: tuple[float, ...], high: float = 1.0, low: float = 0.0
-    ) -> tuple[float, ...]:
-        """As many numbers as the default has."""
-        values = block.get(key, default)
-        if not isinstance(values, list | tuple) or len(values) != len(default):
-            raise self.wrong(f"{key} {str(values)[:40]!r} is not {len(default)} numbers")
-        return tuple(self.number({key: value}, key, 0.0, high, low) for value in values)
-
-    def wrong(self, problem: str) -> AssetError:
-        return AssetError(self.materials.document.path, f"materials {self.index}: {problem}")
