@@ -1,19 +1,27 @@
-"""Pictures as textures take them: the numbers as stored, and whether they may be sRGB."""
+"""Pictures as textures take them, of files and of numbers in a scene: as stored, and whether they may be sRGB."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from torchpt.errors import AssetError
 from torchpt.files import read_regular
+from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS, EncodedImage, Pixels, existing, pixels_of
 from torchpt.images.layers import group_channels
+from torchpt.spec import Refused
 
-__all__ = ["Texels", "has_alpha", "picture_of", "read_texels"]
+__all__ = ["TEXELS", "Texels", "check_source", "has_alpha", "picture_of", "radiance_of", "read_texels", "texels_of"]
+
+#: What is accepted.
+TEXELS = "texels (H, W, C), channels last, or (H, W), C from 1 to 4: finite numbers, or 8 bits a value (uint8)"
 
 
 @dataclass(frozen=True)
@@ -55,6 +63,64 @@ def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MA
     else:
         scaled /= np.float32(pixels.white)
     return Texels(scaled, pixels.eight_bit)
+
+
+def texels_of(value: Any) -> Texels:
+    """Return numbers as a picture ``(H, W, C)``: row 0 at the top, linear; of 8 or 16 bits they are scaled to 0..1 as a file's.
+
+    Raises:
+        Refused: another shape, numbers that are not finite in float32, or too many of them.
+    """
+    if not isinstance(value, np.ndarray | list | tuple):
+        raise Refused(TEXELS)
+    try:
+        array = np.asarray(value)
+    except (OverflowError, TypeError, ValueError, RuntimeError):
+        raise Refused(TEXELS, "rows of different lengths") from None
+    if array.dtype.kind not in "iuf" or array.ndim not in (2, 3):
+        raise Refused(TEXELS, f"{array.dtype} of shape {array.shape}")
+    array = array if array.ndim == 3 else array[..., None]
+    if not array.size or array.shape[2] > 4 or array.shape[0] * array.shape[1] > MAX_PIXELS:
+        raise Refused(TEXELS, f"shape {array.shape}")
+    with np.errstate(over="ignore"):
+        values = np.array(array, np.float32, order="C")
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=(1, 2)))
+    if len(bad):
+        raise Refused(TEXELS, f"a value that is not finite (row {bad[0]})")
+    if array.dtype in (np.uint8, np.uint16):
+        values /= np.float32(np.iinfo(array.dtype).max)
+    return Texels(values, array.dtype == np.uint8)
+
+
+def radiance_of(read: Texels, source: str, key: str) -> NDArray[np.float32]:
+    """Return a picture as radiance ``(H, W, 3)``: grey ones in all channels, 8-bit ones decoded from sRGB, no alpha.
+
+    Args:
+        read: the picture.
+        source: what errors call it.
+        key: the parameter that names it, for the error.
+
+    Raises:
+        Refused: a negative value.
+    """
+    values = read.values[..., :3] if read.values.shape[2] >= 3 else read.values[..., :1].repeat(3, 2)
+    if read.eight_bit:
+        values = srgb_to_linear(torch.from_numpy(np.ascontiguousarray(values))).numpy()
+    if values.min() < 0:
+        raise Refused(f"numbers >= 0 in the texels of {source}", float(values.min()), (key,))
+    return np.ascontiguousarray(values)
+
+
+def check_source(values: Mapping[str, Any]) -> None:
+    """Check that a picture comes from the file ``path`` or from the numbers ``data``.
+
+    Raises:
+        Refused: it comes from neither, or from both.
+    """
+    if values["path"] is None and values["data"] is None:
+        raise Refused("a file path or data (one of them is required)", None, ("path",))
+    if values["path"] is not None and values["data"] is not None:
+        raise Refused("either path or data, not both", "texels", ("data",))
 
 
 def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from torchpt.ibl.equirect import Cell, angles
-from torchpt.images.given import TEXELS, check_source, texels_of
+from torchpt.images.texels import TEXELS, check_source, radiance_of, read_texels, texels_of
 from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.math.angles import azimuth
 from torchpt.math.distributions import Cells, invert_linear
@@ -292,12 +292,11 @@ class Envmap(Environment):
         cls, values: Mapping[str, Any], find: Callable[[str], FilePath]
     ) -> dict[str, tuple[NDArray[np.float32], Spec]]:
         """See :class:`Light`."""
-        from torchpt.lights.pictures import radiance_in, radiance_of
-
         spec = Texels(doc="radiance `(H, W, 3)`, before `scale`")
         if values["data"] is not None:
-            return {"texels": (radiance_in(values["data"], "data", "data"), spec)}
-        return {"texels": (radiance_of(find("path"), "path"), spec)}
+            return {"texels": (radiance_of(values["data"], "data", "data"), spec)}
+        file = find("path")
+        return {"texels": (radiance_of(read_texels(file), str(file), "path"), spec)}
 
     @classmethod
     def row(cls, scene: Setting) -> Row:

@@ -12,7 +12,7 @@ from torchpt.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, Texels, read_texels
 from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS
-from torchpt.images.given import TEXELS, check_source, texels_of
+from torchpt.images.texels import TEXELS, check_source, texels_of
 from torchpt.spec import Choice, Color, Other, Path, Refused, Whole
 from torchpt.spec import Texels as TexelsSpec
 from torchpt.textures.atlas import WRAPS, ImageNode
