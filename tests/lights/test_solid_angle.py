@@ -14,8 +14,8 @@ from trials import SIGNIFICANCE, chi_square_p
 import torchpt.engines  # noqa: F401  (takes sampling over)
 from torchpt.lanes.function import Lanewise
 from torchpt.lights import solid_angle
-from torchpt.lights.area import inverse_pdf as planar
 from torchpt.lights.solid_angle import LEAST, MOST, OTHER, RECTANGLE, SKEW, TRIANGLE
+from torchpt.lights.surface import flat_inverse_pdf as planar
 from torchpt.math.vectors import affine, cross, dot, normalize
 from torchpt.math.warps import uniform_triangle
 

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from torchpt.lights.base import KINDS, Cone, Emitter
-from torchpt.math.vectors import dot
+from torchpt.math.vectors import affine, dot, safe_reciprocal
 from torchpt.records import KINDS as PRIMITIVES
 from torchpt.records import Lights, Quadrics
 from torchpt.spec import Kinds
 
-__all__ = ["SURFACES", "Faces", "OnSurface", "Surface", "emitter"]
+__all__ = ["SURFACES", "Faces", "OnSurface", "Surface", "emitter", "flat_inverse_pdf", "flat_point"]
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,24 @@ class Faces:
     column: Tensor  # (E,) int64 among the scene's primitives of the kind
     quadrics: Quadrics | None  # of the scene
     frame: Tensor | None  # (12, Q) float64: p0 e1 e2 e3 of them
+
+
+def flat_point(p0: Tensor, e1: Tensor, e2: Tensor, uv: Tensor) -> Tensor:
+    """Return the point ``(3, N)`` at ``(u, v)`` of affine primitives."""
+    return affine(p0, e1, uv[0], e2, uv[1])
+
+
+def flat_inverse_pdf(normal: Tensor, area: Tensor, wi: Tensor, square: Tensor) -> Tensor:
+    """Return ``1 / pdf`` in solid angle of a point drawn by area, ``area cos / r^2``; 0 behind the emitter.
+
+    Args:
+        normal: of the emitting side ``(3, N)``.
+        area: ``(N,)``.
+        wi: unit direction toward the light ``(3, N)``.
+        square: squared distance ``(N,)``.
+    """
+    cosine = (-dot(wi, normal)).clamp_min(0.0)
+    return area * cosine * safe_reciprocal(square)
 
 
 class Surface(Emitter):

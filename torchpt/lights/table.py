@@ -13,9 +13,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lights import area, choice, solid_angle
+from torchpt.lights import choice, solid_angle
 from torchpt.lights.base import COLUMNS, KINDS, Environment, Surroundings, taken
-from torchpt.lights.surface import SURFACES, Surface, emitter
+from torchpt.lights.surface import SURFACES, Surface, emitter, flat_inverse_pdf, flat_point
 from torchpt.math.vectors import dot, safe_reciprocal, take
 from torchpt.records import Interaction, Lights, LightSample
 
@@ -107,7 +107,7 @@ def _on_surfaces(
     place, angle, kinds = torch.zeros_like(u), None, _surfaces(lights)
     if lights.solid is not None:
         place, angle = solid_angle.sample(lights.solid, row, x, u, lights.shapes)
-        target, normal = area.point(at.p0, at.e1, at.e2, place), at.normal.expand_as(x)
+        target, normal = flat_point(at.p0, at.e1, at.e2, place), at.normal.expand_as(x)
     for k, kind in kinds:
         if kind.code != solid_angle.OTHER:
             continue
@@ -149,7 +149,7 @@ def _inverse_pdf(
     for k, kind in kinds:
         other = kind.size(at, normal)
         size = size if other is None else _pick(number, k, other, size)
-    inverse = area.inverse_pdf(normal, size, wi, square)
+    inverse = flat_inverse_pdf(normal, size, wi, square)
     if angle is not None:
         inverse = solid_angle.inverse_pdf(angle, inverse)
     for k, kind in kinds:

@@ -6,8 +6,7 @@ import math
 
 from torch import Tensor
 
-from torchpt.lights import area
-from torchpt.lights.surface import OnSurface, Surface
+from torchpt.lights.surface import OnSurface, Surface, flat_point
 from torchpt.math.warps import concentric_disk
 from torchpt.records import Lights
 
@@ -24,4 +23,4 @@ class Disk(Surface):
     def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
         """See :class:`Surface`."""
         place = concentric_disk(u)
-        return OnSurface(area.point(at.p0, at.e1, at.e2, place), at.normal, place)
+        return OnSurface(flat_point(at.p0, at.e1, at.e2, place), at.normal, place)
