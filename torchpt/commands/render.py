@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.commands import collector, ranked
-from torchpt.commands.denoised import denoised_files
 from torchpt.commands.interrupt import Interrupt, Interrupted
 from torchpt.commands.notices import not_finite, notices, unknown_error, which_job
 from torchpt.commands.progress import Bar
@@ -81,7 +80,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
         outs = _outputs(job, wishes)
         preview = wishes.render.preview and numbered(str(Path(wishes.render.preview).expanduser()), job.number)
         previews = _preview_files(preview) if preview else []
-        denoised = denoised_files(wishes, outs)
+        denoised = _denoised_files(wishes, outs)
         kept = wishes.render.checkpoint and numbered(str(Path(wishes.render.checkpoint).expanduser()), job.number)
         check_distinct(
             [
@@ -199,6 +198,21 @@ def check_distinct(files: Sequence[tuple[str, str]]) -> None:
 
 def _is_exr(path: str) -> bool:
     return Path(path).suffix.lower() == ".exr"
+
+
+def _denoised_files(wishes: Any, outs: list[str]) -> list[str]:
+    """Return where the denoised pictures go, one for each of ``outs``; none where none is wanted.
+
+    Raises:
+        RenderError: there is no denoiser.
+    """
+    if not wishes.film.denoise:
+        return []
+    from torchpt.forward.files import beside
+    from torchpt.images.denoiser import check_denoiser
+
+    check_denoiser()
+    return [beside(path) for path in outs]
 
 
 def _preview_files(preview: str) -> list[str]:
