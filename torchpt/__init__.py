@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from torchpt.forward import Rendering
     from torchpt.images import metrics, read_header, read_image, read_layers, write_image
     from torchpt.images.denoiser import denoise
-    from torchpt.rendering import render
+    from torchpt.rendering import render, trace
     from torchpt.scene import Scene, load
     from torchpt.scene.from_trimesh import from_trimesh
 
@@ -65,6 +65,7 @@ __all__ = [
     "read_layers",
     "render",
     "render_batch",
+    "trace",
     "write_image",
 ]
 
@@ -82,6 +83,7 @@ _LAZY = {
     "read_layers": "torchpt.images",
     "render": "torchpt.rendering",
     "render_batch": "torchpt.batches",
+    "trace": "torchpt.rendering",
     "write_image": "torchpt.images",
 }
 

@@ -26,7 +26,7 @@ from torchpt.scene import Scene
 from torchpt.scene.editions import AFTER, check_unchanged
 from torchpt.scene.scene import numbered
 
-__all__ = ["known", "opaque"]
+__all__ = ["known", "opaque", "outside"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -58,6 +58,17 @@ def opaque(render: Callable[P, R]) -> Callable[P, R]:
 
     in_graph = partial(_in_graph, render)
     return call
+
+
+def outside(call: Callable[P, R]) -> Callable[P, R]:
+    """``call`` for eager code and for graphs, which break there."""
+
+    @wraps(call)
+    def either(*args: P.args, **wishes: P.kwargs) -> R:
+        made: Any = torch.compiler.disable(call) if torch.compiler.is_compiling() else call
+        return made(*args, **wishes)
+
+    return either
 
 
 def _in_graph(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -26,13 +27,14 @@ from torchpt.scene import Scene
 from torchpt.scene.editions import AFTER, check_unchanged
 from torchpt.scene.entry import as_scene
 from torchpt.scene.textured import renew, with_texels
-from torchpt.settings import Settings
+from torchpt.settings import SAMPLERS, Settings
 from torchpt.taped import in_batch, on_tape, wants_gradients
 
-__all__ = ["Common", "Order", "Wishes", "check_names", "ordered", "rendered"]
+__all__ = ["Common", "Order", "Wishes", "check_names", "ordered", "ordered_along", "rendered"]
 
 #: How gradients are taken, the default first.
 ADJOINTS = ("replay", "autograd")
+_FLOATS = (torch.float32, torch.float64)
 
 
 class Common(TypedDict, total=False):
@@ -83,6 +85,7 @@ class Order:
         adjoint: how gradients are taken.
         ranks: that share the work.
         editions: of the scene's own parameters, but for those that ``params`` stand for, as they were.
+        rays: origins and directions ``(..., 3)`` in place of the camera's, one for each pixel of the film; None: the camera's.
     """
 
     given: Scene
@@ -94,6 +97,7 @@ class Order:
     adjoint: str
     ranks: Group | None = None
     editions: Mapping[str, int] = field(default_factory=dict)
+    rays: tuple[Tensor, Tensor] | None = None
 
     @property
     def wanted(self) -> tuple[str, ...]:
@@ -101,9 +105,14 @@ class Order:
         return tuple(name for name, value in self.params.items() if wants_gradients(value))
 
     @property
+    def by_rays(self) -> bool:
+        """Return True where rays are differentiated."""
+        return any(wants_gradients(vectors) for vectors in self.rays or ())
+
+    @property
     def taped(self) -> bool:
         """Return True where the picture is to carry gradients."""
-        return torch.is_grad_enabled() and bool(self.wanted or self.scene.weights())
+        return torch.is_grad_enabled() and bool(self.wanted or self.by_rays or self.scene.weights())
 
     def noted(self) -> Order:
         """The same, with what :meth:`check_unchanged` compares."""
@@ -173,6 +182,67 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
     return order.noted() if order.taped else order
 
 
+def ordered_along(scene: Scene, o: Tensor, d: Tensor, **wishes: Unpack[Wishes]) -> Order:
+    """Return what the arguments of ``trace`` ask for: a picture whose pixels are the rays.
+
+    Raises:
+        SceneError: one that is not accepted.
+    """
+    as_scene(scene)
+    o, d = _broadcast(scene, o, d)
+    wishes["edges"] = False
+    order = ordered(scene, False, **wishes)
+    settings, sampler = order.settings, order.settings.sampler
+    if not settings.integrator.light:
+        radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
+        raise SceneError(
+            "integrator.type", settings.integrator.name, f"one of {radiant}: along rays there is light alone"
+        )
+    if settings.integrator.splats:
+        raise SceneError("integrator.type", settings.integrator.name, "one without splats, which rays have no film for")
+    if sampler.kind.of_film:
+        others = ", ".join(name for name in SAMPLERS if not SAMPLERS[name].of_film)
+        raise SceneError("sampler.type", sampler.name, f"one of {others}: rays have no places on a film")
+    wished = wishes.get("sampler")
+    if isinstance(wished, Mapping) and wished.get("adaptive"):
+        raise SceneError("sampler.adaptive", True, "false: rays have the same number of samples")
+    if seen := [name for name in wishes.get("params") or {} if name.startswith("camera.")]:
+        raise SceneError("params", seen[0], "none of the camera's, which rays do not come from")
+    # What a scene file says of its picture, and of when that is done, is not meant for rays.
+    height, width = math.prod(d.shape[:-2]), d.shape[-2] if d.dim() > 1 else 1
+    settings = replace(
+        settings,
+        film=settings.film.but(width=width, height=height, crop=None, aovs=(), denoise=False),
+        sampler=replace(sampler, values={key: value for key, value in sampler.values.items() if key != "adaptive"}),
+        render=settings.render.but(
+            pilots=False, time_limit=None, target_error=None, checkpoint=None, resume=False, preview=None
+        ),
+    )
+    params = {name: value for name, value in order.params.items() if not name.startswith("camera.")}
+    order = replace(order, settings=settings, params=params, rays=(o, d))
+    return order.noted() if order.taped else order
+
+
+def _broadcast(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
+    """Return origins and directions of rays in one shape ``(..., 3)``.
+
+    Raises:
+        SceneError: no such tensors, or on another device than the scene.
+    """
+    for key, vectors in (("o", o), ("d", d)):
+        form = (vectors.dtype, tuple(vectors.shape)) if isinstance(vectors, Tensor) else vectors
+        if not isinstance(vectors, Tensor) or vectors.dtype not in _FLOATS or vectors.shape[-1:] != (3,):
+            raise SceneError(key, form, "a tensor (..., 3) of float32 or float64")
+        if vectors.device != scene.device:
+            raise SceneError(key, str(vectors.device), f"a tensor on the scene's device {scene.device}")
+    try:
+        o, d = torch.broadcast_tensors(o, d)
+    except RuntimeError:
+        shapes = tuple(o.shape), tuple(d.shape)
+        raise SceneError("o, d", shapes, "shapes (..., 3) that are one when they are broadcast") from None
+    return o, d
+
+
 def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
     """Parameters in place of the scene's, those of its own that want gradients among them.
 
@@ -200,20 +270,23 @@ def rendered(order: Order, made: list[Rendering] | None = None) -> Rendering:
     """
     scene, settings = order.scene, order.settings
 
-    def render(params: Mapping[str, Tensor]) -> Rendering:
+    def render(params: Mapping[str, Tensor], rays: tuple[Tensor, ...]) -> Rendering:
         if made:
             return made.pop()
         with nullcontext() if order.ranks is None else order.ranks.together():
             scene.check(params)
-        return known(lambda: render_scene(scene, settings, params=params, dtype=order.dtype, ranks=order.ranks))
+        given = _pair(rays)
+        return known(
+            lambda: render_scene(scene, settings, params=params, dtype=order.dtype, ranks=order.ranks, rays=given)
+        )
 
     if order.taped:
         seed = settings.render.seed ^ 0x5DEECE66D if order.backward["seed"] is None else order.backward["seed"]
         rendering = _differentiable(replace(order, backward={**order.backward, "seed": seed}), render)
-    elif order.params:
-        rendering = _constant(order.params, render)
+    elif order.params or order.rays is not None:
+        rendering = _constant(order, render)
     else:
-        rendering = render({})
+        rendering = render({}, ())
     if settings.film.denoise:
         denoise_rendering(rendering, settings)
     if rendering.relmse_unknown:
@@ -248,7 +321,7 @@ def _check(
     """Refuse arguments of :func:`render` that are no settings; ``numbers`` are whole, with the least of each."""
     if device not in (None, "auto") and not _same(device, scene.device):
         raise SceneError("device", str(device), f"the scene's own device {scene.device}; load the scene on the other")
-    if dtype not in (torch.float32, torch.float64):
+    if dtype not in _FLOATS:
         raise SceneError("dtype", dtype, "torch.float32 or torch.float64")
     if adjoint not in (None, *ADJOINTS):
         raise SceneError("adjoint", adjoint, " or ".join(ADJOINTS))
@@ -281,8 +354,17 @@ def _same(wish: str | torch.device, own: torch.device) -> bool:
     return device.type == own.type and device.index in (None, own.index or 0)
 
 
-def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rendering]) -> Rendering:
-    """A rendering whose picture is on a tape from the parameters that are wanted; ``render`` makes it without."""
+def _pair(rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor] | None:
+    """Return origins and directions of rays; None where there are none."""
+    return (rays[0], rays[1]) if rays else None
+
+
+#: Makes a rendering of parameters and rays, without a tape.
+_Make = Callable[[Mapping[str, Tensor], tuple[Tensor, ...]], Rendering]
+
+
+def _differentiable(order: Order, render: _Make) -> Rendering:
+    """A rendering whose picture is on a tape from the parameters (and rays) that are wanted; ``render`` makes it without."""
     from torchpt import adjoint, edges  # a render without gradients does not wait for them
 
     scene, settings, params, backward = order.scene, order.settings, order.params, order.backward
@@ -292,8 +374,9 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         raise SceneError("integrator.type", settings.integrator.name, f"one of {radiant} where gradients are wanted")
     if settings.render.checkpoint is not None:
         raise SceneError("render.checkpoint", settings.render.checkpoint, "null where gradients are wanted")
-    attached = adjoint.attached(scene, wanted)
-    if edges.concerns(scene, wanted):
+    by_rays = order.by_rays
+    attached = by_rays or adjoint.attached(scene, wanted)
+    if by_rays or edges.concerns(scene, wanted):
         _warn_of_edges(edges.left_out(scene, settings), backward["edges"] == 0)
     for name in edges.without_gradient(scene, wanted):
         said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"
@@ -303,10 +386,10 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
     taken: list[int] = []
 
     def given_by(*tensors: Tensor) -> dict[str, Tensor]:
-        return dict(zip(names, tensors, strict=True))
+        return dict(zip(names, tensors, strict=False))  # rays follow
 
     def forward(*tensors: Tensor) -> tuple[Tensor]:
-        made.append(render(given_by(*tensors)))
+        made.append(render(given_by(*tensors), tensors[len(names) :]))
         return (made[-1].image,)
 
     def backward_pass(cotangents: tuple[Tensor, ...], *tensors: Tensor) -> list[Tensor | None]:
@@ -321,14 +404,18 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         own = again().render
         exact = own.seed == settings.render.seed and own.spp == taken[0]
         held = not exact and adjoint.suits(scene, settings, wanted)
-        found = adjoint.gradients(scene, again(), given, wanted, dtype, attached, order.adjoint, cotangent, held, ranks)
+        rays = _pair(tensors[len(names) :])
+        found = adjoint.gradients(
+            scene, again(), given, wanted, dtype, attached, order.adjoint, cotangent, held, ranks, rays, by_rays
+        )
         if of_edges and edges.concerns(scene, wanted):
             _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
             moved = edges.add_gradients(
                 scene, again(1), given, wanted, dtype, cotangent.T.reshape(height, width, 3), of_edges, held, ranks
             )
             found[: len(wanted)] = [a if b is None else a + b for a, b in zip(found, moved, strict=False)]
-        return [*found[: len(wanted)], *(None for _ in names[len(wanted) :]), *found[len(wanted) :]]
+        still = [None] * (len(tensors) - len(wanted) - (2 if by_rays else 0))
+        return [*found[: len(wanted)], *still, *found[len(wanted) :]]
 
     def again(spp: int | None = None) -> Settings:
         spp = spp or backward["spp"] or taken[0]
@@ -341,7 +428,7 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
         order.check_unchanged(AFTER)
         return edges.Asked(scene, again(), wanted, dtype, edges_taken())
 
-    tensors = tuple(params[name] for name in names)
+    tensors = (*(params[name] for name in names), *(order.rays or ()))
     (image,) = on_tape(forward, backward_pass, tensors, scene.weights())
     rendering = made[-1]
     made.clear()  # the tape keeps the closures, which are not to keep pictures
@@ -353,15 +440,15 @@ def _differentiable(order: Order, render: Callable[[Mapping[str, Tensor]], Rende
     return replace(rendering, image=image)
 
 
-def _constant(params: Mapping[str, Tensor], render: Callable[[Mapping[str, Tensor]], Rendering]) -> Rendering:
-    """A rendering without gradients, of parameters that may still be those of a transform of ``torch.func``."""
-    made: list[Rendering] = []
+def _constant(order: Order, render: _Make) -> Rendering:
+    """A rendering without gradients, of parameters and rays that may still be those of a transform of ``torch.func``."""
+    params, made = order.params, list[Rendering]()
 
     def forward(*tensors: Tensor) -> tuple[Tensor]:
-        made.append(render(dict(zip(params, tensors, strict=True))))
+        made.append(render(dict(zip(params, tensors, strict=False)), tensors[len(params) :]))
         return (made[-1].image,)
 
-    (image,) = on_tape(forward, lambda *_: (), tuple(params.values()), ())
+    (image,) = on_tape(forward, lambda *_: (), (*params.values(), *(order.rays or ())), ())
     return replace(made[-1], image=image)
 
 

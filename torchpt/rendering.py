@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 from torchpt.forward import Progress, Rendering, render_scene
-from torchpt.graphs import opaque
+from torchpt.graphs import opaque, outside
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators.base import Integrator
-from torchpt.orders import Wishes, ordered, rendered
+from torchpt.orders import Wishes, ordered, ordered_along, rendered
 from torchpt.ranks import Group
 from torchpt.scene import Scene
 from torchpt.settings import FILTERS, Settings
 from torchpt.spec.declared import Described
 
-__all__ = ["Progress", "Rendering", "Wishes", "first_hit", "render", "render_scene"]
+__all__ = ["Progress", "Rendering", "Wishes", "first_hit", "render", "render_scene", "trace"]
 
 
 @overload
@@ -99,6 +99,61 @@ def render(
     )  # fmt: skip
     rendering = rendered(order)
     return rendering if full else rendering.image
+
+
+@outside
+def trace(
+    scene: Scene,
+    o: Tensor,
+    d: Tensor,
+    *,
+    spp: int | None = 1,
+    seed: int | None = 0,
+    integrator: str | Mapping[str, Any] | Integrator | None = None,
+    sampler: str | Mapping[str, Any] | None = None,
+    params: Mapping[str, Tensor] | None = None,
+    accel: str | None = None,
+    compile: str | bool | None = None,
+    threads: int | str | None = None,
+    max_memory: int | str | None = None,
+    device: str | torch.device | None = None,
+    dtype: torch.dtype = torch.float32,
+    adjoint: str | None = None,
+    seed_grad: int | None = None,
+    spp_grad: int | None = None,
+) -> Tensor:
+    """Return the radiance that arrives at ``o`` from ``d``, linear RGB ``(..., 3)``; differentiable in both and in ``params``.
+
+    Random numbers are a function of the seed, of a ray's number in row-major order, and of the sample. Rays that stand as
+    pixels do, ``(H, W, 3)``, have those of the pixels: along a camera's own rays this is ``render``, to the bit. A ray has no
+    width, so textures are looked up at points. Gradients leave out visibility edges, and say so by an
+    :class:`torchpt.EdgeWarning` where rays, surfaces or places of lights are differentiated.
+
+    Main arguments:
+        scene: from :func:`torchpt.load`.
+        o: origins ``(..., 3)``, float32 or float64, in the scene's world, on its device.
+        d: directions from there ``(..., 3)``, of any length; ``o`` and ``d`` are broadcast. The derivative is that of
+            ``d / |d|``.
+        spp: samples a ray, which are averaged.
+        seed: any integer from 0; the same seed gives the same numbers.
+        params: tensors in place of ``scene.params`` by dotted name, but for those of the camera.
+
+    Other arguments, all as of :func:`render`:
+        integrator, sampler, accel, compile, threads, max_memory, device, dtype, adjoint, seed_grad, spp_grad.
+        What a scene file says of its film, and of when a picture is done, does not count here.
+
+    Raises:
+        SceneError: a setting, parameter or ray that is not accepted: a direction that is zero, numbers that are not finite.
+        RenderError: a device or compiler that is not there.
+    """
+    order = ordered_along(
+        scene, o, d, spp=spp, seed=seed, integrator=integrator, sampler=sampler, params=params, accel=accel, compile=compile,
+        threads=threads, max_memory=max_memory, device=device, dtype=dtype, adjoint=adjoint, seed_grad=seed_grad,
+        spp_grad=spp_grad,
+    )  # fmt: skip
+    assert order.rays is not None
+    o, d = order.rays
+    return rendered(order).image.reshape(o.shape) if o.numel() else (o + d).to(dtype)
 
 
 def first_hit(scene: Scene, settings: Settings, names: tuple[str, ...] = ("albedo", "normal")) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ def test_the_lessons_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     blocks = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
-    assert len(blocks) == 6
+    assert len(blocks) == 7
     for block in blocks:
         exec(compile(block, str(PAGE), "exec"), names)
     for name in ("fov", "paint"):
@@ -31,6 +31,11 @@ def test_the_lessons_run(tmp_path, monkeypatch, capsys):
     found = torch.tensor([float(x) for x in re.findall(r"\d\.\d+", capsys.readouterr().out)])
     right = torchpt.load("cornell_box", "cpu").params["materials.red.reflectance"]
     torch.testing.assert_close(found, right, rtol=0, atol=0.02)
+    irradiance, panorama = names["irradiance"], names["panorama"]
+    assert isinstance(irradiance, torch.Tensor) and isinstance(panorama, torch.Tensor)
+    rows = (torch.arange(16) + 0.5) / 32 * torch.pi  # the upper half, by its cosine
+    weight = (rows.cos() * rows.sin() * torch.pi / 32 * 2 * torch.pi / 64)[:, None, None]
+    torch.testing.assert_close((panorama[:16] * weight).sum((0, 1)), irradiance, rtol=0.1, atol=0.0)
     batch = names["batch"]
     assert isinstance(batch, dict) and batch["image"].shape == (2, 16, 16, 3) and batch["K"].shape == (2, 3, 3)
 

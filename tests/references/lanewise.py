@@ -168,7 +168,7 @@ def _generate(found: Differences, wave: Wave, kernels: Kernels, pixels: int, sam
     worker.start(Chunk(0, pixels, 0, samples))
     worker.calls.clear()
     worker.calls.name_salts(0)
-    worker.calls.run(kernels.generate(False), pixels * samples, here, here)
+    worker.calls.run(kernels.generate(False, False), pixels * samples, here, here)
     taken = kernels.state.take(here, np.arange(pixels * samples), _STATE)
     for name, value in taken.items():
         if name == "eta":

@@ -611,11 +611,11 @@ def test_memory_that_runs_out_in_a_thread(monkeypatch):
     expected = torchpt.render_batch(scenes)
     plain, failed = loop_kernels.Kernels.generate, []
 
-    def once(self, chosen):
+    def once(self, *form):
         if not failed:
             failed.append(True)
             raise MemoryError
-        return plain(self, chosen)
+        return plain(self, *form)
 
     monkeypatch.setattr(loop_kernels.Kernels, "generate", once)
     assert torch.equal(torchpt.render_batch(scenes, threads=2), expected) and failed

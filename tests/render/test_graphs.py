@@ -214,3 +214,20 @@ def test_what_is_no_tensor_is_refused_as_by_eager_code(scene: torchpt.Scene) -> 
     compiled = torch.compile(picture, backend="aot_eager")
     with pytest.raises(SceneError, match=f"{WALL}: expected a floating tensor"):
         compiled(scene, [1.0, 1.0, 1.0])  # type: ignore[arg-type]
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute:UserWarning")
+def test_rays_are_traced_between_graphs(scene):
+    o, d = torch.tensor([0.1, 0.2, 2.0]), torch.tensor([[0.0, 0.1, -1.0], [0.2, 0.0, -1.0]])
+
+    def loss(colour: Tensor) -> Tensor:
+        return torchpt.trace(scene, o, d, params={WALL: colour.sigmoid()}, seed_grad=1).square().sum()
+
+    found = []
+    counter = CompileCounter()
+    for of in (loss, torch.compile(loss, backend=counter)):
+        leaf = torch.tensor([0.5, 0.0, -1.0], requires_grad=True)
+        value = of(leaf)
+        found.append((value.detach(), *torch.autograd.grad(value, leaf)))
+    assert counter.frame_count == 2
+    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))

@@ -48,8 +48,10 @@ def gradients(
     asked: Tensor,
     held: bool = False,
     ranks: Group | None = None,
+    rays: tuple[Tensor, Tensor] | None = None,
+    by_rays: bool = False,
 ) -> list[Tensor]:
-    """Derivatives by the parameters ``wanted`` and by the weights of the caller's own models.
+    """Derivatives by the parameters ``wanted``, by rays, and by the weights of the caller's own models.
 
     Args:
         scene: what is rendered.
@@ -62,6 +64,8 @@ def gradients(
         asked: derivatives of a loss by the pixels ``(3, H W)``.
         held: whether what the camera sees is held in place (:func:`suits`), and the picture moves over it.
         ranks: those that share the pixels, which are the same on each.
+        rays: in place of the camera's, see :func:`torchpt.forward.wave.make_wave`.
+        by_rays: whether they are differentiated: their origins and directions follow the parameters.
 
     Raises:
         SceneError: ``render.max_memory`` is too small for it.
@@ -76,7 +80,7 @@ def gradients(
         raise NotBuiltError("integrator.type", integrator.name, expected)
     with limited_threads(settings.render.threads):
         attached = follows(scene, wanted) if held else attached
-        assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks)
+        assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks, rays, by_rays)
         if settings.render.max_memory is not None:
             need = need_of(settings, scene.device, "tape", len(assembly.wave.context.world.materials.models))
             check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)

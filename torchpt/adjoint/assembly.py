@@ -37,6 +37,8 @@ class Assembly:
         dtype: of the lanes.
         attached: whether geometry is differentiated.
         ranks: those that share the pixels; None: there is but one process.
+        rays: in place of the camera's, see :func:`torchpt.forward.wave.make_wave`.
+        by_rays: whether they are differentiated too.
 
     Attributes:
         wave: with plain tensors.
@@ -56,12 +58,17 @@ class Assembly:
         dtype: torch.dtype,
         attached: bool,
         ranks: Group | None = None,
+        rays: tuple[Tensor, Tensor] | None = None,
+        by_rays: bool = False,
     ) -> None:
         self._ranks = ranks
         self._inputs = [params[name].detach().requires_grad_() for name in wanted]
-        given = {name: value.detach() for name, value in params.items()} | dict(zip(wanted, self._inputs, strict=True))
+        if rays is not None:
+            o, d = rays = rays[0].detach().requires_grad_(by_rays), rays[1].detach().requires_grad_(by_rays)
+            self._inputs += [o, d] if by_rays else []
+        given = {name: value.detach() for name, value in params.items()} | dict(zip(wanted, self._inputs, strict=False))
         with torch.enable_grad():
-            made = make_wave(scene, settings, given, dtype, True, attached)
+            made = make_wave(scene, settings, given, dtype, True, attached, rays=rays)
         self._outputs: list[Tensor] = []
         self.leaves: list[Tensor] = []
         self.plain: list[Tensor] = []
@@ -118,7 +125,7 @@ class Assembly:
         return Sums((*self.leaves, *self.held))
 
     def gradients(self, sums: Sums) -> list[Tensor]:
-        """Gradients of the parameters, and of what is held, from those of the leaves."""
+        """Gradients of the parameters, of rays, and of what is held, from those of the leaves."""
         found = sums.gradients()
         pairs = [(y, g) for y, g in zip(self._outputs, found, strict=False) if g is not None]
         own: Sequence[Tensor | None] = [None] * len(self._inputs)
@@ -131,6 +138,7 @@ class Assembly:
 def _over(wave: Wave, change: Callable[[Tensor], Tensor]) -> Wave:
     """A wave with other tensors; stages run as tensor operations."""
     context = wave.context
-    world, pixel, camera, first = map_leaves(change, (context.world, context.pixel, wave.camera, wave.first))
+    own = context.world, context.pixel, wave.camera, wave.first, wave.given
+    world, pixel, camera, first, given = map_leaves(change, own)
     context = replace(context, world=world, pixel=pixel, camera=None if context.camera is None else camera)
-    return replace(wave, context=context, camera=camera, first=first)
+    return replace(wave, context=context, camera=camera, first=first, given=given)

@@ -40,7 +40,7 @@ def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str
     nans = sum(place.nan for place in lost.places)
     causes["nan, not traced"] = lost.nan - nans
     causes["infinite, not traced"] = lost.infinite - (len(lost.places) - nans)
-    first = f"{_named(lost.places[0])}: {_said(scene, wave, faults[0])}"
+    first = f"{_named(wave, lost.places[0])}: {_said(scene, wave, faults[0])}"
     return {name: count for name, count in causes.most_common() if count}, first
 
 
@@ -48,15 +48,17 @@ def told(scene: Scene, wave: Wave, place: Place) -> str:
     """Return a sentence about one sample that is not finite."""
     from torchpt.paths.explain import faults_of
 
-    return f"{_named(place)} is not finite: {_said(scene, wave, faults_of(_trace, wave, [place])[0])}"
+    return f"{_named(wave, place)} is not finite: {_said(scene, wave, faults_of(_trace, wave, [place])[0])}"
 
 
 def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
     return brought(wave, state, observer=observer)
 
 
-def _named(place: Place) -> str:
-    """A sample by number and pixel; pilots take some of their own."""
+def _named(wave: Wave, place: Place) -> str:
+    """A sample by number and pixel, or ray; pilots take some of their own."""
+    if wave.given is not None:
+        return f"sample {place.sample} of ray {place.y * wave.crop[2] + place.x}"
     return str(place) + (" (its second value)" if place.first else "")
 
 

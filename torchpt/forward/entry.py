@@ -26,6 +26,7 @@ def render_scene(
     params: Mapping[str, Tensor] | None = None,
     dtype: torch.dtype = torch.float32,
     ranks: Group | None = None,
+    rays: tuple[Tensor, Tensor] | None = None,
 ) -> Rendering:
     """Render with complete settings.
 
@@ -36,6 +37,7 @@ def render_scene(
         params: tensors in place of the scene's, without gradients.
         dtype: of the lanes.
         ranks: those that share the work; each gets all of the picture.
+        rays: in place of the camera's, see :func:`torchpt.forward.wave.make_wave`; by one process.
 
     Raises:
         SceneError: settings that this scene cannot be rendered with.
@@ -45,4 +47,4 @@ def render_scene(
     """
     with undisturbed(scene.device), limited_threads(settings.render.threads):
         with together(ranks, "what is rendered", lambda: stamp(scene, settings, params, dtype)):
-            return Run(scene, settings, params, dtype, group=ranks).go(on_progress)
+            return Run(scene, settings, params, dtype, group=ranks, rays=rays).go(on_progress)

@@ -58,7 +58,7 @@ def _most(known: KnownError | None) -> float:
 class Run:
     """One forward render: accumulates chunks into films; by several ranks where there is a ``group`` of them.
 
-    ``like``: see :func:`torchpt.forward.wave.make_wave`. ``threads``: that will take samples; None: torch's number.
+    ``like``, ``rays``: see :func:`torchpt.forward.wave.make_wave`. ``threads``: that will take samples; None: torch's number.
     """
 
     def __init__(
@@ -70,6 +70,7 @@ class Run:
         group: Group | None = None,
         like: Wave | None = None,
         threads: int | None = None,
+        rays: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         self.start = time.perf_counter()
         self._others = compile_time.seconds()
@@ -83,7 +84,7 @@ class Run:
         before = 0 if limit is None else meter.peak()
         compiled = looped(settings, self.device, dtype)
         with needing(lambda: f"a scene of {scene.told}"):
-            self.wave = make_wave(scene, settings, params, dtype, like=like)
+            self.wave = make_wave(scene, settings, params, dtype, like=like, rays=rays)
         built = before if limit is None else meter.peak()
         _, _, self.width, self.height = self.wave.crop
         self.params, self.dtype = params, dtype

@@ -14,7 +14,7 @@ from torchpt.cameras import Camera
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.engines.kernels.schedule import Loop
 from torchpt.errors import SceneError
-from torchpt.film import Filter
+from torchpt.film import FILTERS, Filter
 from torchpt.forward.kept import kept
 from torchpt.forward.schedule import streams_of
 from torchpt.forward.waves import say_once
@@ -23,7 +23,8 @@ from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
 from torchpt.integrators.plan import Plan
 from torchpt.integrators.vertex import StageContext
-from torchpt.integrators.wave import Wave
+from torchpt.integrators.wave import Rays, Wave
+from torchpt.math.vectors import dot, normalize
 from torchpt.records import World
 from torchpt.samplers import ADAPTIVE, Points, Sampler
 from torchpt.scene import Scene
@@ -46,10 +47,15 @@ def make_wave(
     tape: bool = False,
     attached: bool = False,
     like: Wave | None = None,
+    rays: tuple[Tensor, Tensor] | None = None,
 ) -> Wave:
     """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``.
 
     ``like``: a wave of the same scene, settings and parameters, but for those of the camera: what it reads is read again.
+    ``rays``: origins and directions ``(..., 3)`` in the scene's coordinates, one for each pixel, in place of the camera's.
+
+    Raises:
+        SceneError: a direction that is zero, or a ray that is not finite.
     """
     film, spp = settings.film, settings.render.spp
     integrator = settings.integrator.counted_in(scene.space.unit)
@@ -70,17 +76,46 @@ def make_wave(
     plan = integrator.plan(points, dtype, tape, attached)
     camera = _camera(scene, settings, params, dtype)
     crop = film.crop or (0, 0, film.width, film.height)
+    filter = _filter(film.filter.kind, tuple(film.filter.values.items()), scene.device)
+    if rays is not None and filter.signed:  # of the others nothing is asked: kernels are those of renders
+        filter = _filter(FILTERS["box"], (), scene.device)
+    context = _context(plan, world, camera, crop, integrator)
     return Wave(
-        context=_context(plan, world, camera, crop, integrator),
+        context=context if rays is None else replace(context, pixel=None),
         integrator=integrator,
         accel=accel,
         camera=camera,
-        filter=_filter(film.filter.kind, tuple(film.filter.values.items()), scene.device),
+        filter=filter,
         sampler=Sampler(points, settings.render.seed, streams_of(settings), spp, film.width),
         crop=crop,
         centre=scene.space.shift,
         first=_first(scene, integrator, world, own) if like is None else like.first,
+        given=None if rays is None else _given(scene, *rays, dtype),
     )
+
+
+def _given(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
+    """Return rays ``(..., 3)`` of the scene's coordinates as lanes have them, differentiable."""
+    o, d = (x.reshape(-1, 3).T.double() for x in (o, d))
+    origin = ((o - scene.space.centre[:, None]) / scene.space.unit).to(dtype).contiguous()
+    _refuse("o", o, torch.isfinite(origin).all(0), f"an origin that is finite in {str(dtype).removeprefix('torch.')}")
+    _refuse("d", d, torch.isfinite(d).all(0) & (d != 0).any(0), "a direction that is finite and not zero")
+    unit = normalize(d)
+    # What is of unit length up to rounding keeps its bits.
+    near = (dot(d, d) - 1.0).abs() < 8.0 * torch.finfo(dtype).eps
+    unit = unit + torch.where(near, d - unit, 0.0).detach()
+    return Rays(origin, unit.to(dtype).contiguous())
+
+
+def _refuse(key: str, given: Tensor, good: Tensor, expected: str) -> None:
+    """Refuse the first of some vectors ``(3, N)`` that is not ``good (N,)``.
+
+    Raises:
+        SceneError: names it.
+    """
+    bad = (~good).nonzero()
+    if len(bad):
+        raise SceneError(f"{key}, ray {int(bad[0])}", given[:, int(bad[0])].tolist(), expected)
 
 
 def _camera(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:

@@ -18,6 +18,7 @@ from torchpt.integrators.base import Integrator
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.stages import generate
 from torchpt.integrators.vertex import StageContext, VertexInput, VertexOutput
+from torchpt.math.vectors import take
 from torchpt.records import PathState
 from torchpt.samplers import Dimension, Draws, Sampler, Streams, salts
 
@@ -27,7 +28,20 @@ if TYPE_CHECKING:
 #: A stage of the surfaces of one BSDF model.
 Bounce = Callable[[StageContext, int, VertexInput], VertexOutput]
 
-__all__ = ["Bounce", "Wave", "camera_state", "still_of"]
+__all__ = ["Bounce", "Rays", "Wave", "camera_state", "still_of"]
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays that paths begin with in place of a camera's: number k is that of pixel k.
+
+    Attributes:
+        o: origins ``(3, N)``, in the lanes' coordinates.
+        d: unit directions ``(3, N)``.
+    """
+
+    o: Tensor
+    d: Tensor
 
 
 @dataclass(frozen=True)
@@ -44,6 +58,7 @@ class Wave:
         crop: ``(x, y, width, height)`` of the picture on the film.
         centre: ``(3,)`` float64, see Space.shift.
         first: what happens at first surfaces; None where paths go on.
+        given: rays in place of the camera's, one for each pixel of the film; None: the camera's.
     """
 
     context: StageContext
@@ -55,6 +70,7 @@ class Wave:
     crop: tuple[int, int, int, int]
     centre: Tensor
     first: FirstSurface | None = None
+    given: Rays | None = None
 
     @property
     def bounce(self) -> Bounce:
@@ -64,7 +80,7 @@ class Wave:
     def rays(
         self, first_pixel: int, pixels: int, first_sample: int, samples: int, plate: Plate | None = None
     ) -> PathState:
-        """Camera rays of consecutive pixels of a plate (the picture, row by row); lanes run over pixels, then over samples."""
+        """Rays of consecutive pixels of a plate (the picture, row by row); lanes run over pixels, then over samples."""
         device = self.centre.device
         x0, y0, width, _ = self.crop
         place = torch.arange(first_pixel, first_pixel + pixels, device=device)
@@ -75,7 +91,7 @@ class Wave:
         return self.rays_of(x.repeat(samples), y.repeat(samples), sample, None if plate is None else plate.streams)
 
     def rays_of(self, x: Tensor, y: Tensor, sample: Tensor, streams: Streams | None = None) -> PathState:
-        """Camera rays of single samples.
+        """Rays of single samples: the camera's, or those that are given.
 
         Args:
             x: of pixels on the whole film ``(N,)`` int64.
@@ -84,7 +100,10 @@ class Wave:
             streams: which share a pixel's samples; None: those of the picture.
         """
         # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
-        key = self.sampler.key(y * self.camera.resolution[0] + x, sample, streams)
+        number = y * self.camera.resolution[0] + x
+        key = self.sampler.key(number, sample, streams)
+        if self.given is not None:
+            return camera_state(take(self.given.o, number), take(self.given.d, number), key)
         x, y = (a.to(self.context.plan.dtype) for a in (x, y))
         return generate(self.context.plan, self.camera, self.filter, x, y, key, salts(0, self.centre.device))
 

@@ -45,6 +45,7 @@ class Points(ABC):
         needs_count: whether the number of points must be known before the first is drawn, so that nothing but ``spp`` may
             end a render.
         rows: of a key.
+        of_film: whether points depend on where a pixel lies beside others; else on its number alone.
         joint: whether sets of two dimensions go on: :meth:`draw_further` gives two more, stratified with them.
     """
 
@@ -52,6 +53,7 @@ class Points(ABC):
     parameters: ClassVar[Mapping[str, Spec]] = {}
     needs_count: ClassVar[bool] = False
     rows: ClassVar[int] = 2
+    of_film: ClassVar[bool] = False
     joint: ClassVar[bool] = False
 
     def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:

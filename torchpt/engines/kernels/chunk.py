@@ -156,20 +156,27 @@ class Worker:
         ).astype(np.int32)  # fmt: skip
 
     def spawn(self, chunk: Chunk) -> Paths:
-        """Start the paths of a chunk at the camera; where the search is inside of the stages with their first hits."""
+        """Start the paths of a chunk by its rays; where the search is inside of the stages with their first hits."""
         self.start(chunk)
-        kernels, calls = self.kernels, self.calls
+        kernels, calls, given = self.kernels, self.calls, self.wave.given
         self.splats, self._lost = [], []
         count, places = chunk.pixels * chunk.samples, None if chunk.plate is None else chunk.plate.places
         paths, source = self._begin(self.room(1), 1, count), self.room(1).arena
         calls.clear()
         calls.name_salts(0)
-        if places is not None:  # the numbers of chosen pixels lie in the arena of the next vertex until then
-            chosen = places[chunk.first_pixel : chunk.first_pixel + chunk.pixels].numpy().astype(np.int32)
+        own = slice(chunk.first_pixel, chunk.first_pixel + chunk.pixels)
+        if places is not None or given is not None:  # they lie in the arena of the next vertex until then
             source = self.room(2).arena
+        if places is not None:
+            chosen = places[own].numpy().astype(np.int32)
             source.words[kernels.state.first("prim"), :count] = np.tile(chosen, chunk.samples)
+        if given is not None:
+            for name, vectors in (("o", given.o), ("d", given.d)):
+                row = kernels.state.first(name)
+                source.floats[row : row + 3, :count] = np.tile(vectors[:, own].numpy(), chunk.samples)
         lists = paths.lists if kernels.fused else None
-        calls.run(kernels.generate(places is not None), count, source, paths.arena, lists=lists)
+        kernel = kernels.generate(places is not None, given is not None)
+        calls.run(kernel, count, source, paths.arena, lists=lists)
         if kernels.fused:
             self.tally.rays += count
         return paths

@@ -122,9 +122,9 @@ class Kernels(Layout):
 
     # -- vertices of paths
 
-    def generate(self, chosen: bool) -> Kernel:
+    def generate(self, chosen: bool, given: bool) -> Kernel:
         """See :func:`torchpt.engines.kernels.vertex.generate`."""
-        return self._get(False, vertex.generate, chosen)
+        return self._get(False, vertex.generate, chosen, given)
 
     def settle(self, shadow: bool) -> Kernel:
         """See :func:`torchpt.engines.kernels.vertex.settle`."""

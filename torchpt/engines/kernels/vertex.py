@@ -15,6 +15,7 @@ from torchpt.engines.kernels.trace import Trace
 from torchpt.integrators import stages
 from torchpt.integrators.base import check_output
 from torchpt.integrators.vertex import Splat, VertexInput, no_shadow
+from torchpt.integrators.wave import camera_state
 from torchpt.lanes.sinks import Pack, Scatter, Sinks
 from torchpt.records import PathState, Shadow
 from torchpt.samplers import Dimension, Draws
@@ -26,12 +27,17 @@ __all__ = ["PLACE", "bounce", "emit", "escape", "generate", "retire", "settle"]
 PLACE = ("first", "pixels", "turn", "point", "stream", "streams", "x", "y", "crop", "film")
 
 
-def generate(trace: Trace, chosen: bool) -> Sinks:
-    """Camera rays; with their first hits where the search is inside. Row ``prim`` holds the numbers of ``chosen`` pixels."""
+def generate(trace: Trace, chosen: bool, given: bool) -> Sinks:
+    """Rays that paths begin with; with their first hits where the search is inside.
+
+    Row ``prim`` holds the numbers of ``chosen`` pixels; rows ``o`` and ``d`` hold rays that are ``given`` in place of the
+    camera's.
+    """
     layout, tracer, wave = trace.layout, trace.tracer, trace.layout.wave
     place = trace.uniform("place", torch.ones(len(PLACE), dtype=torch.int32))
     salts = trace.salts()
     pixels = layout.state.read(tracer, "prim")["prim"] if chosen else torch.empty(0)
+    rays = layout.state.read(tracer, "o", "d") if given else {}
     unseen: dict[str, Tensor] = {}
     with tracer:
         chunk = dict(zip(PLACE, place.to(torch.int64).unbind(), strict=True))
@@ -47,7 +53,10 @@ def generate(trace: Trace, chosen: bool) -> Sinks:
         point = torch.div(turn, chunk["streams"], rounding_mode="floor") + chunk["point"]
         key = wave.sampler.points.key(layout.numbers, number, group, point)
         x, y = x.to(layout.plan.dtype), y.to(layout.plan.dtype)
-        state = stages.generate(layout.plan, wave.camera, wave.filter, x, y, key, salts)
+        if given:
+            state = camera_state(rays["o"], rays["d"], key)
+        else:
+            state = stages.generate(layout.plan, wave.camera, wave.filter, x, y, key, salts)
         if wave.filter.signed:
             unseen["weight"] = wave.filter.weight(Draws(layout.plan.sampler, key, salts).two(Dimension.PIXEL))
         state = wave.begun(state)

@@ -54,6 +54,7 @@ class ZSobol(Points):
 
     name = "zsobol"
     needs_count = True
+    of_film = True
 
     def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
         """``(2, N)`` int32: the seed of the block, and the place of the point on the curve within it.
