@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -85,7 +84,7 @@ class Order:
         adjoint: how gradients are taken.
         ranks: that share the work.
         editions: of the scene's own parameters, but for those that ``params`` stand for, as they were.
-        rays: origins and directions ``(..., 3)`` in place of the camera's, one for each pixel of the film; None: the camera's.
+        rays: origins and directions ``(..., 3)`` in place of the camera's, pixels of a film of one row; None: the camera's.
     """
 
     given: Scene
@@ -209,10 +208,9 @@ def ordered_along(scene: Scene, o: Tensor, d: Tensor, **wishes: Unpack[Wishes]) 
     if seen := [name for name in wishes.get("params") or {} if name.startswith("camera.")]:
         raise SceneError("params", seen[0], "none of the camera's, which rays do not come from")
     # What a scene file says of its picture, and of when that is done, is not meant for rays.
-    height, width = math.prod(d.shape[:-2]), d.shape[-2] if d.dim() > 1 else 1
     settings = replace(
         settings,
-        film=settings.film.but(width=width, height=height, crop=None, aovs=(), denoise=False),
+        film=settings.film.but(width=d.numel() // 3, height=1, crop=None, aovs=(), denoise=False),
         sampler=replace(sampler, values={key: value for key, value in sampler.values.items() if key != "adaptive"}),
         render=settings.render.but(
             pilots=False, time_limit=None, target_error=None, checkpoint=None, resume=False, preview=None

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from mirrored import Mirrored
 from torch import Tensor
 
 import torchpt
@@ -19,6 +21,8 @@ from torchpt.engines.kernels.kernels import Kernels
 from torchpt.errors import RenderError, SceneError
 from torchpt.format.description import settings
 from torchpt.forward import kernels_of, make_wave
+from torchpt.forward.along import Along
+from torchpt.integrators.wave import Rays
 
 quiet = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 
@@ -328,6 +332,7 @@ ONES, DOWN = torch.ones(2, 3), torch.tensor([[0.0, 0, -1], [0, 0, 0]])
         (ONES, ONES, {"sampler": "zsobol"}, "sampler.type: expected one of sobol, independent, stratified, hammersley"),
         (ONES, ONES, {"sampler": {"type": "sobol", "adaptive": True}}, "sampler.adaptive: expected false"),
         (ONES, ONES, {"integrator": "aov"}, "integrator.type: expected one of path, direct, ibl"),
+        (ONES, ONES, {"integrator": Mirrored()}, "integrator.type: expected one without splats"),
         (ONES, ONES, {"params": {"camera.fov": torch.tensor(40.0)}}, "params: expected none of the camera's"),
         (ONES, ONES, {"params": {"lights.sun": torch.tensor(40.0)}}, "lights.sun"),
         (ONES, ONES, {"spp": 0}, "render.spp: expected"),
@@ -361,6 +366,29 @@ def test_what_is_of_pictures_is_not_of_rays():
         unknown: Any = {name: None}
         with pytest.raises(TypeError, match=name):
             torchpt.trace(scene, o, d, **unknown)
+
+
+@pytest.mark.parametrize("compile", ["on", "off"])
+@pytest.mark.parametrize("accel", ["brute", "numba"])
+def test_rays_by_numbers(compile, accel):
+    """As edges ask for them: rays of one number draw alike, whichever ray it is and whichever engine traces it."""
+    scene = torchpt.load("cornell_box", device="cpu")
+    limit = {"type": "path", "max_depth": 5, "clamp": 0.3}
+    wish = settings(scene.description, {"integrator": limit, "render": {"accel": accel, "compile": compile, "spp": 2}})
+    wave = make_wave(scene, wish, None, torch.float32)
+    o = torch.tensor([[278.0], [273.0], [-500.0]]).repeat(1, 6)
+    d = torch.tensor([[0.1], [-0.2], [1.0]]).repeat(1, 6) / math.sqrt(1.05)
+    number = torch.tensor([4, 70_000, 4, 2, 1 << 30, 70_000])
+    found = Along(scene, wish, wave).radiance(wave.along(Rays(o, d, number)), 1)
+    assert found.dtype == torch.float64
+    assert torch.equal(found[:, 0], found[:, 2])
+    assert torch.equal(found[:, 1], found[:, 5])
+    assert len(set(found[1].tolist())) == 4
+    assert float(found.max()) == pytest.approx(0.3)
+    own = Along(scene, wish, wave).radiance(wave.along(Rays(o, d)), 1)
+    assert torch.equal(own[:, 2], found[:, 3])
+    eager = Along(scene, replace(wish, render=wish.render.but(compile="off")), wave)
+    assert torch.allclose(eager.radiance(wave.along(Rays(o, d, number)), 1), found, atol=1e-5)
 
 
 @quiet

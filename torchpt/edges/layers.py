@@ -90,8 +90,8 @@ def _gradients(
         def look(boundary: Boundary) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
             traced = boundary.traced
 
-            def values(o: Tensor, d: Tensor, key: Tensor) -> Tensor:
-                found = tensors.seen(traced.wave, names, traced.state(o, d, key))
+            def values(o: Tensor, d: Tensor, number: Tensor) -> Tensor:
+                found = tensors.seen(traced.wave, names, traced.state(o, d, number))
                 return torch.cat([found[name] for name in names]).double()
 
             return values

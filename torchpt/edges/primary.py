@@ -32,7 +32,7 @@ _BEFORE = 1.0 - 2.0**-10
 #: The same where the ray meets the edge's own surface.
 _OWN = 1.0 - 2.0**-6
 
-#: Values ``(C, N)`` that rays ``o, d (3, N)`` bring, by keys.
+#: Values ``(C, N)`` that rays ``o, d (3, N)`` bring, by the numbers of their samples.
 Look = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
@@ -104,8 +104,7 @@ class Primary:
         seen = (share > 0).nonzero().squeeze(1)
         both = torch.cat((seen, seen + len(index)))
         o, d, index = take(o, both), take(d, both), take(index, seen)
-        key = self.traced.key(take(number, index))
-        values = look(o, d, torch.cat((key, key), 1)) if len(index) else torch.zeros(len(value), 0).to(value)
+        values = look(o, d, take(number, index).repeat(2)) if len(index) else torch.zeros(len(value), 0).to(value)
         jump = values[:, : len(index)] - values[:, len(index) :]
         worthy = (take(value, index) * jump).sum(0) * take(share, seen)
         chance, normal = take(chance * density, index) * total, take(normal, seen)

@@ -235,11 +235,10 @@ class Shadows:
         to = beam.view.e - passed.p
         whole = beam.view.e - x
         factor = light * dot(to, to) / (dot(whole, whole) * beam.chance)
-        integrator, key = self.traced.wave.integrator, self.traced.key(number, 2)
-        o, most = x + whole * _BEGIN, integrator.limits.max_depth
+        o, most = x + whole * _BEGIN, self.traced.wave.integrator.limits.max_depth
 
         def brought(k: int, lane: Tensor) -> Tensor:
-            rays = (take(o, lane), take(wi, lane), take(key, lane))
+            rays = (take(o, lane), take(wi, lane), take(number, lane), 2)
             depth = most if most < 0 else most - k
             if not len(lane) or 0 <= depth < 2:  # nothing but light of sources themselves
                 return torch.zeros_like(rays[1])

@@ -1,4 +1,4 @@
-"""What rays of edges see: the forward render's own search and integrator, without derivatives."""
+"""What rays of edges see: the forward render's own search, integrator and engines, without derivatives."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchpt.engines import tensors
 from torchpt.forward import make_wave
-from torchpt.integrators.clamp import clamp_scale
+from torchpt.forward.along import Along
 from torchpt.integrators.plan import FOREVER
-from torchpt.integrators.wave import Wave, camera_state
+from torchpt.integrators.wave import Rays, Wave
 from torchpt.records import PathState
 from torchpt.samplers import Sampler
 from torchpt.scene import Scene
@@ -24,49 +23,55 @@ __all__ = ["Traced", "traced_of"]
 
 @dataclass(frozen=True)
 class Traced:
-    """A render's wave whose rays are given one by one."""
+    """A render's wave whose rays are given one by one, and what traces them."""
 
     wave: Wave
-    clamp: float | None
+    along: Along
 
     @property
     def dtype(self) -> torch.dtype:
         """Of the lanes."""
         return self.wave.context.plan.dtype
 
-    def key(self, sample: Tensor, row: int = 0) -> Tensor:
+    def key(self, number: Tensor, row: int = 0) -> Tensor:
         """The sampler's keys of samples ``(N,)`` int64; those of one ``row`` share their numbers with those of no other."""
-        return self.wave.sampler.key(sample, torch.full_like(sample, row))
+        return self.wave.sampler.key(number, torch.full_like(number, row))
 
     def nearest(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Return how far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none."""
         t, prim, _, _ = self.wave.accel.intersect(o, d, torch.full_like(d[0], FOREVER, dtype=torch.float32))
         return t.double(), prim.long()
 
-    def state(self, o: Tensor, d: Tensor, key: Tensor) -> PathState:
-        """Camera rays; ``d`` of any length."""
-        return camera_state(o.to(self.dtype), (d / (d * d).sum(0).sqrt()).to(self.dtype), key)
+    def given(self, o: Tensor, d: Tensor, number: Tensor) -> Wave:
+        """Return the wave along rays ``(3, N)``, ``d`` of any length, with the random numbers of samples ``number (N,)``."""
+        return self.wave.along(Rays(o.to(self.dtype), (d / (d * d).sum(0).sqrt()).to(self.dtype), number))
 
-    def radiance(self, o: Tensor, d: Tensor, key: Tensor, depth: int | None = None) -> Tensor:
+    def state(self, o: Tensor, d: Tensor, number: Tensor) -> PathState:
+        """Paths that begin with rays, as of :meth:`given`."""
+        return self.given(o, d, number).rays(0, len(number), 0, 1)
+
+    def radiance(self, o: Tensor, d: Tensor, number: Tensor, row: int = 0, depth: int | None = None) -> Tensor:
         """Radiance ``(3, N)`` float64 that rays bring; black where it is not finite, as in pictures.
 
-        ``depth``: vertices of their paths at most, in place of the integrator's own limit.
+        Args:
+            o: origins ``(3, N)``.
+            d: directions ``(3, N)`` of any length.
+            number: of the samples ``(N,)``, by which random numbers are drawn.
+            row: of :meth:`key`.
+            depth: vertices of their paths at most, in place of the integrator's own limit.
         """
-        wave = self.wave
+        wave = self.given(o, d, number)
         if depth is not None:
             wave = replace(wave, integrator=wave.integrator.but(max_depth=depth))
-        values = tensors.trace(wave, self.state(o, d, key))
-        values = torch.where(torch.isfinite(values).all(0), values, 0.0).double()
-        if self.clamp is not None:
-            values = values * clamp_scale(values, self.clamp)
-        return values
+        return self.along.radiance(wave, row)
 
 
 def traced_of(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Traced:
-    """The wave of a scene under ``params``, eager; its numbers are independent from sample to sample."""
+    """The wave of a scene under ``params``; its numbers are independent from sample to sample."""
     render = settings.render
     plain = replace(settings, sampler=Described(SAMPLERS["independent"], {}))
     wave = make_wave(scene, plain, params, dtype)
     if wave.accel.name == "brute":  # packets widen primitives by their rounding, further than edges look beside
         wave = make_wave(scene, replace(plain, render=render.but(accel="numba")), params, dtype)
-    return Traced(replace(wave, sampler=Sampler(wave.sampler.points, settings.render.seed)), settings.integrator.clamp)
+    wave = replace(wave, sampler=Sampler(wave.sampler.points, settings.render.seed))
+    return Traced(wave, Along(scene, settings, wave))

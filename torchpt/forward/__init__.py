@@ -2,8 +2,8 @@
 
 ``wave`` makes what all waves of a render share, ``stopping`` says how many samples are next, ``waves`` cuts them into pieces as
 large as memory lets them be (``budget``), ``piece`` computes one, ``run`` adds them up, ``twice`` samples pilots and
-``adaptive`` sends samples where they say, ``many`` renders several at once, ``kept`` is what renders of a scene leave
-for the next one.
+``adaptive`` sends samples where they say, ``along`` traces rays alone, ``many`` renders several at once, ``kept`` is what
+renders of a scene leave for the next one.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from torchpt.cameras import Camera
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.engines.kernels.schedule import Loop
 from torchpt.errors import SceneError
-from torchpt.film import FILTERS, Filter
+from torchpt.film import Filter
 from torchpt.forward.kept import kept
 from torchpt.forward.schedule import streams_of
 from torchpt.forward.waves import say_once
@@ -52,7 +52,7 @@ def make_wave(
     """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``.
 
     ``like``: a wave of the same scene, settings and parameters, but for those of the camera: what it reads is read again.
-    ``rays``: origins and directions ``(..., 3)`` in the scene's coordinates, one for each pixel, in place of the camera's.
+    ``rays``: origins and directions ``(..., 3)`` in the scene's coordinates, in place of the camera's.
 
     Raises:
         SceneError: a direction that is zero, or a ray that is not finite.
@@ -76,22 +76,19 @@ def make_wave(
     plan = integrator.plan(points, dtype, tape, attached)
     camera = _camera(scene, settings, params, dtype)
     crop = film.crop or (0, 0, film.width, film.height)
-    filter = _filter(film.filter.kind, tuple(film.filter.values.items()), scene.device)
-    if rays is not None and filter.signed:  # of the others nothing is asked: kernels are those of renders
-        filter = _filter(FILTERS["box"], (), scene.device)
     context = _context(plan, world, camera, crop, integrator)
-    return Wave(
-        context=context if rays is None else replace(context, pixel=None),
+    wave = Wave(
+        context=context if rays is None else replace(context, pixel=None),  # rays have no width
         integrator=integrator,
         accel=accel,
         camera=camera,
-        filter=filter,
+        filter=_filter(film.filter.kind, tuple(film.filter.values.items()), scene.device),
         sampler=Sampler(points, settings.render.seed, streams_of(settings), spp, film.width),
         crop=crop,
         centre=scene.space.shift,
         first=_first(scene, integrator, world, own) if like is None else like.first,
-        given=None if rays is None else _given(scene, *rays, dtype),
     )
+    return wave if rays is None else wave.along(_given(scene, *rays, dtype))
 
 
 def _given(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:

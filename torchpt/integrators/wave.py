@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpt import lights
 from torchpt.accel import Accel
 from torchpt.cameras import Camera
-from torchpt.film import Filter
+from torchpt.film import FILTERS, Filter
 from torchpt.integrators.base import Integrator
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.stages import generate
@@ -33,15 +33,17 @@ __all__ = ["Bounce", "Rays", "Wave", "camera_state", "still_of"]
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays that paths begin with in place of a camera's: number k is that of pixel k.
+    """Rays that paths begin with in place of a camera's: one for each pixel of a picture of one row.
 
     Attributes:
         o: origins ``(3, N)``, in the lanes' coordinates.
         d: unit directions ``(3, N)``.
+        number: ``(N,)`` int64 of the pixels whose random numbers they have; None: of their own.
     """
 
     o: Tensor
     d: Tensor
+    number: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class Wave:
         crop: ``(x, y, width, height)`` of the picture on the film.
         centre: ``(3,)`` float64, see Space.shift.
         first: what happens at first surfaces; None where paths go on.
-        given: rays in place of the camera's, one for each pixel of the film; None: the camera's.
+        given: rays in place of the camera's; None: the camera's.
     """
 
     context: StageContext
@@ -100,12 +102,22 @@ class Wave:
             streams: which share a pixel's samples; None: those of the picture.
         """
         # Numbered on the whole film, so that a crop shows the very pixels of the full picture.
-        number = y * self.camera.resolution[0] + x
-        key = self.sampler.key(number, sample, streams)
+        pixel = y * self.camera.resolution[0] + x
         if self.given is not None:
-            return camera_state(take(self.given.o, number), take(self.given.d, number), key)
+            number = pixel if self.given.number is None else take(self.given.number, pixel)
+            key = self.sampler.key(number, sample, streams)
+            return camera_state(take(self.given.o, pixel), take(self.given.d, pixel), key)
+        key = self.sampler.key(pixel, sample, streams)
         x, y = (a.to(self.context.plan.dtype) for a in (x, y))
         return generate(self.context.plan, self.camera, self.filter, x, y, key, salts(0, self.centre.device))
+
+    def along(self, rays: Rays) -> Wave:
+        """Return the wave whose paths begin with rays; no filter weighs them."""
+        n = rays.d.shape[1]
+        # Of filters that weigh nothing nothing is asked: kernels are those of renders.
+        filter = FILTERS["box"]({}, rays.d.device) if self.filter.signed else self.filter
+        camera = replace(self.camera, resolution=(n, 1))
+        return replace(self, camera=camera, crop=(0, 0, n, 1), filter=filter, given=rays)
 
     def begun(self, state: PathState) -> PathState:
         """Return rays with what only some scenes and integrators ask of a path that begins."""

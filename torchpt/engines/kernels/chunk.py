@@ -161,6 +161,8 @@ class Worker:
         kernels, calls, given = self.kernels, self.calls, self.wave.given
         self.splats, self._lost = [], []
         count, places = chunk.pixels * chunk.samples, None if chunk.plate is None else chunk.plate.places
+        if given is not None:
+            places = given.number
         paths, source = self._begin(self.room(1), 1, count), self.room(1).arena
         calls.clear()
         calls.name_salts(0)
