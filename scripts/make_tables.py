@@ -4,7 +4,7 @@
     python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
 
 A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), ``common.lights``: what all kinds
-of it have, or ``summary.lights``: a row a kind. ``bounds`` is the table of :mod:`bounds`.
+of it have, or ``summary.lights``: a row a kind. ``bounds`` is the table of :mod:`bounds`, ``arguments`` that of ``render``'s.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from typing import Any
 
 import bounds
 
+from torchpt.settings import Every
 from torchpt.spec import REQUIRED, Color, Index, Scalar, Spec, parameters_of
+from torchpt.spec.arguments import declared
 
 DOCS = Path(__file__).parents[1] / "docs"
 MARKED = re.compile(r"(<!-- generated: ([\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -102,6 +104,15 @@ def rows(specs: Mapping[str, Spec]) -> str:
     return HEAD + "".join(row(key, spec) + "\n" for key, spec in specs.items())
 
 
+def arguments(form: Any) -> str:
+    """Keyword arguments as a table: what they are by default in Python, and what None stands for."""
+    text = "| argument | what it is | accepted | default |\n|---|---|---|---|\n"
+    for name, item in declared(form).items():
+        default = item.stands_for.replace("None", "`None`") or f"`{item.default}`"
+        text += f"| `{name}` | {item.spec.doc} | {item.accepted} | {default} |\n"
+    return text
+
+
 def about(kind: Any) -> str:
     """The first paragraph of a kind's docstring, as Markdown."""
     return " ".join((kind.__doc__ or "").strip().split("\n\n")[0].split()).replace("``", "`")
@@ -130,6 +141,8 @@ def written(name: str) -> str:
     first, _, second = name.partition(".")
     if name == "bounds":
         return bounds.table()
+    if name == "arguments":
+        return arguments(Every)
     if first == "summary":
         return summary(kinds(second))
     if first == "common":

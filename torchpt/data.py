@@ -17,9 +17,10 @@ from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
 from torchpt.errors import SceneError
-from torchpt.orders import check_names
 from torchpt.rendering import render
 from torchpt.scene import Scene, load
+from torchpt.settings import Every
+from torchpt.spec.arguments import check_names
 
 __all__ = ["Made", "RenderDataset", "RenderStream"]
 
@@ -43,7 +44,7 @@ class _Items:
     ) -> None:
         if not callable(make):
             raise SceneError("make", make, "a function from a scene's index to the scene")
-        check_names(call, wishes, ("cameras", "layers"))
+        check_names(call, wishes, Every, ("cameras", "layers"))
         for key in ("params", "spp", "seed"):
             if key in wishes:
                 raise SceneError(key, wishes[key], "an argument of the data set, of `make` or none")
@@ -95,7 +96,7 @@ class _Items:
                     "a scene from torchpt.load, a mapping of the scene format, or (one of them, arguments of render)"
                 )
                 raise SceneError(f"make({number})", made, expected)
-            check_names("render", own)
+            check_names("render", own, Every)
             _check_wishes(own, f"make({number}).")
             scene = source if isinstance(source, Scene) else load(dict(source), self.device)
             self.latest = number, scene, dict(own)

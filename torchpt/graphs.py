@@ -25,6 +25,7 @@ from torchpt.forward import Rendering
 from torchpt.scene import Scene
 from torchpt.scene.editions import AFTER, check_unchanged
 from torchpt.scene.scene import numbered
+from torchpt.settings import BLOCKS
 
 __all__ = ["known", "opaque", "outside"]
 
@@ -156,7 +157,7 @@ class _Order(NamedTuple):
 
     def like(self) -> Tensor:
         """A picture of the right size, unfilled."""
-        blocks = {name: self.wishes.get(name) for name in ("film", "integrator", "sampler")}
+        blocks = {name: self.wishes.get(name) for name in BLOCKS if name != "render"}
         film = settings(self.scene.description, blocks).film
         _, _, width, height = film.crop or (0, 0, film.width, film.height)
         return torch.empty(height, width, 3, dtype=self.wishes["dtype"], device=self.scene.device)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from typing import Any, TypedDict, Unpack
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor
@@ -19,54 +18,19 @@ from torchpt.graphs import known
 from torchpt.images.denoiser import check_denoiser
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators import LAYERS
-from torchpt.integrators.base import Integrator
 from torchpt.integrators.layer import SurfaceLayer
-from torchpt.ranks import Group, together
+from torchpt.ranks import together
 from torchpt.scene import Scene
 from torchpt.scene.editions import AFTER, check_unchanged
 from torchpt.scene.entry import as_scene
 from torchpt.scene.textured import renew, with_texels
-from torchpt.settings import SAMPLERS, Settings
+from torchpt.settings import SAMPLERS, Call, Settings, Wishes, blocks_of
+from torchpt.spec import Role
 from torchpt.taped import in_batch, on_tape, wants_gradients
 
-__all__ = ["Common", "Order", "Wishes", "check_names", "ordered", "ordered_along", "rendered"]
+__all__ = ["Order", "ordered", "ordered_along", "rendered"]
 
-#: How gradients are taken, the default first.
-ADJOINTS = ("replay", "autograd")
 _FLOATS = (torch.float32, torch.float64)
-
-
-class Common(TypedDict, total=False):
-    """Arguments of :func:`render` that are the same for all pictures of a batch, for type checkers."""
-
-    spp: int | None
-    integrator: str | Mapping[str, Any] | Integrator | None
-    sampler: str | Mapping[str, Any] | None
-    film: Mapping[str, Any] | None
-    time_limit: float | None
-    target_error: float | None
-    pilots: bool | str | None
-    checkpoint: str | None
-    resume: bool | None
-    accel: str | None
-    compile: str | bool | None
-    threads: int | str | None
-    max_memory: int | str | None
-    device: str | torch.device | None
-    dtype: torch.dtype
-    adjoint: str | None
-    seed_grad: int | None
-    spp_grad: int | None
-    edges: bool
-    edge_spp: int | None
-    ranks: Group | None
-
-
-class Wishes(Common, total=False):
-    """The other arguments of :func:`render`, for type checkers."""
-
-    seed: int | None
-    params: Mapping[str, Tensor] | None
 
 
 @dataclass(frozen=True)
@@ -77,12 +41,8 @@ class Order:
         given: the scene as the caller has it.
         scene: what is rendered: the same, or one that reads texels where that has numbers.
         settings: how.
-        params: tensors in place of the scene's.
-        backward: the backward pass's own seed, its samples a pixel and its samples of edges a pixel (0: none); None: as the
-            forward pass.
-        dtype: of the lanes.
-        adjoint: how gradients are taken.
-        ranks: that share the work.
+        call: what the arguments say beside settings.
+        params: tensors in place of the scene's, those of its own that want gradients among them.
         editions: of the scene's own parameters, but for those that ``params`` stand for, as they were.
         rays: origins and directions ``(..., 3)`` in place of the camera's, pixels of a film of one row; None: the camera's.
     """
@@ -90,11 +50,8 @@ class Order:
     given: Scene
     scene: Scene
     settings: Settings
+    call: Call
     params: Mapping[str, Tensor]
-    backward: Mapping[str, int | None]
-    dtype: torch.dtype
-    adjoint: str
-    ranks: Group | None = None
     editions: Mapping[str, int] = field(default_factory=dict)
     rays: tuple[Tensor, Tensor] | None = None
 
@@ -128,31 +85,6 @@ class Order:
         renew(self.scene, self.given, self.params)
 
 
-#: Of the arguments of ``render``, those that the block ``render`` of a scene file has too.
-_OF_RENDER = (
-    "spp", "seed", "accel", "compile", "threads", "max_memory", "time_limit", "target_error", "pilots", "checkpoint", "resume",
-)  # fmt: skip
-
-
-def check_names(call: str, wishes: Collection[str], own: Collection[str] = ()) -> None:
-    """Refuse arguments that ``render`` does not know, in Python's own words.
-
-    Args:
-        call: who takes them, such as ``render_batch``.
-        wishes: names that were given to be handed on.
-        own: names that ``call`` takes itself, which may be meant.
-
-    Raises:
-        TypeError: an unknown one.
-    """
-    known = {*Wishes.__annotations__, "full"}
-    for name in wishes:
-        if name not in known:
-            close = difflib.get_close_matches(name, sorted(known.union(own)), 1)
-            hint = f". Did you mean '{close[0]}'?" if close else ""
-            raise TypeError(f"{call}() got an unexpected keyword argument '{name}'{hint}")
-
-
 def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
     """Return what the arguments of ``render`` ask for.
 
@@ -160,24 +92,18 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
         SceneError: one that is not accepted.
         RenderError: a denoiser that is not there.
     """
-    _check_types(as_scene(scene), full, wishes)
-    dtype, adjoint, film = wishes.get("dtype", torch.float32), wishes.get("adjoint"), wishes.get("film")
-    backward = {"seed": wishes.get("seed_grad"), "spp": wishes.get("spp_grad"), "edges": wishes.get("edge_spp")}
-    numbers = {"seed_grad": (backward["seed"], 0), "spp_grad": (backward["spp"], 1), "edge_spp": (backward["edges"], 1)}
-    _check(scene, wishes.get("device"), dtype, adjoint, numbers)
-    if not wishes.get("edges", True):
-        backward["edges"] = 0
-    given = {name: wishes.get(name) for name in _OF_RENDER}
-    blocks = {"film": film, "integrator": wishes.get("integrator"), "sampler": wishes.get("sampler"), "render": given}
-    settings = complete(scene.description, blocks)
+    scene = as_scene(scene)
+    call = Call.of({**wishes, "full": full})
+    _check(scene, call, wishes.get("device"))
+    settings = complete(scene.description, blocks_of(wishes))
     if not full:
-        settings = _of_one_picture(settings, film)
+        settings = _of_one_picture(settings, wishes.get("film"))
     elif settings.film.denoise:
         check_denoiser()
-    params = _given(scene, wishes.get("params"), full)
+    params = _given(scene, call.params, full)
     textured = with_texels(scene, params)
     textured.check_own()
-    order = Order(scene, textured, settings, params, backward, dtype, adjoint or ADJOINTS[0], wishes.get("ranks"))
+    order = Order(scene, textured, settings, call, params)
     return order.noted() if order.taped else order
 
 
@@ -212,9 +138,7 @@ def ordered_along(scene: Scene, o: Tensor, d: Tensor, **wishes: Unpack[Wishes]) 
         settings,
         film=settings.film.but(width=d.numel() // 3, height=1, crop=None, aovs=(), denoise=False),
         sampler=replace(sampler, values={key: value for key, value in sampler.values.items() if key != "adaptive"}),
-        render=settings.render.but(
-            pilots=False, time_limit=None, target_error=None, checkpoint=None, resume=False, preview=None
-        ),
+        render=settings.render.without(Role.ENDS | Role.FILES).but(pilots=False),
     )
     params = {name: value for name, value in order.params.items() if not name.startswith("camera.")}
     order = replace(order, settings=settings, params=params, rays=(o, d))
@@ -266,21 +190,20 @@ def rendered(order: Order, made: list[Rendering] | None = None) -> Rendering:
     Raises:
         SceneError: a parameter that is not accepted.
     """
-    scene, settings = order.scene, order.settings
+    scene, settings, call = order.scene, order.settings, order.call
 
     def render(params: Mapping[str, Tensor], rays: tuple[Tensor, ...]) -> Rendering:
         if made:
             return made.pop()
-        with nullcontext() if order.ranks is None else order.ranks.together():
+        with nullcontext() if call.ranks is None else call.ranks.together():
             scene.check(params)
         given = _pair(rays)
         return known(
-            lambda: render_scene(scene, settings, params=params, dtype=order.dtype, ranks=order.ranks, rays=given)
+            lambda: render_scene(scene, settings, params=params, dtype=call.dtype, ranks=call.ranks, rays=given)
         )
 
     if order.taped:
-        seed = settings.render.seed ^ 0x5DEECE66D if order.backward["seed"] is None else order.backward["seed"]
-        rendering = _differentiable(replace(order, backward={**order.backward, "seed": seed}), render)
+        rendering = _differentiable(order, render)
     elif order.params or order.rays is not None:
         rendering = _constant(order, render)
     else:
@@ -309,38 +232,13 @@ def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Setti
     return replace(settings, film=settings.film.but(denoise=False, aovs=aovs))
 
 
-def _check(
-    scene: Scene,
-    device: str | torch.device | None,
-    dtype: torch.dtype,
-    adjoint: str | None,
-    numbers: Mapping[str, tuple[int | None, int]],
-) -> None:
-    """Refuse arguments of :func:`render` that are no settings; ``numbers`` are whole, with the least of each."""
-    if device not in (None, "auto") and not _same(device, scene.device):
-        raise SceneError("device", str(device), f"the scene's own device {scene.device}; load the scene on the other")
-    if dtype not in _FLOATS:
-        raise SceneError("dtype", dtype, "torch.float32 or torch.float64")
-    if adjoint not in (None, *ADJOINTS):
-        raise SceneError("adjoint", adjoint, " or ".join(ADJOINTS))
-    for key, (value, low) in numbers.items():
-        if value is not None and (type(value) is not int or value < low):
-            raise SceneError(key, value, f"a whole number >= {low}")
-
-
-def _check_types(scene: Scene, full: Any, wishes: Mapping[str, Any]) -> None:
-    """Refuse arguments of :func:`render` that are of another kind than they must be."""
-    for key, value in (("full", full), ("edges", wishes.get("edges", True))):
-        if type(value) is not bool:
-            raise SceneError(key, value, "True or False")
-    ranks, params = wishes.get("ranks"), wishes.get("params")
-    if ranks is not None and not isinstance(ranks, Group):
-        raise SceneError("ranks", ranks, "a torchpt.ranks.Group")
-    if params is not None and not isinstance(params, Mapping):
-        raise SceneError("params", params, "a mapping from names of scene.params to tensors")
-    for name in params or {}:
+def _check(scene: Scene, call: Call, device: str | torch.device | None) -> None:
+    """Refuse arguments of :func:`render` that do not fit the scene."""
+    for name in call.params or {}:
         if not isinstance(name, str):
             raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
+    if device not in (None, "auto") and not _same(device, scene.device):
+        raise SceneError("device", str(device), f"the scene's own device {scene.device}; load the scene on the other")
 
 
 def _same(wish: str | torch.device, own: torch.device) -> bool:
@@ -365,8 +263,9 @@ def _differentiable(order: Order, render: _Make) -> Rendering:
     """A rendering whose picture is on a tape from the parameters (and rays) that are wanted; ``render`` makes it without."""
     from torchpt import adjoint, edges  # a render without gradients does not wait for them
 
-    scene, settings, params, backward = order.scene, order.settings, order.params, order.backward
-    wanted, dtype, ranks = order.wanted, order.dtype, order.ranks
+    scene, settings, call, params = order.scene, order.settings, order.call, order.params
+    wanted, dtype, ranks = order.wanted, call.dtype, call.ranks
+    seed = settings.render.seed ^ 0x5DEECE66D if call.seed_grad is None else call.seed_grad
     if not settings.integrator.light:
         radiant = ", ".join(name for name in INTEGRATORS if INTEGRATORS[name].light)
         raise SceneError("integrator.type", settings.integrator.name, f"one of {radiant} where gradients are wanted")
@@ -375,7 +274,7 @@ def _differentiable(order: Order, render: _Make) -> Rendering:
     by_rays = order.by_rays
     attached = by_rays or adjoint.attached(scene, wanted)
     if by_rays or edges.concerns(scene, wanted):
-        _warn_of_edges(edges.left_out(scene, settings), backward["edges"] == 0)
+        _warn_of_edges(edges.left_out(scene, settings), not call.edges)
     for name in edges.without_gradient(scene, wanted):
         said = f"{name} changes the picture by jumps alone, which are not differentiated: its gradient is 0"
         warn_caller(said, EdgeWarning)
@@ -404,7 +303,7 @@ def _differentiable(order: Order, render: _Make) -> Rendering:
         held = not exact and adjoint.suits(scene, settings, wanted)
         rays = _pair(tensors[len(names) :])
         found = adjoint.gradients(
-            scene, again(), given, wanted, dtype, attached, order.adjoint, cotangent, held, ranks, rays, by_rays
+            scene, again(), given, wanted, dtype, attached, call.adjoint, cotangent, held, ranks, rays, by_rays
         )
         if of_edges and edges.concerns(scene, wanted):
             _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
@@ -416,11 +315,11 @@ def _differentiable(order: Order, render: _Make) -> Rendering:
         return [*found[: len(wanted)], *still, *found[len(wanted) :]]
 
     def again(spp: int | None = None) -> Settings:
-        spp = spp or backward["spp"] or taken[0]
-        return replace(settings, render=settings.render.but(seed=backward["seed"], spp=spp))
+        spp = spp or call.spp_grad or taken[0]
+        return replace(settings, render=settings.render.but(seed=seed, spp=spp))
 
     def edges_taken() -> int:
-        return 0 if backward["edges"] == 0 else backward["edges"] or backward["spp"] or taken[0]
+        return (call.edge_spp or call.spp_grad or taken[0]) if call.edges else 0
 
     def asked() -> edges.Asked:
         order.check_unchanged(AFTER)

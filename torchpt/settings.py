@@ -6,20 +6,43 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypedDict
+
+import torch
+from torch import Tensor
 
 from torchpt.errors import SceneError
 from torchpt.film import FILTERS
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
+from torchpt.ranks import Group
 from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.spec import Choice, Flag, Other, Refused, Scalar, Valued, Whole, parameters_of, reading
+from torchpt.spec import Choice, Flag, Other, Refused, Role, Scalar, Valued, Whole, parameters_of, reading
+from torchpt.spec.arguments import Argument, declared
 from torchpt.spec.declared import Described, described, refuse_foreign, values_of
 from torchpt.spec.memo import Memo
-from torchpt.spec.validate import check_keys, dotted
+from torchpt.spec.validate import check_keys, dotted, refused
 
-__all__ = ["BLOCKS", "FILTERS", "INTEGRATORS", "RECORDS", "SAMPLERS", "TYPED", "Film", "Render", "Settings", "merge"]
+__all__ = [
+    "BLOCKS",
+    "FILTERS",
+    "INTEGRATORS",
+    "RECORDS",
+    "SAMPLERS",
+    "TYPED",
+    "Call",
+    "Common",
+    "Every",
+    "Film",
+    "Render",
+    "Settings",
+    "Traced",
+    "Wishes",
+    "blocks_of",
+    "having",
+    "merge",
+]
 
 BLOCKS = ("film", "integrator", "sampler", "render")
 MAX_SIDE = 65_536
@@ -87,13 +110,16 @@ class Film(Valued):
             doc="layers, kept by .exr",
         ),
         "denoise": Flag(False, doc="a second picture beside the first, without its noise"),
-        "exposure": Scalar(0.0, low=-64, high=64, words="a number of stops in -64..64", doc="of 8-bit files"),
-        "tonemap": Choice("none", names=("none", "filmic", "aces", "reinhard"), doc="of 8-bit files"),
+        "exposure": Scalar(
+            0.0, low=-64, high=64, words="a number of stops in -64..64", doc="of 8-bit files", role=Role.FREE
+        ),
+        "tonemap": Choice("none", names=("none", "filmic", "aces", "reinhard"), doc="of 8-bit files", role=Role.FREE),
         "gamma": Other(
             "srgb",
             reader=_gamma,
             words="srgb or an exponent > 0",
             doc="of 8-bit files: out = in^gamma",
+            role=Role.FREE,
         ),
     }
 
@@ -128,59 +154,222 @@ def _file(value: Any) -> str:
     raise Refused("null or a file path")
 
 
-class Render(Valued):
-    """Settings of how the work is done; none of them but ``spp`` and ``seed`` changes what the picture converges to."""
+#: How gradients are taken, the default first.
+ADJOINTS = ("replay", "autograd")
+_TYPE = "a type, or a mapping with `type` and its settings"
+_FILE = "null or a file path"
 
-    parameters: ClassVar = {
-        "spp": Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take"),
-        "seed": Whole(0, high=MOST_SEED, doc="the same seed gives the same picture"),
-        "device": Other("auto", reader=_device, words="auto, cpu, cuda or cuda:N", doc="auto: CUDA where there is one"),
-        "accel": Choice("auto", names=("auto", "torch", "numba", "brute"), doc="the search structure"),
-        "compile": Choice(
+
+def _whole(low: int, doc: str) -> Argument:
+    fits = lambda value: type(value) is int and value >= low  # noqa: E731
+    return Argument(None, fits=fits, words=f"a whole number >= {low}", doc=doc)
+
+
+def _truth(default: bool, doc: str) -> Argument:
+    return Argument(default, fits=lambda value: type(value) is bool, words="True or False", doc=doc)
+
+
+# The arguments of `render`, and with them the block `render`: each is declared here and nowhere else. Signatures, `help`,
+# checks, keys of the command line, files of configs/ and tables of the docs are made of this (`scripts/make_configs.py`,
+# `scripts/make_tables.py`).
+
+
+class Traced(TypedDict, total=False):
+    """Arguments of whatever traces paths."""
+
+    spp: Annotated[int | None, Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take")]
+    integrator: Annotated[
+        str | Mapping[str, Any] | Integrator | None,
+        Other(TYPED["integrator"][1], words=_TYPE, doc="what is estimated"),
+    ]
+    sampler: Annotated[
+        str | Mapping[str, Any] | None,
+        Other(TYPED["sampler"][1], words=_TYPE, doc="where sample points come from"),
+    ]
+    device: Annotated[
+        str | torch.device | None,
+        Other(
+            "auto",
+            reader=_device,
+            words="auto, cpu, cuda or cuda:N",
+            doc="auto: CUDA where there is one; in Python the scene's own, where it was loaded",
+        ),
+    ]
+    accel: Annotated[
+        str | None,
+        Choice("auto", names=("auto", "torch", "numba", "brute"), doc="the search structure"),
+    ]
+    compile: Annotated[
+        str | bool | None,
+        Choice(
             "auto",
             names=("auto", "on", "off"),
             booleans={True: "on", False: "off"},
             doc="whether stages run as kernels; auto: in float32 on a CPU, else as tensor operations",
         ),
-        "threads": Whole(
-            "auto",
-            low=1,
-            high=1024,
-            also=("auto",),
-            doc="auto: as many as torch uses",
-        ),
-        "max_memory": Other(
+    ]
+    threads: Annotated[
+        int | str | None,
+        Whole("auto", low=1, high=1024, also=("auto",), doc="auto: as many as torch uses", role=Role.FREE),
+    ]
+    max_memory: Annotated[
+        int | str | None,
+        Other(
             None,
             reader=reading.memory_size,
             words="null, bytes, or a size such as 4GB",
             doc="of all that the process holds above what import took; see docs/stability.md",
+            role=Role.FREE,
         ),
-        "pilots": Other(
+    ]
+    dtype: Annotated[
+        torch.dtype,
+        Argument(
+            torch.float32,
+            fits=lambda value: value in (torch.float32, torch.float64),
+            words="torch.float32 or torch.float64",
+            doc="of the lanes; float64 is for checking derivatives, and the search stays float32",
+        ),
+    ]
+    adjoint: Annotated[
+        str | None,
+        Argument(
+            ADJOINTS[0],
+            fits=lambda value: value in ADJOINTS,
+            words=" or ".join(ADJOINTS),
+            doc="how gradients are taken: `replay` traces paths again and goes back along them, in memory that grows with"
+            " neither depth nor samples; `autograd` runs each chunk of pixels again under a plain tape",
+        ),
+    ]
+    seed_grad: Annotated[
+        int | None,
+        _whole(
+            0, "of the backward pass; none: one of its own, as shared samples would bias the gradient of a squared loss"
+        ),
+    ]
+    spp_grad: Annotated[int | None, _whole(1, "of the backward pass; none: as many as the forward pass took")]
+    edges: Annotated[
+        bool, _truth(True, "whether silhouettes and shadow edges that move are differentiated; False warns")
+    ]
+    edge_spp: Annotated[
+        int | None,
+        _whole(1, "samples a pixel of each estimator of edges; none: as many as the backward pass takes"),
+    ]
+
+
+class Common(Traced, total=False):
+    """Arguments of :func:`torchpt.render` that are the same for all pictures of a batch."""
+
+    film: Annotated[
+        Mapping[str, Any] | None,
+        Other(None, words=f"a mapping of {', '.join(Film.parameters)}", doc="the picture: its size, its layers"),
+    ]
+    pilots: Annotated[
+        bool | str | None,
+        Other(
             "auto",
             reader=_pilots,
             words="auto, true or false",
             doc="whether one pixel of 16 is sampled twice, by which the picture knows its error; auto: not in Python",
         ),
-        "time_limit": Scalar(
-            None, above=0.0, words="null or seconds > 0", doc="seconds of sampling; loading, building, compiling apart"
+    ]
+    time_limit: Annotated[
+        float | None,
+        Scalar(
+            None,
+            above=0.0,
+            words="null or seconds > 0",
+            doc="seconds of sampling; loading, building, compiling apart",
+            role=Role.ENDS | Role.FREE,
         ),
-        "target_error": Scalar(
-            None, above=0.0, words="null or a relMSE > 0", doc="the relMSE, by its pilots, at which the picture is done"
+    ]
+    target_error: Annotated[
+        float | None,
+        Scalar(
+            None,
+            above=0.0,
+            words="null or a relMSE > 0",
+            doc="the relMSE, by its pilots, at which the picture is done",
+            role=Role.ENDS,
         ),
-        "checkpoint": Other(
+    ]
+    checkpoint: Annotated[
+        str | None,
+        Other(
             None,
             reader=_file,
-            words="null or a file path",
+            words=_FILE,
             doc="where the state is written every few seconds and at the end, to go on from",
+            role=Role.FILES | Role.FREE,
         ),
-        "resume": Flag(False, doc="whether to go on from the checkpoint, where there is one"),
+    ]
+    resume: Annotated[
+        bool | None,
+        Flag(False, doc="whether to go on from the checkpoint, where there is one", role=Role.FILES | Role.FREE),
+    ]
+    ranks: Annotated[
+        Group | None,
+        Argument(
+            None,
+            fits=lambda value: isinstance(value, Group),
+            words="a torchpt.ranks.Group",
+            doc="processes that share the work; each gets all of the picture",
+        ),
+    ]
+
+
+class Wishes(Common, total=False):
+    """Arguments of :func:`torchpt.render` beside the scene and ``full``."""
+
+    seed: Annotated[int | None, Whole(0, high=MOST_SEED, doc="the same seed gives the same picture")]
+    params: Annotated[
+        Mapping[str, Tensor] | None,
+        Argument(
+            None,
+            fits=lambda value: isinstance(value, Mapping),
+            words="a mapping from names of scene.params to tensors",
+            doc="tensors in place of the scene's, where a material has a number or colour also texels (H, W, C); where one"
+            " requires gradients, so does the picture",
+        ),
+    ]
+
+
+class Every(Wishes, total=False):
+    """All keyword arguments of :func:`torchpt.render`."""
+
+    full: Annotated[
+        bool,
+        _truth(False, "True: a torchpt.Rendering: picture, layers, error, counts and seconds as one object"),
+    ]
+
+
+_ARGUMENTS = {name: argument.spec for name, argument in declared(Every).items()}
+
+
+class Render(Valued):
+    """Settings of how the work is done; none of them but ``spp`` and ``seed`` changes what the picture converges to."""
+
+    parameters: ClassVar = {
+        **{name: _ARGUMENTS[name] for name in ("spp", "seed")},  # which lists begin with
+        **{name: s for name, s in _ARGUMENTS.items() if name not in BLOCKS and not isinstance(s, Argument)},
         "preview": Other(
             None,
             reader=_file,
-            words="null or a file path",
+            words=_FILE,
             doc="albedo and normal beside it first, then the picture so far after each pass",
+            role=Role.FILES | Role.FREE,
         ),
     }
+
+    @property
+    def stops(self) -> dict[str, Any]:
+        """The stop rules that are set besides ``spp``, by name."""
+        every = {name: getattr(self, name) for name in having(Role.ENDS)["render"]}
+        return {name: value for name, value in every.items() if value is not None}
+
+    def without(self, role: Role) -> Render:
+        """Return the same with the settings of a role left out."""
+        return Render(**{name: value for name, value in self.values.items() if name not in having(role)["render"]})
 
     @classmethod
     def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
@@ -189,8 +378,43 @@ class Render(Valued):
             raise Refused("false without render.checkpoint, the file to go on from", True, ("resume",))
 
 
+class Call(Valued):
+    """What a call of :func:`torchpt.render` says beside settings of the scene file."""
+
+    parameters: ClassVar = {name: s for name, s in _ARGUMENTS.items() if isinstance(s, Argument)}
+
+    @classmethod
+    def of(cls, wishes: Mapping[str, Any]) -> Call:
+        """Return what arguments say, checked.
+
+        Raises:
+            SceneError: one that is not accepted.
+        """
+        values: dict[str, Any] = {}
+        for name in [name for name in cls.parameters if name in wishes]:
+            try:
+                values[name] = declared(Every)[name].read(wishes[name])
+            except Refused as error:
+                raise refused(error, name, wishes[name], None) from None
+        return cls(**values)
+
+
+def blocks_of(wishes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings among the arguments of a call by block; the device is none of them: it is the scene's."""
+    own = {name: wishes.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
+    return {**{name: wishes.get(name) for name in BLOCKS}, "render": own}
+
+
 #: The blocks without types.
 RECORDS: Mapping[str, type[Valued]] = {"film": Film, "render": Render}
+
+
+def having(role: Role, but: Role = Role.NONE) -> dict[str, tuple[str, ...]]:
+    """Return the settings of a role by block, without those that have the role ``but`` too."""
+    return {
+        block: tuple(name for name, s in parameters_of(record).items() if s.role & role and not s.role & but)
+        for block, record in RECORDS.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -344,7 +568,7 @@ def _check_pilots(settings: Settings, file: str | None) -> None:
 
 def _open_end(raw: Mapping[str, Any], sampler: Described) -> None:
     """Raise where something else than ``spp`` is to end a render whose points depend on their number."""
-    for name in ("time_limit", "target_error"):
+    for name in having(Role.ENDS)["render"]:
         if sampler.kind.needs_count and raw.get(name) is not None:
             free = ", ".join(kind for kind in SAMPLERS if not SAMPLERS[kind].needs_count)
             expected = (

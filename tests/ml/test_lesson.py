@@ -49,9 +49,9 @@ def table(heading: str) -> dict[str, list[str]]:
 
 def test_every_argument_of_render_has_a_row_with_its_default():
     rows, signature = table("Arguments of `render`"), inspect.signature(torchpt.render)
-    assert set(rows) == set(signature.parameters)
+    assert {"scene", *rows} == set(signature.parameters)
     for name, parameter in signature.parameters.items():
-        if parameter.default is not inspect.Parameter.empty:
+        if name != "scene":
             default = str(parameter.default)
             assert f"`{default}`" in rows[name][-1], name
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from base64 import b64decode
 from importlib.util import find_spec
-from inspect import signature
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from PIL import Image
 import torchpt
 from torchpt.errors import OutputError, RenderError, SceneError
 from torchpt.images import denoiser
-from torchpt.rendering import Wishes
 
 BALL: dict[str, Any] = {
     "camera": {"type": "perspective", "origin": [0, 0, 4], "target": [0, 0, 0], "fov": 40},
@@ -68,10 +66,6 @@ def test_the_picture_is_the_same(scene: torchpt.Scene) -> None:
     assert (full.spp, full.paths, full.nonfinite_samples, full.complete) == (8, 8 * 24 * 16, 0, True)
     assert full.rays > full.paths and full.relmse is None and full.relmse_interval is None
     assert 0 < full.render_seconds < full.seconds and full.load_seconds == scene.load_seconds > 0
-
-
-def test_type_checkers_see_every_argument() -> None:
-    assert set(signature(torchpt.render).parameters) == {"scene", "full", *Wishes.__annotations__}
 
 
 def test_layers_by_name(scene: torchpt.Scene) -> None:

@@ -20,10 +20,12 @@ from torchpt.forward.budget import too_little
 from torchpt.integrators.wave import Wave
 from torchpt.native.memory import mb
 from torchpt.native.modes import lasting
-from torchpt.orders import Common, Order, check_names, ordered, rendered
+from torchpt.orders import Order, ordered, rendered
 from torchpt.scene import Scene
 from torchpt.scene.editions import check_unchanged
 from torchpt.scene.entry import as_scene
+from torchpt.settings import Common, Every
+from torchpt.spec.arguments import check_names, spelled
 from torchpt.taped import in_transform
 
 __all__ = ["Renderings", "render_batch"]
@@ -79,6 +81,7 @@ def render_batch(
     scenes: Scene | Iterable[Scene], cameras: Cameras = None, params: Pictures = None, *, seed: Seeds = None,
     on_progress: Callable[[int, int | None], None] | None = None, full: Literal[True], **wishes: Unpack[Common],
 ) -> Renderings: ...  # fmt: skip
+@spelled
 def render_batch(
     scenes: Scene | Iterable[Scene],
     cameras: Cameras = None,
@@ -115,7 +118,7 @@ def render_batch(
         RenderError: as :func:`torchpt.render`.
         TypeError: an argument that ``render`` does not know.
     """
-    check_names("render_batch", wishes, ("cameras", "on_progress"))
+    check_names("render_batch", wishes, Every, ("cameras", "on_progress"))
     if on_progress is not None and not callable(on_progress):
         raise SceneError("on_progress", on_progress, "a function")
     scenes = scenes_of(scenes)
@@ -236,7 +239,7 @@ def _entries(
         def make(threads: int) -> Run:
             like = next((wave for scene, wave in latest if scene == picture.scene), None)
             plain = {name: value.detach() for name, value in order.params.items()}
-            run = Run(order.scene, order.settings, plain, order.dtype, order.ranks, like, threads)
+            run = Run(order.scene, order.settings, plain, order.call.dtype, order.call.ranks, like, threads)
             latest[:] = [(picture.scene, run.wave)]
             return run
 
@@ -260,6 +263,8 @@ def _check_memory(order: Order, total: int | None) -> None:
     """Refuse a bound that the pictures of a batch alone would break."""
     limit, film = order.settings.render.max_memory, order.settings.film
     _, _, width, height = film.crop or (0, 0, film.width, film.height)
-    held = 2 * 3 * width * height * torch.finfo(order.dtype).bits // 8 * (total or 1)  # one by one, and then together
+    held = (
+        2 * 3 * width * height * torch.finfo(order.call.dtype).bits // 8 * (total or 1)
+    )  # one by one, and then together
     if limit is not None and limit < held:
         raise too_little(limit, f"more than the {mb(held)} that the pictures alone take")

@@ -1,29 +1,32 @@
 """Take a command line apart: what belongs to torchpt itself, and what is left for Hydra.
 
 File names never enter Hydra's grammar, in which blanks, brackets, commas and ``=`` mean something: ``scene=``, ``out=``
-and the keys of `PATH_KEYS` are taken out here, as they are written.
+and the settings that are files (:func:`path_keys`) are taken out here, as they are written.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 from torchpt.errors import TorchptError
+from torchpt.files import configs
 
-__all__ = ["COMMANDS", "DEBUG_KEYS", "GROUPS", "Arguments", "UsageError", "parse"]
+__all__ = ["COMMANDS", "DEBUG_KEYS", "GROUPS", "Arguments", "UsageError", "parse", "path_keys"]
 
 COMMANDS = ("render", "orbit", "info", "converge", "compare", "stress")  # the last two take their words themselves
 GROUPS = ("film", "integrator", "sampler", "render")
-PATH_KEYS = ("render.preview", "render.checkpoint")
 #: Keys of `torchpt orbit` alone.
 TURN_KEYS = ("frames", "degrees", "fps", "keep")
 _TURN = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)
 #: Keys of `torchpt render` alone: one path in place of a picture. No scene file has them.
 DEBUG_KEYS = ("debug.pixel", "debug.sample")
 _DEBUG = re.compile(r"\+{0,2}(debug\.[^=]*)=(.*)\Z", re.DOTALL)
-_TAKEN = re.compile(r"\+{0,2}(scene|out|render\.preview|render\.checkpoint)=(.*)\Z", re.DOTALL)
+_TAKEN = re.compile(r"\+{0,2}([\w.]+)=(.*)\Z", re.DOTALL)
+#: A line of a group's file, as ``scripts/make_configs.py`` writes it of a setting that is a file.
+_PATH = re.compile(r"^(\w+): .*\(null or a file path\)$", re.MULTILINE)
 
 # option -> (its other name, whether a value follows)
 _OPTIONS = {
@@ -51,7 +54,7 @@ class Arguments:
         command: one of `COMMANDS`.
         scenes: names or paths; several only with ``multirun``.
         outs: pictures to write, as given; empty where nothing was said.
-        paths: values of the keys in `PATH_KEYS`.
+        paths: values of the settings that are files.
         turn: values of the keys in `TURN_KEYS`, as written.
         debug: values of the keys in `DEBUG_KEYS`, as written.
         study: of `converge` all words by key, as written: its lists are axes, which Hydra has no part in.
@@ -81,6 +84,13 @@ class Arguments:
         return any(option in ("--cfg", "--hydra-help") for option in self.options)
 
 
+@cache
+def path_keys() -> tuple[str, ...]:
+    """Return the settings that are files, by the groups' files: importing what declares them would take seconds."""
+    files = [(group, configs() / group / "default.yaml") for group in GROUPS]
+    return tuple(f"{group}.{key}" for group, file in files for key in _PATH.findall(file.read_text(encoding="utf-8")))
+
+
 def parse(argv: list[str]) -> Arguments:
     """Take the words after ``torchpt`` apart.
 
@@ -98,7 +108,9 @@ def parse(argv: list[str]) -> Arguments:
         if word.startswith("-"):
             _option(arguments, word, words)
             continue
-        match = _TAKEN.match(word) or (_TURN.match(word) if arguments.command == "orbit" else _DEBUG.match(word))
+        match = _TAKEN.match(word)
+        if match is None or match[1] not in ("scene", "out", *path_keys()):
+            match = _TURN.match(word) if arguments.command == "orbit" else _DEBUG.match(word)
         if match is None:
             _override(arguments, word)
             continue
@@ -123,7 +135,7 @@ def parse(argv: list[str]) -> Arguments:
         raise UsageError("out: `torchpt info` writes no picture")
     arguments.scenes = _scenes(taken.get("scene"), arguments.multirun)
     arguments.outs = _names("out", taken.get("out"))
-    arguments.paths = {key: None if taken[key] == "null" else taken[key] for key in PATH_KEYS if key in taken}
+    arguments.paths = {key: None if taken[key] == "null" else taken[key] for key in path_keys() if key in taken}
     arguments.turn = {key: taken[key] for key in TURN_KEYS if key in taken}
     sweep = f"+scene_number={','.join(map(str, range(len(arguments.scenes))))}"
     arguments.overrides = [sweep if word == "scene" else word for word in arguments.overrides]

@@ -55,8 +55,6 @@ stopped, the same command takes up where it was. The last line on stdout is a su
 Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the finished frames kept.
 """
 _MOST_FRAMES = 100_000
-#: Settings that leave a frame as it is.
-_FREE = {"render": ("threads", "max_memory", "preview", "checkpoint", "resume")}
 _MANIFEST = "orbit.json"
 
 
@@ -318,9 +316,12 @@ class Frames:
 def _facts(scene: Scene, wishes: Settings, turn: Turn) -> dict[str, Any]:
     """Return what frames depend on, by dotted name: the turn, the settings, and a hash of the scene."""
     from torchpt.scene.fingerprint import fingerprint
+    from torchpt.settings import having
+    from torchpt.spec import Role
 
     facts = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
-    return {**facts, **dict(_dotted(wishes.plain(_FREE))), "scene": fingerprint(scene)}
+    free = {"render": having(Role.FREE, but=Role.ENDS)["render"]}  # which leave a frame as it is
+    return {**facts, **dict(_dotted(wishes.plain(free))), "scene": fingerprint(scene)}
 
 
 def _dotted(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -17,8 +17,9 @@ from torchpt.format.materials import Kind, check_material, material_types, read_
 from torchpt.format.textures import check_texture, texture_of
 from torchpt.format.yaml_file import parse_yaml, plain, read_open, read_yaml
 from torchpt.lights import KINDS as LIGHTS
-from torchpt.settings import BLOCKS, Settings
+from torchpt.settings import BLOCKS, Settings, having
 from torchpt.shapes import KINDS as SHAPES
+from torchpt.spec import Role
 from torchpt.spec.declared import Described, described
 from torchpt.spec.validate import check_keys
 from torchpt.textures import KINDS as TEXTURES
@@ -37,8 +38,6 @@ __all__ = [
 ASSETS = "$TORCHPT_ASSETS"
 #: Textures, materials, shapes (instances are some) and lights that a scene may name, of each.
 MAX_ENTRIES = 100_000
-#: Keys of ``render`` by which files are written, or read as the render's own.
-_WRITTEN = ("preview", "checkpoint", "resume")
 _KEYS = ("version", "camera", *BLOCKS, "textures", "materials", "shapes", "lights")
 
 T = TypeVar("T")
@@ -232,7 +231,7 @@ def _settings_block(raw: Mapping[str, Any], name: str, file: str | None) -> dict
         return {}
     if not isinstance(block, dict):
         raise SceneError(name, block, "a mapping of settings", file)
-    for key in _WRITTEN if name == "render" else ():
+    for key in having(Role.FILES).get(name, ()):
         if block.get(key) not in (None, False):
             expected = "null: which files are written is said on the command line or in Python, never by a scene"
             raise SceneError(f"{name}.{key}", block[key], expected, file)

@@ -30,17 +30,15 @@ from torchpt.images.write import check_writable, place_of, reason_of, temporary_
 from torchpt.integrators.lost import Lost
 from torchpt.scene.fingerprint import fingerprints
 from torchpt.scene.scene import Scene
-from torchpt.settings import Settings
+from torchpt.settings import Settings, having
+from torchpt.spec import Role
 
 __all__ = ["EVERY", "FREE", "Keeper", "State", "identity"]
 
 #: Seconds between two checkpoints, at least; and at least so many times as long as it takes to write one.
 EVERY, PATIENCE = 5.0, 20.0
 #: Settings that may differ between a checkpoint and the render that goes on from it: no sample depends on them.
-FREE = {
-    "film": ("exposure", "tonemap", "gamma"),
-    "render": ("threads", "max_memory", "preview", "checkpoint", "resume", "time_limit"),
-}
+FREE = having(Role.FREE)
 #: Name of the JSON text among the arrays.
 _FACTS = "facts"
 _FORMAT = 3

@@ -101,8 +101,7 @@ class Rendering:
         """Return True where anything but ``render.spp`` has a say in how many samples a pixel gets."""
         if self.settings is None:
             return False
-        render = self.settings.render
-        return self.settings.adaptive or render.time_limit is not None or render.target_error is not None
+        return self.settings.adaptive or bool(self.settings.render.stops)
 
     def __getitem__(self, name: str) -> Tensor:
         """The picture (``rgb``) or a layer, by name.

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchpt import __version__
 from torchpt.core import tree
 from torchpt.film import Film
-from torchpt.forward.checkpoint import FREE, State
+from torchpt.forward.checkpoint import State
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
@@ -24,15 +24,14 @@ from torchpt.lanes.graph import Unsupported
 from torchpt.ranks import Group, dealt
 from torchpt.scene import Scene
 from torchpt.scene.fingerprint import fingerprints
-from torchpt.settings import Settings
+from torchpt.settings import Settings, having
+from torchpt.spec import Role
 
 if TYPE_CHECKING:
     from torchpt.forward.run import Run
 
 __all__ = ["Span", "Split", "stamp"]
 
-#: Of the settings that no sample depends on those that ranks must agree upon all the same.
-DECIDED = ("preview", "checkpoint", "resume")
 #: A plate, its first sample and how many.
 Span = tuple[Plate, int, int]
 
@@ -154,7 +153,7 @@ def _films(plate: Plate) -> list[Film]:
 
 def stamp(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype) -> bytes:
     """Return a hash of what ranks must have in common to render one picture."""
-    free = {block: {*keys} - {*DECIDED} for block, keys in FREE.items()}
-    free["render"].add("device")
+    free = having(Role.FREE, but=Role.FILES)  # upon files ranks must agree all the same
+    free["render"] = (*free["render"], "device")
     own = settings.integrator if settings.integrator.foreign else None
     return tree.fingerprint((__version__, settings.plain(free), own, fingerprints(scene, params), dtype))

@@ -54,7 +54,7 @@ class Stop:
     @property
     def open(self) -> bool:
         """Whether something else than the number of samples may end it."""
-        return self.render.time_limit is not None or self.render.target_error is not None
+        return bool(self.render.stops)
 
     def asks(self, taken: float, adaptive: bool = False) -> bool:
         """Whether an error may end the render at so many samples a pixel; adaptive rounds are few, so each may."""

@@ -5,18 +5,19 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor, nn
 
 from torchpt.errors import SceneError
 from torchpt.nn.ranges import range_of
-from torchpt.orders import check_names
 from torchpt.rendering import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
+from torchpt.settings import Common, Every
+from torchpt.spec.arguments import check_names, spelled
 
 __all__ = ["Renderer"]
 
@@ -43,6 +44,7 @@ class Renderer(nn.Module):
         seed: any integer from 0.
         rigid: whether poses are turned and moved alone (six numbers each); False: their 16 numbers are parameters, as they are,
             where poses need not keep angles, as those of balls and cameras must.
+        full: whether calls return a :class:`torchpt.Rendering`.
         wishes: further arguments of ``torchpt.render`` for each call.
 
     Raises:
@@ -52,6 +54,7 @@ class Renderer(nn.Module):
 
     steps: Tensor
 
+    @spelled
     def __init__(
         self,
         scene: Scene,
@@ -59,18 +62,18 @@ class Renderer(nn.Module):
         *,
         seed: int = 0,
         rigid: bool = True,
-        **wishes: Any,
+        full: bool = False,
+        **wishes: Unpack[Common],
     ) -> None:
         super().__init__()
-        check_names("Renderer", wishes, ("names", "rigid"))
+        check_names("Renderer", wishes, Every, ("names", "rigid"))
         if type(rigid) is not bool:
             raise SceneError("rigid", rigid, "True or False")
-        for key in ("params", "seed"):
-            if key in wishes:
-                raise SceneError(key, wishes[key], "an argument of Renderer.forward")
+        if "params" in wishes:
+            raise SceneError("params", wishes["params"], "an argument of Renderer.forward")
         if type(seed) is not int or seed < 0:
             raise SceneError("seed", seed, "a whole number >= 0")
-        self.scene, self.seed, self.wishes = as_scene(scene), seed, wishes
+        self.scene, self.seed, self.full, self.wishes = as_scene(scene), seed, full, wishes
         self.names = () if names is None else _chosen(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
@@ -84,22 +87,32 @@ class Renderer(nn.Module):
         self.ranges, self.free = nn.ModuleList(ranges), nn.ParameterDict(free)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
-    def forward(self, params: Mapping[str, Tensor] | None = None, *, seed: int | None = None, **wishes: Any) -> Any:
+    @spelled
+    def forward(
+        self,
+        params: Mapping[str, Tensor] | None = None,
+        *,
+        seed: int | None = None,
+        full: bool | None = None,
+        **wishes: Unpack[Common],
+    ) -> Any:
         """Render.
 
         Args:
             params: further parameters in place of the scene's, by dotted name, such as those of the camera; of a name that is a
                 parameter of this module, in place of that.
             seed: in place of the counted one.
+            full: in place of what was said at first.
             wishes: arguments of ``torchpt.render``, in place of those given at first.
 
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
         """
-        wishes = {**self.wishes, **wishes}
+        given: Common = {**self.wishes, **wishes}
         if seed is None:
-            seed = self._next_seed(wishes.get("ranks") is not None)
-        return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, **wishes)
+            seed = self._next_seed(given.get("ranks") is not None)
+        full = self.full if full is None else full
+        return render(self.scene, params={**self.values(), **(params or {})}, seed=seed, full=full, **given)
 
     def values(self) -> dict[str, Tensor]:
         """What the parameters stand for, by dotted name, as ``torchpt.render(params=...)`` takes them; gradients flow."""

@@ -10,7 +10,8 @@ from typing import Any
 from torchpt.errors import SceneError
 from torchpt.files import configs
 from torchpt.format.yaml_file import read_yaml
-from torchpt.settings import BLOCKS
+from torchpt.settings import BLOCKS, having
+from torchpt.spec import Role
 from torchpt.spec.validate import check_keys
 
 __all__ = ["Variant", "blocks_of", "denoised_label", "flat", "variants_of"]
@@ -19,13 +20,13 @@ __all__ = ["Variant", "blocks_of", "denoised_label", "flat", "variants_of"]
 _LISTS = ("film.crop",)
 #: Settings that a study has its own way of saying, or that have no place in one.
 _TAKEN = {
+    **{f"render.{name}": "nothing: every run takes the samples that spp= says" for name in having(Role.ENDS)["render"]},
+    **{
+        f"render.{name}": "nothing: a study that was stopped resumes by itself" for name in having(Role.FILES)["render"]
+    },
+    "render.preview": "nothing: a study keeps every picture in its folder",
     "render.spp": "spp=[...], the steps of every curve",
     "render.seed": "seed=, from which the seeds of all runs follow",
-    "render.time_limit": "nothing: every run takes the samples that spp= says",
-    "render.target_error": "nothing: every run takes the samples that spp= says",
-    "render.preview": "nothing: a study keeps every picture in its folder",
-    "render.checkpoint": "nothing: a study that was stopped resumes by itself",
-    "render.resume": "nothing: a study that was stopped resumes by itself",
     "film.denoise": "denoise=true, which gives denoised pictures curves of their own",
     "film.aovs": "nothing: a study compares pictures without layers",
 }

@@ -27,12 +27,16 @@ from torchpt.reports.study import Study
 from torchpt.scene.devices import device_of
 from torchpt.scene.fingerprint import fingerprint
 from torchpt.scene.scene import Scene
-from torchpt.settings import Settings
+from torchpt.settings import Settings, having
+from torchpt.spec import Role
 
 __all__ = ["Curve", "Job", "Measured", "Stopped", "film_size", "measure", "prepare", "seed_of"]
 
-#: Settings that no run depends on: how 8-bit files show it, and what is written on the way.
-_FREE = {"film": ("exposure", "tonemap", "gamma", "aovs"), "render": ("preview", "checkpoint", "resume", "seed", "spp")}
+#: Settings that no run depends on, or that each has its own of.
+_FREE = {
+    "film": (*having(Role.FREE)["film"], "aovs"),
+    "render": (*having(Role.FILES)["render"], "seed", "spp"),
+}
 
 
 class Stopped(Exception):
@@ -153,7 +157,7 @@ def _job(
 ) -> Job:
     description, wishes = overridden(description, overrides)
     # Such wishes of a scene are about files.
-    film, render = wishes.film.but(denoise=False, aovs=()), wishes.render.but(checkpoint=None, resume=False)
+    film, render = wishes.film.but(denoise=False, aovs=()), wishes.render.without(Role.FILES)
     wishes = replace(wishes, film=film, render=render)
     if not wishes.integrator.light:
         raise SceneError("integrator.type", wishes.integrator.name, "an integrator that carries light")

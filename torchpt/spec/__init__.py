@@ -7,7 +7,7 @@ files and the tables of the docs are made of these.
 
 from __future__ import annotations
 
-from torchpt.spec.base import REQUIRED, Moves, Spec
+from torchpt.spec.base import REQUIRED, Moves, Role, Spec
 from torchpt.spec.choices import Choice, Flag, Map, Other, Pair, Path, Whole
 from torchpt.spec.kinds import Block, Kinds, parameters_of
 from torchpt.spec.numbers import Angle, Color, Index, Scalar, Texels, spec_of
@@ -34,6 +34,7 @@ __all__ = [
     "Point",
     "Pose",
     "Refused",
+    "Role",
     "Scalar",
     "Spec",
     "Texels",

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, Flag, auto
 from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["REQUIRED", "Moves", "Spec"]
+__all__ = ["REQUIRED", "Moves", "Role", "Spec"]
 
 
 class Moves(Enum):
@@ -19,6 +19,15 @@ class Moves(Enum):
     SURFACES = 1  #: or the camera: points slide, and silhouettes move
     SHADOWS = 2  #: a light: shadow edges move, and no point does
     RAYS = 3  #: rays that a delta lobe sends on
+
+
+class Role(Flag):
+    """What a setting has to do with the samples of a picture."""
+
+    NONE = 0
+    FREE = auto()  #: nothing: no sample depends on it
+    ENDS = auto()  #: it is a stop rule: it may end a render before ``spp`` samples are taken
+    FILES = auto()  #: it says which files are written on the way
 
 
 class _Required(Enum):
@@ -44,6 +53,7 @@ class Spec:
         length: whether it is a length in the scene's units.
         moves: what changes place with it.
         words: what errors say is accepted; by default made of the bounds.
+        role: of a run setting.
     """
 
     default: Any = REQUIRED
@@ -52,6 +62,7 @@ class Spec:
     length: bool = field(default=False, kw_only=True)
     moves: Moves = field(default=Moves.NOTHING, kw_only=True)
     words: str = field(default="", kw_only=True)
+    role: Role = field(default=Role.NONE, kw_only=True)
 
     #: Whether it is a tensor of ``scene.params``; else it is fixed once the scene is loaded.
     traced: ClassVar[bool] = False

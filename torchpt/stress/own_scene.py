@@ -19,6 +19,7 @@ from torchpt.scene.devices import device_of
 from torchpt.scene.scene import Scene
 from torchpt.scene.space import extent_of
 from torchpt.settings import Settings
+from torchpt.spec import Role
 from torchpt.stress.bench import Bench, apart
 from torchpt.stress.case import Case, powers
 
@@ -94,9 +95,7 @@ def _small(settings: Settings) -> Settings:
     """The same, quickly rendered and nothing written."""
     film, most = settings.film, max(settings.film.width, settings.film.height)
     width, height = (max(round(side * SIZE / most), 1) for side in (film.width, film.height))
-    render = settings.render.but(
-        spp=SPP, pilots=False, checkpoint=None, resume=False, preview=None, time_limit=None, target_error=None
-    )
+    render = settings.render.without(Role.FILES | Role.ENDS).but(spp=SPP, pilots=False)
     sampler = settings.sampler
     if settings.adaptive:
         sampler = replace(sampler, values={**sampler.values, "adaptive": False})

@@ -1,0 +1,277 @@
+"""The arguments of `render` are declared once: signatures, checks, keys of the command line and docs follow from that."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+import pytest
+import torch
+
+import torchpt
+from torchpt.commands.arguments import GROUPS, path_keys
+from torchpt.errors import SceneError
+from torchpt.settings import BLOCKS, RECORDS, Common, Every, Render, Wishes
+from torchpt.spec import Role, parameters_of
+from torchpt.spec.arguments import declared, spelled
+
+ROOT = Path(__file__).parents[2]
+BALL: dict[str, Any] = {
+    "camera": {"origin": [0, 0, 4], "target": [0, 0, 0]},
+    "film": {"width": 4, "height": 4},
+    "shapes": {"ball": {"type": "sphere", "material": {"type": "diffuse"}}},
+    "lights": {"sky": {"type": "constant", "radiance": 1.0}},
+}
+
+
+@pytest.fixture(scope="module")
+def scene() -> torchpt.Scene:
+    return torchpt.load(BALL, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("function", "own", "form"),
+    [
+        (torchpt.render, ("scene", "full"), Wishes),
+        (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), Common),
+        (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), Common),
+        (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), Common),
+    ],
+)
+def test_signatures_spell_every_argument_out(function: Any, own: tuple[str, ...], form: Any) -> None:
+    signature = inspect.signature(function)
+    assert tuple(signature.parameters) == (*own, *declared(form))
+    for name, argument in declared(form).items():
+        shown = signature.parameters[name]
+        assert (shown.kind, shown.default, shown.annotation) == (shown.KEYWORD_ONLY, argument.default, argument.type)
+
+
+def test_signatures_are_as_they_were_written_by_hand() -> None:
+    shown = inspect.signature(torchpt.render).parameters
+    assert str(shown["spp"]) == "spp: int | None = None" and str(shown["edges"]) == "edges: bool = True"
+    assert shown["dtype"].default is torch.float32 and shown["adjoint"].default is None and len(shown) == 25
+
+
+def test_help_says_what_each_argument_is() -> None:
+    lines = [line.strip() for line in (inspect.getdoc(torchpt.render) or "").splitlines()]
+    for name, argument in declared(Wishes).items():
+        assert sum(line.startswith(f"{name}: {argument.spec.doc}") for line in lines) == 1
+    assert (
+        "spp: samples a pixel, and the most that other limits let it take (a whole number 1..2147483647; None: 64)"
+        in lines
+    )
+
+
+def test_the_block_of_scene_files_has_the_settings_among_them() -> None:
+    own = {"params", "full", "dtype", "adjoint", "seed_grad", "spp_grad", "edges", "edge_spp", "ranks"}
+    assert {*declared(Every)} - own == {*parameters_of(Render), *BLOCKS} - {"preview", "render"}
+
+
+def test_the_command_line_knows_blocks_and_files() -> None:
+    assert GROUPS == BLOCKS
+    files = {
+        f"{b}.{name}" for b, r in RECORDS.items() for name, s in parameters_of(r).items() if "file path" in s.words
+    }
+    assert {*path_keys()} == files == {"render.checkpoint", "render.preview"}
+
+
+def test_an_argument_without_a_spec_is_no_declaration() -> None:
+    class Form(TypedDict, total=False):
+        plain: int
+
+    Form.__annotations__["plain"] = int
+    with pytest.raises(TypeError, match=r"Form.plain has no spec"):
+        declared(Form)
+
+
+def test_what_a_function_says_itself_comes_first() -> None:
+    @spelled
+    def f(scene: int, *, seed: int = 0, **wishes: Unpack[Common]) -> None:
+        """Do it."""
+
+    assert tuple(inspect.signature(f).parameters)[:3] == ("scene", "seed", "spp")
+    assert (f.__doc__ or "").startswith("Do it.\n\nWishes:\n    spp: samples a pixel")
+
+
+UNKNOWN = [({"sp": 1}, "'sp'. Did you mean 'spp'?"), ({"preview": "a.png"}, "'preview'"), ({"ful": 1}, "mean 'full'?")]
+
+
+@pytest.mark.parametrize(("wishes", "says"), UNKNOWN)
+def test_unknown_arguments_are_errors_in_pythons_words(scene: torchpt.Scene, wishes: Any, says: str) -> None:
+    with pytest.raises(TypeError) as error:
+        torchpt.render(scene, **wishes)
+    assert str(error.value).startswith("render() got an unexpected keyword argument") and says in str(error.value)
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"full": 1}, "full: expected True or False, got 1"),
+    ({"full": None}, "full: expected True or False, got None"),
+    ({"edges": None}, "edges: expected True or False, got None"),
+    ({"edges": "no"}, "edges: expected True or False, got 'no'"),
+    ({"dtype": None}, "dtype: expected torch.float32 or torch.float64, got None"),
+    ({"dtype": torch.float16}, "dtype: expected torch.float32 or torch.float64, got torch.float16"),
+    ({"adjoint": "radiative"}, "adjoint: expected replay or autograd, got 'radiative'"),
+    ({"seed_grad": -1}, "seed_grad: expected a whole number >= 0, got -1"),
+    ({"spp_grad": 0}, "spp_grad: expected a whole number >= 1, got 0"),
+    ({"spp_grad": 2.0}, "spp_grad: expected a whole number >= 1, got 2.0"),
+    ({"edge_spp": True}, "edge_spp: expected a whole number >= 1, got True"),
+    ({"ranks": 2}, "ranks: expected a torchpt.ranks.Group, got 2"),
+    ({"params": []}, "params: expected a mapping from names of scene.params to tensors, got []"),
+    ({"params": {3: 0}}, "params: expected names of scene.params such as "),
+    ({"device": "meta"}, "device: expected the scene's own device cpu; load the scene on the other, got 'meta'"),
+    ({"spp": 0}, "render.spp: expected a whole number 1..2147483647, got 0"),
+    ({"time_limit": 0}, "render.time_limit: expected null or seconds > 0, got 0"),
+    ({"resume": True}, "render.resume: expected false without render.checkpoint, the file to go on from, got True"),
+    ({"film": 3}, "film: expected a mapping of settings, got 3"),
+]
+
+
+@pytest.mark.parametrize(("wishes", "says"), WRONG, ids=str)
+def test_wrong_values_are_errors_of_a_line(scene: torchpt.Scene, wishes: Any, says: str) -> None:
+    with pytest.raises(SceneError) as error:
+        torchpt.render(scene, **wishes)
+    assert str(error.value).startswith(says) and "\n" not in str(error.value)
+
+
+def test_none_is_what_nobody_said(scene: torchpt.Scene) -> None:
+    unsaid = {name: argument.default for name, argument in declared(Wishes).items()}
+    wishes: Any = {**unsaid, "spp": 1, "compile": "off"}
+    assert torch.equal(torchpt.render(scene, **wishes), torchpt.render(scene, spp=1, compile="off"))
+
+
+def test_a_role_is_left_out() -> None:
+    render = Render(time_limit=1.0, target_error=0.1, threads=2, checkpoint="a.npz", resume=True, preview="b.png")
+    assert render.stops == {"time_limit": 1.0, "target_error": 0.1}
+    assert render.without(Role.ENDS | Role.FILES) == Render(threads=2)
+
+
+#: A stop rule that the renderer has not: file, what stands there, what is put before it.
+TOY = {
+    "settings.py": (
+        "    checkpoint: Annotated[",
+        '    enough: Annotated[int | None, Whole(None, low=1, doc="samples that are enough", role=Role.ENDS)]\n',
+    ),
+    "forward/stopping.py": (
+        "        self.share = min(",
+        '        if self.render.enough is not None:\n            done["enough"] = taken / self.render.enough\n',
+    ),
+}
+#: What the tree with the toy in it is asked.
+QUESTIONS = """
+import inspect, json, sys, torchpt
+from torchpt.cli import main
+from torchpt.errors import SceneError
+from torchpt.reports.grid import variants_of
+
+def refused(work):
+    try:
+        work()
+    except (SceneError, TypeError) as error:
+        return str(error)
+
+scene = torchpt.load(json.loads(sys.argv[1]), "cpu")
+wishes = {"spp": 64, "compile": "off", "threads": 1}
+ended = torchpt.render(scene, enough=4, full=True, **wishes)
+batch = torchpt.render_batch([scene], enough=4, full=True, **wishes)
+module = torchpt.nn.Renderer(scene, enough=4, full=True, **wishes)()
+answers = {
+    "file": torchpt.__file__,
+    "signatures": [str(inspect.signature(f).parameters["enough"])
+                   for f in (torchpt.render, torchpt.render_batch, torchpt.nn.Renderer)],
+    "help": inspect.getdoc(torchpt.render),
+    "ended": [[each.stopped_by, each.spp] for each in (ended, batch[0, 0], module)],
+    "wrong": refused(lambda: torchpt.render(scene, enough=0)),
+    "near": refused(lambda: torchpt.render(scene, enugh=4)),
+    "counted": refused(lambda: torchpt.render(scene, enough=4, sampler="hammersley")),
+    "study": refused(lambda: variants_of({"render.enough": [4, 8]}, None)),
+    "code": [main(["render", "scene=ball.yaml", "render.enough=4", "render.compile=off", "out=a.png"]),
+             main(["render", "scene=ball.yaml", "render.enough=0", "out=b.png"]),
+             main(["render", "--help"])],
+}
+print(json.dumps(answers))
+"""
+
+
+def test_a_new_stop_rule_is_one_declaration_and_its_use(tmp_path: Path) -> None:
+    """In a copy of the tree: two files are edited, two scripts write what is generated."""
+    tree = tmp_path / "tree"
+    for folder in ("torchpt", "configs", "scripts", "scenes"):
+        shutil.copytree(ROOT / folder, tree / folder, ignore=shutil.ignore_patterns("__pycache__", "*.png"))
+    (tree / "docs").mkdir()
+    for page in (ROOT / "docs").glob("*.md"):
+        shutil.copy(page, tree / "docs")
+    for name, (place, line) in TOY.items():
+        file = tree / "torchpt" / name
+        text = file.read_text(encoding="utf-8")
+        assert text.count(place) == 1
+        file.write_text(text.replace(place, line + place), encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
+
+    def run(*words: str) -> str:
+        done = subprocess.run(
+            [sys.executable, *words],
+            cwd=tree,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert run("scripts/make_configs.py") == "written: render/default.yaml\n"
+    assert run("scripts/make_tables.py") == "written: ml.md, scenes.md\n"
+    row = "a whole number 1..2147483647"
+    assert f"\n| `enough` | samples that are enough | {row} | `None` |\n" in (tree / "docs" / "ml.md").read_text()
+    assert f"\n| `enough` |  | {row} | samples that are enough |\n" in (tree / "docs" / "scenes.md").read_text()
+
+    (tree / "ball.yaml").write_text(json.dumps(BALL), encoding="utf-8")
+    *said, last = run("-c", QUESTIONS, json.dumps(BALL)).splitlines()
+    answers = json.loads(last)
+    assert answers["file"] == str(tree / "torchpt" / "__init__.py")
+    assert answers["signatures"] == ["enough: int | None = None"] * 3
+    assert f"    enough: samples that are enough ({row})" in answers["help"].splitlines()
+    assert answers["ended"] == [["enough", 4]] * 3
+    assert answers["wrong"] == f"render.enough: expected {row}, got 0"
+    assert answers["near"].endswith("'enugh'. Did you mean 'enough'?")
+    assert answers["counted"].startswith("render.enough: expected null where sampler is hammersley")
+    assert answers["study"] == "render.enough: expected nothing: every run takes the samples that spp= says, got [4, 8]"
+    assert answers["code"] == [0, 2, 0] and any("enough" in line.split() for line in said)
+    assert any('"stopped_by": "enough"' in line for line in said)
+
+
+CALLS = """
+import torch
+import torchpt
+
+scene = torchpt.load("cornell_box", "cpu")
+image: torch.Tensor = torchpt.render(scene, spp=4, film={"width": 8}, edges=False)
+full: torchpt.Rendering = torchpt.render(scene, seed=3, full=True)
+images: torch.Tensor = torchpt.render_batch([scene], spp=4, seed=[1])
+module = torchpt.nn.Renderer(scene, spp=4, target_error=0.1)
+torchpt.render(scene, spp="many")  # wrong
+torchpt.render(scene, sp=4)  # wrong
+torchpt.render(scene, edges=None)  # wrong
+torchpt.render_batch([scene], resume="yes")  # wrong
+torchpt.nn.Renderer(scene, threads=1.5)  # wrong
+module(dtype="float32")
+"""
+
+
+@pytest.mark.slow
+def test_type_checkers_see_every_argument(tmp_path: Path) -> None:
+    pytest.importorskip("pyright", reason="pyright (extra `dev`)")
+    file = tmp_path / "calls.py"
+    file.write_text(CALLS, encoding="utf-8")
+    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable, str(file)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+    found = json.loads(done.stdout)["generalDiagnostics"]
+    wrong = {number for number, line in enumerate(CALLS.splitlines()) if line.endswith("# wrong")}
+    assert {each["range"]["start"]["line"] for each in found} == wrong, found
