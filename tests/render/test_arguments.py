@@ -164,7 +164,9 @@ TOY = {
 }
 #: What the tree with the toy in it is asked.
 QUESTIONS = """
-import inspect, json, sys, torchpt
+import inspect, json, sys
+sys.argv, ball = sys.argv[:1], json.loads(sys.argv[1])
+import make_configs, make_tables, torchpt
 from torchpt.cli import main
 from torchpt.errors import SceneError
 from torchpt.reports.grid import variants_of
@@ -175,7 +177,8 @@ def refused(work):
     except (SceneError, TypeError) as error:
         return str(error)
 
-scene = torchpt.load(json.loads(sys.argv[1]), "cpu")
+assert make_configs.main() == make_tables.main() == 0
+scene = torchpt.load(ball, "cpu")
 wishes = {"spp": 64, "compile": "off", "threads": 1}
 ended = torchpt.render(scene, enough=4, full=True, **wishes)
 batch = torchpt.render_batch([scene], enough=4, full=True, **wishes)
@@ -199,7 +202,7 @@ print(json.dumps(answers))
 
 
 def test_a_new_stop_rule_is_one_declaration_and_its_use(tmp_path: Path) -> None:
-    """In a copy of the tree: two files are edited, two scripts write what is generated."""
+    """In a copy of the tree: two files are edited, two scripts write what is made of them."""
     tree = tmp_path / "tree"
     for folder in ("torchpt", "configs", "scripts", "scenes"):
         shutil.copytree(ROOT / folder, tree / folder, ignore=shutil.ignore_patterns("__pycache__", "*.png"))
@@ -211,29 +214,18 @@ def test_a_new_stop_rule_is_one_declaration_and_its_use(tmp_path: Path) -> None:
         text = file.read_text(encoding="utf-8")
         assert text.count(place) == 1
         file.write_text(text.replace(place, line + place), encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-
-    def run(*words: str) -> str:
-        done = subprocess.run(
-            [sys.executable, *words],
-            cwd=tree,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    assert run("scripts/make_configs.py") == "written: render/default.yaml\n"
-    assert run("scripts/make_tables.py") == "written: ml.md, scenes.md\n"
+    (tree / "ball.yaml").write_text(json.dumps(BALL), encoding="utf-8")
+    path = os.pathsep.join([str(tree), str(tree / "scripts")])
+    command = [sys.executable, "-c", QUESTIONS, json.dumps(BALL)]
+    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    *said, last = done.stdout.splitlines()
+    assert said[:2] == ["written: render/default.yaml", "written: ml.md, scenes.md"]
     row = "a whole number 1..2147483647"
     assert f"\n| `enough` | samples that are enough | {row} | `None` |\n" in (tree / "docs" / "ml.md").read_text()
     assert f"\n| `enough` |  | {row} | samples that are enough |\n" in (tree / "docs" / "scenes.md").read_text()
 
-    (tree / "ball.yaml").write_text(json.dumps(BALL), encoding="utf-8")
-    *said, last = run("-c", QUESTIONS, json.dumps(BALL)).splitlines()
     answers = json.loads(last)
     assert answers["file"] == str(tree / "torchpt" / "__init__.py")
     assert answers["signatures"] == ["enough: int | None = None"] * 3
