@@ -161,8 +161,8 @@ _FILE = "null or a file path"
 
 
 def _whole(low: int, doc: str) -> Argument:
-    fits = lambda value: type(value) is int and value >= low  # noqa: E731
-    return Argument(None, fits=fits, words=f"a whole number >= {low}", doc=doc)
+    words = f"a whole number >= {low}"
+    return Argument(None, fits=lambda value: type(value) is int and value >= low, words=words, doc=doc)
 
 
 def _truth(default: bool, doc: str) -> Argument:
@@ -174,10 +174,15 @@ def _truth(default: bool, doc: str) -> Argument:
 # `scripts/make_tables.py`).
 
 
+class _Samples(TypedDict, total=False):
+    """What lists begin with."""
+
+    spp: Annotated[int | None, Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take")]
+
+
 class Traced(TypedDict, total=False):
     """Arguments of whatever traces paths."""
 
-    spp: Annotated[int | None, Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take")]
     integrator: Annotated[
         str | Mapping[str, Any] | Integrator | None,
         Other(TYPED["integrator"][1], words=_TYPE, doc="what is estimated"),
@@ -247,17 +252,12 @@ class Traced(TypedDict, total=False):
             0, "of the backward pass; none: one of its own, as shared samples would bias the gradient of a squared loss"
         ),
     ]
-    spp_grad: Annotated[int | None, _whole(1, "of the backward pass; none: as many as the forward pass took")]
-    edges: Annotated[
-        bool, _truth(True, "whether silhouettes and shadow edges that move are differentiated; False warns")
-    ]
-    edge_spp: Annotated[
-        int | None,
-        _whole(1, "samples a pixel of each estimator of edges; none: as many as the backward pass takes"),
+    spp_grad: Annotated[
+        int | None, _whole(1, "samples a pixel of the backward pass; none: as many as the forward pass took")
     ]
 
 
-class Common(Traced, total=False):
+class Common(_Samples, Traced, total=False):
     """Arguments of :func:`torchpt.render` that are the same for all pictures of a batch."""
 
     film: Annotated[
@@ -306,6 +306,13 @@ class Common(Traced, total=False):
     resume: Annotated[
         bool | None,
         Flag(False, doc="whether to go on from the checkpoint, where there is one", role=Role.FILES | Role.FREE),
+    ]
+    edges: Annotated[
+        bool, _truth(True, "whether silhouettes and shadow edges that move are differentiated; False warns")
+    ]
+    edge_spp: Annotated[
+        int | None,
+        _whole(1, "samples a pixel of each estimator of edges; none: as many as the backward pass takes"),
     ]
     ranks: Annotated[
         Group | None,

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from torchpt.commands.arguments import UsageError, parse
-from torchpt.commands.converge import raw_study
+from torchpt.commands.converge import HELP, raw_study
 from torchpt.errors import SceneError
-from torchpt.reports.study import read_study, study_of
+from torchpt.reports.study import OWN_KEYS, read_study, study_of
 
 
 def labels(raw: dict[str, Any]) -> list[str]:
@@ -33,6 +33,11 @@ def test_lists_make_a_grid_and_labels_say_what_differs() -> None:
     assert labels({"film.filter.type": ["box", "tent"]}) == ["box", "tent"]
     assert labels({"film.crop": [0, 0, 8, 8]}) == ["as the scene says"]
     assert labels({"film.crop": [[0, 0, 8, 8], [8, 8, 8, 8]]})[1] == "crop [8, 8, 8, 8]"
+
+
+@pytest.mark.parametrize("key", OWN_KEYS)
+def test_help_names_every_key_of_a_study(key: str) -> None:
+    assert sum(line.startswith(f"  {key}=") for line in HELP.splitlines()) == 1
 
 
 def test_settings_become_blocks() -> None:

@@ -14,10 +14,10 @@ from torchpt.settings import BLOCKS, having
 from torchpt.spec import Role
 from torchpt.spec.validate import check_keys
 
-__all__ = ["Variant", "blocks_of", "denoised_label", "flat", "variants_of"]
+__all__ = ["LISTS", "Variant", "blocks_of", "denoised_label", "flat", "variants_of"]
 
 #: Settings whose value is a list: of these only a list of lists is an axis.
-_LISTS = ("film.crop",)
+LISTS = ("film.crop",)
 #: Settings that a study has its own way of saying, or that have no place in one.
 _TAKEN = {
     **{f"render.{name}": "nothing: every run takes the samples that spp= says" for name in having(Role.ENDS)["render"]},
@@ -87,7 +87,7 @@ def variants_of(settings: Mapping[str, Any], file: str | None) -> list[Variant]:
 
 
 def _is_axis(key: str, value: Any) -> bool:
-    return isinstance(value, list) and (key not in _LISTS or not value or isinstance(value[0], list))
+    return isinstance(value, list) and (key not in LISTS or not value or isinstance(value[0], list))
 
 
 def _values(key: str, values: list[Any], file: str | None) -> list[Any]:

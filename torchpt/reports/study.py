@@ -6,7 +6,7 @@ The same keys stand on the command line and in a study file; any other key there
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +16,8 @@ from torchpt.errors import SceneError
 from torchpt.files import configs
 from torchpt.format.yaml_file import plain, read_yaml
 from torchpt.images.metrics import METRICS
-from torchpt.reports.grid import Variant, blocks_of, denoised_label, flat, variants_of
+from torchpt.reports.grid import LISTS, Variant, blocks_of, denoised_label, flat, variants_of
+from torchpt.settings import Render
 from torchpt.spec import Flag, Other, Refused, Valued, Whole, parameters_of
 from torchpt.spec.declared import values_of
 
@@ -102,7 +103,7 @@ class Asked(Valued):
     parameters: ClassVar = {
         "spp": Other((4, 16, 64, 256), reader=_steps, words="growing numbers", doc="samples a pixel of each step"),
         "seeds": Whole(5, low=2, high=1000, doc="independent runs of each step"),
-        "seed": Whole(0, high=2**63 - 1, doc="the seeds of all runs follow from it"),
+        "seed": replace(parameters_of(Render)["seed"], doc="the seeds of all runs follow from it"),
         "metrics": Other(
             ("relmse", "relmse_trimmed", "mse", "smape", "psnr", "ssim", "flip"),
             reader=_metrics,
@@ -283,7 +284,7 @@ def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> Pla
     made = values_of(Reference, own, "reference", file, "a reference")
     settings = flat({key: value for key, value in raw.items() if key not in own})
     for key, value in settings.items():
-        if isinstance(value, list) and key != "film.crop":
+        if isinstance(value, list) and key not in LISTS:
             raise SceneError(f"reference.{key}", value, "one value: there is one reference", file)
     variants_of(settings, file)  # refuses what is no setting
     return Plan({}, made["spp"] or 4 * most, made["seeds"], settings)
