@@ -56,6 +56,11 @@ def test_every_argument_of_render_has_a_row_with_its_default():
             assert f"`{default}`" in rows[name][-1], name
 
 
+def test_every_argument_of_trace_is_named():
+    named = re.findall(r"`(\w+)`", " ".join(row[0] for row in table("Rays").values()))
+    assert {"scene", "o", "d", *named} == set(inspect.signature(torchpt.trace).parameters)
+
+
 @pytest.mark.parametrize("loss", torchpt.losses.__all__)
 def test_every_loss_has_a_row(loss):
     assert any(row.startswith(f"{loss}(") for row in table("Losses"))

@@ -17,7 +17,7 @@ import torch
 import torchpt
 from torchpt.commands.arguments import GROUPS, path_keys
 from torchpt.errors import SceneError
-from torchpt.settings import BLOCKS, RECORDS, Common, Every, Render, Wishes
+from torchpt.settings import BLOCKS, RECORDS, Common, Every, Render, Traced, Wishes
 from torchpt.spec import Role, parameters_of
 from torchpt.spec.arguments import declared, spelled
 
@@ -39,6 +39,7 @@ def scene() -> torchpt.Scene:
     ("function", "own", "form"),
     [
         (torchpt.render, ("scene", "full"), Wishes),
+        (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), Traced),
         (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), Common),
         (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), Common),
         (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), Common),

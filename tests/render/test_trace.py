@@ -118,7 +118,8 @@ def test_numbers_are_those_of_the_ray():
     assert torch.equal(whole[:70], torchpt.trace(scene, o, d[:70], **wish))
     assert torch.equal(whole[:70], torchpt.trace(scene, o, d[:70].view(7, 5, 2, 3), **wish).view(70, 3))
     assert torch.equal(whole[0], torchpt.trace(scene, o, d[0], **wish))
-    assert not torch.equal(whole, torchpt.trace(scene, o, d, **{**wish, "seed": 10}))
+    other: Any = {**wish, "seed": 10}
+    assert not torch.equal(whole, torchpt.trace(scene, o, d, **other))
     eager = torchpt.trace(scene, o, d[:70], compile="off", **wish)
     assert float((eager - whole[:70]).abs().median()) < 1e-6
     assert torchpt.trace(scene, o, d[:0], **wish).shape == (0, 3)
