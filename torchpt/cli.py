@@ -125,7 +125,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _out_of_memory(error: Exception) -> int:
     """Refuse where memory ran out; any other error goes on its way."""
-    from torchpt.shortage import ran_out
+    from torchpt.core.memory import ran_out
 
     if not ran_out(error):
         raise error

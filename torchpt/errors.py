@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from functools import cache
 
 __all__ = [
     "AssetError",
@@ -17,6 +18,7 @@ __all__ = [
     "RenderError",
     "SceneError",
     "TorchptError",
+    "say_once",
     "warn_caller",
 ]
 
@@ -127,6 +129,12 @@ class EnergyWarning(UserWarning):
 
 class NoLightWarning(UserWarning):
     """A picture, or part of it, lacks light that no sample met, so that its error is not known."""
+
+
+@cache
+def say_once(text: str) -> None:
+    """Write a line on stderr, the first time only."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def warn_caller(message: str, category: type[Warning]) -> None:

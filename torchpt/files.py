@@ -19,7 +19,7 @@ __all__ = ["MAX_BYTES", "Unfit", "as_path", "check_regular", "configs", "is_regu
 MAX_BYTES = 4 * 2**30
 
 _PACKAGE = Path(__file__).resolve().parent
-_PIECE = 2**24  # bytes read at a time of a file that is longer than it said
+_PIECE = 2**20  # bytes read at a time of a file that is longer than it said
 
 
 class Unfit(OSError):

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch._C import _DisableFuncTorch  # pyright: ignore[reportAttributeAccessIssue, reportPrivateUsage]
 from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
 
+from torchpt.core.threads import undisturbed
 from torchpt.errors import TorchptError
-from torchpt.native.modes import undisturbed
 
 __all__ = ["Backward", "Forward", "in_batch", "in_transform", "on_tape", "outside_transforms", "wants_gradients"]
 

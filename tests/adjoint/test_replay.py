@@ -107,7 +107,7 @@ def test_no_gradient_as_large_as_the_table_for_each_look_up():
 @pytest.mark.parametrize("name", [NAME, "shapes.plate.to_world"])
 def test_stages_of_which_no_kernel_can_be_made(monkeypatch, name, capfd):
     from torchpt.engines.kernels.joint_kernels import JointKernels
-    from torchpt.forward.waves import say_once
+    from torchpt.errors import say_once
     from torchpt.lanes.graph import Unsupported
 
     scene = torchpt.load(room(PLATE, lights={"sky": {"type": "constant", "radiance": [0.2, 0.3, 0.4]}}), "cpu")

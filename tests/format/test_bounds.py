@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from small_files import DAE, MTL, OBJ, glb, gltf_document
 
 import torchpt
@@ -255,7 +256,7 @@ def test_xml_entities_are_refused_in_any_encoding(tmp_path: Path, text: bytes) -
 def test_a_film_that_memory_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """It ended the process: a film of 2^28 pixels takes tens of GiB."""
     scene = torchpt.load({"camera": CAMERA, "film": {"width": 16384, "height": 16384}}, "cpu")
-    monkeypatch.setattr("torchpt.forward.room.free_memory", lambda: 2**30)
+    monkeypatch.setattr("torchpt.forward.need.free_memory", lambda _: 2**30)
     with pytest.raises(
         SceneError, match=r"^film.width: expected a film that fits into memory: .* 1.0 GiB are free, got \[16384"
     ):
@@ -264,15 +265,15 @@ def test_a_film_that_memory_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPat
 
 
 def test_free_memory_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from torchpt.native import memory
+    from torchpt.core import memory
 
-    told = memory.free_memory()
+    told = memory.free_memory(torch.device("cpu"))
     assert told is None or 2**20 < told < 2**50
     (tmp_path / "memory.max").write_text("1000\n")
     (tmp_path / "memory.current").write_text("900\n")
     (tmp_path / "memory.stat").write_text("anon 3\ninactive_file 50\n")
     monkeypatch.setattr(memory, "_GROUP", tmp_path)
-    assert memory.free_memory() == 150
+    assert memory.free_memory(torch.device("cpu")) == 150
     monkeypatch.setattr(memory, "_GROUP", tmp_path / "none")
     monkeypatch.setattr(memory, "_MEMINFO", tmp_path / "none")
-    assert memory.free_memory() is None
+    assert memory.free_memory(torch.device("cpu")) is None

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import tries
 
-from torchpt.native.threads import settle
+from torchpt.core.threads import settle
 
 LONG = {"documents": 10_000, "assets": 4_000}
 #: Tries that one process makes.

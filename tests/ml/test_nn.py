@@ -14,9 +14,9 @@ from scene_makers import room
 from torch import Tensor
 
 import torchpt
+from torchpt.core.memory import Meter, let_go
 from torchpt.errors import SceneError
 from torchpt.lanes import engine
-from torchpt.native.memory import Meter, let_go
 from torchpt.nn import Renderer
 from torchpt.nn.ranges import Above, Bounded, Free, Rigid, range_of
 from torchpt.spec import Angle, Color, Index, Scalar

@@ -151,7 +151,7 @@ def test_samples_enter_the_film_as_eagerly(clamp):
     for place, bad in (((0, 2, 7), math.nan), ((1, 5, 199), math.inf), ((2, 0, 0), -math.inf), ((0, 0, 0), math.nan)):
         values[place] = bad
     films = [Film(20, 10, 2, torch.device("cpu")) for _ in range(2)]
-    loop = Loop(kernels, 1, clamp, False, print)
+    loop = Loop(kernels, 1, clamp, False)
     worker = Worker(kernels)
     finite = torch.isfinite(values).all(0)
     eager = torch.where(finite, values, 0.0)

@@ -19,9 +19,8 @@ import torchpt
 from torchpt.bsdfs import Parameters
 from torchpt.engines.kernels import chunk, programs
 from torchpt.engines.kernels.kernels import Kernels
-from torchpt.errors import SceneError
+from torchpt.errors import SceneError, say_once
 from torchpt.format.description import settings
-from torchpt.forward import say_once
 from torchpt.lanes import engine
 from torchpt.lanes.graph import Unsupported
 from torchpt.math.warps import cosine_hemisphere

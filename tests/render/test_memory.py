@@ -18,11 +18,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
+from torchpt.core.memory import ran_out
 from torchpt.engines.kernels import rows
 from torchpt.engines.kernels.chunk import Worker
-from torchpt.errors import RenderError, SceneError
-from torchpt.forward import say_once
-from torchpt.shortage import ran_out
+from torchpt.errors import RenderError, SceneError, say_once
 
 #: How allocations fail, on a CPU and on CUDA.
 FAILURES: dict[str, Callable[[], Exception]] = {
@@ -304,7 +303,7 @@ def measured(wish: str, more: str = "{}") -> tuple[str, int]:
     """Return what a render of a process of its own says, and bytes that it held above import at most."""
     text = f"""
 import torchpt
-from torchpt.native.memory import Meter
+from torchpt.core.memory import Meter
 scene = torchpt.load("cornell_box", "cpu")
 try:
     found = torchpt.render(scene, spp=1, full=True, max_memory={wish!r}, **{more})

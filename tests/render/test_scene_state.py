@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import torchpt
+from torchpt.core.threads import limited_threads
 from torchpt.errors import SceneError
 from torchpt.format.description import settings
-from torchpt.forward import limited_threads
 from torchpt.rendering import render_scene
 from torchpt.scene.sources import labels_of
 

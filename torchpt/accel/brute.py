@@ -17,8 +17,8 @@ from torch import Tensor
 
 from torchpt.accel.base import Accel, Array, Hits, closer
 from torchpt.accel.tables import extent, inverses, prepare, tolerances
+from torchpt.core.threads import thread_count
 from torchpt.errors import SceneError
-from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
 __all__ = ["MAX_TOLERANCE", "Brute", "eligible"]

@@ -15,8 +15,8 @@ from torchpt.accel.base import Accel, Array, Hits
 from torchpt.accel.blocks import Others, aligned, lines_of, mesh_tree, room_of, write
 from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.topology import Topology
+from torchpt.core.threads import thread_count
 from torchpt.native.jit import compiled, launch
-from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
 __all__ = ["Wide"]

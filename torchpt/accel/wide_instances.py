@@ -17,8 +17,8 @@ from torchpt.accel.instances import CopyTables
 from torchpt.accel.kernels_blocks import LINE
 from torchpt.accel.topology import Topology
 from torchpt.accel.wide import Wide
+from torchpt.core.threads import thread_count
 from torchpt.native.jit import compiled, launch
-from torchpt.native.threads import thread_count
 from torchpt.records import Geometry
 
 __all__ = ["WideInstanced"]

@@ -25,9 +25,9 @@ from torchpt.adjoint.attachment import attached
 from torchpt.adjoint.held import by_film, follows, suits
 from torchpt.adjoint.loop import compiled_replay
 from torchpt.adjoint.tape import tape
+from torchpt.core.memory import check_memory
+from torchpt.core.threads import limited_threads
 from torchpt.errors import NotBuiltError
-from torchpt.forward import limited_threads
-from torchpt.forward.budget import check_memory
 from torchpt.forward.need import loaded, need_of
 from torchpt.integrators.path import PathIntegrator
 from torchpt.ranks import Group

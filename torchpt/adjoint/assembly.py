@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from torchpt.adjoint.sums import Sums
+from torchpt.core.memory import Budget, Span
 from torchpt.core.tree import leaves, map_leaves
-from torchpt.forward.schedule import Span
 from torchpt.forward.wave import make_wave
-from torchpt.forward.waves import Waves
 from torchpt.integrators.wave import Wave
 from torchpt.ranks import Group, blocks
 from torchpt.scene import Scene
@@ -110,14 +109,14 @@ class Assembly:
         """Consecutive pixels, first and how many, that this process takes: the same ones by kernels and without."""
         return blocks(pixels, samples, self._ranks)
 
-    def through(self, waves: Waves, work: Callable[[Span], None], pixels: int, samples: int) -> None:
+    def through(self, budget: Budget, work: Callable[[Span], None], pixels: int, samples: int) -> None:
         """Work on them, piece by piece."""
         for start, count in self.blocks(pixels, samples):
 
             def moved(span: Span, start: int = start) -> None:
                 work((start + span[0], *span[1:]))
 
-            for _ in waves.through(moved, count, 0, samples):
+            for _ in budget.through(moved, count, 0, samples):
                 pass
 
     def sums(self) -> Sums:

@@ -35,8 +35,8 @@ from torchpt.adjoint.attachment import attached
 from torchpt.adjoint.samples import counted
 from torchpt.adjoint.sums import Sums
 from torchpt.adjoint.tape import chunk_by_chunk
+from torchpt.core.memory import Span
 from torchpt.engines import tensors
-from torchpt.forward.schedule import Span
 from torchpt.integrators.path import PathIntegrator
 from torchpt.integrators.wave import Wave, camera_state
 from torchpt.math.vectors import dot, normalize, take

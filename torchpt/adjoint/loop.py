@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -14,15 +12,15 @@ from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.replay import replay
 from torchpt.adjoint.sums import ChunkSums, Sums
 from torchpt.adjoint.sweep import KEPT, Sweep
+from torchpt.core.memory import Budget, Span, ran_out
+from torchpt.core.threads import deal
 from torchpt.engines.kernels.chunk import LANES, Chunk
 from torchpt.engines.kernels.joint_kernels import JointKernels
-from torchpt.forward.schedule import Span
-from torchpt.forward.waves import say_once
+from torchpt.errors import say_once
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.graph import Unsupported
 from torchpt.scene import Scene
 from torchpt.settings import Settings
-from torchpt.shortage import ran_out
 
 __all__ = ["compiled_replay"]
 
@@ -47,7 +45,7 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
     kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets, cotangent)
     models = wave.context.world.materials.models
     kernels.eager = kernels.probe([k for k, model in enumerate(models) if any(model is x for x in scene.own_models)])
-    threads = _threads(kernels, settings)
+    budget = _budget(kernels, settings)
     blocks = assembly.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
     chunks = [Chunk(*span) for span in _spans(blocks, settings.render.spp)]
     sweeps: list[Sweep] = []
@@ -58,19 +56,30 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
             sweep = sweeps.pop() if sweeps else Sweep(kernels, assembly, settings)
         with torch.no_grad():
             pixels = asked[:, chunk.first_pixel : chunk.first_pixel + chunk.pixels].float()
-            found = sweep.run(chunk, pixels, sums if threads == 1 else None)
+            found = sweep.run(chunk, pixels, sums if budget.threads == 1 else None)
         with lock:
             sweeps.append(sweep)
         return found
 
-    reason = ""
-    try:
-        for part in _in_order(task, chunks, threads):
+    def merge(part: ChunkSums | None) -> bool:
+        if part is not None:
             sums.merge(part)
-    except Exception as error:
-        if not isinstance(error, Unsupported) and not ran_out(error):
-            raise
-        reason = f"no kernel can be made of {error}" if isinstance(error, Unsupported) else "memory ran out"
+        return False
+
+    reason = ""
+    while not reason:
+        try:
+            deal(chunks, task, budget.threads, merge, ahead=2 * budget.threads)
+            break
+        except Exception as error:
+            if not isinstance(error, Unsupported) and not ran_out(error):
+                raise
+            reason = f"no kernel can be made of {error}" if isinstance(error, Unsupported) else "memory ran out"
+        sweeps.clear()
+        sums.clear()
+        if reason == "memory ran out" and budget.threads > 1:
+            budget.shrink()
+            reason = ""
     for stage, why in kernels.back_eager.items():
         model = f" at {models[stage[1]]}" if stage[0] == "bounce" else ""
         say_once(
@@ -78,27 +87,7 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
         )
     if reason:
         say_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
-        sweeps.clear()
-        sums.clear()
         replay(assembly, settings, asked, sums)
-
-
-def _in_order(task: Callable[[Chunk], ChunkSums], chunks: Sequence[Chunk], threads: int) -> Iterator[ChunkSums]:
-    """Yield what a task gives for chunks, in their order, by some threads."""
-    if threads == 1:
-        yield from map(task, chunks)
-        return
-    waiting: deque[Future[ChunkSums]] = deque()
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="torchpt")
-    try:
-        for chunk in chunks:
-            waiting.append(pool.submit(task, chunk))
-            if len(waiting) > 2 * threads:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
@@ -111,14 +100,14 @@ def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
                 yield pixel, min(step, start + pixels - pixel), sample, count
 
 
-def _threads(kernels: JointKernels, settings: Settings) -> int:
+def _budget(kernels: JointKernels, settings: Settings) -> Budget:
     """Return how many threads there are, fewer where the arenas of all would take more than half of ``render.max_memory``."""
-    threads, limit = torch.get_num_threads(), settings.render.max_memory
-    if limit is None:
-        return threads
-    depth = settings.integrator.limits.max_depth
-    levels = min(depth, KEPT) if depth >= 0 else KEPT
-    return max(1, min(threads, limit // (8 * CAPACITY * (levels + 2) * (kernels.state.count + kernels.models + 2))))
+    budget = Budget(torch.device("cpu"), CAPACITY, torch.get_num_threads(), what="a gradient", instead="one thread")
+    limit, depth = settings.render.max_memory, settings.integrator.limits.max_depth
+    if limit is not None:
+        levels = min(depth, KEPT) if depth >= 0 else KEPT
+        budget.fit(limit // 2, 4 * (levels + 2) * (kernels.state.count + kernels.models + 2), CAPACITY)
+    return budget
 
 
 def _looped(assembly: Assembly, settings: Settings) -> bool:

@@ -17,10 +17,8 @@ from torch import Tensor
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
 from torchpt.adjoint.sums import Sums
+from torchpt.core.memory import Budget, Span
 from torchpt.engines.tensors import Paths, Tensors, escaped
-from torchpt.forward.budget import Budget
-from torchpt.forward.schedule import Span
-from torchpt.forward.waves import Waves
 from torchpt.integrators import joint
 from torchpt.integrators.joint import Behind
 from torchpt.integrators.path import Ends, partition, slides
@@ -89,9 +87,8 @@ def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) ->
         sums.join(piece(assembly, settings, asked, span))
 
     device = wave.centre.device
-    budget = Budget(None, device, LANES.get(device.type, LANES["cpu"]), 0)
-    waves = Waves(budget, "the vertices of a single lane")
-    assembly.through(waves, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
+    budget = Budget(device, LANES.get(device.type, LANES["cpu"]), what="the vertices of a single lane")
+    assembly.through(budget, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
 def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:

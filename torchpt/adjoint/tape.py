@@ -10,16 +10,14 @@ from torch import Tensor
 from torchpt.adjoint.assembly import Assembly
 from torchpt.adjoint.samples import asked_of
 from torchpt.adjoint.sums import Sums
+from torchpt.core.memory import Budget, Span
+from torchpt.core.threads import one_thread
 from torchpt.engines import tensors
 from torchpt.film.splats import Splats
-from torchpt.forward.budget import Budget
-from torchpt.forward.schedule import BYTES_PER_LANE, Span, budget_of
-from torchpt.forward.waves import Waves
+from torchpt.forward.need import BYTES_PER_LANE
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.math.gathers import gathered_by
-from torchpt.math.threads import one_thread
 from torchpt.math.vectors import take
-from torchpt.native.memory import Meter
 from torchpt.settings import Settings
 
 __all__ = ["chunk_by_chunk", "tape", "tape_per_lane"]
@@ -28,8 +26,6 @@ __all__ = ["chunk_by_chunk", "tape", "tape_per_lane"]
 LANES = {"cpu": 1 << 16, "cuda": 1 << 18}
 #: Bytes of a chunk's tape where memory is not limited.
 TAPE = 1 << 29
-#: Of the memory that is free under a limit, what a chunk is let to use.
-SHARE = 0.88
 #: Vertices of a path that memory is planned for where its depth is without end.
 LONGEST = 64
 
@@ -86,7 +82,7 @@ def chunk_by_chunk(assembly: Assembly, settings: Settings, sums: Sums, part: Par
     def add(span: Span) -> None:
         sums.join(piece(assembly, part, span))
 
-    assembly.through(Waves(_budget(settings, assembly), "the tape of a single lane"), add, count, samples)
+    assembly.through(_budget(settings, assembly), add, count, samples)
 
 
 def piece(assembly: Assembly, part: Part, span: Span) -> Sums:
@@ -103,15 +99,12 @@ def piece(assembly: Assembly, part: Part, span: Span) -> Sums:
 
 def _budget(settings: Settings, assembly: Assembly) -> Budget:
     """Chunks of always the same size, or, where that is more than ``render.max_memory`` leaves, of what fits."""
-    device, limit, each = assembly.wave.centre.device, settings.render.max_memory, tape_per_lane(settings)
+    device, each = assembly.wave.centre.device, tape_per_lane(settings)
     lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE // each, 1))
-    if limit is not None:
-        meter = Meter(device)
-        if lanes * each > SHARE * (meter.base() + limit - meter.now()):
-            budget = budget_of(settings, device, each)
-            budget.most = min(budget.most, lanes)
-            return budget
-    return Budget(None, device, lanes, each)
+    limit = settings.render.max_memory
+    budget = Budget(device, lanes, what="the tape of a single lane", limit=limit, per_lane=each)
+    budget.steady()
+    return budget
 
 
 def tape_per_lane(settings: Settings) -> int:

@@ -13,13 +13,12 @@ import torch
 from torch import Tensor
 
 from torchpt.batches.inputs import Cameras, Seeds, cameras_of, named, params_of, scenes_of, seeds_of
+from torchpt.core.memory import check_limit, mb
+from torchpt.core.threads import lasting, limited_threads
 from torchpt.engines.kernels.schedule import TASKS
 from torchpt.errors import SceneError
-from torchpt.forward import Entry, Rendering, Run, limited_threads, render_many
-from torchpt.forward.budget import too_little
+from torchpt.forward import Entry, Rendering, Run, render_many
 from torchpt.integrators.wave import Wave
-from torchpt.native.memory import mb
-from torchpt.native.modes import lasting
 from torchpt.orders import Order, ordered, rendered
 from torchpt.scene import Scene
 from torchpt.scene.editions import check_unchanged
@@ -263,8 +262,7 @@ def _check_memory(order: Order, total: int | None) -> None:
     """Refuse a bound that the pictures of a batch alone would break."""
     limit, film = order.settings.render.max_memory, order.settings.film
     _, _, width, height = film.crop or (0, 0, film.width, film.height)
-    held = (
-        2 * 3 * width * height * torch.finfo(order.call.dtype).bits // 8 * (total or 1)
-    )  # one by one, and then together
-    if limit is not None and limit < held:
-        raise too_little(limit, f"more than the {mb(held)} that the pictures alone take")
+    bytes_each = torch.finfo(order.call.dtype).bits // 8
+    held = 2 * 3 * width * height * bytes_each * (total or 1)  # one by one, and then together
+    if limit is not None:
+        check_limit(limit, held, f"more than the {mb(held)} that the pictures alone take")

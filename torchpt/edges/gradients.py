@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.accel.bounds import primitive_bounds
+from torchpt.core.threads import limited_threads
 from torchpt.edges.bodies import Bodies, bodies_of
 from torchpt.edges.draws import Numbers
 from torchpt.edges.film import Worth
@@ -20,7 +21,6 @@ from torchpt.edges.primary import Look, primary_of
 from torchpt.edges.seen import pieces_of
 from torchpt.edges.shadows import Shadows
 from torchpt.edges.traced import Traced, traced_of
-from torchpt.forward import limited_threads
 from torchpt.integrators.path import PathIntegrator
 from torchpt.ranks import Group, share
 from torchpt.scene import Scene

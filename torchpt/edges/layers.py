@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from torchpt import taped
+from torchpt.core.threads import limited_threads
 from torchpt.edges.gradients import Boundary, boundary_of
 from torchpt.engines import tensors
-from torchpt.forward import limited_threads, make_wave, rebound
+from torchpt.forward import make_wave, rebound
 from torchpt.integrators import LAYERS, aov
 from torchpt.integrators.layer import SurfaceLayer
 from torchpt.scene import Scene

@@ -24,11 +24,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.core.threads import sum_all
 from torchpt.film.pilots import Pilots
 from torchpt.film.tail import FEWEST as TAIL
 from torchpt.film.tail import heavy_tail
 from torchpt.images.metrics import relative
-from torchpt.math.threads import sum_all
 
 __all__ = [
     "STREAMS",

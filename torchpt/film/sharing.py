@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.math.threads import sum_all
+from torchpt.core.threads import sum_all
 
 __all__ = ["foreseen", "shared_out"]
 

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.core.threads import mean_all
 from torchpt.film.splats import SplatSums
 from torchpt.images.metrics import relative
-from torchpt.math.threads import mean_all
 
 __all__ = ["Film"]
 

@@ -9,9 +9,9 @@ from torchpt.engines import tensors
 from torchpt.engines.kernels.chunk import Worker
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.engines.kernels.schedule import Loop
+from torchpt.errors import say_once
 from torchpt.film import Film
 from torchpt.forward.wave import kernels_of, looped
-from torchpt.forward.waves import say_once
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.wave import Wave

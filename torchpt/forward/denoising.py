@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
+from torchpt.core.threads import limited_threads
 from torchpt.forward.result import Rendering
-from torchpt.forward.threads import limited_threads
 from torchpt.images import denoiser
 from torchpt.settings import Settings
 

@@ -7,11 +7,10 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
+from torchpt.core.threads import limited_threads, undisturbed
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.run import Run
 from torchpt.forward.split import stamp
-from torchpt.forward.threads import limited_threads
-from torchpt.native.modes import undisturbed
 from torchpt.ranks import Group, together
 from torchpt.scene import Scene
 from torchpt.settings import Settings

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 
-from torchpt.engines.kernels.together import Job, Together
+from torchpt.core.threads import Crew, one_thread, undisturbed
+from torchpt.engines.kernels.schedule import Block, Share
 from torchpt.forward.result import Rendering
 from torchpt.forward.run import Run
 from torchpt.lanes.graph import Unsupported
-from torchpt.math.threads import one_thread
-from torchpt.native.modes import undisturbed
 
 __all__ = ["Entry", "render_many"]
 
@@ -31,6 +31,8 @@ class Entry:
         done: told of the rendering.
         failed: told of an error instead, which it may raise as another one.
         run: once it is ready.
+        left: tasks of it that are not done.
+        rest: blocks that memory did not suffice for.
     """
 
     device: torch.device
@@ -38,6 +40,8 @@ class Entry:
     done: Callable[[Rendering], None]
     failed: Callable[[BaseException], None]
     run: Run = field(init=False)
+    left: int = field(init=False, default=0)
+    rest: list[Block] = field(init=False, default_factory=list)
 
 
 def render_many(entries: Iterable[Entry], tasks: int) -> None:
@@ -53,8 +57,8 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
     Raises:
         Exception: what an entry's ``failed`` raises; the others are given up then.
     """
-    crew = Together[Entry](torch.get_num_threads())
-    waiting = iter(entries)
+    crew = Crew[Entry, Share](torch.get_num_threads())
+    waiting, begun = iter(entries), dict[int, Entry]()
     try:
         while True:
             with _beside(crew):
@@ -65,7 +69,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 entry.run = entry.make(crew.threads)
                 spans = entry.run.at_once()
             if spans is None:
-                _drain(crew, 0)
+                _drain(crew, begun, 0)
                 with undisturbed(entry.device), _blamed(entry):
                     entry.done(entry.run.go(None))
                 del entry.run
@@ -73,15 +77,22 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
             with _blamed(entry):
                 loop = entry.run.loop
                 assert loop is not None
-                crew.add(Job(entry, loop, loop.blocks(spans, tasks)))
-            _drain(crew, AHEAD * crew.threads * tasks)
-        _drain(crew, 0)
+                begun[id(entry)] = entry
+                blocks = loop.blocks(spans, tasks)
+                entry.left = len(blocks)
+                for block in blocks:
+                    crew.add(entry, partial(loop.task, *block))
+            _drain(crew, begun, AHEAD * crew.threads * tasks)
+        _drain(crew, begun, 0)
     finally:
+        for entry in begun.values():  # those that are not done stop at their next kernel
+            if entry.run.loop is not None:
+                entry.run.loop.halt()
         crew.close()
 
 
 @contextmanager
-def _beside(crew: Together[Entry]) -> Iterator[None]:
+def _beside(crew: Crew[Entry, Share]) -> Iterator[None]:
     """While all cores trace, tensor operations of this thread are its own: a team would wait for a core, and spin meanwhile."""
     with one_thread() if crew.pending else nullcontext():
         yield
@@ -97,7 +108,7 @@ def _blamed(entry: Entry) -> Iterator[None]:
         raise
 
 
-def _drain(crew: Together[Entry], most: int) -> None:
+def _drain(crew: Crew[Entry, Share], begun: dict[int, Entry], most: int) -> None:
     """Take in what threads have done, until no more than ``most`` blocks are pending."""
     while True:
         found = crew.next(wait=crew.pending > most)
@@ -105,16 +116,19 @@ def _drain(crew: Together[Entry], most: int) -> None:
             if crew.pending <= most:
                 return
             continue
-        job, share = found
-        entry = job.owner
+        entry, share = found
+        entry.left -= 1
         with undisturbed(entry.device), _blamed(entry), _beside(crew):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
-                job.loop.halt()
+                assert entry.run.loop is not None
+                entry.run.loop.halt()
             elif isinstance(share, BaseException):
                 raise share
             else:
+                entry.rest += share.rest
                 entry.run.took(share)
-            if job.left == 0:
-                entry.done(entry.run.completed(job.rest))
+            if entry.left == 0:
+                del begun[id(entry)]
+                entry.done(entry.run.completed(entry.rest))
                 del entry.run

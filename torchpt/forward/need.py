@@ -1,19 +1,31 @@
-"""What a render is foreseen to take beside its scene; the numbers are measured (docs/stability.md), in bytes."""
+"""What a render is foreseen to take beside its scene, by how it runs; the numbers are measured (docs/stability.md), in bytes.
+
+What is done where there is less, :mod:`torchpt.core.memory` says.
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
+from torchpt.core.memory import FEWEST, free_memory
+from torchpt.errors import SceneError
 from torchpt.film import Film
-from torchpt.forward.schedule import BYTES_PER_LANE, streams_of
+from torchpt.forward.stopping import streams_of
 from torchpt.forward.wave import surface_layers
 from torchpt.settings import Settings
 
-__all__ = ["CODE", "Need", "loaded", "need_of", "shape_of"]
+__all__ = ["BYTES_PER_LANE", "FEWEST_OF_LOOP", "LANES", "Need", "check_film", "loaded", "need_of"]
 
+#: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
+LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
+#: Peak bytes a lane takes in a wave, measured on the Cornell box; under a tape each vertex keeps about this much.
+BYTES_PER_LANE = 640
+#: Lanes that repay a thread of the compiled loop.
+FEWEST_OF_LOOP = 1024
 #: Of machine code and tables of libraries, which are read from disk when they are first called, once a process.
 CODE = {"eager": 75_000_000, "compiled": 54_000_000, "tape": 100_000_000}
 #: Of numba, which not all renders import.
@@ -22,8 +34,8 @@ NUMBA = 60_000_000
 CODE_OF_MODEL = 3_000_000
 #: Of a pixel while the picture is made of the films: alone, with pilots, with adaptive sampling, with layers of variance.
 PICTURE, PILOTS, ADAPTIVE, VARIANCE = 64, 225, 160, 160
-#: Lanes of the smallest wave of tensor operations, and of a chunk that one thread takes in the compiled loop.
-FEWEST, FEWEST_OF_LOOP = 4096, 1024
+#: Bytes a pixel of what is made of films in the end, and bytes of films that are taken without asking how many there are.
+PICTURES, SMALL = 80, 2**28
 #: What the least is above what was foreseen.
 SLACK, SPARE = 1.04, 3_000_000
 
@@ -96,10 +108,30 @@ def need_of(settings: Settings, device: torch.device, how: str, models: int, row
     return Need(pixels * films, code, waves, pixels * picture)
 
 
-def shape_of(left: int, threads: int, rows: int, most: int) -> tuple[int, int]:
-    """Threads of the compiled loop, and the lanes of each, that fit in so many bytes; one thread always does."""
-    for count in range(threads, 0, -1):
-        lanes = left // (4 * rows * count)
-        if lanes >= FEWEST_OF_LOOP or count == 1:
-            return count, max(FEWEST_OF_LOOP, min(lanes, most))
-    return 1, FEWEST_OF_LOOP
+def check_film(
+    width: int, height: int, streams: int, layers: Sequence[int], device: torch.device, splats: bool = False
+) -> None:
+    """Refuse a film that would end the process, with no word of the system's, before a byte of it is touched.
+
+    Args:
+        width: of the picture (after a crop) in pixels.
+        height: of the picture in pixels.
+        streams: randomizations of the picture's samples.
+        layers: how many channels each layer has.
+        device: where the films lie.
+        splats: whether samples light other pixels than their own.
+
+    Raises:
+        SceneError: it takes more memory than there is.
+    """
+    pixels = width * height
+    needed = Film.bytes_of(pixels, streams, splats=splats) + sum(
+        Film.bytes_of(pixels, 1, channels) for channels in layers
+    )
+    needed += PICTURES * pixels
+    if needed < SMALL:
+        return
+    free = free_memory(device)
+    if free is not None and needed > free:
+        expected = f"a film that fits into memory: it takes {needed / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free"
+        raise SceneError("film.width", [width, height], expected)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.core.threads import limited_threads
 from torchpt.engines import tensors
 from torchpt.errors import SceneError
-from torchpt.forward.threads import limited_threads
 from torchpt.forward.wave import make_wave
 from torchpt.integrators import KINDS as INTEGRATORS
 from torchpt.integrators.clamp import clamp_scale

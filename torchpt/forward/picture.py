@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchpt.core.memory import Meter, mb, retried
 from torchpt.film import KnownError
 from torchpt.forward.causes import causes_of
 from torchpt.forward.result import Rendering
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
-from torchpt.native.memory import Meter, let_go, mb
-from torchpt.shortage import needing, ran_out
 
 if TYPE_CHECKING:
     from torchpt.forward.run import Run
@@ -23,21 +22,9 @@ __all__ = ["final", "known_of", "rendering_of"]
 
 
 def final(run: Run) -> Rendering:
-    """The picture at the end, and why samples of it are not finite.
-
-    Where memory does not suffice, what else is held is given back first.
-    """
-    try:
-        return _told(run)
-    except Exception as error:
-        if not ran_out(error):
-            raise
-    if run.loop is not None:
-        run.loop.release()
-    let_go()
+    """The picture at the end, and why samples of it are not finite."""
     size = mb(run.need.picture)
-    with needing(lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}"):
-        return _told(run)
+    return retried(lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}", lambda: _told(run))
 
 
 def _told(run: Run) -> Rendering:
@@ -87,7 +74,7 @@ def rendering_of(run: Run) -> Rendering:
         stopped_by=run.stop.reason,
         complete=bool(run.stop.reason) and not run.ended,
         peak_memory=max(meter.peak() - meter.base(), 0),
-        lanes=run.waves.lanes if run.waves is not None and run.waves.halved else None,
+        lanes=run.waves.lanes if run.waves is not None and run.waves.short else None,
         eager=tuple(run.eager),
         scene=run.name,
         settings=run.settings,

@@ -7,16 +7,15 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from torchpt.core.memory import Span, suffices
 from torchpt.engines import tensors
 from torchpt.errors import RenderError
 from torchpt.film.splats import Splats
-from torchpt.forward.schedule import Span
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave
-from torchpt.shortage import ran_out
 
 __all__ = ["Piece", "take"]
 
@@ -47,21 +46,15 @@ class Piece:
             RenderError: copying failed for want of memory again and again.
         """
         for _ in range(ATTEMPTS):
-            if self._written():
+            if suffices(self._copied):
                 return
         raise RenderError("not enough memory to add samples to the film")
 
-    def _written(self) -> bool:
-        try:
-            for place, value in self.writes:
-                place.copy_(value)
-            for sums, place, value in self.splats:
-                sums.index_copy_(2, place, value)
-        except Exception as error:
-            if not ran_out(error):
-                raise
-            return False
-        return True
+    def _copied(self) -> None:
+        for place, value in self.writes:
+            place.copy_(value)
+        for sums, place, value in self.splats:
+            sums.index_copy_(2, place, value)
 
 
 def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:

@@ -13,8 +13,7 @@ from torch import Tensor
 from torchpt.errors import AssetError
 from torchpt.forward.adaptive import FIRST_ROUND
 from torchpt.forward.checkpoint import State
-from torchpt.forward.schedule import BLOCK, streams_of
-from torchpt.forward.stopping import Stop
+from torchpt.forward.stopping import BLOCK, Stop, streams_of
 from torchpt.integrators.lost import Lost, Place
 
 if TYPE_CHECKING:

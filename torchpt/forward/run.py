@@ -12,37 +12,32 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.core.memory import Budget, Meter, Span, check_memory, mb, needing, retried
 from torchpt.engines.kernels.schedule import Block, Loop, Share
-from torchpt.errors import LostRankError, OutputError, RenderError, SceneError
+from torchpt.errors import LostRankError, OutputError, RenderError, SceneError, say_once
 from torchpt.film import Film, KnownError
 from torchpt.forward.adaptive import FIRST_ROUND, Shares
-from torchpt.forward.budget import check_memory
 from torchpt.forward.causes import told
 from torchpt.forward.checkpoint import EVERY, Keeper, State, identity
-from torchpt.forward.need import loaded, need_of, shape_of
+from torchpt.forward.need import BYTES_PER_LANE, FEWEST_OF_LOOP, LANES, check_film, loaded, need_of
 from torchpt.forward.picture import final, known_of, rendering_of
 from torchpt.forward.piece import take
 from torchpt.forward.result import Progress, Rendering
 from torchpt.forward.resume import check_samples, check_whole
-from torchpt.forward.room import check_room
-from torchpt.forward.schedule import Span, budget_of
 from torchpt.forward.split import Split
 from torchpt.forward.stopping import Stop
 from torchpt.forward.twice import second_values
 from torchpt.forward.wave import loop_of, looped, make_wave, surface_layers
-from torchpt.forward.waves import Waves, say_once
 from torchpt.integrators.lost import Lost
 from torchpt.integrators.plate import Plate
 from torchpt.integrators.tally import Tally
 from torchpt.integrators.wave import Wave
 from torchpt.lanes.graph import Unsupported
 from torchpt.native import compile_time
-from torchpt.native.memory import Meter, mb
 from torchpt.ranks import Group
 from torchpt.records import Geometry
 from torchpt.scene import Scene
 from torchpt.settings import Settings
-from torchpt.shortage import needing
 
 __all__ = ["Run"]
 
@@ -83,8 +78,10 @@ class Run:
         meter, limit = Meter(self.device), settings.render.max_memory
         before = 0 if limit is None else meter.peak()
         compiled = looped(settings, self.device, dtype)
-        with needing(lambda: f"a scene of {scene.told}"):
-            self.wave = make_wave(scene, settings, params, dtype, like=like, rays=rays)
+        self.wave = retried(
+            lambda: f"a scene of {scene.told}",
+            lambda: make_wave(scene, settings, params, dtype, like=like, rays=rays),
+        )
         built = before if limit is None else meter.peak()
         _, _, self.width, self.height = self.wave.crop
         self.params, self.dtype = params, dtype
@@ -107,10 +104,9 @@ class Run:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
             check_memory(limit, self.device, self.need.least, loading)
             if self.loop is not None:
-                left = self.need.left(limit, max(meter.now() - meter.base(), 0))
-                self.loop.threads, self.loop.lanes = shape_of(left, self.loop.threads, rows, self.loop.lanes)
-        with needing(lambda: f"films of {self.width} x {self.height} pixels, which take {mb(self.need.films)}"):
-            self._begin()
+                self.loop.budget.fit(self.need.left(limit, meter.above()), 4 * rows, FEWEST_OF_LOOP)
+        films = mb(self.need.films)
+        retried(lambda: f"films of {self.width} x {self.height} pixels, which take {films}", self._begin)
         self._compiled = self.compile_seconds()
         self.build_seconds = time.perf_counter() - self.start - self._compiled
 
@@ -118,7 +114,7 @@ class Run:
         """Nothing is sampled yet."""
         device, streams = self.device, self.wave.sampler.streams
         splats, channels = self.integrator.splats, [len(x.channels) for x in self.seen.values()]
-        check_room(self.width, self.height, streams.count, channels, device, splats)
+        check_film(self.width, self.height, streams.count, channels, device, splats)
         film = Film(self.width, self.height, streams.count, device, splats=splats)
         layers = {
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
@@ -138,7 +134,7 @@ class Run:
         self.lost = Lost()
         self._unlooked: tuple[dict[str, Any], Tensor] = {}, torch.empty(0)  # counted before pixels were looked at again
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
-        self.waves: Waves | None = None  # of tensor operations
+        self.waves: Budget | None = None  # of tensor operations
         self.begun: float | None = None
 
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
@@ -153,8 +149,7 @@ class Run:
             if not self.keeps:
                 raise
             raise LostRankError(f"{error}; render.resume=true goes on from the last checkpoint") from None
-        loaded("eager" if self.loop is None else "compiled")
-        return final(self)
+        return self._final()
 
     def at_once(self) -> list[tuple[Plate, int, int]] | None:
         """All samples, to be handed to :meth:`took` as they come, and then :meth:`completed`.
@@ -178,7 +173,12 @@ class Run:
                     self.loop.take_rest(rest, self.took)
                 self.taken = self.settings.render.spp
                 self.stop.told(self.taken, self.seconds_of_sampling(), None)
+        return self._final()
+
+    def _final(self) -> Rendering:
         loaded("eager" if self.loop is None else "compiled")
+        if self.loop is not None:
+            self.loop.dismiss(keep=self.settings.render.max_memory is None)
         return final(self)
 
     def _all(self) -> None:
@@ -429,7 +429,13 @@ class Run:
         if self.loop is not None:
             return self.loop.run(spans, self.took)
         if self.waves is None:
-            self.waves = Waves(budget_of(self.settings, self.device))
+            self.waves = Budget(
+                self.device,
+                LANES.get(self.device.type, LANES["cpu"]),
+                what="a wave of a single lane",
+                limit=self.settings.render.max_memory,
+                per_lane=BYTES_PER_LANE,
+            )
         for plate, first, count in spans:
             pixels = plate.film.width * plate.film.height
             for _, n, _, samples in self.waves.through(partial(self._piece, plate), pixels, first, count):

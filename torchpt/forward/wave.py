@@ -13,11 +13,10 @@ from torch import Tensor
 from torchpt.cameras import Camera
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.engines.kernels.schedule import Loop
-from torchpt.errors import SceneError
+from torchpt.errors import SceneError, say_once
 from torchpt.film import Filter
 from torchpt.forward.kept import kept
-from torchpt.forward.schedule import streams_of
-from torchpt.forward.waves import say_once
+from torchpt.forward.stopping import streams_of
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
@@ -270,4 +269,4 @@ def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = No
         eager.append(f"{name}: {reason}")
         say_once(f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}")
     integrator = wave.integrator
-    return Loop(kernels, threads or torch.get_num_threads(), integrator.clamp, integrator.strict, say_once)
+    return Loop(kernels, threads or torch.get_num_threads(), integrator.clamp, integrator.strict)

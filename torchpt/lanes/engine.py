@@ -8,9 +8,9 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
+from torchpt.core.memory import check_room
 from torchpt.lanes.form import VECTORS, Form
 from torchpt.native import cache
-from torchpt.native.memory import MARGIN, room_for
 
 __all__ = [
     "Function",
@@ -71,7 +71,7 @@ def _llvm() -> Any:
 def host() -> Target:
     """This machine."""
     if "host" not in _state:
-        _check_room()
+        check_room()
         llvm = _llvm()
         _state["host"] = Target(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
     return _state["host"]
@@ -90,7 +90,7 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         function = _functions.get(key)
         if function is None:
             code = cache.read(f"{key[:40]}.o")
-            _check_room()
+            check_room()  # LLVM ends the process where it finds no memory
             if code is None:
                 code = _object(ir, target)
                 _state["compiled"] += 1
@@ -101,23 +101,13 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         return function
 
 
-def _check_room() -> None:
-    """LLVM ends the process where it finds no memory, so it is asked for before.
-
-    Raises:
-        MemoryError: there is none.
-    """
-    if not room_for(MARGIN):
-        raise MemoryError("no room to make kernels")
-
-
 def kept(key: str) -> Function | None:
     """A function of this machine by its key, from this process or from disk; None where there is none."""
     with _lock:
         function = _functions.get(key)
         code = cache.read(f"{key[:40]}.o") if function is None else None
         if code is not None:
-            _check_room()
+            check_room()
             _state["loaded"] += 1
             function = _functions[key] = _loaded(code, host(), key)
         return function

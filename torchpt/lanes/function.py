@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchpt.core.threads import share, thread_count
 from torchpt.core.tree import leaves, signature
 from torchpt.lanes import operators, programs  # noqa: F401  (the operators register how they are lowered)
 from torchpt.lanes.engine import Target
@@ -27,7 +28,6 @@ from torchpt.lanes.sinks import Sinks, Store
 from torchpt.lanes.stage import TracedStage
 from torchpt.lanes.tracing import Tracer, lanes_for, tracing
 from torchpt.native import compile_time
-from torchpt.native.threads import share, thread_count
 
 __all__ = ["Lanewise", "lanewise"]
 

@@ -11,11 +11,11 @@ from dataclasses import astuple, dataclass, replace
 import torch
 from torch import Tensor
 
+from torchpt.core.threads import sum_all
 from torchpt.lights import tree
 from torchpt.lights.bounds import bounds_of
 from torchpt.lights.tree import LightTree
 from torchpt.math.distributions import Discrete
-from torchpt.math.threads import sum_all
 from torchpt.math.vectors import take
 from torchpt.records import Lights
 

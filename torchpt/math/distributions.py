@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpt.math.threads import sum_all
+from torchpt.core.threads import sum_all
 from torchpt.math.vectors import take
 
 __all__ = ["Cells", "Discrete", "invert_linear"]

@@ -22,11 +22,11 @@ from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.event import Event, Listener, register
 
+from torchpt.core.memory import MARGIN, check_room
+from torchpt.core.threads import share
 from torchpt.errors import RenderError
 from torchpt.native import cache, compile_time
 from torchpt.native.content import code_of_function
-from torchpt.native.memory import MARGIN, room_for
-from torchpt.native.threads import share
 
 if getattr(numba_config, "DISABLE_JIT", 0):
     raise RenderError("NUMBA_DISABLE_JIT is set, and kernels are machine code that Python cannot run: unset it")
@@ -130,8 +130,7 @@ def compiled(kernel: Any, *args: Any) -> Any:
     """The kernel, compiled for arguments with which it does nothing; says so on stderr, once, where that takes long."""
     if not kernel.overloads:
         # LLVM ends the process where it finds no memory, and so does the BLAS that numba brings along with its first kernel.
-        if not room_for(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN):
-            raise MemoryError("no room to make kernels")
+        check_room(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN)
         timer = threading.Timer(_PATIENCE, _say)
         timer.daemon = True
         timer.start()

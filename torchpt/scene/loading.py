@@ -9,9 +9,10 @@ from typing import Any
 import torch
 
 from torchpt.bsdfs import Bsdf
+from torchpt.core.memory import needing
+from torchpt.core.threads import lasting
 from torchpt.format.description import Source, read_description, settings
 from torchpt.format.tensors import Tensors
-from torchpt.native.modes import lasting
 from torchpt.scene.devices import device_of
 from torchpt.scene.scene import Scene
 from torchpt.scene.traced import corners_in, traced, widened
@@ -49,7 +50,8 @@ def load(
 def _load(source: Source, device: str | torch.device | None, bsdfs: Mapping[str, Bsdf] | None) -> Scene:
     start = time.perf_counter()
     tensors = Tensors()
-    description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
+    with needing("the scene file"):
+        description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
     chosen = device_of(settings(description).render.device if device is None else device)
     with lasting():
         scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))

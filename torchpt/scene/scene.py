@@ -21,11 +21,10 @@ from torchpt.accel import Accel
 from torchpt.bsdfs import Bsdf
 from torchpt.cameras import Camera, PinholeMatrices
 from torchpt.cameras.opencv import extrinsics
+from torchpt.core.memory import Meter, mb, retried
+from torchpt.core.threads import lasting, settle
 from torchpt.errors import SceneError
 from torchpt.format.description import Description, settings
-from torchpt.native.memory import Meter, mb
-from torchpt.native.modes import lasting
-from torchpt.native.threads import settle
 from torchpt.records import Geometry, World
 from torchpt.scene.assembly import assemble
 from torchpt.scene.build import Built, build_parts
@@ -37,7 +36,6 @@ from torchpt.scene.space import FARTHEST, Space, extent_of, middle_of
 from torchpt.scene.vetting import check_tensor, shared, vet
 from torchpt.scene.view import through
 from torchpt.settings import Film, Settings
-from torchpt.shortage import needing
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 from torchpt.taped import outside_transforms
 
@@ -87,8 +85,7 @@ class Scene:
         before = meter.peak()
         self.load_seconds = 0.0
         self.description, self.device, self.own_models = description, device, own_models
-        with needing("the files and shapes of the scene"):
-            self._built: Built = build_parts(description, traced)
+        self._built: Built = retried("the files and shapes of the scene", lambda: build_parts(description, traced))
         # Geometry far from the origin would lose its detail in float32 before it can be moved there.
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {

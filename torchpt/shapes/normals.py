@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchpt.math.threads import in_pieces
+from torchpt.core.threads import in_pieces
 from torchpt.math.vectors import cross, dot, normalize
 
 __all__ = ["smooth_normals"]

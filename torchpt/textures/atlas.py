@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.math.threads import mean_all
+from torchpt.core.threads import mean_all
 from torchpt.math.vectors import luminance, take
 from torchpt.textures.base import SAME, Matrix, Node, Table, TexturePoint, moved
 

@@ -48,11 +48,15 @@ class Calls:
         self._salts: dict[tuple[int, int], Any] = {}
         self._uniforms = {"place": self.place.ctypes.data}
 
+    def leave(self) -> None:
+        """Let go of the render and its kernels."""
+        del self.kernels, self._halt
+        self._prepared.clear()
+        self._keep.clear()
+
     def serve(self, kernels: Kernels, halt: threading.Event) -> None:
         """Go on with the kernels of another render of the same structure, whose memory looks the same."""
         self.kernels, self._halt = kernels, halt
-        self._prepared.clear()
-        self._keep.clear()
 
     def clear(self) -> None:
         """Start to count anew."""

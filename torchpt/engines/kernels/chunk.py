@@ -113,8 +113,16 @@ class Worker:
         """Return the memory of a vertex: two take turns."""
         return self._rooms[depth % 2]
 
+    def leave(self) -> int:
+        """Let go of the render; return the bytes that are kept for another one of the same structure."""
+        held = [self.slots, *self.search.passed, self.search.sifted, *([] if self.shown is None else [self.shown])]
+        held += [memory for room in self._rooms for memory in (room.arena, *room.lists)]
+        self.calls.leave()
+        del self.kernels, self.wave, self.search.kernels
+        return sum(memory.words.nbytes for memory in held)
+
     def serve(self, kernels: Kernels, halt: threading.Event) -> None:
-        """Go on with another render of the same structure: fresh memory would cost time."""
+        """Go on with another render of the same structure, after `leave`: fresh memory would cost time."""
         self.kernels, self.wave = kernels, kernels.wave
         self.calls.serve(kernels, halt)
         self.search.kernels = kernels

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from queue import Empty, SimpleQueue
 
 import numpy as np
 import torch
 
+from torchpt.core.memory import Budget, needing, ran_out
+from torchpt.core.threads import deal
+from torchpt.engines.kernels import spare
 from torchpt.engines.kernels.calls import Halted
 from torchpt.engines.kernels.chunk import LANES, Chunk, Worker
 from torchpt.engines.kernels.kernels import Kernels
-from torchpt.errors import RenderError
 from torchpt.film import Film
 from torchpt.integrators.clamp import clamp_scale
 from torchpt.integrators.lost import Lost
@@ -24,10 +24,8 @@ from torchpt.integrators.tally import Tally
 from torchpt.lanes.arena import CAPACITY
 from torchpt.lanes.form import VECTORS
 from torchpt.lanes.kernel import HEAD
-from torchpt.native.memory import let_go
-from torchpt.shortage import needing, ran_out
 
-__all__ = ["PATIENCE", "TASKS", "Block", "Loop", "Share"]
+__all__ = ["TASKS", "Block", "Loop", "Share"]
 
 #: Tasks of a pass for each thread, so that none waits long for the last one.
 TASKS = 6
@@ -35,8 +33,6 @@ TASKS = 6
 FEWEST = 1024
 #: Pixels of a task, unless threads would be idle: a chunk of many samples of few pixels adds them up in as many steps.
 NARROW = 128
-#: Seconds after which the thread that asked for the render looks whether it is to end.
-PATIENCE = 0.05
 
 #: A plate, its first pixel and how many, the first sample and how many of each.
 Block = tuple[Plate, int, int, int, int]
@@ -61,14 +57,6 @@ class Share:
     rest: list[Block] = field(default_factory=list)
 
 
-def _next(shares: SimpleQueue[Share | BaseException]) -> Share | BaseException | None:
-    """Return what comes next; None after a while."""
-    try:
-        return shares.get(timeout=PATIENCE)
-    except Empty:
-        return None
-
-
 class Loop:
     """A render's tasks over threads. A pixel's samples are summed in their order, whichever thread takes them.
 
@@ -77,25 +65,21 @@ class Loop:
         threads: how many.
         clamp: largest contribution of a path, or None.
         strict: whether a task ends at a sample that is not finite; whoever is told of it ends the render.
-        said: tells the user a line.
 
     Attributes:
-        lanes: most of a chunk.
-        idle: workers of renders of the same structure that are done, to be taken over; those of this one are put there.
+        budget: how many threads, and most lanes of a chunk.
     """
 
-    def __init__(
-        self,
-        kernels: Kernels,
-        threads: int,
-        clamp: float | None,
-        strict: bool,
-        said: Callable[[str], None],
-    ) -> None:
-        self.kernels, self.threads, self.clamp, self.strict = kernels, threads, clamp, strict
-        self.said = said
-        self.lanes = LANES
-        self.idle: list[Worker] = []
+    def __init__(self, kernels: Kernels, threads: int, clamp: float | None, strict: bool) -> None:
+        self.kernels, self.clamp, self.strict = kernels, clamp, strict
+        self.budget = Budget(
+            torch.device("cpu"),
+            LANES,
+            threads,
+            what="the compiled loop on one thread",
+            instead="one thread and fewer lanes",
+            fewest=VECTORS.width,
+        )
         self._workers: list[Worker] = []
         self._halt = threading.Event()
 
@@ -110,7 +94,7 @@ class Loop:
         Returns:
             Whether all were taken.
         """
-        return self.take(self.blocks(spans, self.threads * TASKS), each)
+        return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
 
     def blocks(self, spans: Sequence[tuple[Plate, int, int]], tasks: int) -> list[Block]:
         """Samples of plates cut into blocks of pixels: ``tasks`` for each plate, as far as they repay."""
@@ -134,104 +118,48 @@ class Loop:
 
     def _round(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> list[Block]:
         """Take blocks on threads; return what of them memory did not suffice for."""
-        todo, shares = deque(blocks), SimpleQueue[Share | BaseException]()
-        # Tasks never run in this thread: it looks after signals.
-        crew = self._crew(min(self.threads, len(blocks)), todo, shares)
         rest: list[Block] = []
-        try:
-            left = len(blocks)
-            while left and not self._halt.is_set():
-                share = _next(shares)
-                if isinstance(share, BaseException):
-                    raise share
-                if share is not None:
-                    left -= 1
-                    rest += share.rest
-                if each(share):
-                    self._halt.set()
-        except BaseException:
-            self._halt.set()
-            raise
-        finally:
-            for thread in crew:
-                thread.join()
-        while not shares.empty():  # of tasks that were on their way
-            share = shares.get()
-            if isinstance(share, Share):
-                each(share)
+
+        def told(share: Share | None) -> bool:
+            if share is not None:
+                rest.extend(share.rest)
+            return each(share)
+
+        deal(blocks, lambda block: self.task(*block), self.budget.threads, told, self._halt)
         return rest
 
-    def _crew(
-        self, size: int, todo: deque[Block], shares: SimpleQueue[Share | BaseException]
-    ) -> list[threading.Thread]:
-        """Threads at work, as many as there is memory for.
-
-        Raises:
-            RenderError: there is none for a single one.
-        """
-
-        def work() -> None:
-            while not self._halt.is_set():
-                try:
-                    block = todo.popleft()
-                except IndexError:
-                    return
-                try:
-                    shares.put(self.task(*block))
-                except BaseException as error:
-                    shares.put(error)
-                    return
-
-        crew: list[threading.Thread] = []
-        for number in range(size):
-            thread = threading.Thread(target=work, name=f"torchpt_{number}")
-            try:
-                thread.start()
-            except (RuntimeError, MemoryError):
-                if not crew:
-                    raise RenderError("not enough memory for a thread that renders") from None
-                break
-            crew.append(thread)
-        return crew
-
     def _smaller(self, blocks: list[Block]) -> list[Block]:
-        """The blocks that are left, for one thread alone, and for chunks of fewer lanes where that was so already.
+        """The blocks that are left, for fewer threads, or cut for chunks of fewer lanes.
 
         Raises:
             RenderError: there is no memory for one thread and a vector of lanes.
         """
-        self.release()
-        if self.threads == 1:
-            if self.lanes <= VECTORS.width:
-                raise RenderError("not enough memory for the compiled loop on one thread")
-            self.lanes = max(self.lanes // 4, VECTORS.width)
-        self.threads = 1
-        self.said("torchpt: memory ran out: one thread and fewer lanes from now on, for the same picture")
+        self._workers.clear()
+        self.budget.shrink()
+        lanes = self.budget.lanes
         return [
-            (plate, pixel, min(self.lanes, start + size - pixel), first, count)
+            (plate, pixel, min(lanes, start + size - pixel), first, count)
             for plate, start, size, first, count in blocks
-            for pixel in range(start, start + size, self.lanes)
+            for pixel in range(start, start + size, lanes)
         ]
 
     def _cut(self, plate: Plate, samples: int, tasks: int) -> Iterator[tuple[int, int]]:
         """Consecutive pixels of each task."""
         pixels = plate.film.width * plate.film.height
         size = pixels
-        if tasks > 1 and self.threads > 1:
-            size = max(-(-pixels // tasks), -(-FEWEST // samples), min(NARROW, -(-pixels // self.threads)))
-        size = max(min(-(-size // VECTORS.width) * VECTORS.width, self.lanes), 1)
+        threads = self.budget.threads
+        if tasks > 1 and threads > 1:
+            size = max(-(-pixels // tasks), -(-FEWEST // samples), min(NARROW, -(-pixels // threads)))
+        size = max(min(-(-size // VECTORS.width) * VECTORS.width, self.budget.lanes), 1)
         for start in range(0, pixels, size):
             yield start, min(size, pixels - start)
 
-    def release(self) -> None:
-        """Give back what threads keep for their next task."""
-        self._workers.clear()
-        let_go()
-
-    def dismiss(self) -> None:
-        """Leave this render's workers to the next one of its structure."""
-        self.idle += self._workers
-        self._workers = []
+    def dismiss(self, keep: bool) -> None:
+        """Give up this render's workers, or keep them for the next one of its structure."""
+        while self._workers:
+            worker = self._workers.pop()
+            if keep:
+                spare.keep(self.kernels.structure, worker)
 
     def halt(self) -> None:
         """End the render: tasks stop at their next kernel."""
@@ -243,7 +171,7 @@ class Loop:
         sample = first
         try:
             worker = self._worker()
-            step = max(self.lanes // size, 1)
+            step = max(self.budget.lanes // size, 1)
             while sample < first + count:
                 chunk = Chunk(start, size, sample, min(step, first + count - sample), plate)
                 self._chunk(worker, chunk, plate, share)
@@ -261,15 +189,14 @@ class Loop:
         return share
 
     def _worker(self) -> Worker:
-        for workers in (self._workers, self.idle):
-            try:
-                worker = workers.pop()
-            except IndexError:
-                continue
-            if worker.kernels is not self.kernels:
-                worker.serve(self.kernels, self._halt)
-            return worker
-        return Worker(self.kernels, self._halt)
+        try:
+            return self._workers.pop()
+        except IndexError:
+            worker = spare.taken(self.kernels.structure)
+        if worker is None:
+            return Worker(self.kernels, self._halt)
+        worker.serve(self.kernels, self._halt)
+        return worker
 
     def _chunk(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
         """A chunk into the films: all of it, or nothing where memory runs out."""

@@ -29,12 +29,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
+from torchpt.core.threads import sum_all
 from torchpt.ibl.equirect import Cell, angles
 from torchpt.images.texels import TEXELS, check_source, radiance_of, read_texels, texels_of
 from torchpt.lights.base import Environment, Row, Setting, Surroundings, bright
 from torchpt.math.angles import azimuth
 from torchpt.math.distributions import Cells, invert_linear
-from torchpt.math.threads import sum_all
 from torchpt.math.vectors import dot, luminance, safe_reciprocal, take
 from torchpt.records import Lights, LightSample
 from torchpt.spec import Moves, Other, Path, Pose, Scalar, Spec, Texels

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchpt.core.threads import PIECE, in_pieces, mean_all, sum_all
 from torchpt.images.colour import display, linear_to_srgb, srgb_to_linear
 from torchpt.math.distributions import Discrete
-from torchpt.math.threads import PIECE, in_pieces, mean_all, sum_all
 from torchpt.shapes.normals import smooth_normals
 
 THREADS = (2, 3)
