@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from torchpt.engines.kernels import schedule as loop
-from torchpt.forward import schedule as eager
+from torchpt.forward.need import LANES
 
 __all__ = ["few_lanes"]
 
@@ -18,6 +18,7 @@ def few_lanes(lanes: int | None) -> Iterator[None]:
     """Context in which a wave of tensor operations, or a chunk of the compiled loop, has so many lanes at most."""
     with pytest.MonkeyPatch.context() as patched:
         if lanes is not None:
-            patched.setattr(eager, "LANES", {"cpu": lanes, "cuda": lanes})
+            for device in LANES:
+                patched.setitem(LANES, device, lanes)
             patched.setattr(loop, "LANES", min(lanes, loop.LANES))
         yield
