@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import subprocess
 import sys
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,8 +20,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
-from torchpt.core.memory import ran_out
-from torchpt.engines.kernels import rows
+from torchpt.core.memory import let_go, ran_out
+from torchpt.engines.kernels import rows, spare
 from torchpt.engines.kernels.chunk import Worker
 from torchpt.errors import RenderError, SceneError, say_once
 
@@ -347,3 +349,66 @@ def test_a_limit_changes_no_bit(box):
     limit = str(int(torchpt.render(box, spp=1, film=film_of(4), full=True).peak_memory / 1e6) + 300) + "MB"
     found = torchpt.render(box, spp=2, film=film_of(100, 80), compile="off", threads=2, max_memory=limit, full=True)
     assert torch.equal(found.image, whole) and found.peak_memory > 0
+
+
+# -- what is kept between renders
+
+
+def test_the_next_render_takes_over_the_memory_of_threads(box, monkeypatch):
+    let_go()
+    assert not spare._kept
+    wish: dict[str, Any] = {"spp": 2, "film": film_of(64, 60), "threads": 2}
+    whole, made, new = torchpt.render(box, **wish), [], rows.Memory.__init__
+    assert 1 <= len(spare._kept) <= 2
+
+    def making(self: rows.Memory, count: int) -> None:
+        made.append(count)
+        new(self, count)
+
+    monkeypatch.setattr(rows.Memory, "__init__", making)
+    for _ in range(3):
+        assert torch.equal(torchpt.render(box, **wish | {"threads": 1}), whole) and not made
+    other = torchpt.load("veach_mis", "cpu")  # of another structure
+    small = {"spp": 1, "film": film_of(8, 8), "threads": 1}
+    torchpt.render(other, **small)
+    assert made and len({one[0] for one in spare._kept}) == 2
+    limit = str(int(torchpt.render(box, spp=1, film=film_of(4), full=True).peak_memory / 1e6) + 300) + "MB"
+    torchpt.render(box, **wish | {"max_memory": limit})
+    assert not spare._kept  # asked for before, and none of its own
+
+
+def test_memory_of_threads_is_bounded_and_holds_no_scene(monkeypatch):
+    let_go()
+    scene = torchpt.load("cornell_box", "cpu")
+    for k in range(4):
+        torchpt.render(scene, spp=1, film=film_of(64, 60), threads=2, seed=k)
+    sizes = [one[2] for one in spare._kept]
+    assert len(sizes) <= 2 and all(1e6 < size < 1e7 for size in sizes)
+    watch = weakref.ref(scene)
+    del scene
+    gc.collect()
+    assert watch() is None and spare._kept
+    for size, left in ((max(sizes), 1), (max(sizes) - 1, 0)):
+        monkeypatch.setattr(spare, "MOST", size)
+        torchpt.render(torchpt.load("cornell_box", "cpu"), spp=1, film=film_of(64, 60), threads=2)
+        assert len(spare._kept) <= left
+
+
+def test_memory_of_threads_goes_where_a_chunk_needs_it(box, monkeypatch, capsys):
+    """Workers that nobody has are given back before lanes are made fewer."""
+    say_once.cache_clear()
+    torchpt.render(box, spp=1, film=film_of(64, 60), threads=2)
+    whole, calls, there = torchpt.render(box, spp=2, film=film_of(64, 60)), [0], []
+    torchpt.render(torchpt.load("veach_mis", "cpu"), spp=1, film=film_of(8, 8), threads=1)
+    trace = Worker.trace
+
+    def failing(self: Worker, *args: Any) -> Any:
+        calls[0] += 1
+        there.append(len(spare._kept))
+        if calls[0] == 1:
+            raise MemoryError
+        return trace(self, *args)
+
+    monkeypatch.setattr(Worker, "trace", failing)
+    assert torch.equal(torchpt.render(box, spp=2, film=film_of(64, 60), threads=2), whole)
+    assert there[0] and not there[-1] and "memory ran out" in capsys.readouterr().err

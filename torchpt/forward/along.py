@@ -6,10 +6,8 @@ import torch
 from torch import Tensor
 
 from torchpt.engines import tensors
-from torchpt.engines.kernels.chunk import Worker
 from torchpt.engines.kernels.kernels import Kernels
 from torchpt.engines.kernels.schedule import Loop
-from torchpt.errors import say_once
 from torchpt.film import Film
 from torchpt.forward.wave import kernels_of, looped
 from torchpt.integrators.clamp import clamp_scale
@@ -37,7 +35,7 @@ class Along:
         compiled = looped(settings, scene.device, wave.context.plan.dtype) and not wave.integrator.own_stages
         self._compiled = compiled
         self._kernels: Kernels | None = None
-        self._idle: list[Worker] = []
+        self._keep = settings.render.max_memory is None
 
     def radiance(self, wave: Wave, sample: int) -> Tensor:
         """Return what the rays that a wave is given bring, ``(3, N)`` float64, clamped, and black where it is not finite.
@@ -55,9 +53,8 @@ class Along:
 
     def _by_kernels(self, wave: Wave, sample: int) -> Tensor:
         self._kernels = kernels_of(self._scene, wave, self._kernels)
-        loop = Loop(self._kernels, torch.get_num_threads(), self._clamp, False, say_once)
-        loop.idle = self._idle
+        loop = Loop(self._kernels, torch.get_num_threads(), self._clamp, False)
         plate = Plate(Film(wave.crop[2], 1, 1, wave.centre.device))
         loop.run([(plate, sample, 1)], lambda _: False)
-        loop.dismiss()
+        loop.dismiss(self._keep)
         return plate.film.sums[0]

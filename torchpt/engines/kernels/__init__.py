@@ -5,6 +5,7 @@ a chunk there is neither an operator of torch nor a barrier between threads.
 
 ======================  ==============================================================================
 ``schedule.py``         which thread takes which chunk, and how samples add up to a picture: start here
+``spare.py``            engines of threads that no render has, kept for the next one
 ``chunk.py``            the engine of a thread: the events of a walk by kernels
 ``search.py``           what rays meet, where that is asked between kernels
 ``eager.py``            a vertex by tensor operations, for models that no kernel can be made of
