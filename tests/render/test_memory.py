@@ -357,8 +357,8 @@ def test_a_limit_changes_no_bit(box):
 def test_the_next_render_takes_over_the_memory_of_threads(box, monkeypatch):
     let_go()
     assert not spare._kept
-    wish: dict[str, Any] = {"spp": 2, "film": film_of(64, 60), "threads": 2}
-    whole, made, new = torchpt.render(box, **wish), [], rows.Memory.__init__
+    wish: dict[str, Any] = {"spp": 2, "film": film_of(64, 60)}
+    whole, made, new = torchpt.render(box, **wish, threads=2), [], rows.Memory.__init__
     assert 1 <= len(spare._kept) <= 2
 
     def making(self: rows.Memory, count: int) -> None:
@@ -367,13 +367,12 @@ def test_the_next_render_takes_over_the_memory_of_threads(box, monkeypatch):
 
     monkeypatch.setattr(rows.Memory, "__init__", making)
     for _ in range(3):
-        assert torch.equal(torchpt.render(box, **wish | {"threads": 1}), whole) and not made
+        assert torch.equal(torchpt.render(box, **wish, threads=1), whole) and not made
     other = torchpt.load("veach_mis", "cpu")  # of another structure
-    small = {"spp": 1, "film": film_of(8, 8), "threads": 1}
-    torchpt.render(other, **small)
+    torchpt.render(other, spp=1, film=film_of(8, 8), threads=1)
     assert made and len({one[0] for one in spare._kept}) == 2
     limit = str(int(torchpt.render(box, spp=1, film=film_of(4), full=True).peak_memory / 1e6) + 300) + "MB"
-    torchpt.render(box, **wish | {"max_memory": limit})
+    torchpt.render(box, **wish, threads=2, max_memory=limit)
     assert not spare._kept  # asked for before, and none of its own
 
 

@@ -118,6 +118,7 @@ class Worker:
         held = [self.slots, *self.search.passed, self.search.sifted, *([] if self.shown is None else [self.shown])]
         held += [memory for room in self._rooms for memory in (room.arena, *room.lists)]
         self.calls.leave()
+        self.splats, self._lost = [], []
         del self.kernels, self.wave, self.search.kernels
         return sum(memory.words.nbytes for memory in held)
 
