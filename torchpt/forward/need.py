@@ -14,7 +14,6 @@ import torch
 from torchpt.core.memory import FEWEST, free_memory
 from torchpt.errors import SceneError
 from torchpt.film import Film
-from torchpt.forward.stopping import streams_of
 from torchpt.forward.wave import surface_layers
 from torchpt.settings import Settings
 
@@ -90,9 +89,7 @@ def need_of(settings: Settings, device: torch.device, how: str, models: int, row
     _, _, width, height = settings.film.crop or (0, 0, settings.film.width, settings.film.height)
     pixels = width * height
     channels = [len(layer.channels) for layer in surface_layers(settings).values()]
-    films = Film.bytes_of(1, streams_of(settings), splats=settings.integrator.splats) + sum(
-        16 * c + 8 for c in channels
-    )
+    films = Film.bytes_of(1, settings.streams, splats=settings.integrator.splats) + sum(16 * c + 8 for c in channels)
     picture = PICTURE
     if "variance" in settings.film.aovs:
         picture = VARIANCE

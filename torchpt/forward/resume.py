@@ -13,7 +13,7 @@ from torch import Tensor
 from torchpt.errors import AssetError
 from torchpt.forward.adaptive import FIRST_ROUND
 from torchpt.forward.checkpoint import State
-from torchpt.forward.stopping import BLOCK, Stop, streams_of
+from torchpt.forward.stopping import BLOCK, Stop
 from torchpt.integrators.lost import Lost, Place
 
 if TYPE_CHECKING:
@@ -35,8 +35,8 @@ def check_samples(run: Run, state: State, path: Path) -> None:
     before = replace(settings, render=settings.render.but(spp=there))
     if settings.sampler.kind.needs_count:
         reason = f"where {settings.sampler.name} points lie depends on how many there are"
-    elif streams_of(before) != streams_of(settings):
-        reason = f"the variance is of {streams_of(before)} streams there, of {streams_of(settings)} here"
+    elif before.streams != settings.streams:
+        reason = f"the variance is of {before.streams} streams there, of {settings.streams} here"
     elif taken > here:
         reason = f"it holds {taken} samples a pixel already"
     elif settings.adaptive and taken >= FIRST_ROUND and (here < there or state.facts["cut"]):

@@ -12,14 +12,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchpt.settings import Render, Settings
+from torchpt.settings import Render
 
-__all__ = ["BLOCK", "Stop", "streams_of"]
+__all__ = ["BLOCK", "Stop"]
 
-#: From this many samples a pixel on they are shared by four streams, below by two, where every pixel is to know its variance.
-#: Each takes something from Sobol' points (Cornell box, 64 spp: relMSE 0.38, 0.50, 0.58 of independent sampling for one, two,
-#: four); four make the variance of a single pixel less of a guess.
-MANY_SAMPLES = 256
 #: A pass never holds more samples a pixel than this.
 LARGEST_PASS = 64
 #: Where something else than the number of samples may end a render, passes hold no more than this.
@@ -32,12 +28,6 @@ FEWEST = 16
 SLOWER, SLOWER_ONE = 2.0, 1.25
 #: What is left of the difference to a quicker pass, from one pass to the next.
 FADING = 0.75
-
-
-def streams_of(settings: Settings) -> int:
-    """Return how many streams share the samples of a pixel: one, unless each pixel is to know its variance."""
-    spp = settings.render.spp
-    return min(spp, 4 if spp >= MANY_SAMPLES else 2) if "variance" in settings.film.aovs else 1
 
 
 @dataclass

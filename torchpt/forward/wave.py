@@ -16,7 +16,6 @@ from torchpt.engines.kernels.schedule import Loop
 from torchpt.errors import SceneError, say_once
 from torchpt.film import Filter
 from torchpt.forward.kept import kept
-from torchpt.forward.stopping import streams_of
 from torchpt.images.denoiser import GUIDES
 from torchpt.integrators import LAYERS
 from torchpt.integrators.base import Integrator
@@ -82,7 +81,7 @@ def make_wave(
         accel=accel,
         camera=camera,
         filter=_filter(film.filter.kind, tuple(film.filter.values.items()), scene.device),
-        sampler=Sampler(points, settings.render.seed, streams_of(settings), spp, film.width),
+        sampler=Sampler(points, settings.render.seed, settings.streams, spp, film.width),
         crop=crop,
         centre=scene.space.shift,
         first=_first(scene, integrator, world, own) if like is None else like.first,
