@@ -96,9 +96,10 @@ def test_the_first_error_in_order_is_raised_and_ends_the_others():
 
 
 def test_an_error_of_whoever_is_told_ends_the_tasks():
-    halt, ended = threading.Event(), []
+    halt, ended, all_begun = threading.Event(), [], threading.Barrier(3, timeout=60)
 
     def task(k: int) -> int:
+        all_begun.wait()
         while k and not halt.is_set():
             time.sleep(0.001)
         ended.append(k)
