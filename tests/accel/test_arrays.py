@@ -42,6 +42,7 @@ SCENES = {
     "quadrics": (with_quadrics, "numba"),
     "copies": (with_copies, "numba"),
     "brute": (lambda: soup(3), "brute"),
+    "brute quadrics": (with_quadrics, "brute"),
 }
 
 

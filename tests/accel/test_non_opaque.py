@@ -68,7 +68,7 @@ def test_a_mesh_that_lets_light_pass_blocks_nothing():
     assert (found[~alive.numpy()] == 0).all()
 
 
-@pytest.mark.parametrize("name", ["copies", "brute"])
+@pytest.mark.parametrize("name", ["copies", "brute", "brute quadrics"])
 def test_others_have_every_ray_that_meets_anything_looked_at_closer(name):
     make, kind = SCENES[name]
     g = make()

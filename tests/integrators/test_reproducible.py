@@ -115,7 +115,7 @@ EXACT = {
     "full", "full_like", "gather", "index", "index_copy", "index_select", "lift_fresh", "new_zeros", "ones", "ones_like",
     "permute",
     "repeat", "repeat_interleave", "scalar_tensor", "scatter_", "scatter_add_", "select", "slice", "sort", "split",
-    "squeeze", "stack", "take", "unsqueeze", "view", "zeros", "zeros_like", "brute_intersect", "brute_occluded", "draw",
+    "squeeze", "stack", "take", "unsqueeze", "view", "zeros", "zeros_like", "draw",
 }  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 One contract (:class:`~torchpt.accel.base.Accel`), three backends:
 
-- ``brute`` (numba, CPU): every ray against every primitive in packets; for a few dozen primitives.
+- ``brute`` (CPU): every ray against every primitive in packets, by kernels of the lane compiler; for a few dozen primitives.
 - ``numba`` (CPU): a wide tree built by the surface area heuristic.
 - ``torch`` (any device, the reference): a linear BVH built and traversed by tensor operations.
 
@@ -31,12 +31,12 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
     Args:
         geometry: the primitives, on the device where rays will live.
         kind: ``auto``, ``torch``, ``numba`` or ``brute``.
-        threads: CPU threads of the numba backends; ``None`` is torch's own number. Results do not depend on it.
+        threads: CPU threads of ``numba`` and ``brute``; ``None`` is torch's own number. Results do not depend on it.
         before: a structure that may be refitted where it is of the kind that is wanted; it stays as it is.
 
     Returns:
-        The structure. ``auto`` gives ``torch`` on an accelerator; on a CPU ``brute`` for few primitives of like scale,
-        else ``numba``.
+        The structure. ``auto`` gives ``torch`` on an accelerator; on a CPU ``brute`` for few primitives of like scale and
+        no quadrics, else ``numba``.
 
     Raises:
         SceneError: an unknown kind, or one that cannot serve this geometry.
@@ -73,7 +73,8 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
 
 
 def _choose(geometry: Geometry) -> str:
-    if geometry.size > BRUTE_LIMIT or geometry.copies is not None:
+    # Packets know no quadrics: from three on the tree is as fast or faster.
+    if geometry.size > BRUTE_LIMIT or geometry.copies is not None or geometry.counts[4]:
         return "numba"
     from torchpt.accel.brute import eligible
 

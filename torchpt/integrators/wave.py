@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt import lights
-from torchpt.accel import Accel
+from torchpt.accel.base import Accel
 from torchpt.cameras import Camera
 from torchpt.film import FILTERS, Filter
 from torchpt.integrators.base import Integrator

@@ -1,18 +1,22 @@
 """A packet of rays against every primitive, as functions inside a kernel: the search for scenes of few primitives.
 
-The tests are those of :mod:`torchpt.accel.kernels_brute`: affine rows with their own rounding error as tolerance for planar
-primitives, perpendiculars in float64 for spheres.
+Planar primitives are affine rows with their own rounding error as tolerance (:func:`torchpt.accel.tables.tolerances`); spheres
+are met by perpendiculars in float64. Ascending ids and a strict comparison settle ties.
 """
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor
 
 from torchpt.lanes.block import Block
 from torchpt.lanes.form import Form
 
-__all__ = ["KINDS", "packet_search"]
+__all__ = ["KINDS", "packet_search", "packet_words"]
 
 #: Kinds of primitives that are searched here, in the order of their ids.
 KINDS = ("triangle", "rectangle", "disk", "sphere")
@@ -22,10 +26,7 @@ _RAY = ("ox", "oy", "oz", "dx", "dy", "dz")
 
 
 def packet_search(kinds: Sequence[str], form: Form) -> Block:
-    """Functions ``nearest`` and ``occluded`` of rays and the address of what is searched.
-
-    There lie, 64 bits each: the address of the rows of planar primitives, that of the spheres, for each of :data:`KINDS` the
-    id after its last primitive, and the scene's extent as a float64.
+    """Functions ``nearest`` and ``occluded`` of rays and the address of what is searched, see :func:`packet_words`.
 
     Args:
         kinds: those that the scene has.
@@ -38,6 +39,24 @@ def packet_search(kinds: Sequence[str], form: Form) -> Block:
         whole.lines += block.lines
         whole.declarations |= block.declarations
     return whole
+
+
+def packet_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: float) -> Any:
+    """Return what the functions read of a scene, as an array of ctypes; the tensors must live as long.
+
+    There lie, 64 bits each: the address of the rows of planar primitives, that of the spheres, for each of :data:`KINDS` the
+    id after its last primitive, and the scene's extent as a float64.
+
+    Args:
+        rows: ``(P, 13)`` float32: ``n c a ca b cb`` and the tolerance of each planar primitive.
+        balls: ``(S, 4)`` float64: centres and radii.
+        counts: primitives of each kind; those of further kinds are not searched.
+        extent: see :func:`torchpt.accel.tables.extent`.
+    """
+    ends = [sum(counts[: k + 1]) for k in range(len(KINDS))]
+    words = (ctypes.c_int64 * (3 + len(ends)))(rows.data_ptr(), balls.data_ptr(), *ends)
+    ctypes.c_double.from_buffer(words, 8 * (2 + len(ends))).value = extent
+    return words
 
 
 class _Search(Block):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -72,13 +71,6 @@ def kinds_of(world: World) -> tuple[str, ...]:
 
 
 def search_words(wave: Wave) -> Any:
-    """The argument of :func:`torchpt.lanes.packet.packet_search`."""
+    """Return the argument of :func:`torchpt.lanes.packet.packet_search`."""
     accel: Any = wave.accel
-    words = (ctypes.c_int64 * 7)()
-    words[0], words[1] = accel.table.data_ptr(), accel.spheres.data_ptr()
-    total = 0
-    for k in range(4):
-        total += accel.counts[k]
-        words[2 + k] = total
-    ctypes.memmove(ctypes.addressof(words) + 48, ctypes.byref(ctypes.c_double(accel.extent)), 8)
-    return words
+    return accel.words
