@@ -174,9 +174,9 @@ def test_the_audit_covers_what_waves_use(monkeypatch):
     recorder = _Recorder()
 
     def recorded(method: Any) -> Any:
-        def call(*given: Any) -> Any:
+        def call(*given: Any, **named: Any) -> Any:
             with recorder:
-                return method(*given)
+                return method(*given, **named)
 
         return call
 
