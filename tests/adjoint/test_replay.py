@@ -22,19 +22,6 @@ NAME = "materials.plate.reflectance"
 
 
 @pytest.mark.slow
-def test_bits_do_not_depend_on_threads_nor_memory(monkeypatch):
-    from torchpt.adjoint import loop
-
-    monkeypatch.setattr(loop, "LANES", chunk.LANES // 64)  # so that there are some chunks
-    scene = torchpt.load(room(PLATE), "cpu")
-    wishes: list[dict[str, Any]] = [{"threads": 1}, {"threads": 2}, {"max_memory": "3GB"}]
-    for name in (NAME, "shapes.plate.to_world"):
-        first, *others = (gradient_of(scene, name, spp=16, **wish) for wish in wishes)
-        assert float(first.norm()) > 0
-        assert all(torch.equal(first, other) for other in others)
-
-
-@pytest.mark.slow
 def test_bits_do_not_depend_on_memory_by_tensor_operations():
     scene = torchpt.load(room(PLATE), "cpu")
     first, other = (gradient_of(scene, NAME, compile="off", max_memory=memory) for memory in (None, "3GB"))

@@ -44,6 +44,18 @@ def test_gradients_agree_with_the_cpu():
     assert torch.allclose(*grads, rtol=2e-2)
 
 
+@pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
+@pytest.mark.parametrize("name", ["materials.red.reflectance", "shapes.floor.vertices"])
+def test_gradients_have_the_same_bits_in_each_run(name):
+    scene, grads = torchpt.load("cornell_box", "cuda"), []
+    for _ in range(3):
+        leaf = scene.params[name].clone().requires_grad_()
+        torchpt.render(scene, params={name: leaf}, spp=16, film=FILM, edges=False).mean().backward()
+        assert leaf.grad is not None
+        grads.append(leaf.grad.cpu())
+    assert torch.equal(grads[0], grads[1]) and torch.equal(grads[0], grads[2])
+
+
 def test_mesh_with_smooth_normals():
     wish = {"spp": 8, "film": FILM, "compile": "off"}
     cpu, cuda = (torchpt.render(torchpt.load("cornell_bunny", device), **wish).cpu() for device in ("cpu", "cuda"))

@@ -166,16 +166,21 @@ class _Chunk:
             self._vertex(vertex)
 
     def _vertex(self, vertex: Vertex) -> None:
-        state, hit, depth = vertex.state, vertex.hit, vertex.depth
+        """Back through a vertex: its lanes came grouped by the models before it, and are taken in the order of samples."""
+        depth, order = vertex.depth, vertex.state.lane.argsort()
+        place = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
+        state, hit = rows(vertex.state, order), rows(vertex.hit, order)
         slide = slides(self.plan, self.world, depth)
-        ends, groups = partition(self.world, hit)
-        chance, asked = self._chance(vertex)
+        ends, groups = partition(self.world, vertex.hit)
+        ends = Ends(take(place, ends.emissive).msort(), take(place, ends.missed).msort())
+        chance, asked = self._chance(state, depth)
         hit = replace(hit, chance=chance)
         limits = self.wave.integrator.limits
         clear, splat_clear = iter(vertex.clear), iter(vertex.splat_clear)
         if depth < limits.last:
-            for model, index in groups:
-                self._bounce(model, depth, slide, clear, splat_clear, state, hit, index, asked)
+            for model, came in groups:
+                index, turn = take(place, came).sort()
+                self._bounce(model, depth, slide, clear, splat_clear, turn, state, hit, index, asked)
         self._light(ends, depth, slide, state, hit, asked)
         if chance is not None and asked is not None:
             found = torch.autograd.grad(chance, self.tensors, asked, allow_unused=True)
@@ -184,12 +189,12 @@ class _Chunk:
             for name in ("t", "prim", "u", "v"):
                 getattr(self.met, name).index_copy_(0, state.lane, getattr(hit, name))
 
-    def _chance(self, vertex: Vertex) -> tuple[Tensor | None, Tensor | None]:
+    def _chance(self, state: PathState, depth: int) -> tuple[Tensor | None, Tensor | None]:
         """The chance to get here under a tape, where it has derivatives, and zeros for what is asked of it."""
         if not self.passing:
             return None, None
         with torch.enable_grad(), gathered_by(self.sums):
-            chance = self.engine.hits(vertex.state, vertex.depth).chance
+            chance = self.engine.hits(state, depth).chance
         if chance is None or not chance.requires_grad:
             return None, None
         return chance, torch.zeros_like(chance)
@@ -201,6 +206,7 @@ class _Chunk:
         slide: bool,
         clear: Iterator[Tensor],
         splat_clear: Iterator[Tensor],
+        turn: Tensor,
         state: PathState,
         hit: Hit,
         index: Tensor,
@@ -217,11 +223,11 @@ class _Chunk:
 
         def passed(shadow: Shadow) -> Tensor:
             kept = next(clear)
-            return self.engine.clear(shadow) if self.passing else kept
+            return self.engine.clear(shadow) if self.passing else take(kept, turn)
 
         def landed(splat: Splat) -> tuple[Tensor, Tensor]:
             kept = next(splat_clear)
-            through = self.engine.clear(splat.light) if self.passing else kept
+            through = self.engine.clear(splat.light) if self.passing else take(kept, turn)
             cotangent = self.picture.to(through.dtype) / self.settings.render.spp
             return joint.splatted(self.settings.integrator.clamp, cotangent, splat, through)
 

@@ -1,4 +1,24 @@
-"""Sums of gradients with respect to tables, in the order in which terms are added."""
+"""Sums of gradients with respect to tables, in an order that neither threads nor places of lanes decide.
+
+A chunk's terms come vertex by vertex, from the last to the first, stage by stage and look-up by look-up. Within a look-up they
+come by sample: by the slot that a lane's sample has in its chunk, wherever in an arena the lane lies. What a look-up adds to an
+entry is,
+
+- in tables of few numbers (:data:`FEW`), summed by blocks of consecutive slots (:data:`~torchpt.adjoint.kernels.BLOCK`): an
+  entry's terms of a block are added one after the other, from 0; then the sums of blocks are added one after the other, from 0
+  too; then this is added to the entry. A block without terms may be left out or count 0. A derivative by all of a table is a
+  term of each lane for each of its numbers, and is summed alike;
+- in other tables its terms one after the other, each added to the entry itself.
+
+So the first may be done by a thread for each block and number, then by a thread for each number; the other by a stable sort by
+entry, and a thread for each entry: the bits are the same. Sums are float64, in tables of more than :data:`WIDE`
+numbers of the lanes' own precision. Chunks are added in their order: of tables of up to :data:`DENSE` numbers what a chunk
+comes to, of others its terms one by one.
+
+A stage that runs by tensor operations knows no slots: the number of a term takes the slot's place. Where chunks run by tensor
+operations altogether, the terms of a look-up are added one after the other on a CPU. On other devices they are sorted by entry,
+and an entry's terms are added pairwise (:func:`summed_by_entry`).
+"""
 
 from __future__ import annotations
 
@@ -11,12 +31,14 @@ from torch import Tensor
 
 from torchpt.ranks import Group
 
-__all__ = ["Sums"]
+__all__ = ["ChunkSums", "Sums", "summed_by_entry"]
 
 #: Tables of more numbers than this are summed in the lanes' own precision: few paths meet in one of so many places.
 WIDE = 1 << 20
 #: A chunk sums tables of no more numbers than this by itself.
 DENSE = 1 << 15
+#: Tables of no more numbers than this are summed by blocks of slots: many lanes meet in one of so few entries.
+FEW = 1 << 10
 
 
 class Sums:
@@ -49,13 +71,19 @@ class Sums:
     def add_at(self, number: int, index: Tensor, values: Tensor) -> None:
         """Add ``values (..., n)`` to the entries ``index (n,)`` of a table, in their order."""
         total = self.total(number)
-        values = values.reshape(total.shape[1], -1)
         if total.device.type == "cpu":
             from torchpt.adjoint.kernels import add_at
 
-            add_at(total.numpy(), index.numpy(), values.numpy())
+            add_at(total.numpy(), index.numpy(), values.reshape(total.shape[1], -1).numpy())
         else:
-            total.index_add_(0, index, values.T.to(total.dtype))
+            self.add_sorted(number, index, values)
+
+    def add_sorted(self, number: int, index: Tensor, values: Tensor) -> None:
+        """As :meth:`add_at`, on any device: each entry is added to once, as adding at one place has no order there."""
+        total = self.total(number)
+        if len(index):
+            entries, found = summed_by_entry(index, values.reshape(total.shape[1], -1).to(total.dtype))
+            total.index_add_(0, entries, found.T)
 
     def add(self, number: int, gradient: Tensor) -> None:
         """Add a gradient as large as the table."""
@@ -95,7 +123,7 @@ class Sums:
         self._totals = [None] * len(self.tables)
 
     def add_rows(self, number: int, index: np.ndarray, values: np.ndarray) -> None:
-        """Add ``values (R, n)`` to the entries ``index (n,)`` of a table on a CPU, in their order."""
+        """Add ``values (R, n)`` to the entries ``index (n,)`` of a table on a CPU, one after the other."""
         from torchpt.adjoint.kernels import add_at
 
         add_at(self.total(number).numpy(), index, values)
@@ -134,24 +162,35 @@ class ChunkSums:
     def add_at(self, number: int, index: Tensor, values: Tensor) -> None:
         """See :class:`Sums`."""
         _, width = _form(self.tables[number])
-        self.add_rows(number, index.to(torch.int32).numpy(), values.reshape(width, -1).numpy())
+        terms = np.arange(len(index), dtype=np.int32)
+        self.add_rows(number, index.to(torch.int32).numpy(), values.reshape(width, -1).numpy(), terms)
 
-    def add_rows(self, number: int, index: np.ndarray, values: np.ndarray) -> None:
-        """Add ``values (R, n)`` to the entries ``index (n,)`` int32 of a table, in their order."""
-        if self.tables[number].numel() > DENSE:
+    def add_rows(self, number: int, index: np.ndarray, values: np.ndarray, slots: np.ndarray) -> None:
+        """Add ``values (R, n)`` to the entries ``index (n,)`` int32 of a table.
+
+        ``slots (n,)`` int32, rising: of the samples that the terms are of.
+        """
+        numbers = self.tables[number].numel()
+        if numbers > DENSE:
             if self._whole is None:
                 self.stream.append((number, index.copy(), values.copy()))
             else:
                 self._whole.add_rows(number, index, values)
             return
-        from torchpt.adjoint.kernels import add_at
+        from torchpt.adjoint.kernels import add_at, add_by_blocks
 
-        add_at(self._total(number).numpy(), index, values)
+        if numbers <= FEW:
+            add_by_blocks(self._total(number).numpy(), index, values, slots)
+        else:
+            add_at(self._total(number).numpy(), index, values)
 
-    def add_all(self, number: int, values: np.ndarray) -> None:
-        """Add the sums over lanes of ``values (all numbers of a table, n)``."""
-        table = self.tables[number]
-        self.add(number, torch.from_numpy(values.sum(1, dtype=np.float64)).reshape(table.shape))
+    def add_all(self, number: int, values: np.ndarray, slots: np.ndarray) -> None:
+        """Add the sums over lanes of ``values (all numbers of a table, n)``; ``slots`` as of :meth:`add_rows`."""
+        from torchpt.adjoint.kernels import sum_by_blocks
+
+        total = torch.zeros(self.tables[number].shape, dtype=torch.float64)
+        sum_by_blocks(total.view(-1).numpy(), values, slots)
+        self.add(number, total)
 
     def add(self, number: int, gradient: Tensor) -> None:
         """Add a gradient as large as the table."""
@@ -173,6 +212,29 @@ class ChunkSums:
 def _form(table: Tensor) -> tuple[int, int]:
     """Entries and numbers of an entry: the last axis is the one that is looked up."""
     return (table.shape[-1], math.prod(table.shape[:-1])) if table.dim() else (1, 1)
+
+
+def summed_by_entry(index: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum terms by entry to the same bits on any device: pairwise, in the order in which an entry's terms come.
+
+    Args:
+        index: ``(n,)`` the entries, n > 0.
+        values: ``(R, n)``.
+
+    Returns:
+        Entries ``(m,)``, rising, and their sums ``(R, m)``.
+    """
+    keys, order = torch.sort(index, stable=True)
+    sums = torch.index_select(values, 1, order)
+    entries, counts = torch.unique_consecutive(keys, return_counts=True)
+    first = counts.cumsum(0) - counts
+    rank = torch.arange(len(keys), device=keys.device) - first.repeat_interleave(counts)
+    step, longest = 1, int(counts.max())
+    while step < longest:  # terms 0 and 1 of an entry, 2 and 3, ..., then what came out at 0 and 2, ...
+        pairs = (rank[:-step] % (2 * step) == 0) & (keys[step:] == keys[:-step])
+        sums[:, :-step] += torch.where(pairs, sums[:, step:], 0.0)
+        step *= 2
+    return entries, torch.index_select(sums, 1, first)
 
 
 class _Taken(torch.autograd.Function):

@@ -2,6 +2,8 @@
 
 The kernels of the forward pass trace it, in an arena for each vertex; those of :mod:`torchpt.engines.kernels.joint` go back,
 from the last arena to the first. Paths of more vertices than there are arenas are traced again in parts, from marks on the way.
+
+Lanes lie in an arena as they come; stages are gone back through in the order of samples, as :mod:`torchpt.adjoint.sums` asks.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from torchpt.integrators import joint
 from torchpt.integrators.joint import Before, Behind
 from torchpt.integrators.path import slides
 from torchpt.integrators.vertex import EXTRA, Splat, VertexInput
+from torchpt.lanes.arena import CAPACITY
 from torchpt.math.gathers import gathered_by
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.records import Hit, Shadow
@@ -89,6 +92,7 @@ class Sweep(Worker):
         self._levels: list[Paths] = []
         self._behind = Memory(kernels.slots.count)
         self._results = Memory(1)
+        self._sorted = Memory(2), np.zeros(CAPACITY, np.uint8)  # slots of a list's lanes, and what sorting takes
         self._start = 1
 
     def run(self, chunk: Chunk, pixels: Tensor, whole: Sums | None) -> ChunkSums:
@@ -171,6 +175,7 @@ class Sweep(Worker):
 
     def _one(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
         """Back through one stage on the lanes of a list, by its kernel or by tensor operations."""
+        slots = self._by_sample(paths, places, count)
         kernel = self.joint.back_kernel(key)
         if kernel is None:
             self._eagerly(key, paths, places, count, added)
@@ -181,9 +186,18 @@ class Sweep(Worker):
         for number, index, first, width in kernel.program.sums:
             values = floats[first : first + width, :count]
             if index < 0:
-                self.sums.add_all(number, values)
+                self.sums.add_all(number, values, slots)
             else:
-                self.sums.add_rows(number, words[index, :count], values)
+                self.sums.add_rows(number, words[index, :count], values, slots)
+
+    def _by_sample(self, paths: Paths, places: Memory, count: int) -> np.ndarray:
+        """Sort the lanes of a list by their samples; return the slots of these, rising."""
+        from torchpt.adjoint.kernels import sort_by_sample
+
+        lanes, (memory, taken) = paths.arena.words[self.joint.state.first("lane")], self._sorted
+        slots, found = memory.words
+        sort_by_sample(places.words[0], count, lanes, slots, found, taken)
+        return slots[:count]
 
     def _results_of(self, kernel: Kernel) -> Memory:
         rows = max((max(index + 1, first + width) for _, index, first, width in kernel.program.sums), default=1)
