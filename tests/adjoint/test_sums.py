@@ -13,7 +13,7 @@ from gradient_rooms import room
 import torchpt
 from torchpt.adjoint import loop, replay, sums, sweep
 from torchpt.adjoint.assembly import Assembly
-from torchpt.adjoint.kernels import BLOCK, add_by_blocks, sort_by_sample, sum_by_blocks
+from torchpt.adjoint.kernels import COLUMNS, add_at, add_by_columns, sort_by_sample
 from torchpt.engines import tensors
 from torchpt.engines.kernels import chunk
 from torchpt.engines.kernels.joint_kernels import JointKernels
@@ -22,7 +22,7 @@ from torchpt.lanes.graph import Unsupported
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 
-SLOTS = 9 * BLOCK - 5
+SLOTS = 36 * COLUMNS - 5
 
 
 def terms(count: int, entries: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -36,37 +36,38 @@ def terms(count: int, entries: int, width: int) -> tuple[np.ndarray, np.ndarray,
 
 def by_all_slots(total: np.ndarray, index: np.ndarray, values: np.ndarray, slots: np.ndarray) -> np.ndarray:
     """The sum as it is stated, with a 0 from each slot that has no term, as many threads could do it."""
-    entries, width = total.shape
-    blocks = -(-SLOTS // BLOCK)
-    rows = np.zeros((blocks * BLOCK, entries, width))
+    rows = np.zeros((SLOTS, *total.shape))
     for k, entry in enumerate(index):
-        if 0 <= entry < entries:
+        if 0 <= entry < len(total):
             rows[slots[k], entry] = values[:, k]
-    here = np.zeros((blocks, entries, width))
-    for slot in range(BLOCK):
-        here += rows[slot::BLOCK]
-    whole = np.zeros((entries, width))
-    for block in here:
-        whole += block
-    return total + whole
+    columns = np.zeros((COLUMNS, *total.shape))
+    for first in range(0, SLOTS, COLUMNS):
+        here = rows[first : first + COLUMNS]
+        columns[: len(here)] += here
+    while len(columns) > 1:
+        columns = columns[: len(columns) // 2] + columns[len(columns) // 2 :]
+    return total + columns[0]
 
 
-@pytest.mark.parametrize(("count", "entries", "width"), [(SLOTS, 1, 3), (700, 40, 3), (60, 300, 1), (0, 2, 2)])
-def test_blocks_are_summed_as_is_stated(count, entries, width):
+@pytest.mark.parametrize(("count", "entries", "width"), [(SLOTS, 1, 3), (700, 40, 4), (60, 300, 1), (0, 2, 2)])
+def test_columns_are_summed_as_is_stated(count, entries, width):
     index, values, slots = terms(count, entries, width)
     total = np.random.default_rng(1).standard_normal((entries, width))
     expected = by_all_slots(total, index, values, slots)
-    add_by_blocks(total, index, values, slots)
+    add_by_columns(total, index, values, slots)
     assert np.array_equal(total, expected)
 
 
-@pytest.mark.parametrize("count", [SLOTS, 60, 0])
-def test_a_table_that_all_lanes_share_is_summed_as_one_of_one_entry(count):
-    _, values, slots = terms(count, 1, 4)
-    total, expected = np.ones(4), np.ones((1, 4))
-    add_by_blocks(expected, np.zeros(count, np.int32), values, slots)
-    sum_by_blocks(total, values, slots)
-    assert np.array_equal(total, expected[0])
+@pytest.mark.parametrize("width", [1, 2, 3, 7])
+def test_terms_are_added_in_their_order(width):
+    index, values, _ = terms(900, 12, width)
+    total = np.zeros((12, width))
+    expected = total.copy()
+    for entry, column in zip(index, values.T, strict=True):
+        if 0 <= entry < 12:
+            expected[entry] += column
+    add_at(total, index, values)
+    assert np.array_equal(total, expected)
 
 
 @pytest.mark.parametrize("count", [1, 50, 700, SLOTS])

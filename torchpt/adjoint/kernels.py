@@ -8,10 +8,10 @@ import numpy as np
 
 from torchpt.native.jit import jit
 
-__all__ = ["BLOCK", "add_at", "add_by_blocks", "sort_by_sample", "sum_by_blocks"]
+__all__ = ["COLUMNS", "add_at", "add_by_columns", "sort_by_sample"]
 
-#: Slots of a block, whose terms are added one after the other.
-BLOCK = 128
+#: Columns that slots are dealt to: as many as threads of a GPU go together. A power of two.
+COLUMNS = 32
 
 
 @jit()
@@ -26,13 +26,12 @@ def sort_by_sample(places: Any, count: int, lanes: Any, slots: Any, found: Any, 
         found: int32, one for each slot, to work in.
         taken: uint8, eight or a multiple for all slots: 0 before and after.
     """
-    rising, before = True, -1
     for k in range(count):
-        slot = lanes[places[k]]
-        slots[k] = slot
-        rising &= slot > before
-        before = slot
-    if rising:
+        slots[k] = lanes[np.uint32(places[k])]
+    falls = 0
+    for k in range(1, count):
+        falls |= slots[k] < slots[k - 1]
+    if not falls:
         return
     for k in range(count):
         found[slots[k]] = places[k]
@@ -55,16 +54,27 @@ def add_at(total: Any, index: Any, values: Any) -> None:
         index: ``(n,)`` int64 or int32.
         values: ``(R, n)``.
     """
-    for k in range(index.shape[0]):
-        row = index[k]
-        if 0 <= row < total.shape[0]:
-            for r in range(total.shape[1]):
+    entries, width = total.shape
+    first = 0
+    while first + 3 <= width:  # three at a time, written out: colours and vectors take half as long
+        x, y, z = values[first], values[first + 1], values[first + 2]
+        for k in range(index.shape[0]):
+            row = index[k]
+            if 0 <= row < entries:
+                total[row, first] += x[k]
+                total[row, first + 1] += y[k]
+                total[row, first + 2] += z[k]
+        first += 3
+    for r in range(first, width):
+        for k in range(index.shape[0]):
+            row = index[k]
+            if 0 <= row < entries:
                 total[row, r] += values[r, k]
 
 
 @jit()
-def add_by_blocks(total: Any, index: Any, values: Any, slots: Any) -> None:
-    """As :func:`add_at`, what an entry is given summed by blocks of slots first: see :mod:`torchpt.adjoint.sums`.
+def add_by_columns(total: Any, index: Any, values: Any, slots: Any) -> None:
+    """As :func:`add_at`, what an entry is given summed by columns of slots first: see :mod:`torchpt.adjoint.sums`.
 
     Args:
         total: ``(M, R)`` float64.
@@ -73,47 +83,17 @@ def add_by_blocks(total: Any, index: Any, values: Any, slots: Any) -> None:
         slots: ``(n,)`` int32, rising.
     """
     entries, width = total.shape
-    whole, here = np.zeros((entries, width)), np.zeros((entries, width))
-    blocks = np.full(entries, -1, np.int32)  # of what is in `here`
+    sums, places = np.zeros((COLUMNS, entries * width)), np.empty(index.shape[0], np.int32)
     for k in range(index.shape[0]):
         row = index[k]
-        if 0 <= row < entries:
-            block = slots[k] // BLOCK
-            if block == blocks[row]:
-                for r in range(width):
-                    here[row, r] += values[r, k]
-            else:
-                blocks[row] = block
-                for r in range(width):
-                    whole[row, r] += here[row, r]
-                    here[row, r] = values[r, k]
+        places[k] = (slots[k] & (COLUMNS - 1)) * entries + row if 0 <= row < entries else -1
+    add_at(sums.reshape(COLUMNS * entries, width), places, values)
+    half = COLUMNS // 2
+    while half:
+        for column in range(half):
+            for number in range(entries * width):
+                sums[column, number] += sums[column + half, number]
+        half //= 2
     for row in range(entries):
-        if blocks[row] >= 0:
-            for r in range(width):
-                total[row, r] += whole[row, r] + here[row, r]
-
-
-@jit()
-def sum_by_blocks(total: Any, values: Any, slots: Any) -> None:
-    """``total[r] += sum of values[r]``, summed as :func:`add_by_blocks` sums what one entry is given.
-
-    Args:
-        total: ``(R,)`` float64.
-        values: ``(R, n)``.
-        slots: ``(n,)`` int32, rising.
-    """
-    n, width = slots.shape[0], total.shape[0]
-    whole = np.zeros(width)
-    first = 0
-    while first < n:
-        block, last = slots[first] // BLOCK, first + 1
-        while last < n and slots[last] // BLOCK == block:
-            last += 1
         for r in range(width):
-            here = 0.0
-            for k in range(first, last):
-                here += values[r, k]
-            whole[r] += here
-        first = last
-    for r in range(width):
-        total[r] += whole[r]
+            total[row, r] += sums[0, row * width + r]

@@ -4,16 +4,17 @@ A chunk's terms come vertex by vertex, from the last to the first, stage by stag
 come by sample: by the slot that a lane's sample has in its chunk, wherever in an arena the lane lies. What a look-up adds to an
 entry is,
 
-- in tables of few numbers (:data:`FEW`), summed by blocks of consecutive slots (:data:`~torchpt.adjoint.kernels.BLOCK`): an
-  entry's terms of a block are added one after the other, from 0; then the sums of blocks are added one after the other, from 0
-  too; then this is added to the entry. A block without terms may be left out or count 0. A derivative by all of a table is a
-  term of each lane for each of its numbers, and is summed alike;
+- in tables of few numbers (:data:`FEW`), summed by columns: slot s is in column s modulo C
+  (:data:`~torchpt.adjoint.kernels.COLUMNS`). An entry's terms of a column are added one after the other, from 0; then each
+  column of the second half is added to its fellow of the first, and so on with those that are left, until there is one, which
+  is added to the entry. A slot without a term may be left out or count 0. A derivative by all of a table is a term of each lane
+  for each of its numbers, and is summed alike;
 - in other tables its terms one after the other, each added to the entry itself.
 
-So the first may be done by a thread for each block and number, then by a thread for each number; the other by a stable sort by
-entry, and a thread for each entry: the bits are the same. Sums are float64, in tables of more than :data:`WIDE`
-numbers of the lanes' own precision. Chunks are added in their order: of tables of up to :data:`DENSE` numbers what a chunk
-comes to, of others its terms one by one.
+The first suits threads of a GPU that go together, one for each column; the other may be done by a stable sort by entry, and a
+thread for each: the bits are the same. Sums are float64, in tables of more than :data:`WIDE` numbers of the lanes' own
+precision. Chunks are added in their order: of tables of up to :data:`DENSE` numbers what a chunk comes to, of others its terms
+one by one.
 
 A stage that runs by tensor operations knows no slots: the number of a term takes the slot's place. Where chunks run by tensor
 operations altogether, the terms of a look-up are added one after the other on a CPU. On other devices they are sorted by entry,
@@ -37,8 +38,8 @@ __all__ = ["ChunkSums", "Sums", "summed_by_entry"]
 WIDE = 1 << 20
 #: A chunk sums tables of no more numbers than this by itself.
 DENSE = 1 << 15
-#: Tables of no more numbers than this are summed by blocks of slots: many lanes meet in one of so few entries.
-FEW = 1 << 10
+#: Tables of no more numbers than this are summed by columns of slots: many lanes meet in one of so few entries.
+FEW = 1 << 7
 
 
 class Sums:
@@ -177,19 +178,19 @@ class ChunkSums:
             else:
                 self._whole.add_rows(number, index, values)
             return
-        from torchpt.adjoint.kernels import add_at, add_by_blocks
+        from torchpt.adjoint.kernels import add_at, add_by_columns
 
         if numbers <= FEW:
-            add_by_blocks(self._total(number).numpy(), index, values, slots)
+            add_by_columns(self._total(number).numpy(), index, values, slots)
         else:
             add_at(self._total(number).numpy(), index, values)
 
     def add_all(self, number: int, values: np.ndarray, slots: np.ndarray) -> None:
         """Add the sums over lanes of ``values (all numbers of a table, n)``; ``slots`` as of :meth:`add_rows`."""
-        from torchpt.adjoint.kernels import sum_by_blocks
+        from torchpt.adjoint.kernels import add_by_columns
 
         total = torch.zeros(self.tables[number].shape, dtype=torch.float64)
-        sum_by_blocks(total.view(-1).numpy(), values, slots)
+        add_by_columns(total.view(1, -1).numpy(), np.zeros(len(slots), np.int32), values, slots)
         self.add(number, total)
 
     def add(self, number: int, gradient: Tensor) -> None:

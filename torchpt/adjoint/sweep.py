@@ -175,13 +175,15 @@ class Sweep(Worker):
 
     def _one(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
         """Back through one stage on the lanes of a list, by its kernel or by tensor operations."""
-        slots = self._by_sample(paths, places, count)
         kernel = self.joint.back_kernel(key)
+        slots = self._by_sample(paths, places, count) if kernel is None or kernel.program.sums else None
         if kernel is None:
             self._eagerly(key, paths, places, count, added)
             return
         self._results = self._results_of(kernel)
         self.calls.run(kernel, count, paths.arena, self._results, places, slots=self._behind)
+        if slots is None:
+            return
         floats, words = self._results.floats, self._results.words
         for number, index, first, width in kernel.program.sums:
             values = floats[first : first + width, :count]
