@@ -9,6 +9,7 @@ import pytest
 import torch
 from few import few
 from gradient_rooms import room
+from mirrored import Mirrored, lights
 
 import torchpt
 from torchpt.adjoint import loop, replay, sums, sweep
@@ -200,16 +201,17 @@ def test_places_of_lanes_do_not_matter_to_stages_by_tensor_operations(monkeypatc
     assert torch.equal(first, sums_of(scene, NAMES[0]))
 
 
+def turned(world: Any, hit: Any) -> Any:
+    """Groups of lanes the other way round, so that those behind them lie elsewhere."""
+    ends, groups = partition(world, hit)
+    groups = [(model, index.flip(0)) for model, index in groups]
+    return type(ends)(ends.emissive.flip(0), ends.missed.flip(0)), groups
+
+
 @pytest.mark.parametrize("sorts", [False, True])
 @pytest.mark.parametrize("name", few([*NAMES, "materials.plate.opacity"], 2))
 def test_places_of_lanes_do_not_matter_by_tensor_operations(monkeypatch, name, sorts):
     """Neither to the sums of a CPU nor to those of other devices (here on a CPU)."""
-
-    def turned(world: Any, hit: Any) -> Any:
-        ends, groups = partition(world, hit)
-        groups = [(model, index.flip(0)) for model, index in groups]
-        return type(ends)(ends.emissive.flip(0), ends.missed.flip(0)), groups
-
     if sorts:
         monkeypatch.setattr(sums.Sums, "add_at", sums.Sums.add_sorted)
     scene = several(0.5 if name.endswith("opacity") else 1.0)
@@ -218,6 +220,16 @@ def test_places_of_lanes_do_not_matter_by_tensor_operations(monkeypatch, name, s
         monkeypatch.setattr(module, "partition", turned)
     other = sums_of(scene, name, compile="off")
     assert torch.equal(first, other)
+
+
+@pytest.mark.parametrize("compile", ["on", "off"])
+def test_places_of_lanes_do_not_matter_to_splats(monkeypatch, compile):
+    scene, wish = several(), {"compile": compile, "integrator": Mirrored(**lights())}
+    first = sums_of(scene, NAMES[0], **wish)
+    shuffled(monkeypatch)
+    for module in (replay, tensors):
+        monkeypatch.setattr(module, "partition", turned)
+    assert torch.equal(first, sums_of(scene, NAMES[0], **wish))
 
 
 @pytest.mark.parametrize("name", few(NAMES, 1))
