@@ -81,7 +81,7 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 blocks = loop.blocks(spans, tasks)
                 entry.left = len(blocks)
                 for block in blocks:
-                    crew.add(entry, partial(loop.task, *block))
+                    crew.add(entry, partial(loop.task, block))
             _drain(crew, begun, AHEAD * crew.threads * tasks)
         _drain(crew, begun, 0)
     finally:

@@ -125,7 +125,7 @@ class Loop:
                 rest.extend(share.rest)
             return each(share)
 
-        deal(blocks, lambda block: self.task(*block), self.budget.threads, told, self._halt)
+        deal(blocks, self.task, self.budget.threads, told, self._halt)
         return rest
 
     def _smaller(self, blocks: list[Block]) -> list[Block]:
@@ -165,8 +165,9 @@ class Loop:
         """End the render: tasks stop at their next kernel."""
         self._halt.set()
 
-    def task(self, plate: Plate, start: int, size: int, first: int, count: int) -> Share:
+    def task(self, block: Block) -> Share:
         """Take a block, in a thread of its own."""
+        plate, start, size, first, count = block
         share = Share(Tally())
         sample = first
         try:
