@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchpt.accel import build
-from torchpt.accel.base import Accel
-from torchpt.records import Geometry
+from torchpt.physics.shapes.geometry import Geometry
+from torchpt.search import build
+from torchpt.search.base import Accel
 
 
 def mesh_geometry(vertices: np.ndarray, faces: np.ndarray) -> Geometry:

@@ -7,8 +7,8 @@ import sys
 import torch
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
 
 
 def main(device: str) -> None:

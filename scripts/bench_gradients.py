@@ -418,7 +418,7 @@ def theirs(case: Case, arguments: argparse.Namespace) -> Take:
 
     from mitsuba_scene import convert, load_mitsuba
 
-    from torchpt.format.description import settings
+    from torchpt.scene.formats.description import settings
 
     mi = load_mitsuba("llvm_ad_rgb")
     dr: Any = importlib.import_module("drjit")

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
 from torchpt.scene import Scene
+from torchpt.scene.formats.description import settings
 
 WAYS = ("uniform", "power", "tree")
 

@@ -20,10 +20,10 @@ from mitsuba_scene import comparable, convert, find_llvm, load_mitsuba
 from torch import Tensor
 
 import torchpt
-from torchpt.format.description import settings
 from torchpt.images.metrics import relative
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
 from torchpt.scene import Scene
+from torchpt.scene.formats.description import settings
 
 FLOOR = {"type": "rectangle", "transform": [{"rotate": {"axis": [1, 0, 0], "angle": -90}}, {"scale": 4}]}
 BUNNY = ["$TORCHPT_ASSETS/bunny.ply", str(Path(__file__).parent.parent / "scenes" / "standin.ply")]

@@ -2,7 +2,7 @@
 
 Run: ``python scripts/bench_refit.py [--rounds 5] [--json file]``; ``$TORCHPT_ASSETS/bunny.ply`` must be there. One thread, by
 its CPU time. Of each way of moving the bunny's vertices a line tells how often its tree's cost has multiplied since it was
-built (what ``torchpt.accel.topology.REBUILD`` bounds), what it costs beside a tree built anew, and how much longer searches
+built (what ``torchpt.search.tree.REBUILD`` bounds), what it costs beside a tree built anew, and how much longer searches
 take than there.
 """
 
@@ -21,9 +21,9 @@ import torch
 from bench_accel import bumpy_sphere
 from bench_search import built, bunny, camera, contenders, extent, measure, ray_sets
 
-from torchpt.accel import topology
-from torchpt.accel.wide import Wide
-from torchpt.records import Geometry
+from torchpt.physics.shapes.geometry import Geometry
+from torchpt.search import tree as topology
+from torchpt.search.tree import Wide
 
 
 def noise(x: np.ndarray, amount: float) -> np.ndarray:

@@ -22,8 +22,8 @@ import numpy as np
 import torch
 from bench_accel import bumpy_sphere, mesh_geometry
 
-from torchpt.accel.wide import Wide
-from torchpt.records import Geometry
+from torchpt.physics.shapes.geometry import Geometry
+from torchpt.search.tree import Wide
 
 Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 RAYS = 1 << 18

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchpt.scene import Scene
-    from torchpt.settings import Settings
+    from torchpt.scene.settings import Settings
 
 DEPTH = 8
 OURS, LLVM, SCALAR = "torchpt", "llvm_ad_rgb", "scalar_rgb"
@@ -142,7 +142,7 @@ def timed(shoot: Shoot, size: int, spp: int, seed: int, out: str | None = None) 
 
 def wishes(scene: Scene, arguments: argparse.Namespace) -> Settings:
     """Complete settings of a render."""
-    from torchpt.format.description import settings
+    from torchpt.scene.formats.description import settings
 
     blocks = {
         "film": {"width": arguments.size, "height": arguments.size, "filter": "box"},
@@ -187,7 +187,7 @@ def torchpt(arguments: argparse.Namespace) -> Shoot:
     """Pictures by torchpt."""
     from mitsuba_scene import nearest
 
-    from torchpt.rendering import render_scene
+    from torchpt.rendering.api import render_scene
 
     scene = nearest(arguments.scene)
     given = wishes(scene, arguments)

@@ -21,9 +21,9 @@ from mitsuba_scene import convert, find_llvm, lets_pass, load_mitsuba, nearest
 from torch import Tensor
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
 from torchpt.scene import Scene
+from torchpt.scene.formats.description import settings
 
 BLOCK = 8
 #: Where Mitsuba counts surfaces that light passes.

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 
 import torchpt
-from torchpt.errors import TorchptError
+from torchpt.core.errors import TorchptError
 
 SCENES = sorted(path.stem for path in (Path(__file__).parents[1] / "configs" / "scene").glob("*.yaml"))
 SMALL = {"width": 48, "height": 40}

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from torchpt.settings import BLOCKS, RECORDS, TYPED
+from torchpt.scene.settings import BLOCKS, RECORDS, TYPED
 from torchpt.spec import Choice, Spec, not_built, parameters_of
 
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt.images.colour import display
-from torchpt.samplers import Dimension, Sampler, points_of, salts
+from torchpt.physics.samplers import Dimension, Sampler, points_of, salts
 
 #: Soft shadows of two balls on a floor, under one lamp.
 SHADOWS: dict[str, Any] = {

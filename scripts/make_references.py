@@ -19,7 +19,7 @@ import torch
 from mitsuba_scene import comparable, convert, load_mitsuba
 
 import torchpt
-from torchpt.format.description import settings
+from torchpt.scene.formats.description import settings
 
 #: Width, height and max_depth by scene. Deep where light passes null, which Mitsuba counts as a bounce.
 SCENES = {

@@ -20,7 +20,7 @@ from typing import Any
 
 import bounds
 
-from torchpt.settings import Every
+from torchpt.scene.settings import Every
 from torchpt.spec import REQUIRED, Color, Index, Scalar, Spec, parameters_of
 from torchpt.spec.arguments import declared
 
@@ -28,16 +28,16 @@ DOCS = Path(__file__).parents[1] / "docs"
 MARKED = re.compile(r"(<!-- generated: ([\w.]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 #: NAME -> where the table of kinds is.
 TABLES = {
-    "materials": ("torchpt.bsdfs", "KINDS"),
-    "lights": ("torchpt.lights", "KINDS"),
-    "cameras": ("torchpt.cameras", "KINDS"),
-    "filters": ("torchpt.film", "FILTERS"),
-    "integrators": ("torchpt.integrators", "KINDS"),
-    "layers": ("torchpt.integrators", "LAYERS"),
-    "settings": ("torchpt.settings", "RECORDS"),
-    "shapes": ("torchpt.shapes", "KINDS"),
+    "materials": ("torchpt.physics.bsdfs", "KINDS"),
+    "lights": ("torchpt.physics.lights", "KINDS"),
+    "cameras": ("torchpt.physics.cameras", "KINDS"),
+    "filters": ("torchpt.physics.film", "FILTERS"),
+    "integrators": ("torchpt.paths.integrators", "KINDS"),
+    "layers": ("torchpt.paths.integrators", "LAYERS"),
+    "settings": ("torchpt.scene.settings", "RECORDS"),
+    "shapes": ("torchpt.physics.shapes", "KINDS"),
     "studies": ("torchpt.reports.study", "RECORDS"),
-    "textures": ("torchpt.textures", "KINDS"),
+    "textures": ("torchpt.physics.textures", "KINDS"),
 }
 
 

@@ -12,9 +12,9 @@ import from_tests  # noqa: F401
 from features import FEATURES, Feature, kernels, with_feature
 
 import torchpt
-from torchpt.engines.kernels.kernels import Kernels
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.engines.kernels.programs import Kernels
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
 
 REPEATS = 15
 

@@ -22,23 +22,23 @@ import numpy as np
 import torch
 
 import torchpt
-from torchpt.bsdfs import KINDS, Bsdf
-from torchpt.bsdfs.metal import by_reflectance
-from torchpt.bsdfs.resolved import ResolvedMaterial
-from torchpt.format.description import Description, read_description
-from torchpt.format.materials import inner_of, read_material
-from torchpt.format.textures import TextureInput
 from torchpt.math.vectors import cross, dot, luminance
+from torchpt.physics.bsdfs import KINDS, Bsdf
+from torchpt.physics.bsdfs.metal import by_reflectance
+from torchpt.physics.bsdfs.resolved import ResolvedMaterial
+from torchpt.physics.parts import Part, Source
+from torchpt.physics.shapes import KINDS as SHAPES
+from torchpt.physics.shapes import Shape
+from torchpt.physics.textures import Node
+from torchpt.physics.textures.atlas import ImageNode
 from torchpt.scene import Scene
-from torchpt.scene.assembly import corners_of
-from torchpt.scene.parts import Part, Source
+from torchpt.scene.formats.description import Description, read_description
+from torchpt.scene.formats.materials import inner_of, read_material
+from torchpt.scene.formats.textures import TextureInput
+from torchpt.scene.settings import Film, Settings
 from torchpt.scene.space import Space
-from torchpt.settings import Film, Settings
-from torchpt.shapes import KINDS as SHAPES
-from torchpt.shapes import Shape
-from torchpt.spec.declared import Described, values_of
-from torchpt.textures import Node
-from torchpt.textures.atlas import ImageNode
+from torchpt.scene.world import corners_of
+from torchpt.spec.schema import Described, values_of
 
 __all__ = [
     "NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "lets_pass", "load_mitsuba", "nearest",

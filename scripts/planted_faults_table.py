@@ -38,7 +38,7 @@ FAULTS = (
     # -- math
     Fault(
         "cdf_lower_ends",
-        "math/distributions.py",
+        "math/sampling.py",
         "math lights",
         "Discrete.of",
         "torch.cumsum(w, 0)",
@@ -47,7 +47,7 @@ FAULTS = (
     ),
     Fault(
         "fresnel_without_p",
-        "math/fresnel.py",
+        "math/microfacet.py",
         "math bsdfs",
         "fresnel_dielectric",
         "0.5 * (s * s + p * p)",
@@ -75,7 +75,7 @@ FAULTS = (
     # -- bsdfs
     Fault(
         "phong_without_cosine",
-        "bsdfs/kinds/phong.py",
+        "physics/bsdfs/kinds/phong.py",
         "bsdfs integrators",
         "Phong.eval_pdf",
         "(exponent + 2.0) * peak * cosine",
@@ -84,7 +84,7 @@ FAULTS = (
     ),
     Fault(
         "radiance_across_glass",
-        "bsdfs/glass.py",
+        "physics/bsdfs/lobes.py",
         "bsdfs integrators",
         "polished",
         "share * side.eta_ti * side.eta_ti",
@@ -93,7 +93,7 @@ FAULTS = (
     ),
     Fault(
         "frosted_density",
-        "bsdfs/kinds/roughdielectric.py",
+        "physics/bsdfs/kinds/roughdielectric.py",
         "bsdfs integrators",
         "RoughDielectric.eval_pdf",
         "(1.0 - r) * (eta_it * eta_it)",
@@ -102,7 +102,7 @@ FAULTS = (
     ),
     Fault(
         "blend_reuses_choice",
-        "bsdfs/kinds/blend.py",
+        "physics/bsdfs/kinds/blend.py",
         "bsdfs",
         "Blend.sample",
         "((lobe - low) / width).clamp(0.0, 1.0 - 2.0**-24)",
@@ -112,7 +112,7 @@ FAULTS = (
     ),
     Fault(
         "energy_without_colour",
-        "bsdfs/kinds/roughconductor.py",
+        "physics/bsdfs/kinds/roughconductor.py",
         "bsdfs",
         "RoughConductor.eval_pdf",
         "value * f0",
@@ -121,7 +121,7 @@ FAULTS = (
     ),
     Fault(
         "plastic_from_outside",
-        "bsdfs/kinds/plastic.py",
+        "physics/bsdfs/kinds/plastic.py",
         "bsdfs",
         "Plastic.prepare",
         "diffuse_passed(1.0 / eta)",
@@ -131,7 +131,7 @@ FAULTS = (
     # -- lights
     Fault(
         "environment_chance_of_first",
-        "lights/choice.py",
+        "physics/lights/choice.py",
         "lights math",
         "environment",
         "chosen.pmf[-1]",
@@ -140,7 +140,7 @@ FAULTS = (
     ),
     Fault(
         "share_of_even_draws",
-        "lights/choice.py",
+        "physics/lights/choice.py",
         "lights integrators",
         "_chance",
         "p * (1.0 - share)",
@@ -149,7 +149,7 @@ FAULTS = (
     ),
     Fault(
         "light_from_behind",
-        "lights/solid_angle.py",
+        "physics/lights/solid_angle.py",
         "lights integrators",
         "inverse_pdf",
         "angle * torch.sign(by_area)",
@@ -158,8 +158,8 @@ FAULTS = (
     ),
     Fault(
         "near_light_has_no_gradient",
-        "lights/solid_angle.py",
-        "lights render adjoint",
+        "physics/lights/solid_angle.py",
+        "lights render gradients",
         "inverse_pdf",
         "angle * torch.where(seen, by_area / torch.where(seen, value, 1.0), 0.0)",
         "angle * seen",
@@ -167,7 +167,7 @@ FAULTS = (
     ),
     Fault(
         "environment_turned_back",
-        "lights/kinds/envmap.py",
+        "physics/lights/kinds/envmap.py",
         "lights",
         "Envmap.row",
         "torch.linalg.inv(linear)",
@@ -176,7 +176,7 @@ FAULTS = (
     ),
     Fault(
         "environment_half_texel",
-        "lights/kinds/envmap.py",
+        "physics/lights/kinds/envmap.py",
         "lights integrators",
         "sample",
         "x + (column + 0.5)",
@@ -185,7 +185,7 @@ FAULTS = (
     ),
     Fault(
         "cone_without_own_spread",
-        "lights/tree_build.py",
+        "physics/lights/tree_build.py",
         "lights",
         "_cone",
         "off + _angle(cos_o[k])",
@@ -195,7 +195,7 @@ FAULTS = (
     # -- textures
     Fault(
         "bilinear_half_texel",
-        "textures/atlas.py",
+        "physics/textures/atlas.py",
         "textures integrators",
         "_corners",
         "u * wide - 0.5 * blend",
@@ -204,7 +204,7 @@ FAULTS = (
     ),
     Fault(
         "slope_by_wrong_axis",
-        "textures/atlas.py",
+        "physics/textures/atlas.py",
         "textures",
         "_slope",
         "across * c.maps[1] + along * c.maps[4]",
@@ -213,7 +213,7 @@ FAULTS = (
     ),
     Fault(
         "alpha_decoded",
-        "textures/kinds/image.py",
+        "physics/textures/kinds/image.py",
         "textures format",
         "_decoded",
         "values.shape[2] - (1 if values.shape[2] in (2, 4) else 0)",
@@ -223,7 +223,7 @@ FAULTS = (
     # -- cameras
     Fault(
         "pixel_aspect_upside",
-        "cameras/pinhole.py",
+        "physics/cameras/pinhole.py",
         "cameras",
         "Pinhole.slopes",
         "up / self.pixel_aspect",
@@ -232,7 +232,7 @@ FAULTS = (
     ),
     Fault(
         "opencv_place",
-        "cameras/opencv.py",
+        "physics/cameras/opencv.py",
         "cameras",
         "pose",
         "-turn.T @ move",
@@ -242,7 +242,7 @@ FAULTS = (
     # -- samplers
     Fault(
         "same_numbers_at_each_depth",
-        "samplers/dimensions.py",
+        "physics/samplers/dimensions.py",
         "samplers integrators",
         "salt",
         "1 + (depth + step * STEPS) * STREAMS + int(dimension)",
@@ -251,7 +251,7 @@ FAULTS = (
     ),
     Fault(
         "sampler_without_seed",
-        "samplers/base.py",
+        "physics/samplers/base.py",
         "samplers",
         "Points.key",
         "mix(mix(pixel.to(torch.int32)) ^ seed)",
@@ -261,7 +261,7 @@ FAULTS = (
     # -- film
     Fault(
         "mitchell_coefficient",
-        "film/kinds/mitchell.py",
+        "physics/film/kinds/mitchell.py",
         "film",
         "Mitchell.profile",
         "(6 * b + 30 * c) * x**2",
@@ -270,7 +270,7 @@ FAULTS = (
     ),
     Fault(
         "variance_of_few",
-        "film/sums.py",
+        "physics/film/sums.py",
         "film render",
         "Film.variance",
         "len(filled) - 1",
@@ -279,7 +279,7 @@ FAULTS = (
     ),
     Fault(
         "pilots_say_twice",
-        "film/known_error.py",
+        "physics/film/error.py",
         "film render",
         "error_at",
         "(a - b).square() / 2",
@@ -289,7 +289,7 @@ FAULTS = (
     # -- integrators
     Fault(
         "roulette_without_weight",
-        "integrators/roulette.py",
+        "paths/roulette.py",
         "integrators",
         "survived",
         "throughput / torch.where(alive, chance, 1.0)",
@@ -298,7 +298,7 @@ FAULTS = (
     ),
     Fault(
         "emission_without_mis",
-        "integrators/stages.py",
+        "paths/vertex.py",
         "integrators lights",
         "_gathered",
         "throughput * radiance * weight",
@@ -316,7 +316,7 @@ FAULTS = (
     ),
     Fault(
         "infinite_counted_twice",
-        "integrators/lost.py",
+        "paths/lost.py",
         "integrators render",
         "Lost.of",
         "count - nans",
@@ -325,7 +325,7 @@ FAULTS = (
     ),
     Fault(
         "position_in_lanes",
-        "integrators/layers/position.py",
+        "paths/layers/position.py",
         "integrators render",
         "Position.values",
         "seen.at.p + seen.centre.to(seen.dtype)[:, None]",
@@ -335,7 +335,7 @@ FAULTS = (
     # -- ibl
     Fault(
         "prefiltered_by_roughness",
-        "ibl/convolve.py",
+        "physics/ibl/convolve.py",
         "ibl",
         "prefiltered",
         "_facets(roughness * roughness, samples)",
@@ -345,7 +345,7 @@ FAULTS = (
     # -- shapes
     Fault(
         "normals_move_like_points",
-        "shapes/primitives/triangle.py",
+        "physics/shapes/primitives/triangle.py",
         "shapes scene meshes",
         "Triangle.corners",
         "torch.linalg.inv(linear).T @ given.T",
@@ -354,8 +354,8 @@ FAULTS = (
     ),
     Fault(
         "measure_has_no_derivative",
-        "shapes/interaction.py",
-        "shapes render adjoint",
+        "physics/shapes/interaction.py",
+        "shapes render gradients",
         "reattach",
         "torch.where(usable, measure / torch.where(usable, value, 1.0), 1.0)",
         "torch.ones_like(measure)",
@@ -363,7 +363,7 @@ FAULTS = (
     ),
     Fault(
         "rays_leave_by_the_front",
-        "shapes/interaction.py",
+        "physics/shapes/interaction.py",
         "shapes integrators",
         "offset_origin",
         "torch.copysign(step, dot(w, at.ng))",
@@ -373,8 +373,8 @@ FAULTS = (
     # -- search
     Fault(
         "disk_box_by_one_axis",
-        "accel/bounds.py",
-        "accel shapes",
+        "search/bounds.py",
+        "search shapes",
         "primitive_bounds",
         "((p1 - p0)[:, b:c].square() + (p2 - p0)[:, b:c].square()).sqrt()",
         "torch.maximum((p1 - p0)[:, b:c].abs(), (p2 - p0)[:, b:c].abs())",
@@ -382,8 +382,8 @@ FAULTS = (
     ),
     Fault(
         "refit_forgets_a_corner",
-        "accel/kernels_refit.py",
-        "accel render",
+        "search/tree.py",
+        "search render",
         "_leaf",
         "select(good, y1, high)",
         "select(good, y0, high)",
@@ -392,7 +392,7 @@ FAULTS = (
     Fault(
         "unsorted_children",
         "native/simd/lanes.py",
-        "native accel",
+        "native search",
         "_network",
         "size // 4",
         "size // 8",
@@ -401,8 +401,8 @@ FAULTS = (
     # -- lanes
     Fault(
         "odd_powers",
-        "lanes/operators/arithmetic.py",
-        "lanes",
+        "compiler/operators/arithmetic.py",
+        "compiler",
         "_pow",
         "graph.binary('mul', ty, square, x) if n % 2 else square",
         "square",
@@ -411,8 +411,8 @@ FAULTS = (
     # -- gradients
     Fault(
         "clamp_has_no_derivative",
-        "adjoint/samples.py",
-        "adjoint render",
+        "gradients/tape.py",
+        "gradients render",
         "asked_of",
         "(asked * scale).scatter_add(0, channel, -back)",
         "asked * scale",
@@ -420,7 +420,7 @@ FAULTS = (
     ),
     Fault(
         "edges_pull_backwards",
-        "edges/primary.py",
+        "gradients/edges/primary.py",
         "edges render",
         "Primary.samples",
         "values[:, : len(index)] - values[:, len(index) :]",
@@ -439,7 +439,7 @@ FAULTS = (
     ),
     Fault(
         "camera_of_another_height",
-        "forward/wave.py",
+        "scene/prepare.py",
         "render scene",
         "_camera",
         "([id(value) for value in held], [value._version for value in given], film.width, film.height, dtype)",
@@ -448,8 +448,8 @@ FAULTS = (
     ),
     Fault(
         "copies_placed_twice",
-        "scene/assembly/copies.py",
-        "scene shapes accel",
+        "scene/world/primitives.py",
+        "scene shapes search",
         "copy_maps",
         "torch.linalg.inv(shift) @ pose @ back[copy.of] @ shift",
         "torch.linalg.inv(shift) @ pose @ shift",
@@ -457,7 +457,7 @@ FAULTS = (
     ),
     Fault(
         "crop_beyond_the_film",
-        "settings.py",
+        "scene/settings.py",
         "format cli",
         "Film.check",
         "crop[0] + crop[2] > wide or crop[1] + crop[3] > high",
@@ -467,7 +467,7 @@ FAULTS = (
     # -- meshes
     Fault(
         "obj_upside_down",
-        "meshes/obj.py",
+        "scene/meshes/obj.py",
         "meshes",
         "load_obj",
         "1.0 - uvs[:, 1]",
@@ -476,7 +476,7 @@ FAULTS = (
     ),
     Fault(
         "gltf_turned_back",
-        "meshes/gltf_material.py",
+        "scene/meshes/gltf_material.py",
         "meshes",
         "_Rules.texture",
         "-math.degrees(turn)",
@@ -485,7 +485,7 @@ FAULTS = (
     ),
     Fault(
         "ply_never_white",
-        "meshes/ply.py",
+        "scene/meshes/ply.py",
         "meshes",
         "_colors",
         "np.iinfo(kinds[name]).max",
@@ -514,7 +514,7 @@ FAULTS = (
     # -- renders, ranks, batches
     Fault(
         "resumed_a_sample_early",
-        "forward/run.py",
+        "rendering/run.py",
         "render",
         "Run._state",
         "self.taken",
@@ -523,7 +523,7 @@ FAULTS = (
     ),
     Fault(
         "rays_of_one_rank",
-        "forward/split.py",
+        "rendering/split.py",
         "ranks",
         "Split.take",
         "rays + sum(int(said[1]) for said in every)",
@@ -532,7 +532,7 @@ FAULTS = (
     ),
     Fault(
         "batch_of_one_seed",
-        "batches/inputs.py",
+        "rendering/batches/inputs.py",
         "render",
         "seeds_of",
         "row[c] if isinstance(row, Sequence) else row",
@@ -589,7 +589,7 @@ FAULTS = (
     # -- the command line
     Fault(
         "debug_other_pixel",
-        "commands/debug.py",
+        "cli/debug.py",
         "cli",
         "Wish.read",
         "(int(pixel[1]), int(pixel[2]))",

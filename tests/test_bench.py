@@ -17,9 +17,9 @@ import torch
 from trials import chi_square_p, z_limit
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
 from torchpt.scene import Scene
+from torchpt.scene.formats.description import settings
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 CAMERA = {"origin": [0, 1.4, 4.2], "target": [0, 0.6, 0], "fov": 45}

@@ -12,7 +12,7 @@ import torch
 from pytest import approx
 
 import torchpt
-from torchpt.math.warps import uniform_hemisphere
+from torchpt.math.sampling import uniform_hemisphere
 
 FOLDER = Path(__file__).parent.parent / "scripts" / "examples"
 #: Steps, size of the film, and to what part of itself the error falls at least.

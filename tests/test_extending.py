@@ -13,9 +13,10 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"`(torchpt/[\w/]+\.py)`:\n\n```python\n(.*?)```\n", PAGE, re.DOTALL))
 KINDS = {
-    "bsdfs/kinds", "lights/kinds", "shapes/kinds", "cameras/kinds", "samplers/kinds", "film/kinds", "textures/kinds",
-    "integrators/kinds", "integrators/layers",
-}  # fmt: skip
+    *(f"physics/{room}/kinds" for room in ("bsdfs", "lights", "shapes", "cameras", "samplers", "film", "textures")),
+    "paths/integrators/kinds",
+    "paths/layers",
+}
 
 #: What a process does once its packages also look into the folder of the new files.
 USES = """

@@ -29,7 +29,7 @@ def test_import_is_quick_and_light() -> None:
 @pytest.mark.slow
 def test_the_public_names_load_on_use() -> None:
     found, _ = loaded(
-        "import torchpt, torchpt.cli, torchpt.rendering\n"
+        "import torchpt, torchpt.cli.main, torchpt.rendering.api\n"
         "for name in torchpt.__all__: getattr(torchpt, name)\n"
         "from torchpt import render; assert callable(torchpt.render) and torchpt.render is render"
     )
@@ -90,7 +90,7 @@ film = {{"width": 8, "height": 8}}
 scene = torchpt.load("cornell_box", device="cpu")
 pictures = [torchpt.render(scene, spp=2, film=film, compile=mode) for mode in ("off", "on")]
 assert all(float(picture.mean()) > 0 for picture in pictures)
-from torchpt.cli import main
+from torchpt.cli.main import main
 assert main(["--version"]) == 0
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from torchpt.errors import (
+from torchpt.core.errors import (
     AssetError,
     EdgeWarning,
     EnergyWarning,
@@ -21,19 +21,19 @@ from torchpt.errors import (
     SceneError,
     TorchptError,
 )
+from torchpt.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from torchpt import cameras, data, ibl, losses, nn, ranks
-    from torchpt.batches import Renderings, render_batch
-    from torchpt.bsdfs import Bsdf
-    from torchpt.forward import Rendering
-    from torchpt.images import metrics, read_header, read_image, read_layers, write_image
+    from torchpt import cameras, data, extend, ibl, losses, metrics, nn, ranks
+    from torchpt.images import read_header, read_image, read_layers, write_image
     from torchpt.images.denoiser import denoise
-    from torchpt.rendering import render, trace
+    from torchpt.physics.bsdfs import Bsdf
+    from torchpt.rendering import Rendering
+    from torchpt.rendering.api import render, trace
+    from torchpt.rendering.batches import Renderings, render_batch
     from torchpt.scene import Scene, load
     from torchpt.scene.from_trimesh import from_trimesh
 
-__version__ = "0.1.0"
 __all__ = [
     "AssetError",
     "Bsdf",
@@ -53,6 +53,7 @@ __all__ = [
     "cameras",
     "data",
     "denoise",
+    "extend",
     "from_trimesh",
     "ibl",
     "load",
@@ -71,9 +72,9 @@ __all__ = [
 
 # public name -> the module that has it
 _LAZY = {
-    "Bsdf": "torchpt.bsdfs",
-    "Rendering": "torchpt.forward",
-    "Renderings": "torchpt.batches",
+    "Bsdf": "torchpt.physics.bsdfs",
+    "Rendering": "torchpt.rendering",
+    "Renderings": "torchpt.rendering.batches",
     "Scene": "torchpt.scene",
     "denoise": "torchpt.images.denoiser",
     "from_trimesh": "torchpt.scene.from_trimesh",
@@ -81,9 +82,9 @@ _LAZY = {
     "read_header": "torchpt.images",
     "read_image": "torchpt.images",
     "read_layers": "torchpt.images",
-    "render": "torchpt.rendering",
-    "render_batch": "torchpt.batches",
-    "trace": "torchpt.rendering",
+    "render": "torchpt.rendering.api",
+    "render_batch": "torchpt.rendering.batches",
+    "trace": "torchpt.rendering.api",
     "write_image": "torchpt.images",
 }
 
@@ -91,9 +92,10 @@ _LAZY = {
 _MODULES = {
     "cameras": "torchpt.cameras",
     "data": "torchpt.data",
+    "extend": "torchpt.extend",
     "ibl": "torchpt.ibl",
     "losses": "torchpt.losses",
-    "metrics": "torchpt.images.metrics",
+    "metrics": "torchpt.metrics",
     "nn": "torchpt.nn",
     "ranks": "torchpt.ranks",
 }

@@ -1,6 +1,6 @@
 """``python -m torchpt`` is ``torchpt``."""
 
-from torchpt.cli import run
+from torchpt.cli.main import run
 
 if __name__ == "__main__":
     run()

@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
 
-from torchpt.errors import SceneError
-from torchpt.rendering import render
+from torchpt.core.errors import SceneError
+from torchpt.rendering.api import render
 from torchpt.scene import Scene, load
-from torchpt.settings import Every
+from torchpt.scene.settings import Every
 from torchpt.spec.arguments import check_names
 
 __all__ = ["Made", "RenderDataset", "RenderStream"]

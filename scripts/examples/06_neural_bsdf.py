@@ -19,8 +19,8 @@ from example_tools import arguments, grid
 from torch import Tensor, nn
 
 import torchpt
-from torchpt.math.warps import cosine_hemisphere
-from torchpt.records import BsdfSample
+from torchpt.math.sampling import cosine_hemisphere
+from torchpt.physics.bsdfs.records import BsdfSample
 
 LACQUER = {"type": "principled", "base_color": [0.75, 0.3, 0.15], "metallic": 0.6, "roughness": 0.45, "clearcoat": 0.5}
 #: Where the lamp stands in the pictures to match; and where in the one that is held out.

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt import bsdfs
-from torchpt.bsdfs import Bsdf, Parameters
+from torchpt.physics import bsdfs
+from torchpt.physics.bsdfs import Bsdf, Parameters
 from torchpt.spec import REQUIRED, Color, Scalar, parameters_of
 
 RED = (0.8, 0.5, 0.1)

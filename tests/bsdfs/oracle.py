@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs import Bsdf, Parameters, gather
+from torchpt.physics.bsdfs import Bsdf, Parameters, gather
 
 __all__ = [
     "PAIRS",

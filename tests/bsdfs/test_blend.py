@@ -11,17 +11,17 @@ from few import few
 from oracle import assert_same, both_sides, mitsuba_eval_pdf, random_pairs, rgb
 from torch import Tensor
 
-from torchpt.bsdfs import Bsdf, Parameters, gather
-from torchpt.bsdfs.kinds.blend import Blend
-from torchpt.bsdfs.kinds.conductor import Conductor
-from torchpt.bsdfs.kinds.dielectric import Dielectric
-from torchpt.bsdfs.kinds.diffuse import Diffuse
-from torchpt.bsdfs.kinds.null import Null
-from torchpt.bsdfs.kinds.phong import Phong
-from torchpt.bsdfs.kinds.principled import Principled
-from torchpt.bsdfs.kinds.roughconductor import RoughConductor
-from torchpt.bsdfs.kinds.roughdielectric import RoughDielectric
 from torchpt.math import microfacet
+from torchpt.physics.bsdfs import Bsdf, Parameters, gather
+from torchpt.physics.bsdfs.kinds.blend import Blend
+from torchpt.physics.bsdfs.kinds.conductor import Conductor
+from torchpt.physics.bsdfs.kinds.dielectric import Dielectric
+from torchpt.physics.bsdfs.kinds.diffuse import Diffuse
+from torchpt.physics.bsdfs.kinds.null import Null
+from torchpt.physics.bsdfs.kinds.phong import Phong
+from torchpt.physics.bsdfs.kinds.principled import Principled
+from torchpt.physics.bsdfs.kinds.roughconductor import RoughConductor
+from torchpt.physics.bsdfs.kinds.roughdielectric import RoughDielectric
 
 RED, BLUE = (0.8, 0.5, 0.1), (0.1, 0.2, 0.9)
 GOLD = {"eta": (0.143, 0.375, 1.442), "k": (3.983, 2.386, 1.603)}

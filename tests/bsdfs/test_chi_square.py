@@ -15,10 +15,10 @@ from few import few
 from test_contract import EACH, Experiment, Setting
 from torch import Tensor
 
-from torchpt.bsdfs import Bsdf, Parameters
+from torchpt.math.sampling import cosine_hemisphere, uniform_sphere
 from torchpt.math.vectors import dot, normalize
-from torchpt.math.warps import cosine_hemisphere, uniform_sphere
-from torchpt.records import BsdfSample
+from torchpt.physics.bsdfs import Bsdf, Parameters
+from torchpt.physics.bsdfs.records import BsdfSample
 
 N = 1_000_000
 

@@ -10,14 +10,14 @@ import torch
 from oracle import ours_eval_pdf, random_pairs
 from torch import Tensor
 
-from torchpt.bsdfs import Bsdf, Parameters, gather
-from torchpt.bsdfs.kinds.blinn_phong import BlinnPhong
-from torchpt.bsdfs.kinds.microfacet import Microfacet
-from torchpt.bsdfs.kinds.nonmetal import Nonmetal
-from torchpt.bsdfs.kinds.phong import Phong
-from torchpt.bsdfs.kinds.plastic import Plastic
-from torchpt.bsdfs.kinds.roughconductor import RoughConductor
-from torchpt.math.fresnel import fresnel_dielectric
+from torchpt.math.microfacet import fresnel_dielectric
+from torchpt.physics.bsdfs import Bsdf, Parameters, gather
+from torchpt.physics.bsdfs.kinds.blinn_phong import BlinnPhong
+from torchpt.physics.bsdfs.kinds.microfacet import Microfacet
+from torchpt.physics.bsdfs.kinds.nonmetal import Nonmetal
+from torchpt.physics.bsdfs.kinds.phong import Phong
+from torchpt.physics.bsdfs.kinds.plastic import Plastic
+from torchpt.physics.bsdfs.kinds.roughconductor import RoughConductor
 
 RED, GREY = (0.8, 0.5, 0.1), (0.2, 0.3, 0.4)
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)

@@ -26,10 +26,10 @@ from chi_square import Chart, Integral, SlopeChart, Tree, counts_p, integrate
 from significance import SIGNIFICANCE, z_limit
 from torch import Tensor
 
-from torchpt import bsdfs
+from torchpt.math.sampling import uniform_sphere
 from torchpt.math.vectors import normalize
-from torchpt.math.warps import uniform_sphere
-from torchpt.records import BsdfSample
+from torchpt.physics import bsdfs
+from torchpt.physics.bsdfs.records import BsdfSample
 
 ANGLES = (0.0, 30.0, 60.0, 85.0, 89.9)
 AZIMUTH = 0.7  # of wo: on no axis, so that no anisotropy is hidden

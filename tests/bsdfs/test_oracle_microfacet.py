@@ -11,18 +11,18 @@ import torch
 from oracle import assert_same, both_sides, mitsuba_bsdf, mitsuba_eval_pdf, ours_eval_pdf, random_pairs, rgb
 from torch import Tensor
 
-from torchpt.bsdfs import Bsdf, gather
-from torchpt.bsdfs.base import Parameters
-from torchpt.bsdfs.kinds.conductor import Conductor
-from torchpt.bsdfs.kinds.dielectric import Dielectric
-from torchpt.bsdfs.kinds.null import Null
-from torchpt.bsdfs.kinds.plastic import Plastic
-from torchpt.bsdfs.kinds.roughconductor import RoughConductor
-from torchpt.bsdfs.kinds.roughdielectric import RoughDielectric
-from torchpt.bsdfs.kinds.roughplastic import RoughPlastic
-from torchpt.bsdfs.kinds.thindielectric import ThinDielectric
 from torchpt.math import microfacet
 from torchpt.math.vectors import dot, normalize
+from torchpt.physics.bsdfs import Bsdf, gather
+from torchpt.physics.bsdfs.base import Parameters
+from torchpt.physics.bsdfs.kinds.conductor import Conductor
+from torchpt.physics.bsdfs.kinds.dielectric import Dielectric
+from torchpt.physics.bsdfs.kinds.null import Null
+from torchpt.physics.bsdfs.kinds.plastic import Plastic
+from torchpt.physics.bsdfs.kinds.roughconductor import RoughConductor
+from torchpt.physics.bsdfs.kinds.roughdielectric import RoughDielectric
+from torchpt.physics.bsdfs.kinds.roughplastic import RoughPlastic
+from torchpt.physics.bsdfs.kinds.thindielectric import ThinDielectric
 
 Values = dict[str, Any]
 
@@ -132,7 +132,7 @@ def their_passed(eta: Tensor) -> Tensor:
 @pytest.fixture
 def their_fits(monkeypatch):
     """All but the fit is compared."""
-    monkeypatch.setattr("torchpt.bsdfs.kinds.plastic.diffuse_passed", their_passed)
+    monkeypatch.setattr("torchpt.physics.bsdfs.kinds.plastic.diffuse_passed", their_passed)
 
 
 @pytest.mark.mitsuba

@@ -13,10 +13,10 @@ from oracle import assert_same, both_sides, mitsuba_eval_pdf, ours_eval_pdf, ran
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from torchpt.bsdfs import Parameters, gather
-from torchpt.bsdfs.kinds.principled import Principled
-from torchpt.bsdfs.principled_lobes import Facet, Probabilities
 from torchpt.math import microfacet
+from torchpt.physics.bsdfs import Parameters, gather
+from torchpt.physics.bsdfs.kinds.principled import Principled
+from torchpt.physics.bsdfs.principled_lobes import Facet, Probabilities
 
 RED, WHITE = (0.8, 0.5, 0.1), (1.0, 1.0, 1.0)
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.cameras import Camera
-from torchpt.format.description import settings
+from torchpt.physics.cameras import Camera
+from torchpt.scene.formats.description import settings
 
 POSE = {"origin": [0.3, 1.1, 5], "target": [-0.2, 0.4, 0.1], "up": [0.1, 1, 0]}
 LENS = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.2, "fov": 35}

@@ -13,11 +13,11 @@ from outside import numbers_outside, values_outside
 from torch import Tensor
 
 import torchpt
-from torchpt.cameras import KINDS, Camera
-from torchpt.errors import SceneError
-from torchpt.format.cameras import read_camera
-from torchpt.format.description import settings
+from torchpt.core.errors import SceneError
+from torchpt.physics.cameras import KINDS, Camera
 from torchpt.scene import Scene
+from torchpt.scene.formats.cameras import read_camera
+from torchpt.scene.formats.description import settings
 from torchpt.spec import Moves, parameters_of
 
 SIZE = {"width": 8, "height": 6}

@@ -17,7 +17,7 @@ from torch import Tensor
 
 import torchpt
 from torchpt import cameras
-from torchpt.errors import AssetError, OutputError, SceneError
+from torchpt.core.errors import AssetError, OutputError, SceneError
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::torchpt.EdgeWarning")
 WIDTH, HEIGHT = 24, 16

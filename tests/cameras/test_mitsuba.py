@@ -12,8 +12,8 @@ from optics import CAMERAS, POSE, numbers
 from trials import coarse, film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt.cameras.pinhole import FOV_AXES
-from torchpt.format.description import settings
+from torchpt.physics.cameras.pinhole import FOV_AXES
+from torchpt.scene.formats.description import settings
 
 pytestmark = pytest.mark.mitsuba
 SEEDS = 8

@@ -12,9 +12,9 @@ from optics import CAMERAS, POSE, made, numbers
 from trials import shoot
 
 import torchpt
-from torchpt.cameras import PinholeMatrices
-from torchpt.errors import SceneError
-from torchpt.format.description import settings
+from torchpt.core.errors import SceneError
+from torchpt.physics.cameras.opencv import PinholeMatrices
+from torchpt.scene.formats.description import settings
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 WIDTH, HEIGHT = 64, 48

@@ -11,8 +11,8 @@ from optics import CAMERAS, LENS, POSE
 from trials import film_of, shoot
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
 
 AHEAD = {"origin": [0, 0, 0], "target": [0, 0, -1]}
 SIZE, BALL = 64, 0.03

@@ -9,7 +9,7 @@ import torch
 from optics import CAMERAS, LENS, POSE, made, numbers
 
 import torchpt
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.math.transforms import look_at
 
 N = 4096

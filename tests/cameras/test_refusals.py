@@ -14,7 +14,7 @@ import torch
 
 import torchpt
 from torchpt import cameras
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 
 SIZE = (24, 16)
 K = [[20.0, 0.0, 12.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]]

@@ -95,9 +95,9 @@ class Renderer:
 @pytest.fixture
 def renderer(monkeypatch: pytest.MonkeyPatch) -> Renderer:
     stand_in = Renderer()
-    module: Any = types.ModuleType("torchpt.rendering")
+    module: Any = types.ModuleType("torchpt.rendering.api")
     module.render_scene, module.first_hit = stand_in.render_scene, stand_in.first_hit
-    monkeypatch.setitem(sys.modules, "torchpt.rendering", module)
+    monkeypatch.setitem(sys.modules, "torchpt.rendering.api", module)
     return stand_in
 
 

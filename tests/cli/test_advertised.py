@@ -14,9 +14,9 @@ import pytest
 import torch
 from few import few
 
-from torchpt import cli
-from torchpt.cli import main
-from torchpt.files import configs
+from torchpt.cli import main as cli
+from torchpt.cli.main import main
+from torchpt.core.files import configs
 from torchpt.images import write_image
 
 from .conftest import Renderer

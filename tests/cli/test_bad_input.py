@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from few import few
 
-from torchpt.cli import main
+from torchpt.cli.main import main
 
 from .conftest import Renderer
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.cli import main
+from torchpt.cli.main import main
 from torchpt.images import read_image, read_layers, write_image
 from torchpt.images.comparison import Shown
 from torchpt.images.comparison import compare as measure
@@ -314,5 +314,6 @@ def test_a_map_replaces_an_old_one_and_follows_links(pair: Path, capfd: Captured
 def test_nothing_of_hydra_is_imported(pair: Path) -> None:
     import subprocess
 
-    code = "import sys; from torchpt.cli import main; main(['compare', 'a.exr', 'b.exr']); assert 'hydra' not in sys.modules"
+    run = "from torchpt.cli.main import main; main(['compare', 'a.exr', 'b.exr'])"
+    code = f"import sys; {run}; assert 'hydra' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL, timeout=120)

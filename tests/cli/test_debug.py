@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from few import few
 
-from torchpt.cli import main
+from torchpt.cli.main import main
 
 BALL = """\
 camera: {origin: [0, 0, -4], target: [0, 0, 0]}

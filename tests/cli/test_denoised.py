@@ -14,8 +14,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.cli import main
-from torchpt.errors import RenderError
+from torchpt.cli.main import main
+from torchpt.core.errors import RenderError
 from torchpt.images import denoiser, read_header, read_image, read_layers
 
 from .conftest import SCENE, Renderer

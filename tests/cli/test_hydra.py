@@ -10,11 +10,11 @@ import yaml
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.hydra import Hydra
 
-from torchpt.cli import GROUPS, main
-from torchpt.commands import render
-from torchpt.commands.render import Job
-from torchpt.files import configs
-from torchpt.settings import TYPED
+from torchpt.cli import render
+from torchpt.cli.main import GROUPS, main
+from torchpt.cli.render import Job
+from torchpt.core.files import configs
+from torchpt.scene.settings import TYPED
 from torchpt.spec import not_built, parameters_of
 
 from .conftest import Renderer

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from torchpt.cli import main
-from torchpt.commands.hydra_process import hydra_process
+from torchpt.cli.hydra_process import hydra_process
+from torchpt.cli.main import main
 
 
 @pytest.mark.parametrize("set_before", [None, "0"])

@@ -16,8 +16,8 @@ from PIL import Image, ImageSequence
 from textured_quad import repeated, textured_quad
 
 import torchpt
-from torchpt.cli import main
-from torchpt.commands.orbit import Turn, poses
+from torchpt.cli.main import main
+from torchpt.cli.orbit import Turn, poses
 from torchpt.images.movie import write_movie
 
 from .conftest import SCENE, Renderer

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchpt.cli import main
+from torchpt.cli.main import main
 from torchpt.images import read_image, read_layers
 
 from .conftest import SCENE
@@ -29,13 +29,13 @@ NEEDLESS = (
     *("networkx", "pandas", "pydantic", "rich", "scipy", "sympy", "triton"),
     *("torch._dynamo", "torch._inductor", "torch.onnx", "torch.utils.tensorboard"),
     "PIL.TiffImagePlugin",
-    *(f"torchpt.meshes.{name}" for name in ("gltf", "obj", "ply", "stl")),
+    *(f"torchpt.scene.meshes.{name}" for name in ("gltf", "obj", "ply", "stl")),
     "torchpt.ranks.launch",
 )
 #: A small render, what was imported for it, and then the command as ``python -m`` runs it.
 CODE = """
 import json, runpy, sys
-from torchpt.cli import main
+from torchpt.cli.main import main
 assert main(["render", "scene=cornell_box", "render.spp=16", "film.width=64", "film.height=64", "out=small.png"]) == 0
 print("imported", json.dumps([name for name in {needless!r} if name in sys.modules]))
 sys.argv[1:] = {words!r}

@@ -10,12 +10,12 @@ import pytest
 import torch
 from few import few
 
-from torchpt.cli import main
-from torchpt.commands.render import plain, sentence
-from torchpt.errors import OutputError
-from torchpt.forward import files as files_module
+from torchpt.cli.main import main
+from torchpt.cli.render import plain, sentence
+from torchpt.core.errors import OutputError
 from torchpt.images import read_header, read_image, read_layers
 from torchpt.images.colour import TONEMAPS
+from torchpt.rendering import result as files_module
 
 from .conftest import SCENE, Renderer
 

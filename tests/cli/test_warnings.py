@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from torchpt.cli import main
+from torchpt.cli.main import main
 
 from .conftest import SCENE, Renderer
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchpt.core import memory
+from torchpt.core.errors import RenderError, SceneError
 from torchpt.core.memory import Budget, Span, check_limit, retried, suffices
-from torchpt.errors import RenderError, SceneError
 
 CPU = torch.device("cpu")
 

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from torchpt.core import threads
+from torchpt.core.errors import RenderError
 from torchpt.core.threads import Crew, deal, share
-from torchpt.errors import RenderError
 
 
 def dealt(task: Callable[[int], Any], count: int, **wish: Any) -> list[Any]:

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchpt.core.threads import PIECE, in_pieces, mean_all, sum_all
 from torchpt.images.colour import display, linear_to_srgb, srgb_to_linear
-from torchpt.math.distributions import Discrete
-from torchpt.shapes.normals import smooth_normals
+from torchpt.math.sampling import Discrete
+from torchpt.physics.shapes.normals import smooth_normals
 
 THREADS = (2, 3)
 #: Elements: parts of two and of three threads end beside whole vectors.

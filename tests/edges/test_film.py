@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.edges.film import Worth, film_places
-from torchpt.format.description import settings
+from torchpt.gradients.edges.film import Worth, film_places
+from torchpt.scene.formats.description import settings
 
 PLACE = {"origin": [1, 2, 3], "target": [0, 0.5, 0], "up": [0, 1, 0.2]}
 CAMERAS: dict[str, dict[str, Any]] = {

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.cameras import Camera
 from torchpt.core.tree import map_leaves
-from torchpt.edges import left_out
-from torchpt.format.description import settings
+from torchpt.gradients.edges import left_out
+from torchpt.physics.cameras import Camera
+from torchpt.scene.formats.description import settings
 
 
 @pytest.mark.parametrize("kind", ["perspective", "orthographic"])

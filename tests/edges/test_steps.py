@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 
 import torchpt
-from torchpt.edges.bodies import bodies_of
-from torchpt.edges.steps import step_of, steps_at
-from torchpt.format.description import settings
+from torchpt.gradients.edges.bodies import bodies_of
+from torchpt.gradients.edges.primary import step_of, steps_at
+from torchpt.scene.formats.description import settings
 
 
 def test_steps_are_shorter_beside_narrow_faces() -> None:

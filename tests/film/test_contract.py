@@ -11,10 +11,10 @@ from outside import values_outside
 from trials import SIGNIFICANCE, chi_square_p, film_of
 
 import torchpt
-from torchpt.errors import SceneError
-from torchpt.film import FILTERS, Filter, filter_of
+from torchpt.core.errors import SceneError
+from torchpt.physics.film import FILTERS, Filter, filter_of
 from torchpt.spec import parameters_of
-from torchpt.spec.declared import described
+from torchpt.spec.schema import described
 
 CPU = torch.device("cpu")
 #: Beside the defaults: parameters that make a filter of another shape.

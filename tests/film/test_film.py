@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchpt.film import Film, filter_of
 from torchpt.images.metrics import FLOOR
+from torchpt.physics.film import Film, filter_of
 
 CPU = torch.device("cpu")
 

@@ -12,10 +12,10 @@ from few import few
 from trials import film_of, shoot, z_limit
 
 import torchpt
-from torchpt.film import Filter, filter_of
-from torchpt.format.description import settings
-from torchpt.rendering import first_hit
+from torchpt.physics.film import Filter, filter_of
+from torchpt.rendering.api import first_hit
 from torchpt.scene import Scene
+from torchpt.scene.formats.description import settings
 
 CPU = torch.device("cpu")
 U = (torch.arange(1 << 20, dtype=torch.float64) + 0.5) / (1 << 20)

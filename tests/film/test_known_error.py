@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.film import KnownError, pilots_of
-from torchpt.film.known_error import STREAMS, Again, around, known_error, pilots_alone, to_look_at
+from torchpt.physics.film import KnownError, pilots_of
+from torchpt.physics.film.error import STREAMS, Again, around, known_error, pilots_alone, to_look_at
 
 SIDE = 96
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchpt.film import Pilots, pilots_of
+from torchpt.physics.film import Pilots, pilots_of
 
 
 def at(pilots: Pilots, width: int) -> set[tuple[int, int]]:

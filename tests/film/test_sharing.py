@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchpt.film.sharing import foreseen, shared_out
+from torchpt.physics.film.error import foreseen, shared_out
 
 PIXELS = torch.full((100,), 16)
 

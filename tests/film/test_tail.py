@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.film.tail import FEWEST, heavy_tail
+from torchpt.physics.film.error import FEWEST, heavy_tail
 
 
 def pareto(shape: float, count: int, seed: int) -> Tensor:

@@ -14,13 +14,13 @@ import torch
 from small_files import DAE, MTL, OBJ, glb, gltf_document
 
 import torchpt
-from torchpt.errors import AssetError, SceneError, TorchptError
-from torchpt.files import Unfit, check_regular, read_regular
-from torchpt.format import description, yaml_file
-from torchpt.format.description import read_description
-from torchpt.format.yaml_file import parse_yaml, plain
+from torchpt.core.errors import AssetError, SceneError, TorchptError
+from torchpt.core.files import Unfit, check_regular, read_regular
 from torchpt.images import has_alpha, read_header, read_image, read_layers, read_texels
-from torchpt.meshes import FORMATS, PARSERS, load_mesh, mesh_part
+from torchpt.scene.formats import description, yaml
+from torchpt.scene.formats.description import read_description
+from torchpt.scene.formats.yaml import parse_yaml, plain
+from torchpt.scene.meshes import FORMATS, PARSERS, load_mesh, mesh
 
 CAMERA = {"origin": [0, 1, 4], "target": [0, 0, 0]}
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="devices and pipes are others there")
@@ -192,7 +192,7 @@ def test_entries_are_bounded(monkeypatch: pytest.MonkeyPatch, block: str) -> Non
     "text", ["[" + "1, " * 60 + "]", "- 1\n" * 60, "a: [[1, 1], [1, 1], [1, 1], [1, 1], [1, 1], [1, 1]]"]
 )
 def test_values_are_bounded_while_they_are_read(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    monkeypatch.setattr(yaml_file, "MAX_VALUES", 15)
+    monkeypatch.setattr(yaml, "MAX_VALUES", 15)
     with pytest.raises(SceneError, match="at most 15 values, got 16"):
         parse_yaml(text)
 
@@ -202,14 +202,14 @@ def test_parts_are_bounded_and_quick(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     file.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(f"usemtl m{number}\nf 1 2 3\n" for number in range(5000)))
     parts = load_mesh(file)
     assert [part.name for part in parts] == [f"m{number}" for number in range(5000)]
-    monkeypatch.setattr("torchpt.meshes.obj.MOST_PARTS", 4999)
-    assert f"more than {mesh_part.MOST_PARTS} parts" in refused(lambda: load_mesh(file))
+    monkeypatch.setattr("torchpt.scene.meshes.obj.MOST_PARTS", 4999)
+    assert f"more than {mesh.MOST_PARTS} parts" in refused(lambda: load_mesh(file))
     document, body = gltf_document()
     document["nodes"] = [{"children": list(range(1, 5))}, *({"mesh": 0} for _ in range(4))]
     file = tmp_path / "a.glb"
     file.write_bytes(glb(document, body))
     assert len(load_mesh(file)) == 4
-    monkeypatch.setattr("torchpt.meshes.gltf.MOST_PARTS", 3)
+    monkeypatch.setattr("torchpt.scene.meshes.gltf.MOST_PARTS", 3)
     assert "parts; at most so many are read" in refused(lambda: load_mesh(file))
 
 
@@ -256,7 +256,7 @@ def test_xml_entities_are_refused_in_any_encoding(tmp_path: Path, text: bytes) -
 def test_a_film_that_memory_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """It ended the process: a film of 2^28 pixels takes tens of GiB."""
     scene = torchpt.load({"camera": CAMERA, "film": {"width": 16384, "height": 16384}}, "cpu")
-    monkeypatch.setattr("torchpt.forward.need.free_memory", lambda _: 2**30)
+    monkeypatch.setattr("torchpt.scene.need.free_memory", lambda _: 2**30)
     with pytest.raises(
         SceneError, match=r"^film.width: expected a film that fits into memory: .* 1.0 GiB are free, got \[16384"
     ):

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchpt.errors import AssetError, NotBuiltError, SceneError
-from torchpt.files import configs
-from torchpt.format.cameras import read_camera
-from torchpt.format.description import read_description, scene_names, settings
+from torchpt.core.errors import AssetError, NotBuiltError, SceneError
+from torchpt.core.files import configs
 from torchpt.scene.build import build_parts
-from torchpt.spec.declared import Described
+from torchpt.scene.formats.cameras import read_camera
+from torchpt.scene.formats.description import read_description, scene_names, settings
+from torchpt.spec.schema import Described
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
 TRIANGLE = {"type": "mesh", "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "faces": [[0, 1, 2]]}

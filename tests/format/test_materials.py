@@ -14,32 +14,32 @@ from few import few
 from torch import Tensor
 
 import torchpt
-from torchpt.adjoint import attached
-from torchpt.bsdfs import KINDS, Bsdf, Parameters
-from torchpt.bsdfs.kinds.blend import Blend
-from torchpt.bsdfs.kinds.blinn_phong import BlinnPhong
-from torchpt.bsdfs.kinds.conductor import Conductor
-from torchpt.bsdfs.kinds.dielectric import Dielectric
-from torchpt.bsdfs.kinds.diffuse import Diffuse
-from torchpt.bsdfs.kinds.microfacet import Microfacet
-from torchpt.bsdfs.kinds.nonmetal import Nonmetal
-from torchpt.bsdfs.kinds.null import Null
-from torchpt.bsdfs.kinds.phong import Phong
-from torchpt.bsdfs.kinds.plastic import Plastic
-from torchpt.bsdfs.kinds.principled import Principled
-from torchpt.bsdfs.kinds.roughconductor import RoughConductor
-from torchpt.bsdfs.kinds.roughdielectric import RoughDielectric
-from torchpt.bsdfs.kinds.roughplastic import RoughPlastic
-from torchpt.bsdfs.kinds.thindielectric import ThinDielectric
-from torchpt.bsdfs.presets import INDICES, METALS, metal
-from torchpt.bsdfs.resolved import ResolvedMaterial
-from torchpt.errors import EnergyWarning, NotBuiltError, SceneError
-from torchpt.format.description import Description, read_description
-from torchpt.format.materials import MAX_BLENDS
-from torchpt.records import BsdfSample
+from torchpt.core.errors import EnergyWarning, NotBuiltError, SceneError
+from torchpt.gradients import attached
+from torchpt.physics.bsdfs import KINDS, Bsdf, Parameters
+from torchpt.physics.bsdfs.kinds.blend import Blend
+from torchpt.physics.bsdfs.kinds.blinn_phong import BlinnPhong
+from torchpt.physics.bsdfs.kinds.conductor import Conductor
+from torchpt.physics.bsdfs.kinds.dielectric import Dielectric
+from torchpt.physics.bsdfs.kinds.diffuse import Diffuse
+from torchpt.physics.bsdfs.kinds.microfacet import Microfacet
+from torchpt.physics.bsdfs.kinds.nonmetal import Nonmetal
+from torchpt.physics.bsdfs.kinds.null import Null
+from torchpt.physics.bsdfs.kinds.phong import Phong
+from torchpt.physics.bsdfs.kinds.plastic import Plastic
+from torchpt.physics.bsdfs.kinds.principled import Principled
+from torchpt.physics.bsdfs.kinds.roughconductor import RoughConductor
+from torchpt.physics.bsdfs.kinds.roughdielectric import RoughDielectric
+from torchpt.physics.bsdfs.kinds.roughplastic import RoughPlastic
+from torchpt.physics.bsdfs.kinds.thindielectric import ThinDielectric
+from torchpt.physics.bsdfs.presets import INDICES, METALS, metal
+from torchpt.physics.bsdfs.records import BsdfSample
+from torchpt.physics.bsdfs.resolved import ResolvedMaterial
+from torchpt.scene.formats.description import Description, read_description
+from torchpt.scene.formats.materials import MAX_BLENDS
 from torchpt.scene.materials import resolved
 from torchpt.spec import Color, Flag, Index, Refused, Scalar, parameters_of
-from torchpt.spec.declared import Described
+from torchpt.spec.schema import Described
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
 AIR, BK7, PP = 1.000277, 1.5046, 1.49

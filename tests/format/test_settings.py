@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from torchpt.errors import SceneError
-from torchpt.format.description import read_description, settings
-from torchpt.integrators import KINDS
-from torchpt.settings import Settings
+from torchpt.core.errors import SceneError
+from torchpt.paths.integrators import KINDS
+from torchpt.scene.formats.description import read_description, settings
+from torchpt.scene.settings import Settings
 
 PATH, DIRECT = KINDS["path"], KINDS["direct"]
 

@@ -9,7 +9,7 @@ import re
 import pytest
 
 import torchpt
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 
 TEXT = """
 camera: {type: perspective, origin: [0, 0, 4], target: [0, 0, 0], fov: 40}
@@ -25,7 +25,7 @@ BALL = (
 
 
 def test_all_forms_give_one_picture(tmp_path, monkeypatch):
-    from torchpt.format.yaml_file import parse_yaml
+    from torchpt.scene.formats.yaml import parse_yaml
 
     (tmp_path / "ball.ply").write_text(BALL)
     (tmp_path / "s.yaml").write_text(TEXT)

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0], "fov": 20}
 
@@ -97,7 +97,7 @@ def test_files_that_are_not_there_or_lack_alpha(tmp_path: Path):
 def test_info_says_what_is_read(png: str):
     image = {"type": "image", "path": png, "scale": 0.9}
     found = scene({"m": {"type": "diffuse", "reflectance": image}, "n": {"type": "diffuse"}})
-    from torchpt.format.description import settings
+    from torchpt.scene.formats.description import settings
 
     info = found.info(settings(found.description))
     assert info["built"]["bsdfs"] == {"diffuse, textured: reflectance": 1, "diffuse": 1}
@@ -206,7 +206,7 @@ def test_images_are_capped_unless_said_otherwise(png: str, monkeypatch: pytest.M
     with pytest.raises(torchpt.AssetError, match="more than 23 pixels"):
         material = {"type": "principled", "base_color": image, "roughness": {**image, "max_pixels": 23}}
         scene({"m": material})
-    monkeypatch.setattr("torchpt.textures.kinds.image.MAX_PIXELS", 10)
+    monkeypatch.setattr("torchpt.physics.textures.kinds.image.MAX_PIXELS", 10)
     with pytest.raises(torchpt.AssetError, match="more than 10 pixels"):
         scene({"m": {"type": "diffuse", "reflectance": image}})
     scene({"m": {"type": "diffuse", "reflectance": {**image, "max_pixels": 24}}})

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from torchpt.errors import SceneError
-from torchpt.format.description import read_description
-from torchpt.format.yaml_file import parse_yaml, plain
+from torchpt.core.errors import SceneError
+from torchpt.scene.formats.description import read_description
+from torchpt.scene.formats.yaml import parse_yaml, plain
 
 CAMERA = "camera: {origin: [0, 0, 1], target: [0, 0, 0]}\n"
 

@@ -13,18 +13,18 @@ import torch
 import yaml
 from damage import damaged
 
-from torchpt.bsdfs import KINDS as MATERIALS
-from torchpt.cameras import KINDS as CAMERAS
-from torchpt.files import configs
-from torchpt.film import FILTERS
-from torchpt.format.yaml_file import read_yaml
-from torchpt.integrators import KINDS as INTEGRATORS
-from torchpt.lights import KINDS as LIGHTS
-from torchpt.samplers import KINDS as SAMPLERS
-from torchpt.settings import RECORDS
-from torchpt.shapes import KINDS as SHAPES
+from torchpt.core.files import configs
+from torchpt.paths.integrators import KINDS as INTEGRATORS
+from torchpt.physics.bsdfs import KINDS as MATERIALS
+from torchpt.physics.cameras import KINDS as CAMERAS
+from torchpt.physics.film import FILTERS
+from torchpt.physics.lights import KINDS as LIGHTS
+from torchpt.physics.samplers import KINDS as SAMPLERS
+from torchpt.physics.shapes import KINDS as SHAPES
+from torchpt.physics.textures import KINDS as TEXTURES
+from torchpt.scene.formats.yaml import read_yaml
+from torchpt.scene.settings import RECORDS
 from torchpt.spec import REQUIRED, parameters_of
-from torchpt.textures import KINDS as TEXTURES
 
 #: What a document names as meshes and pictures: files that lie beside it.
 MESHES, PICTURES = ("a.obj", "a.ply", "a.glb", "a.stl", "a.off"), ("a.png", "a.exr", "a.jpg", "a.hdr")

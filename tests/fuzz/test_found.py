@@ -13,10 +13,10 @@ import pytest
 from small_files import float_picture
 
 import torchpt
-from torchpt.errors import AssetError
+from torchpt.core.errors import AssetError
 from torchpt.images import read_header, read_image
 from torchpt.images.layers import group_channels
-from torchpt.meshes import load_mesh
+from torchpt.scene.meshes import load_mesh
 
 BALL: dict[str, Any] = {
     "camera": {"origin": [0, 0, 4], "target": [0, 0, 0]},

@@ -36,7 +36,7 @@ def peak() -> int:
 
 def outcome(act: Callable[[], str]) -> dict[str, Any]:
     """What came of a try: ``said`` is a word, or the line of a refusal; ``wrong`` is set where it may not be so."""
-    from torchpt.errors import EdgeWarning, EnergyWarning, TorchptError
+    from torchpt.core.errors import EdgeWarning, EnergyWarning, TorchptError
 
     peak()
     before = peak()
@@ -82,8 +82,8 @@ def load_and_render(source: Any, seed: int = 0) -> str:
     import torch
 
     import torchpt
-    from torchpt.format.description import overridden
-    from torchpt.rendering import render_scene
+    from torchpt.rendering.api import render_scene
+    from torchpt.scene.formats.description import overridden
 
     scene = torchpt.load(source)
     compiled = "on" if seed % COMPILED == 0 else "off"

@@ -10,10 +10,10 @@ from few import few
 from torch import Tensor
 
 import torchpt
-from torchpt.bsdfs.kinds.roughconductor import RoughConductor
-from torchpt.ibl import convolve, equirect
-from torchpt.ibl.cube import look_up_cube
-from torchpt.ibl.pyramid import Pyramid
+from torchpt.physics.bsdfs.kinds.roughconductor import RoughConductor
+from torchpt.physics.ibl import convolve, equirect
+from torchpt.physics.ibl.cube import look_up_cube
+from torchpt.physics.ibl.pyramid import Pyramid
 
 RESULT = (5, 8)
 

@@ -12,11 +12,11 @@ from few import few
 from torch import Tensor
 
 import torchpt
-from torchpt import bsdfs
-from torchpt.ibl import IblMaps, Sky, brdf_table
-from torchpt.integrators.split_sum import under
-from torchpt.lights import without_environment
-from torchpt.math.distributions import Discrete
+from torchpt.math.sampling import Discrete
+from torchpt.paths.integrators.split_sum import under
+from torchpt.physics import bsdfs
+from torchpt.physics.ibl import IblMaps, Sky, brdf_table
+from torchpt.physics.lights import without_environment
 
 IBL = {"type": "ibl"}
 WHITE = {"sky": {"type": "constant", "radiance": 1.0}}

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.images.colour import TONEMAPS, display, linear_to_srgb, srgb_to_linear
 
 

@@ -14,12 +14,12 @@ from torch import Tensor
 
 import torchpt
 from torchpt import metrics
-from torchpt.errors import RenderError, SceneError
-from torchpt.format.description import settings
-from torchpt.forward import Rendering
+from torchpt.core.errors import RenderError, SceneError
 from torchpt.images.denoiser import GUIDES
-from torchpt.rendering import render_scene
-from torchpt.settings import Settings
+from torchpt.rendering import Rendering
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
+from torchpt.scene.settings import Settings
 
 needs_library = pytest.mark.skipif(find_spec("pyoidn") is None, reason="pyoidn is not installed (extra `denoise`)")
 SIDE = 48

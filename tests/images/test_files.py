@@ -13,7 +13,7 @@ import pytest
 import torch
 from few import few
 
-from torchpt.errors import AssetError, OutputError
+from torchpt.core.errors import AssetError, OutputError
 from torchpt.images import check_writable, read_image, read_layers, write_image
 from torchpt.images import read as read_module
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.errors import AssetError
+from torchpt.core.errors import AssetError
 from torchpt.images import read_header, write_image
 
 GREY = torch.full((3, 4, 3), 0.5)

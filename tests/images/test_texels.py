@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torchpt.errors import AssetError
+from torchpt.core.errors import AssetError
 from torchpt.images import EncodedImage, read_texels, write_image
 
 RNG = np.random.default_rng(11)

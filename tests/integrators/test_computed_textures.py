@@ -10,9 +10,9 @@ import torch
 from few import few
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.rendering import Rendering, render_scene
-from torchpt.textures import TexturePoint
+from torchpt.physics.textures import TexturePoint
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.scene.formats.description import settings
 
 NOISE: dict[str, Any] = {"type": "noise", "scale": 3, "octaves": 2, "seed": 1}
 SIZE = 384

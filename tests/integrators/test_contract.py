@@ -12,10 +12,10 @@ from few import few
 from few_lanes import few_lanes
 
 import torchpt
-from torchpt.errors import SceneError
-from torchpt.format.description import read_description, settings
-from torchpt.integrators import KINDS, LAYERS
-from torchpt.integrators.base import Integrator
+from torchpt.core.errors import SceneError
+from torchpt.paths.integrators import KINDS, LAYERS
+from torchpt.paths.integrators.base import Integrator
+from torchpt.scene.formats.description import read_description, settings
 from torchpt.spec import Scalar, parameters_of
 
 #: What a convex body of this albedo shows in a furnace.
@@ -214,7 +214,7 @@ LAYER_ROWS = {
 
 
 def layers_of(scene: torchpt.Scene, name: str, compiled: bool, **wish: Any) -> torch.Tensor:
-    from torchpt.rendering import render_scene
+    from torchpt.rendering.api import render_scene
 
     given = {"film": {"aovs": [name]}, "render": {"spp": 4, "compile": compiled}, **wish}
     found = render_scene(scene, settings(scene.description, given))

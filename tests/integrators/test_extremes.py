@@ -9,7 +9,7 @@ import torch
 from trials import estimate, film_of, shoot
 
 import torchpt
-from torchpt.integrators import base
+from torchpt.paths.integrators import base
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0], "fov": 40}
 SKY = {"sky": {"type": "constant", "radiance": [0.25, 0.5, 1.0]}}

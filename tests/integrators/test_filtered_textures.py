@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.errors import SceneError
-from torchpt.format.description import settings
+from torchpt.core.errors import SceneError
 from torchpt.images import write_image
-from torchpt.rendering import render_scene
-from torchpt.textures.atlas import Atlas
+from torchpt.physics.textures.atlas import Atlas
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
 

@@ -26,7 +26,7 @@ from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p, coarse, film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt.format.description import settings
+from torchpt.scene.formats.description import settings
 
 ROOT = Path(__file__).parent.parent.parent
 SEEDS = 32

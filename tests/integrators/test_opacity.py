@@ -160,8 +160,8 @@ def test_layers_see_through():
 
 def covered(description: dict[str, Any], filter: str, compiled: bool, spp: int = 64) -> torch.Tensor:
     """The layer `alpha` of 24 x 24 pixels."""
-    from torchpt.format.description import settings
-    from torchpt.rendering import render_scene
+    from torchpt.rendering.api import render_scene
+    from torchpt.scene.formats.description import settings
 
     loaded = torchpt.load(description, device="cpu")
     film = {"width": 24, "height": 24, "filter": filter, "aovs": ["alpha"]}

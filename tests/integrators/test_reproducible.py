@@ -24,13 +24,17 @@ from trials import film_of, shoot
 
 import torchpt
 from torchpt.engines import tensors
-from torchpt.integrators.wave import Wave
-from torchpt.math.distributions import Discrete
-from torchpt.math.frames import Frame
-from torchpt.math.mis import power_heuristic
-from torchpt.math.vectors import normalize
-from torchpt.math.warps import concentric_disk, one_minus_cos, uniform_cone, uniform_sphere
-from torchpt.samplers import KINDS as SAMPLERS
+from torchpt.math.sampling import (
+    Discrete,
+    concentric_disk,
+    one_minus_cos,
+    power_heuristic,
+    uniform_cone,
+    uniform_sphere,
+)
+from torchpt.math.vectors import Frame, normalize
+from torchpt.paths.wave import Wave
+from torchpt.physics.samplers import KINDS as SAMPLERS
 
 GRAIN = 32_768  # elements that torch leaves to one thread
 N = 70_003  # above that: two threads share it, and the last vector is not full
@@ -109,7 +113,7 @@ OPERATIONS: list[tuple[str, Callable[..., torch.Tensor]]] = [
     ("", lambda a, b, u: CHOICE.draw(u[0])[1].float()),
 ]
 #: What moves numbers or makes constants, without arithmetic (scatters here have distinct indices), and operators of ours
-#: that tests of their own hold to the bit: tests/samplers/test_kernels.py, tests/accel.
+#: that tests of their own hold to the bit: tests/samplers/test_kernels.py, tests/search.
 EXACT = {
     "_to_copy", "_unsafe_view", "alias", "arange", "cat", "clone", "copy_", "detach", "empty", "empty_like", "expand",
     "full", "full_like", "gather", "index", "index_copy", "index_select", "lift_fresh", "new_zeros", "ones", "ones_like",

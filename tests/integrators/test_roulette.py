@@ -9,9 +9,10 @@ import pytest
 import torch
 from trials import estimate, film_of, shoot, z_limit
 
-from torchpt.integrators import base, roulette
-from torchpt.integrators.base import Limits
-from torchpt.samplers import Draws
+from torchpt.paths import roulette
+from torchpt.paths.integrators import base
+from torchpt.paths.integrators.base import Limits
+from torchpt.physics.samplers import Draws
 
 
 class _Drawn(Draws):

@@ -12,7 +12,7 @@ from few import few
 from trials import film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt.files import configs
+from torchpt.core.files import configs
 
 SMALL = film_of(24)
 

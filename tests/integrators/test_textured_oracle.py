@@ -12,10 +12,10 @@ from mitsuba_scene import load_mitsuba
 from torch import Tensor
 
 import torchpt
-from torchpt.integrators.surfaces import surface_at
 from torchpt.math.vectors import dot, take
-from torchpt.records import Hit
-from torchpt.shapes import interact, surface_uv
+from torchpt.paths.surface import surface_at
+from torchpt.physics.shapes import interact, surface_uv
+from torchpt.physics.shapes.geometry import Hit
 
 pytestmark = pytest.mark.mitsuba
 

@@ -11,16 +11,15 @@ import torch
 from trials import coarse, film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt import lights
-from torchpt.accel.bounds import primitive_bounds
-from torchpt.errors import EdgeWarning, SceneError
-from torchpt.format.description import settings
-from torchpt.lights.bounds import bounds_of
-from torchpt.lights.choice import MANY, ByTree, draw, probability
-from torchpt.math.distributions import Discrete
-from torchpt.records import Hit
-from torchpt.shapes import interact
-from torchpt.shapes.interaction import OFFSET
+from torchpt.core.errors import EdgeWarning, SceneError
+from torchpt.math.sampling import Discrete
+from torchpt.physics import lights
+from torchpt.physics.lights.choice import MANY, ByTree, bounds_of, draw, probability
+from torchpt.physics.shapes import interact
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.physics.shapes.interaction import OFFSET
+from torchpt.scene.formats.description import settings
+from torchpt.search.bounds import primitive_bounds
 
 G = torch.Generator().manual_seed(8)
 LIFT = {"translate": [0, 1.2, 0]}

@@ -19,16 +19,17 @@ from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p
 
 import torchpt
-from torchpt import lights, spec
-from torchpt.accel.bounds import primitive_bounds
-from torchpt.errors import SceneError
-from torchpt.lights.bounds import bounds_of
-from torchpt.math.distributions import Discrete
-from torchpt.math.frames import Frame
-from torchpt.math.vectors import dot, luminance, normalize
-from torchpt.records import Hit, LightSample
-from torchpt.shapes import interact
-from torchpt.shapes.interaction import OFFSET
+from torchpt import spec
+from torchpt.core.errors import SceneError
+from torchpt.math.sampling import Discrete
+from torchpt.math.vectors import Frame, dot, luminance, normalize
+from torchpt.physics import lights
+from torchpt.physics.lights.choice import bounds_of
+from torchpt.physics.lights.records import LightSample
+from torchpt.physics.shapes import interact
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.physics.shapes.interaction import OFFSET
+from torchpt.search.bounds import primitive_bounds
 
 N = 1 << 14
 COLOR = [3.0, 2.0, 1.0]

@@ -11,11 +11,11 @@ from few import few
 from trials import film_of, shoot, z_limit
 
 import torchpt
-from torchpt import lights
-from torchpt.errors import EdgeWarning, SceneError
-from torchpt.math.distributions import Discrete
+from torchpt.core.errors import EdgeWarning, SceneError
+from torchpt.math.sampling import Discrete
 from torchpt.math.vectors import normalize
-from torchpt.shapes.interaction import OFFSET
+from torchpt.physics import lights
+from torchpt.physics.shapes.interaction import OFFSET
 
 ALBEDO = 0.6
 LIGHTS: dict[str, dict[str, Any]] = {

@@ -14,10 +14,10 @@ from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p, coarse, estimate, film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt.errors import AssetError, SceneError
-from torchpt.format.description import settings
-from torchpt.lights.kinds.envmap import EnvironmentMap
-from torchpt.math.distributions import Discrete
+from torchpt.core.errors import AssetError, SceneError
+from torchpt.math.sampling import Discrete
+from torchpt.physics.lights.kinds.envmap import EnvironmentMap
+from torchpt.scene.formats.description import settings
 
 ALBEDO = 0.6
 

@@ -11,10 +11,8 @@ from few import few
 from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p, z_limit
 
-from torchpt.lights.kinds import envmap
-from torchpt.math.distributions import Cells, invert_linear
-from torchpt.math.mis import power_heuristic
-from torchpt.math.warps import cosine_hemisphere, uniform_sphere
+from torchpt.math.sampling import Cells, cosine_hemisphere, invert_linear, power_heuristic, uniform_sphere
+from torchpt.physics.lights.kinds import envmap
 
 N = 1 << 16
 EYE = torch.eye(3)

@@ -10,9 +10,9 @@ from few import few
 from significance import z_limit
 
 import torchpt
-from torchpt.errors import SceneError
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.core.errors import SceneError
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
 
 UP = {"rotate": {"axis": [1, 0, 0], "angle": -90}}
 DOWN = {"rotate": {"axis": [1, 0, 0], "angle": 90}}

@@ -11,13 +11,13 @@ from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p
 
 import torchpt
-from torchpt import lights
-from torchpt.lights.surfaces import sphere
-from torchpt.math.distributions import Discrete
+from torchpt.math.sampling import Discrete
 from torchpt.math.vectors import dot
-from torchpt.records import Hit
-from torchpt.shapes import interact
-from torchpt.shapes.interaction import OFFSET
+from torchpt.physics import lights
+from torchpt.physics.lights.surfaces import sphere
+from torchpt.physics.shapes import interact
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.physics.shapes.interaction import OFFSET
 
 G = torch.Generator().manual_seed(12)
 N = 1 << 15

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 import torchpt
-from torchpt import lights
-from torchpt.math.mis import power_heuristic
+from torchpt.math.sampling import power_heuristic
 from torchpt.math.vectors import dot
-from torchpt.records import KINDS, Hit
-from torchpt.shapes import interact, offset_origin
-from torchpt.shapes.interaction import OFFSET
+from torchpt.physics import lights
+from torchpt.physics.shapes import interact, offset_origin
+from torchpt.physics.shapes.geometry import KINDS, Hit
+from torchpt.physics.shapes.interaction import OFFSET
 
 GLOW = {"emission": [1, 2, 3]}
 TILT = {"rotate": {"axis": [1, 2, 0.5], "angle": 100}}

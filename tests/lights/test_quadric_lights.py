@@ -10,12 +10,11 @@ from few import few
 from trials import film_of, shoot, spread, z_limit
 
 import torchpt
-from torchpt import lights
-from torchpt.math.distributions import Discrete
-from torchpt.math.warps import uniform_sphere
-from torchpt.records import Hit
-from torchpt.shapes import interact
-from torchpt.shapes.interaction import OFFSET
+from torchpt.math.sampling import Discrete, uniform_sphere
+from torchpt.physics import lights
+from torchpt.physics.shapes import interact
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.physics.shapes.interaction import OFFSET
 
 N = 1 << 16
 SHEAR = {"matrix": [[1, 0.5, -0.2, 0.2], [0.1, 0.7, 0.4, 2.2], [-0.6, 0.2, 1.1, -0.4], [0, 0, 0, 1]]}

@@ -12,12 +12,12 @@ from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p
 
 import torchpt.engines  # noqa: F401  (takes sampling over)
-from torchpt.lanes.function import Lanewise
-from torchpt.lights import solid_angle
-from torchpt.lights.solid_angle import LEAST, MOST, OTHER, RECTANGLE, SKEW, TRIANGLE
-from torchpt.lights.surface import flat_inverse_pdf as planar
+from torchpt.compiler.function import Lanewise
+from torchpt.math.sampling import uniform_triangle
 from torchpt.math.vectors import affine, cross, dot, normalize
-from torchpt.math.warps import uniform_triangle
+from torchpt.physics.lights import solid_angle
+from torchpt.physics.lights.solid_angle import LEAST, MOST, OTHER, RECTANGLE, SKEW, TRIANGLE
+from torchpt.physics.lights.surface import flat_inverse_pdf as planar
 
 D = torch.float64
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from trials import SIGNIFICANCE, chi_square_p
 
 import torchpt.engines  # noqa: F401  (takes the walk over)
-from torchpt.lanes.function import Lanewise
-from torchpt.lights import tree
-from torchpt.lights.tree import LightTree
+from torchpt.compiler.function import Lanewise
+from torchpt.physics.lights import tree
+from torchpt.physics.lights.tree import LightTree
 
 G = torch.Generator().manual_seed(5)
 CASES = [

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchpt.math.angles import azimuth
+from torchpt.math.vectors import azimuth
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.math.fresnel import diffuse_passed, fresnel_conductor, fresnel_dielectric, refract, schlick
+from torchpt.math.microfacet import diffuse_passed, fresnel_conductor, fresnel_dielectric, refract, schlick
 
 INDICES = [1e-3, 1 / 1.5, 0.99, 1.0, 1.00001, 1.01, 1.5, 10.0]
 COSINES = torch.linspace(-1, 1, 401, dtype=torch.float64)

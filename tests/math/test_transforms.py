@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.math.transforms import apply_points, compose, is_singular, look_at, rotate, similarity_scale
 
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.cameras import opencv, poses
 from torchpt.math import transforms
-from torchpt.shapes import KINDS
-from torchpt.shapes.base import Place, Size
+from torchpt.physics.cameras import opencv, poses
+from torchpt.physics.shapes import KINDS
+from torchpt.physics.shapes.base import Place, Size
 from torchpt.spec import parameters_of
 
 CPU = torch.device("cpu")

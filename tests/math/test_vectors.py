@@ -8,11 +8,8 @@ import pytest
 import torch
 from trials import SIGNIFICANCE, chi_square_p
 
-from torchpt.math.distributions import Discrete
-from torchpt.math.frames import Frame
-from torchpt.math.mis import power_heuristic
-from torchpt.math.vectors import cross, dot, luminance, normalize, take
-from torchpt.math.warps import uniform_sphere
+from torchpt.math.sampling import Discrete, power_heuristic, uniform_sphere
+from torchpt.math.vectors import Frame, cross, dot, luminance, normalize, take
 
 G = torch.Generator().manual_seed(4)
 AXES = torch.cat((torch.eye(3), -torch.eye(3)), 1)

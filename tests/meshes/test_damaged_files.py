@@ -32,9 +32,9 @@ from small_files import (
     sixteen_bits,
 )  # fmt: skip
 
-from torchpt.errors import AssetError
+from torchpt.core.errors import AssetError
 from torchpt.images import EncodedImage, read_texels
-from torchpt.meshes import load_mesh
+from torchpt.scene.meshes import load_mesh
 
 SECONDS = 5.0
 
@@ -216,9 +216,9 @@ SCRIPT = """
 import resource, sys
 from pathlib import Path
 import OpenImageIO, PIL.Image, PIL.TgaImagePlugin, torch  # what is imported is no part of the measurement
-from torchpt.errors import AssetError
+from torchpt.core.errors import AssetError
 from torchpt.images import read_texels
-from torchpt.meshes import FORMATS, load_mesh
+from torchpt.scene.meshes import FORMATS, load_mesh
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 for name in sys.argv[1:]:
     try:

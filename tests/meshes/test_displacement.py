@@ -11,8 +11,8 @@ import torch
 from cubes import unit_cube
 
 import torchpt
-from torchpt.meshes import MeshPart
-from torchpt.meshes.displacement import displaced, subdivided
+from torchpt.scene.meshes import MeshPart
+from torchpt.scene.meshes.mesh import displaced, subdivided
 
 CAMERA = {"origin": [0, 0, 4], "target": [0, 0, 0]}
 SQUARE: dict[str, Any] = {

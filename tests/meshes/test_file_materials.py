@@ -14,8 +14,8 @@ import torch
 from PIL import Image
 
 import torchpt
-from torchpt.errors import AssetError
-from torchpt.format.description import settings
+from torchpt.core.errors import AssetError
+from torchpt.scene.formats.description import settings
 
 FLAT = {"width": 32, "height": 32, "filter": "box"}
 SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"

@@ -14,10 +14,10 @@ import torch
 import yaml
 
 import torchpt
-from torchpt.errors import AssetError, EdgeWarning, SceneError
-from torchpt.format.cameras import read_camera
-from torchpt.format.description import settings
-from torchpt.meshes import FileLight, load_mesh
+from torchpt.core.errors import AssetError, EdgeWarning, SceneError
+from torchpt.scene.formats.cameras import read_camera
+from torchpt.scene.formats.description import settings
+from torchpt.scene.meshes import FileLight, load_mesh
 
 HALF = math.sqrt(0.5)
 BULB = {"name": "bulb", "type": "point", "color": [1, 0.5, 0.25], "intensity": 8, "range": 50}

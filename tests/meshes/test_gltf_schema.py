@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from small_files import glb, gltf_document
 
-from torchpt.errors import AssetError
-from torchpt.meshes import load_mesh
+from torchpt.core.errors import AssetError
+from torchpt.scene.meshes import load_mesh
 
 #: Where something is put in, what, and what is said of it.
 CASES: list[tuple[str, Any, str]] = [

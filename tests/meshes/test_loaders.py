@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from cubes import unit_cube
 
-from torchpt.errors import AssetError
-from torchpt.meshes import MeshPart, load_mesh, smooth_normals
+from torchpt.core.errors import AssetError
+from torchpt.scene.meshes import MeshPart, load_mesh, smooth_normals
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
 HEADER = "ply\nformat {}\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face {}\n"

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchpt.bsdfs import KINDS
-from torchpt.errors import AssetError
-from torchpt.format.materials import check_material, read_material
+from torchpt.core.errors import AssetError
 from torchpt.images import EncodedImage
-from torchpt.meshes import MeshPart, load_mesh
+from torchpt.physics.bsdfs import KINDS
+from torchpt.scene.formats.materials import check_material, read_material
+from torchpt.scene.meshes import MeshPart, load_mesh
 
 
 def accepted(material: dict[str, Any]) -> None:

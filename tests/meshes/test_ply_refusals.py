@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from torchpt.errors import AssetError
-from torchpt.meshes import load_mesh
+from torchpt.core.errors import AssetError
+from torchpt.scene.meshes import load_mesh
 
 VERTEX = "element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
 FACE = "element face 2\nproperty list uchar int vertex_indices\n"

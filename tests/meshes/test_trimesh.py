@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 import torchpt
-from torchpt.errors import AssetError, SceneError
+from torchpt.core.errors import AssetError, SceneError
 from torchpt.images import EncodedImage, read_texels
 from torchpt.scene.from_trimesh import description_of
 
@@ -83,7 +83,7 @@ def test_colours_of_vertices_and_faces() -> None:
 
 
 def look_of(material: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
-    from torchpt.meshes.trimesh_parts import mesh_parts_of
+    from torchpt.scene.meshes.trimesh_objects import mesh_parts_of
 
     (part,) = mesh_parts_of(square(material))
     assert part.material is not None

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 import torchpt
+from torchpt.core.errors import SceneError
 from torchpt.data import RenderDataset, RenderStream
-from torchpt.errors import SceneError
 
 Items = dict[int, dict[str, Tensor]]
 

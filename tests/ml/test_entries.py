@@ -14,8 +14,8 @@ import torch
 
 import torchpt
 from torchpt import cameras, losses
+from torchpt.core.errors import SceneError
 from torchpt.data import RenderDataset, RenderStream
-from torchpt.errors import SceneError
 from torchpt.nn import Renderer
 
 PAINT = "materials.m.reflectance"

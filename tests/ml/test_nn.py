@@ -14,9 +14,9 @@ from scene_makers import room
 from torch import Tensor
 
 import torchpt
+from torchpt.compiler import cpu
+from torchpt.core.errors import SceneError
 from torchpt.core.memory import Meter, let_go
-from torchpt.errors import SceneError
-from torchpt.lanes import engine
 from torchpt.nn import Renderer
 from torchpt.nn.ranges import Above, Bounded, Free, Rigid, range_of
 from torchpt.spec import Angle, Color, Index, Scalar
@@ -361,7 +361,7 @@ def test_thirty_steps_bring_the_loss_down_and_compile_once():
     alive: list[int] = []
 
     def seen(step: int) -> None:
-        made.append(engine.counts())
+        made.append(cpu.counts())
         if step in (9, 29):
             alive.append(tensors())
 
@@ -379,7 +379,7 @@ def test_a_thousand_steps_take_no_more_memory_than_a_hundred():
     made: list[tuple[int, int]] = []
 
     def seen(step: int) -> None:
-        made.append(engine.counts())
+        made.append(cpu.counts())
         if step >= 300 and step % 20 == 0:
             gc.collect()
             let_go()  # what the allocator keeps for later is no growth

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.nn.ranges import Rigid
 
 ALBEDO, BALL, FOV = "materials.paint.reflectance", "shapes.ball.to_world", "camera.fov"

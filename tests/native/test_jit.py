@@ -114,8 +114,10 @@ def test_each_kernel_has_a_name():
     """What a kernel reads can be told of all of them, so that all are kept."""
     package = Path(content.__file__).parents[1]
     found: dict[str, str] = {}
-    for path in sorted([*package.glob("*/kernels*.py"), package / "lights" / "tree_build.py"]):
-        module = importlib.import_module(f"torchpt.{path.parent.name}.{path.stem}")
+    for path in sorted(
+        [*package.glob("search/*.py"), package / "physics/lights/tree_build.py", package / "gradients/kernels.py"]
+    ):
+        module = importlib.import_module(".".join(("torchpt", *path.relative_to(package).with_suffix("").parts)))
         for name, value in vars(module).items():
             if hasattr(value, "py_func") and value.py_func.__module__ == module.__name__:
                 found[f"{module.__name__}.{name}"] = code_of_function(value)
@@ -123,11 +125,11 @@ def test_each_kernel_has_a_name():
 
 
 def test_the_code_of_intrinsics_is_content(monkeypatch):
-    from torchpt.accel import kernels_search
+    from torchpt.search import tree_packet
 
-    before = code_of_function(kernels_search.nearest)
+    before = code_of_function(tree_packet.nearest)
     monkeypatch.setattr(content, "code_of_folder", lambda folder: "other")
-    assert code_of_function(kernels_search.nearest) != before
+    assert code_of_function(tree_packet.nearest) != before
 
 
 def entries() -> list[Path]:

@@ -15,15 +15,15 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.integrators.base import Limits
-from torchpt.integrators.kinds.aov import Aov
-from torchpt.integrators.kinds.path import Path
-from torchpt.integrators.vertex import Emission, Field, StageContext, Transmission, VertexInput, VertexOutput
+from torchpt.math.sampling import cosine_hemisphere, uniform_sphere
 from torchpt.math.vectors import dot
-from torchpt.math.warps import cosine_hemisphere, uniform_sphere
-from torchpt.records import BsdfSample
-from torchpt.samplers import Dimension, Draws
-from torchpt.shapes import interact
+from torchpt.paths.integrators.base import Limits
+from torchpt.paths.integrators.kinds.aov import Aov
+from torchpt.paths.integrators.kinds.path import Path
+from torchpt.paths.state import Emission, Field, StageContext, Transmission, VertexInput, VertexOutput
+from torchpt.physics.bsdfs.records import BsdfSample
+from torchpt.physics.samplers import Dimension, Draws
+from torchpt.physics.shapes import interact
 
 ENGINES = ("off", "on")
 

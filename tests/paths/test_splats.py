@@ -17,10 +17,9 @@ from mirrored import KEYS, Mirrored, lights, room
 from torch import Tensor
 
 import torchpt
-from torchpt.film.splats import LARGEST, SplatSums
-from torchpt.integrators.kinds.path import Path
-from torchpt.integrators.vertex import Splat, StageContext, VertexInput, VertexOutput, no_shadow
-from torchpt.records import Shadow
+from torchpt.paths.integrators.kinds.path import Path
+from torchpt.paths.state import Shadow, Splat, StageContext, VertexInput, VertexOutput, no_shadow
+from torchpt.physics.film.splats import LARGEST, SplatSums
 
 ENGINES = ("off", "on")
 

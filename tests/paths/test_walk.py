@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 import torchpt
-from torchpt.adjoint import replay, sweep
 from torchpt.engines import tensors
-from torchpt.engines.kernels import chunk
-from torchpt.format.description import settings
-from torchpt.forward.one_path import one_path
-from torchpt.integrators.base import Limits
+from torchpt.engines.kernels import engine as chunk
+from torchpt.gradients import replay, sweep
+from torchpt.paths.integrators.base import Limits
 from torchpt.paths.walk import Counts, Observer, walk
+from torchpt.rendering.one_path import one_path
+from torchpt.scene.formats.description import settings
 
 SMALL = {"width": 8, "height": 8}
 
@@ -90,7 +90,7 @@ def test_the_order_of_events() -> None:
 
 
 def test_paths_that_only_roulette_ends_are_counted_where_they_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchpt.integrators.base.ENDLESS", 2)
+    monkeypatch.setattr("torchpt.paths.integrators.base.ENDLESS", 2)
     assert verbs(Limits(-1, 9))[-1] == "truncate"
 
 

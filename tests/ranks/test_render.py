@@ -19,7 +19,7 @@ from few import few
 from forks import in_ranks
 
 import torchpt
-from torchpt.errors import LostRankError, OtherRankError, RenderError, SceneError, TorchptError
+from torchpt.core.errors import LostRankError, OtherRankError, RenderError, SceneError, TorchptError
 
 FILM = {"width": 24, "height": 16, "filter": "box"}
 CASES: dict[str, dict[str, Any]] = {
@@ -100,8 +100,8 @@ def test_a_checkpoint_of_three_goes_on_in_one_and_back(box: torchpt.Scene, tmp_p
     file = {"checkpoint": str(tmp_path / "a.npz"), "pilots": True, "spp": 12}
 
     def begun(group: Any) -> None:
-        from torchpt.format.description import settings
-        from torchpt.rendering import render_scene
+        from torchpt.rendering.api import render_scene
+        from torchpt.scene.formats.description import settings
 
         wishes = {"film": FILM, "render": {**file, "threads": 1}}
         render_scene(box, settings(box.description, wishes), lambda state: state.done > 1500, ranks=group)
@@ -109,7 +109,7 @@ def test_a_checkpoint_of_three_goes_on_in_one_and_back(box: torchpt.Scene, tmp_p
     def ended(group: Any) -> dict[str, Any]:
         return facts(box, {**file, "resume": True}, group)
 
-    from torchpt.forward import checkpoint
+    from torchpt.rendering import checkpoint
 
     for size, again in ((3, 1), (1, 2)):
         Path(file["checkpoint"]).unlink(missing_ok=True)

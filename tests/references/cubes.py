@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from torchpt.meshes import MeshPart
-from torchpt.shapes import KINDS
+from torchpt.physics.shapes import KINDS
+from torchpt.scene.meshes import MeshPart
 
 __all__ = ["unit_cube"]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import torchpt
-from torchpt.engines.kernels.kernels import Kernels
-from torchpt.forward import kept
+from torchpt.engines.kernels.programs import Kernels
+from torchpt.rendering import kept
 
 __all__ = ["FEATURES", "PLAIN", "Feature", "kernels", "with_feature"]
 
@@ -74,95 +74,95 @@ def _light(scene: dict[str, Any], **keys: Any) -> None:
 #: By name.
 FEATURES: dict[str, Feature] = {
     "second material": Feature(
-        ("bsdfs/kinds/roughconductor.py",),
+        ("physics/bsdfs/kinds/roughconductor.py",),
         lambda scene: _material(scene, **{"type": "roughconductor", "material": "Au", "alpha": 0.2}),
         ("world.materials.parameters.1",),
-        module="torchpt.bsdfs.kinds.roughconductor",
+        module="torchpt.physics.bsdfs.kinds.roughconductor",
     ),
     "refraction": Feature(
-        ("bsdfs/kinds/dielectric.py", "bsdfs/glass.py"),
+        ("physics/bsdfs/kinds/dielectric.py", "physics/bsdfs/lobes.py"),
         lambda scene: _material(scene, type="dielectric"),
         ("world.materials.parameters.1",),
         ("eta",),
-        module="torchpt.bsdfs.kinds.dielectric",
+        module="torchpt.physics.bsdfs.kinds.dielectric",
     ),
     "texture": Feature(
-        ("textures/atlas.py",),
+        ("physics/textures/atlas.py",),
         lambda scene: _material(scene, reflectance=_squares()),
         ("world.textures.tables", "world.geometry.uvs"),
-        module="torchpt.textures.atlas",
+        module="torchpt.physics.textures.atlas",
     ),
     "noise": Feature(
-        ("textures/kinds/noise.py", "textures/computed.py"),
+        ("physics/textures/kinds/noise.py", "physics/textures/computed.py"),
         lambda scene: _material(scene, reflectance={"type": "noise", "color0": 0.2, "color1": 0.8, "octaves": 2}),
         ("world.textures.tables", "world.geometry.uvs"),
-        module="torchpt.textures.kinds.noise",
+        module="torchpt.physics.textures.kinds.noise",
     ),
     "normal map": Feature(
-        ("integrators/relief.py",),
+        ("paths/surface.py",),
         lambda scene: _material(scene, normal_map=_squares(color0=[0.6, 0.45, 0.95], color1=[0.4, 0.5, 0.95])),
         ("world.textures.tables", "world.geometry.tangents"),
     ),
     "opacity": Feature(
-        ("integrators/transmission.py",), lambda scene: _material(scene, opacity=0.5), ("world.materials.opacity",), ("clear",)
+        ("paths/transmission.py",), lambda scene: _material(scene, opacity=0.5), ("world.materials.opacity",), ("clear",)
     ),
     "constant sky": Feature(
-        ("lights/kinds/constant.py",),
+        ("physics/lights/kinds/constant.py",),
         lambda scene: _light(scene, type="constant", radiance=0.3),
         ("world.lights.environment",),
-        module="torchpt.lights.kinds.constant",
+        module="torchpt.physics.lights.kinds.constant",
     ),
     "environment map": Feature(
-        ("lights/kinds/envmap.py",),
+        ("physics/lights/kinds/envmap.py",),
         lambda scene: _light(scene, type="envmap", path=str(_SCENES / "sky.exr")),
         ("world.lights.environment",),
-        module="torchpt.lights.kinds.envmap",
+        module="torchpt.physics.lights.kinds.envmap",
     ),
     "point light": Feature(
-        ("lights/kinds/point.py",),
+        ("physics/lights/kinds/point.py",),
         lambda scene: _light(scene, type="point", position=[1, 2, 1], intensity=5),
-        module="torchpt.lights.kinds.point",
+        module="torchpt.physics.lights.kinds.point",
     ),
     "directional light": Feature(
-        ("lights/kinds/directional.py",),
+        ("physics/lights/kinds/directional.py",),
         lambda scene: _light(scene, type="directional", direction=[1, -2, 1], irradiance=2),
-        module="torchpt.lights.kinds.directional",
+        module="torchpt.physics.lights.kinds.directional",
     ),
     "round lamp": Feature(
-        ("lights/surfaces/sphere.py",),
+        ("physics/lights/surfaces/sphere.py",),
         lambda scene: scene["shapes"].update(bulb={"type": "sphere", "center": [1, 1, 0], "radius": 0.2, "emission": 3}),
-        module="torchpt.lights.surfaces.sphere",
+        module="torchpt.physics.lights.surfaces.sphere",
     ),
     "sphere": Feature(
-        ("shapes/primitives/sphere.py",),
+        ("physics/shapes/primitives/sphere.py",),
         lambda scene: scene["shapes"].update(more={"type": "sphere", "radius": 0.4, "material": "clay"}),
         ("world.geometry.flip",),
-        module="torchpt.shapes.primitives.sphere",
+        module="torchpt.physics.shapes.primitives.sphere",
     ),
     "quadric": Feature(
-        ("shapes/primitives/quadric.py", "shapes/quadrics.py", "shapes/kinds/cylinder.py"),
+        ("physics/shapes/primitives/quadric.py", "physics/shapes/quadrics.py", "physics/shapes/kinds/cylinder.py"),
         lambda scene: scene["shapes"].update(more={"type": "cylinder", "radius": 0.4, "capped": False, "material": "clay"}),
         ("world.geometry.quadrics",),
-        module="torchpt.shapes.kinds.cylinder",
+        module="torchpt.physics.shapes.kinds.cylinder",
     ),
     "layer": Feature(
-        ("integrators/aov.py", "integrators/layers/normal.py"),
+        ("paths/layer.py", "paths/layers/normal.py"),
         lambda scene: scene["film"].update(aovs=["normal"]),
-        module="torchpt.integrators.layers.normal",
+        module="torchpt.paths.layers.normal",
     ),
     "lens": Feature(
-        ("cameras/kinds/thinlens.py",),
+        ("physics/cameras/kinds/thinlens.py",),
         lambda scene: scene["camera"].update(type="thinlens", aperture_radius=0.05, focus_distance=4),
         ("camera.aperture", "camera.lens"),
-        module="torchpt.cameras.kinds.thinlens",
+        module="torchpt.physics.cameras.kinds.thinlens",
     ),
     "preview": Feature(
-        ("integrators/kinds/ibl.py", "integrators/split_sum.py"),
+        ("paths/integrators/kinds/ibl.py", "paths/integrators/split_sum.py"),
         lambda scene: scene.update(integrator={"type": "ibl"}, lights={"more": {"type": "constant", "radiance": 0.3}}),
         ("first",),
-        module="torchpt.integrators.kinds.ibl",
+        module="torchpt.paths.integrators.kinds.ibl",
     ),
-    "roulette": Feature(("integrators/roulette.py",), lambda scene: scene["integrator"].update(rr_depth=2)),
+    "roulette": Feature(("paths/roulette.py",), lambda scene: scene["integrator"].update(rr_depth=2)),
 }  # fmt: skip
 
 

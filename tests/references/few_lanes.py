@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from torchpt.engines.kernels import schedule as loop
-from torchpt.forward.need import LANES
+from torchpt.engines.kernels import threads as loop
+from torchpt.scene.need import LANES
 
 __all__ = ["few_lanes"]
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import torchpt
-from torchpt.cli import run
-from torchpt.forward import checkpoint
-from torchpt.forward import run as running
+from torchpt.cli.main import run
+from torchpt.rendering import checkpoint
+from torchpt.rendering import run as running
 
 # torch asks DNS for the name of the other side of each connection, to show it in messages: no test waits for such answers.
 os.environ.setdefault("RES_OPTIONS", "attempts:0")

@@ -7,9 +7,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchpt.lanes import engine
-from torchpt.lanes.engine import Target
-from torchpt.lanes.form import SCALAR
+from torchpt.compiler import cpu
+from torchpt.compiler.cpu import Target
+from torchpt.compiler.form import SCALAR
 
 __all__ = ["differing", "one_lane"]
 
@@ -18,7 +18,7 @@ _BITS = {1: torch.uint8, 4: torch.int32, 8: torch.int64}
 
 def one_lane() -> Target:
     """Return this machine, with kernels that take one lane at a time."""
-    return replace(engine.host(), form=SCALAR)
+    return replace(cpu.host(), form=SCALAR)
 
 
 def differing(a: Tensor, b: Tensor) -> Tensor:

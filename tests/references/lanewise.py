@@ -20,22 +20,22 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.compiler.graph import Unsupported
 from torchpt.engines import tensors
-from torchpt.engines.kernels.chunk import Chunk, Worker
-from torchpt.engines.kernels.kernels import Kernels
-from torchpt.engines.kernels.rows import HIT, Memory
+from torchpt.engines.kernels.engine import Chunk, Worker
+from torchpt.engines.kernels.layout import HIT, Memory
+from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.tensors import Paths, Tensors
-from torchpt.format.description import settings
-from torchpt.forward import kernels_of, make_wave
-from torchpt.integrators import stages
-from torchpt.integrators.path import partition
-from torchpt.integrators.tally import Tally
-from torchpt.integrators.vertex import VertexInput
-from torchpt.integrators.wave import Wave
-from torchpt.lanes.graph import Unsupported
+from torchpt.math.vectors import rows
+from torchpt.paths import vertex
+from torchpt.paths.integrators.path import partition
+from torchpt.paths.state import PathState, Shadow, VertexInput
 from torchpt.paths.walk import walk
-from torchpt.records import Hit, PathState, Shadow, rows
-from torchpt.samplers import salts
+from torchpt.paths.wave import Tally, Wave
+from torchpt.physics.samplers import salts
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.rendering import kernels_of, make_wave
+from torchpt.scene.formats.description import settings
 
 __all__ = ["ALLOWED", "TOLERANCE", "Differences", "compare", "loaded", "prepared", "run_bounce", "waves"]
 
@@ -249,7 +249,7 @@ def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recor
             done.add((model, roulette))
             name = f"{kind} bounce {world.materials.models[model]}{' with roulette' if roulette else ''}"
             context = wave.context.at(salts(depth, torch.device("cpu")), roulette=roulette)
-            output = stages.bounce(context, model, VertexInput(rows(state, index), rows(hit, index)))
+            output = vertex.bounce(context, model, VertexInput(rows(state, index), rows(hit, index)))
             after, shadow = output.leaving, output.shadow
             try:
                 values, on, ended = run_bounce(worker, model, roulette, state, hit, index, depth)
@@ -263,14 +263,14 @@ def _vertices(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recor
                 after = replace(after, radiance=torch.addcmul(after.radiance, shadow.radiance, clear))
             _compare_fused(found, name, kernels, after, engine.hits(after, depth + 1), values, on, ended)
     for state, hit, index in recorder.emits:
-        light = stages.emit(wave.context, VertexInput(rows(state, index), rows(hit, index))).brought
+        light = vertex.emit(wave.context, VertexInput(rows(state, index), rows(hit, index))).brought
         here = arena(kernels, **_fields(state, hit))
         worker.calls.run(kernels.emit(), len(index), here, here, _listed(index))
         taken = kernels.state.take(here, index.numpy(), ("radiance",))["radiance"]
         found.add(f"{kind} emit", "radiance", state.radiance[:, index] + light, taken)
     for state, hit, index in recorder.escapes:
         index = index[state.t_max[index] > 0]
-        light = stages.escape(wave.context, VertexInput(rows(state, index), rows(hit, index))).brought
+        light = vertex.escape(wave.context, VertexInput(rows(state, index), rows(hit, index))).brought
         here = arena(kernels, **_fields(state, hit))
         worker.calls.run(kernels.escape(), len(index), here, here, _listed(index))
         lanes = state.lane[index].numpy()
@@ -341,7 +341,7 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
             found.add("nearest", key, getattr(hit, key), taken[key], _floor(key))
     for model, state, hit, index, depth in recorder.bounces:
         context = wave.context.at(salts(depth, torch.device("cpu")))
-        shadow = stages.bounce(context, model, VertexInput(rows(state, index), rows(hit, index))).shadow
+        shadow = vertex.bounce(context, model, VertexInput(rows(state, index), rows(hit, index))).shadow
         if shadow is None:
             continue
         n = len(index)

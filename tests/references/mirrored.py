@@ -12,9 +12,8 @@ from typing import Any
 
 import torch
 
-from torchpt.integrators.kinds.path import Path
-from torchpt.integrators.vertex import Field, Splat, StageContext, VertexInput, VertexOutput, no_shadow
-from torchpt.records import Shadow
+from torchpt.paths.integrators.kinds.path import Path
+from torchpt.paths.state import Field, Shadow, Splat, StageContext, VertexInput, VertexOutput, no_shadow
 
 
 class Mirrored(Path):

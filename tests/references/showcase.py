@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchpt.bsdfs import KINDS
+from torchpt.physics.bsdfs import KINDS
 
 __all__ = ["MATERIALS", "showcase"]
 

@@ -11,9 +11,9 @@ from significance import SIGNIFICANCE, chi_square_p, z_limit
 from torch import Tensor
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.rendering import Rendering, render_scene
+from torchpt.rendering.api import Rendering, render_scene
 from torchpt.scene import Scene
+from torchpt.scene.formats.description import settings
 
 __all__ = [
     "SIGNIFICANCE",

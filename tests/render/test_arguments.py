@@ -15,9 +15,9 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.commands.arguments import GROUPS, path_keys
-from torchpt.errors import SceneError
-from torchpt.settings import BLOCKS, RECORDS, Common, Every, Render, Traced, Wishes
+from torchpt.cli.arguments import GROUPS, path_keys
+from torchpt.core.errors import SceneError
+from torchpt.scene.settings import BLOCKS, RECORDS, Common, Every, Render, Traced, Wishes
 from torchpt.spec import Role, parameters_of
 from torchpt.spec.arguments import declared, spelled
 
@@ -154,11 +154,11 @@ def test_a_role_is_left_out() -> None:
 
 #: A stop rule that the renderer has not: file, what stands there, what is put before it.
 TOY = {
-    "settings.py": (
+    "scene/settings.py": (
         "    checkpoint: Annotated[",
         '    enough: Annotated[int | None, Whole(None, low=1, doc="samples that are enough", role=Role.ENDS)]\n',
     ),
-    "forward/stopping.py": (
+    "rendering/stopping.py": (
         "        self.share = min(",
         '        if self.render.enough is not None:\n            done["enough"] = taken / self.render.enough\n',
     ),
@@ -168,9 +168,9 @@ QUESTIONS = """
 import inspect, json, sys
 sys.argv, ball = sys.argv[:1], json.loads(sys.argv[1])
 import make_configs, make_tables, torchpt
-from torchpt.cli import main
-from torchpt.errors import SceneError
-from torchpt.reports.grid import variants_of
+from torchpt.cli.main import main
+from torchpt.core.errors import SceneError
+from torchpt.reports.study import variants_of
 
 def refused(work):
     try:

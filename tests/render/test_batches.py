@@ -12,12 +12,12 @@ import torch
 from few import few
 
 import torchpt
-from torchpt import accel
-from torchpt.engines.kernels import chunk, programs
-from torchpt.engines.kernels import kernels as loop_kernels
-from torchpt.errors import RenderError, SceneError
-from torchpt.forward import Run, run
-from torchpt.integrators import base
+from torchpt import search
+from torchpt.core.errors import RenderError, SceneError
+from torchpt.engines.kernels import engine, programs
+from torchpt.engines.kernels import programs as loop_kernels
+from torchpt.paths.integrators import base
+from torchpt.rendering import Run, run
 from torchpt.scene import scene as scenes_room
 
 SIZE = {"width": 24, "height": 16, "filter": "box"}
@@ -372,7 +372,7 @@ def counted(monkeypatch):
         monkeypatch.setattr(room, name, call)
 
     counting(scenes_room, "assemble", "worlds")
-    counting(accel, "build", "trees")
+    counting(search, "build", "trees")
     counting(programs, "_traced", "programs")
     plain = loop_kernels.Kernels._make
 
@@ -554,7 +554,7 @@ def test_a_picture_that_renders_alone_is_not_blamed_for_one_before(monkeypatch):
 def test_nothing_piles_up():
     """Workers go from scene to scene, and scenes without gradients go once they are rendered."""
     made, alive, seen = [], weakref.WeakSet(), []
-    plain = chunk.Worker.__init__
+    plain = engine.Worker.__init__
 
     def counting(self, *args):
         made.append(True)
@@ -571,7 +571,7 @@ def test_nothing_piles_up():
         seen.append(len(alive))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chunk.Worker, "__init__", counting)
+        patch.setattr(engine.Worker, "__init__", counting)
         torchpt.render_batch(scenes(), threads=2, on_progress=watch)
     assert len(made) <= 4 and max(seen) <= 8
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.errors import RenderError, SceneError
-from torchpt.forward.run import Run
+from torchpt.core.errors import RenderError, SceneError
+from torchpt.rendering.run import Run
 from torchpt.scene.editions import Editions
 
 WALL, BALL, SKY = "materials.wall.reflectance", "materials.ball.reflectance", "lights.sky.radiance"

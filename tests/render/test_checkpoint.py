@@ -22,14 +22,14 @@ from textured_quad import repeated, textured_quad
 from trials import film_of
 
 import torchpt
-from torchpt.cli import main
-from torchpt.errors import AssetError, OutputError, SceneError, TorchptError
-from torchpt.format.description import settings
-from torchpt.forward import checkpoint
-from torchpt.forward.result import Progress
-from torchpt.forward.resume import ends_a_pass
-from torchpt.forward.run import Run
-from torchpt.rendering import Rendering, render_scene
+from torchpt.cli.main import main
+from torchpt.core.errors import AssetError, OutputError, SceneError, TorchptError
+from torchpt.rendering import checkpoint
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.rendering.checkpoint import ends_a_pass
+from torchpt.rendering.result import Progress
+from torchpt.rendering.run import Run
+from torchpt.scene.formats.description import settings
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_the_bits_of_a_render_that_nobody_stopped(case: str, box: torchpt.Scene,
 @pytest.mark.slow
 def test_passes_are_short_enough_for_checkpoints(box: torchpt.Scene, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(checkpoint, "EVERY", 0.05)
-    monkeypatch.setattr("torchpt.forward.run.EVERY", 0.05)
+    monkeypatch.setattr("torchpt.rendering.run.EVERY", 0.05)
     written: list[float] = []
     write = checkpoint.Keeper.write
     monkeypatch.setattr(checkpoint.Keeper, "write", lambda *given: (written.append(time.perf_counter()), write(*given)))
@@ -441,11 +441,11 @@ def test_parameters_are_part_of_a_render(box: torchpt.Scene, tmp_path: Path) -> 
 
 COMMAND = """
 import sys
-from torchpt.forward import checkpoint
-import torchpt.forward.run
-checkpoint.EVERY = torchpt.forward.run.EVERY = 0.1
+from torchpt.rendering import checkpoint
+import torchpt.rendering.run
+checkpoint.EVERY = torchpt.rendering.run.EVERY = 0.1
 checkpoint.PATIENCE = 1.0
-from torchpt.cli import run
+from torchpt.cli.main import run
 sys.exit(run())
 """
 

@@ -10,12 +10,12 @@ import torch
 from trials import film_of
 
 import torchpt
-from torchpt.engines.kernels import kernels
-from torchpt.engines.kernels.schedule import Loop
-from torchpt.errors import SceneError
-from torchpt.format.description import settings
-from torchpt.forward import kept, looped
-from torchpt.rendering import Rendering, render_scene
+from torchpt.core.errors import SceneError
+from torchpt.engines.kernels import programs
+from torchpt.engines.kernels.threads import Loop
+from torchpt.rendering import kept, looped
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.scene.formats.description import settings
 
 FILM = {"width": 48, "height": 48, "filter": "box"}
 
@@ -60,7 +60,7 @@ def test_the_summary_tells_the_time_that_compiling_took(monkeypatch):
     assert run(scene, 1, "auto").compile_seconds < 0.1  # programs are known by now; binding tables is all
     # The clock runs while kernels are made, and then alone: with one that ticks at each look, one tick a kernel.
     clock = iter(range(1000))
-    monkeypatch.setattr(kernels.time, "perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr(programs.time, "perf_counter", lambda: float(next(clock)))
     ticks = run(scene, 1, "auto").compile_seconds
     made = kept(scene).kernels
     assert made is not None

@@ -19,15 +19,14 @@ from gradient_rooms import gradient_of, room
 from torch import Tensor
 
 import torchpt
-from torchpt.engines.kernels import calls
-from torchpt.engines.kernels.kernels import Kernel
-from torchpt.lanes import engine, programs, shelf
-from torchpt.lanes.arena import CAPACITY
-from torchpt.lanes.engine import Target
-from torchpt.lanes.form import SCALAR, VECTORS
-from torchpt.lanes.kernel import text
-from torchpt.lanes.sinks import Sinks
-from torchpt.lanes.stage import TracedStage
+from torchpt.compiler import cache, cpu
+from torchpt.compiler.cpu import Target
+from torchpt.compiler.form import CAPACITY, SCALAR, VECTORS
+from torchpt.compiler.kernel import text
+from torchpt.compiler.program import TracedStage
+from torchpt.compiler.sinks import Sinks
+from torchpt.engines.kernels import engine as calls
+from torchpt.engines.kernels.programs import Kernel
 
 COLOURED = {"type": "principled", "base_color": [0.6, 0.5, 0.4], "roughness": 0.4}
 SMALL = {"film": {"width": 16, "height": 16}, "threads": 1, "compile": "on"}
@@ -37,18 +36,18 @@ SMALL = {"film": {"width": 16, "height": 16}, "threads": 1, "compile": "on"}
 def stages(monkeypatch) -> Iterator[dict[str, TracedStage]]:
     """Stages by the names of their machine code; all that renders ask for is traced."""
     found: dict[str, TracedStage] = {}
-    compiled = programs.compiled
+    compiled = cache.compiled
 
     def noted(stage: TracedStage) -> Any:
         program = compiled(stage)
         found[program.code] = stage
         return program
 
-    monkeypatch.setattr(programs, "compiled", noted)
-    monkeypatch.setattr(shelf, "key_of", lambda structure: None)
-    programs.forget()
+    monkeypatch.setattr(cache, "compiled", noted)
+    monkeypatch.setattr(cache, "key_of", lambda structure: None)
+    cache.forget()
     yield found
-    programs.forget()
+    cache.forget()
 
 
 class Twice:
@@ -96,7 +95,7 @@ class Twice:
     def _single(self, kernel: Kernel, stage: TracedStage) -> Kernel:
         """The kernel on one lane at a time."""
         if id(kernel) not in self._singles:
-            made = engine.compiled(text(stage, SCALAR), one_lane())
+            made = cpu.compiled(text(stage, SCALAR), one_lane())
             single = replace(kernel, program=replace(kernel.program, call=made.call, code=made.key))
             self._singles[id(kernel)] = kernel, single  # both live, so that their ids stay their own
         return self._singles[id(kernel)][1]
@@ -147,21 +146,21 @@ OTHERS = {"one lane": one_lane, "haswell": lambda: Target("haswell", ""), "nehal
 @pytest.mark.parametrize("name", OTHERS)
 def test_pictures_and_gradients(name, monkeypatch):
     """One lane at a time, and by older vectors (without fused multiply and add): the same from the camera to film and back."""
-    if name != "one lane" and "+fma" not in engine.host().features.split(","):
+    if name != "one lane" and "+fma" not in cpu.host().features.split(","):
         pytest.skip("these are x86 machines that have what Haswell has")
 
     def made() -> list[Tensor]:
-        programs.forget()
+        cache.forget()
         scene = torchpt.load(room(COLOURED), "cpu")
         picture = torchpt.render(scene, spp=4, **SMALL)
         return [picture, gradient_of(scene, "materials.plate.base_color", adjoint="replay")]
 
-    vectors, before = made(), engine.counts()
-    monkeypatch.setitem(engine._state, "host", OTHERS[name]())
+    vectors, before = made(), cpu.counts()
+    monkeypatch.setitem(cpu._state, "host", OTHERS[name]())
     other = made()
-    assert sum(engine.counts()) > sum(before)  # kernels of their own
+    assert sum(cpu.counts()) > sum(before)  # kernels of their own
     monkeypatch.undo()
-    programs.forget()
+    cache.forget()
     assert float(vectors[1].norm()) > 0
     for a, b in zip(vectors, other, strict=True):
         assert not differing(a, b).any()

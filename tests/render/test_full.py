@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 import torchpt
-from torchpt.errors import OutputError, RenderError, SceneError
+from torchpt.core.errors import OutputError, RenderError, SceneError
 from torchpt.images import denoiser
 
 BALL: dict[str, Any] = {
@@ -44,7 +44,6 @@ def film(*aovs: str, **more: Any) -> dict[str, Any]:
 @pytest.fixture
 def halved(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     """A denoiser that halves; the layers that it was given."""
-    import torchpt.rendering
 
     seen: list[tuple[str, ...]] = []
 
@@ -53,7 +52,7 @@ def halved(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
         seen.append(tuple(guides))
         return 0.5 * image
 
-    monkeypatch.setattr(torchpt.orders, "check_denoiser", lambda: None)
+    monkeypatch.setattr("torchpt.rendering.orders.check_denoiser", lambda: None)
     monkeypatch.setattr("torchpt.images.denoiser.denoise", half)
     return seen
 
@@ -135,7 +134,7 @@ def test_gradients_are_of_the_picture_and_of_first_surfaces(scene: torchpt.Scene
 
 
 def test_the_backward_pass_takes_what_the_forward_pass_took(scene: torchpt.Scene, monkeypatch: Any) -> None:
-    from torchpt import adjoint
+    from torchpt import gradients as adjoint
 
     taken: list[int] = []
     gradients = adjoint.gradients
@@ -170,7 +169,7 @@ def test_denoised(scene: torchpt.Scene, halved: list[Any], tmp_path: Path) -> No
 
 
 def test_without_a_denoiser_nothing_is_rendered(scene: torchpt.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    import torchpt.rendering
+    import torchpt.rendering.api
 
     def never(*_: Any, **__: Any) -> None:
         raise AssertionError("rendered")
@@ -178,7 +177,7 @@ def test_without_a_denoiser_nothing_is_rendered(scene: torchpt.Scene, monkeypatc
     def none() -> None:
         raise RenderError("denoising needs the package pyoidn: pip install 'torchpt-renderer[denoise]'")
 
-    monkeypatch.setattr(torchpt.rendering, "render_scene", never)
+    monkeypatch.setattr(torchpt.rendering.api, "render_scene", never)
     monkeypatch.setattr(denoiser, "_library", none)
     with pytest.raises(RenderError, match="pip install"):
         torchpt.render(scene, film=film(denoise=True), full=True)

@@ -11,7 +11,7 @@ from few import few
 from few_lanes import few_lanes
 
 import torchpt
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 ROOM = {

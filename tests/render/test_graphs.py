@@ -16,7 +16,7 @@ from torch._dynamo.exc import Unsupported
 from torch._dynamo.testing import CompileCounter
 
 import torchpt
-from torchpt.errors import RenderError, SceneError
+from torchpt.core.errors import RenderError, SceneError
 
 WALL = "materials.wall.reflectance"
 WISHES: dict[str, Any] = {

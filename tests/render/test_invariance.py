@@ -21,12 +21,12 @@ from showcase import showcase
 from trials import film_of
 
 import torchpt
-from torchpt.engines.kernels import schedule
-from torchpt.film import FILTERS
-from torchpt.format.description import settings
-from torchpt.forward.stopping import Stop
-from torchpt.rendering import Rendering, render_scene
-from torchpt.samplers import KINDS as SAMPLERS
+from torchpt.engines.kernels import threads
+from torchpt.physics.film import FILTERS
+from torchpt.physics.samplers import KINDS as SAMPLERS
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.rendering.stopping import Stop
+from torchpt.scene.formats.description import settings
 
 #: Nothing here is a whole number of vectors, and five samples are passes of 2, 2 and 1.
 WIDTH, HEIGHT, SPP = 19, 15, 5
@@ -209,7 +209,7 @@ def test_the_same_bits(scene_of, monkeypatch, name, mode):
     scene, wish = scene_of(name), ROWS[name].wish
     whole = shot(scene, wish, mode)
     assert whole.complete and float(whole.image.amax()) > 0
-    monkeypatch.setattr(schedule, "FEWEST", 16)  # else a film so small is one task
+    monkeypatch.setattr(threads, "FEWEST", 16)  # else a film so small is one task
     for column, changed in COLUMNS[mode].items():
         assert same(shot(scene, wish, mode, **changed), whole), column
     if mode == "compiled":
@@ -243,8 +243,8 @@ def test_waves_that_threads_divide(scene_of):
 def test_tasks_of_the_loop(scene_of, monkeypatch, tasks, fewest):
     scene, wish = scene_of("opacity"), {"film": {"filter": "mitchell", "aovs": LAYERS, **film_of(37, 23)}}
     whole = shot(scene, wish, "compiled", spp=15)
-    monkeypatch.setattr(schedule, "TASKS", tasks)
-    monkeypatch.setattr(schedule, "FEWEST", fewest)
+    monkeypatch.setattr(threads, "TASKS", tasks)
+    monkeypatch.setattr(threads, "FEWEST", fewest)
     assert same(shot(scene, wish, "compiled", spp=15, threads=2), whole)
 
 

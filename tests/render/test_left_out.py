@@ -17,10 +17,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
+from torchpt.compiler import cache
+from torchpt.compiler.program import Program
 from torchpt.core.tree import leaves
-from torchpt.format.description import settings
-from torchpt.lanes import programs
-from torchpt.lanes.program import Program
+from torchpt.scene.formats.description import settings
 
 
 class _Counter(TorchDispatchMode):
@@ -99,7 +99,7 @@ sys.path[:0] = {paths!r}
 import torchpt
 from features import with_feature
 scene = torchpt.load(with_feature(None), "cpu")
-print(*[name for name in sys.modules if name.startswith("torchpt.bsdfs.kinds.")])
+print(*[name for name in sys.modules if name.startswith("torchpt.physics.bsdfs.kinds.")])
 """
 
 
@@ -107,7 +107,7 @@ print(*[name for name in sys.modules if name.startswith("torchpt.bsdfs.kinds.")]
 def test_a_model_is_imported_where_a_scene_has_it():
     code = _IMPORTED.format(paths=[path for path in sys.path if path.endswith("references")])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.stdout.split() == ["torchpt.bsdfs.kinds.diffuse"], done.stderr
+    assert done.stdout.split() == ["torchpt.physics.bsdfs.kinds.diffuse"], done.stderr
 
 
 # -- kernels of the compiled loop
@@ -150,7 +150,7 @@ def test_kernels_hold_nothing_of_what_is_not_there(name, plain):
 def test_kernels_are_the_same_after_it_was_there_and_is_gone(name, plain):
     """Traced anew, not from the cache: the machine code's name is made of the IR."""
     kernels(with_feature(name))
-    programs.forget()
+    cache.forget()
     again = _programs(with_feature(None))
     assert {key: program.code for key, program in again.items()} == {
         key: program.code for key, program in plain.items()

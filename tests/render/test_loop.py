@@ -18,18 +18,19 @@ from significance import t_limit
 from trials import coarse, film_of
 
 import torchpt
-from torchpt.bsdfs import KINDS
-from torchpt.engines.kernels.chunk import Chunk, Worker
-from torchpt.engines.kernels.rows import HIT
-from torchpt.engines.kernels.schedule import Loop
-from torchpt.film import Film
-from torchpt.format.description import settings
-from torchpt.forward import kernels_of
-from torchpt.integrators import LAYERS
-from torchpt.integrators.stages import STRATEGIES
-from torchpt.records import Hit, rows
-from torchpt.rendering import Rendering, render_scene
-from torchpt.samplers import KINDS as SAMPLERS
+from torchpt.engines.kernels.engine import Chunk, Worker
+from torchpt.engines.kernels.layout import HIT
+from torchpt.engines.kernels.threads import Loop
+from torchpt.math.vectors import rows
+from torchpt.paths.integrators import LAYERS
+from torchpt.paths.vertex import STRATEGIES
+from torchpt.physics.bsdfs import KINDS
+from torchpt.physics.film import Film
+from torchpt.physics.samplers import KINDS as SAMPLERS
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.rendering import kernels_of
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.scene.formats.description import settings
 
 SCENES = sorted(path.stem for path in Path("configs/scene").glob("*.yaml")) or ["cornell_box"]
 #: Layers of first surfaces.

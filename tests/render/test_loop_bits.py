@@ -18,11 +18,11 @@ from showcase import showcase
 from trials import film_of
 
 import torchpt
-from torchpt.engines.kernels.chunk import Chunk, Worker
-from torchpt.errors import RenderError
-from torchpt.format.description import settings
-from torchpt.integrators.tally import Tally
-from torchpt.rendering import Progress, Rendering, render_scene
+from torchpt.core.errors import RenderError
+from torchpt.engines.kernels.engine import Chunk, Worker
+from torchpt.paths.wave import Tally
+from torchpt.rendering.api import Progress, Rendering, render_scene
+from torchpt.scene.formats.description import settings
 
 FILM = {**film_of(37, 23), "filter": "mitchell", "aovs": ["albedo", "normal", "variance"]}
 
@@ -89,7 +89,7 @@ def test_strict_names_pixel_and_sample(broken, threads):
 
 
 def test_paths_without_end_are_counted(monkeypatch):
-    monkeypatch.setattr("torchpt.integrators.base.ENDLESS", 5)
+    monkeypatch.setattr("torchpt.paths.integrators.base.ENDLESS", 5)
     scene = torchpt.load("cornell_box", "cpu")
     wish = {"max_depth": -1, "rr_depth": 100}
     on, off = (rendered(scene, 2, integrator=wish, compile=mode) for mode in ("on", "off"))
@@ -206,7 +206,7 @@ def test_a_worker_is_used_again_as_if_new():
     scene = torchpt.load(showcase("lattice", "glass"), "cpu")
     from lanewise import prepared
 
-    from torchpt.forward import kernels_of
+    from torchpt.rendering import kernels_of
 
     wave, _ = prepared(scene, {"film": film_of(40), "render": {"spp": 4}})
     with torch.no_grad():

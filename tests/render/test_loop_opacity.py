@@ -11,8 +11,8 @@ from few import few
 from trials import film_of
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
 
 MESH = str(Path(__file__).parents[2] / "scenes" / "standin.ply")
 

@@ -16,16 +16,17 @@ from torch import Tensor, nn
 from trials import film_of
 
 import torchpt
-from torchpt.bsdfs import Parameters
-from torchpt.engines.kernels import chunk, programs
-from torchpt.engines.kernels.kernels import Kernels
-from torchpt.errors import SceneError, say_once
-from torchpt.format.description import settings
-from torchpt.lanes import engine
-from torchpt.lanes.graph import Unsupported
-from torchpt.math.warps import cosine_hemisphere
-from torchpt.records import BsdfSample
-from torchpt.rendering import Rendering, render_scene
+from torchpt.compiler import cpu
+from torchpt.compiler.graph import Unsupported
+from torchpt.core.errors import SceneError, say_once
+from torchpt.engines.kernels import engine as chunk
+from torchpt.engines.kernels import programs
+from torchpt.engines.kernels.programs import Kernels
+from torchpt.math.sampling import cosine_hemisphere
+from torchpt.physics.bsdfs import Parameters
+from torchpt.physics.bsdfs.records import BsdfSample
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.scene.formats.description import settings
 
 
 def rendered(scene: torchpt.Scene, params: Any = None, **wishes: Any) -> Rendering:
@@ -45,10 +46,10 @@ def work(monkeypatch) -> Iterator[Any]:
         return kept(*args)
 
     monkeypatch.setattr(programs, "_traced", counting)
-    before = [engine.counts()[0], 0]
+    before = [cpu.counts()[0], 0]
 
     def since() -> tuple[int, int]:
-        now = [engine.counts()[0], traced[0]]
+        now = [cpu.counts()[0], traced[0]]
         found = now[0] - before[0], now[1] - before[1]
         before[:] = now
         return found
@@ -163,7 +164,7 @@ def test_larger_pictures_and_maps(work, tmp_path):
 AGAIN = """
 import sys, torchpt
 from torchpt.engines.kernels import chunk, programs
-from torchpt.lanes import engine
+from torchpt.compiler import engine
 traced, kept = [0], programs._traced
 def counting(*args):
     traced[0] += 1

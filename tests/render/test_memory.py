@@ -20,10 +20,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
+from torchpt.core.errors import RenderError, SceneError, say_once
 from torchpt.core.memory import let_go, ran_out
-from torchpt.engines.kernels import rows, spare
-from torchpt.engines.kernels.chunk import Worker
-from torchpt.errors import RenderError, SceneError, say_once
+from torchpt.engines.kernels import layout
+from torchpt.engines.kernels import threads as spare
+from torchpt.engines.kernels.engine import Worker
 
 #: How allocations fail, on a CPU and on CUDA.
 FAILURES: dict[str, Callable[[], Exception]] = {
@@ -57,7 +58,7 @@ def box() -> torchpt.Scene:
 @contextmanager
 def in_pieces(which: Callable[[int], bool], error: Callable[[], Exception]) -> Iterator[list[int]]:
     """Context in which operations within pieces of passes fail, counted over the whole render; gives how many there were."""
-    from torchpt.forward import run
+    from torchpt.rendering import run
 
     counted = [0]
 
@@ -166,7 +167,7 @@ def backward_failing(
     scene: torchpt.Scene, adjoint: str, which: Callable[[int], bool], monkeypatch: Any
 ) -> tuple[torch.Tensor, int]:
     """The gradient where operations within chunks fail, and how many operations there were."""
-    module = importlib.import_module("torchpt.adjoint." + {"autograd": "tape", "replay": "replay"}[adjoint])
+    module = importlib.import_module("torchpt.gradients." + {"autograd": "tape", "replay": "replay"}[adjoint])
     counted, original = [0], module.piece
 
     def failing(*args: Any) -> Any:
@@ -205,19 +206,19 @@ def looped(scene: torchpt.Scene, threads: int = 2, **film: Any) -> Any:
 @pytest.mark.slow
 def test_the_compiled_loop_goes_on_with_one_thread_and_fewer_lanes(box, monkeypatch, capsys, threads):
     whole = looped(box, threads)
-    made, kept = [0], rows.Memory.__init__
+    made, kept = [0], layout.Memory.__init__
     for number in (*range(0, 8), 17, 23, 31):
         say_once.cache_clear()
         made[0] = 0
 
-        def failing(self: rows.Memory, count: int, number: int = number) -> None:
+        def failing(self: layout.Memory, count: int, number: int = number) -> None:
             made[0] += 1
             if made[0] == number + 1:
                 raise MemoryError
             kept(self, count)
 
         with monkeypatch.context() as patched:
-            patched.setattr(rows.Memory, "__init__", failing)
+            patched.setattr(layout.Memory, "__init__", failing)
             found = looped(box, threads)
         assert same(found, whole), number
         assert capsys.readouterr().err.count("memory ran out") == int(made[0] > number)
@@ -358,14 +359,14 @@ def test_the_next_render_takes_over_the_memory_of_threads(box, monkeypatch):
     let_go()
     assert not spare._kept
     wish: dict[str, Any] = {"spp": 2, "film": film_of(64, 60)}
-    whole, made, new = torchpt.render(box, **wish, threads=2), [], rows.Memory.__init__
+    whole, made, new = torchpt.render(box, **wish, threads=2), [], layout.Memory.__init__
     assert 1 <= len(spare._kept) <= 2
 
-    def making(self: rows.Memory, count: int) -> None:
+    def making(self: layout.Memory, count: int) -> None:
         made.append(count)
         new(self, count)
 
-    monkeypatch.setattr(rows.Memory, "__init__", making)
+    monkeypatch.setattr(layout.Memory, "__init__", making)
     for _ in range(3):
         assert torch.equal(torchpt.render(box, **wish, threads=1), whole) and not made
     other = torchpt.load("veach_mis", "cpu")  # of another structure

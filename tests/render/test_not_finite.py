@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.bsdfs.kinds.diffuse import Diffuse
-from torchpt.errors import RenderError
-from torchpt.format.description import settings
-from torchpt.integrators.lost import KEPT, Lost, Place
-from torchpt.integrators.plate import Plate
-from torchpt.records import BsdfSample
-from torchpt.rendering import Rendering, render_scene
-from torchpt.samplers import Streams
+from torchpt.core.errors import RenderError
+from torchpt.paths.lost import KEPT, Lost, Place
+from torchpt.paths.wave import Plate
+from torchpt.physics.bsdfs.kinds.diffuse import Diffuse
+from torchpt.physics.bsdfs.records import BsdfSample
+from torchpt.physics.samplers import Streams
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.scene.formats.description import settings
 
 #: How a render may run: by tensor operations, as the loop with the search inside its stages, as the loop with a tree.
 WAYS = {"eager": ("off", "auto"), "packets": ("on", "brute"), "numba": ("on", "numba")}
@@ -256,7 +256,7 @@ def test_a_checkpoint_keeps_them(tmp_path: Path):
     whole = rendered(scene_of(**NEAR), spp=8)
     path, resumed = str(tmp_path / "a.ckpt"), None
 
-    def stop(progress: torchpt.rendering.Progress) -> bool:
+    def stop(progress: torchpt.rendering.api.Progress) -> bool:
         return progress.done >= progress.total / 2
 
     scene = scene_of(**NEAR)
@@ -274,7 +274,7 @@ def test_the_first_ones_are_kept_in_order():
     assert (lost.nan, lost.infinite, lost.count) == (1, 1, 2)
     assert lost.places == [Place(6, 2, 15, nan=False), Place(8, 4, 10, nan=True)]
     assert str(lost.places[0]) == "sample 6 of pixel (15, 2)"
-    chosen = Plate(torchpt.film.Film(30, 1, 1, torch.device("cpu")), {}, Streams(2, 3), torch.arange(100, 140))
+    chosen = Plate(torchpt.physics.film.Film(30, 1, 1, torch.device("cpu")), {}, Streams(2, 3), torch.arange(100, 140))
     (first, _) = Lost.of(values, 10, 5, (3, 2, 16, 12), chosen).places
     assert (first.x, first.y, first.first, first.streams) == (112 % 16 + 3, 112 // 16 + 2, 2, 3)
     assert Lost.read(lost.plain()) == lost
@@ -286,7 +286,7 @@ def test_no_more_are_kept_than_are_traced():
         lost.add(Lost.of(torch.full((3, 1, 50), torch.nan), 0, sample, (0, 0, 50, 1)))
     assert lost.count == 100 and len(lost.places) == KEPT
     assert [place.sample for place in lost.places] == [3] * 50 + [9] * (KEPT - 50)
-    pilots = Plate(torchpt.film.Film(50, 1, 1, torch.device("cpu")), {}, Streams(1, 1))
+    pilots = Plate(torchpt.physics.film.Film(50, 1, 1, torch.device("cpu")), {}, Streams(1, 1))
     lost.add(Lost.of(torch.full((3, 1, 50), torch.nan), 0, 0, (0, 0, 50, 1), pilots))
     assert lost.count == 150 and {place.first for place in lost.places} == {0}, "paths of the picture can be looked at"
 

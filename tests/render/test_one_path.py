@@ -11,10 +11,10 @@ import torch
 from few import few
 
 import torchpt
-from torchpt.errors import SceneError
-from torchpt.format.description import settings
-from torchpt.forward.one_path import Path, one_path
-from torchpt.rendering import render_scene
+from torchpt.core.errors import SceneError
+from torchpt.rendering.api import render_scene
+from torchpt.rendering.one_path import Path, one_path
+from torchpt.scene.formats.description import settings
 
 #: Shipped scenes that need no file, on films of a few pixels.
 SCENES = ["cornell_box", "cornell_transmissive", "cornell_rough_specular", "many_lights", "veach_mis", "noise"]

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from trials import film_of, shoot
 
 import torchpt
-from torchpt.bsdfs import Parameters
-from torchpt.errors import SceneError
-from torchpt.math.warps import cosine_hemisphere
-from torchpt.records import BsdfSample
+from torchpt.core.errors import SceneError
+from torchpt.math.sampling import cosine_hemisphere
+from torchpt.physics.bsdfs import Parameters
+from torchpt.physics.bsdfs.records import BsdfSample
 
 
 class Neural(torchpt.Bsdf):

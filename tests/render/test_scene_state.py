@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import torchpt
+from torchpt.core.errors import SceneError
 from torchpt.core.threads import limited_threads
-from torchpt.errors import SceneError
-from torchpt.format.description import settings
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
 from torchpt.scene.sources import labels_of
 
 LAMP = {

@@ -13,14 +13,14 @@ from numba.core.compiler_lock import global_compiler_lock
 from trials import film_of
 
 import torchpt
-from torchpt.accel import wide
-from torchpt.errors import SceneError
-from torchpt.film import KnownError, pilots_of
-from torchpt.format.description import settings
-from torchpt.forward.stopping import Stop
-from torchpt.rendering import Rendering, render_scene
-from torchpt.settings import Render
-from torchpt.spec.declared import values_of
+from torchpt.core.errors import SceneError
+from torchpt.physics.film import KnownError, pilots_of
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.rendering.stopping import Stop
+from torchpt.scene.formats.description import settings
+from torchpt.scene.settings import Render
+from torchpt.search import tree
+from torchpt.spec.schema import values_of
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_no_error_in_doubt_ends_a_render(box, monkeypatch, doubt):
         "null": (KnownError(0.01, (0.009, 0.011), False), "a reason"),
         "wide": (KnownError(0.01, (0.002, 0.05), False), ""),
     }
-    monkeypatch.setattr("torchpt.forward.run.known_of", lambda *_: told[doubt])
+    monkeypatch.setattr("torchpt.rendering.run.known_of", lambda *_: told[doubt])
     found = shot(box, spp=40, target_error=0.02)
     assert (found.spp, found.stopped_by) == (40, "spp") and found.summary()["stopped_by"] == "spp"
     monkeypatch.undo()
@@ -142,7 +142,7 @@ def test_kernels_take_none_of_the_time(monkeypatch):
     """Those of the search are made at their first call, when sampling has begun."""
     scene = torchpt.load("cornell_box", device="cpu")
     shot(scene, spp=2, accel="numba")
-    kept_back, made = wide.compiled, []
+    kept_back, made = tree.compiled, []
 
     def slow(kernel: Any, *args: Any) -> Any:
         if not made:
@@ -151,7 +151,7 @@ def test_kernels_take_none_of_the_time(monkeypatch):
                 time.sleep(0.25)
         return kept_back(kernel, *args)
 
-    monkeypatch.setattr(wide, "compiled", slow)
+    monkeypatch.setattr(tree, "compiled", slow)
     start = time.perf_counter()
     found = shot(scene, spp=10**6, accel="numba", time_limit=0.15, threads=1)
     wall = time.perf_counter() - start

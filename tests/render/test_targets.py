@@ -9,9 +9,10 @@ import torch
 from few import few
 
 import torchpt
-from torchpt.format.description import settings
-from torchpt.lanes import engine, programs
-from torchpt.rendering import render_scene
+from torchpt.compiler import cache
+from torchpt.compiler import cpu as engine
+from torchpt.rendering.api import render_scene
+from torchpt.scene.formats.description import settings
 
 pytestmark = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="these are x86 machines")
 
@@ -30,7 +31,7 @@ def test_older_machines_show_the_same_picture(monkeypatch, name, cpu):
     own = picture(name, 4)
     made = engine.counts()
     monkeypatch.setitem(engine._state, "host", engine.Target(cpu, ""))
-    monkeypatch.setattr(programs, "_programs", {})
+    monkeypatch.setattr(cache, "_programs", {})
     other = picture(name, 4)
     assert engine.counts() != made  # code of its own, made now or read from disk
     # Sums are rounded otherwise, and a decision may fall the other way for it: a few paths differ.

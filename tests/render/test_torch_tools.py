@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 import torchpt
-from torchpt.errors import RenderError, SceneError, TorchptError
+from torchpt.core.errors import RenderError, SceneError, TorchptError
 
 WALL = "materials.wall.reflectance"
 WISHES: dict[str, Any] = {"spp": 4, "seed": 3, "threads": 1, "compile": "off"}

@@ -15,14 +15,14 @@ from mirrored import Mirrored
 from torch import Tensor
 
 import torchpt
-from torchpt.bsdfs.kinds.diffuse import Diffuse
-from torchpt.engines.kernels.chunk import Chunk, Worker
-from torchpt.engines.kernels.kernels import Kernels
-from torchpt.errors import RenderError, SceneError
-from torchpt.format.description import settings
-from torchpt.forward import kernels_of, make_wave
-from torchpt.forward.along import Along
-from torchpt.integrators.wave import Rays
+from torchpt.core.errors import RenderError, SceneError
+from torchpt.engines.kernels.engine import Chunk, Worker
+from torchpt.engines.kernels.programs import Kernels
+from torchpt.gradients.edges.traced import Along
+from torchpt.paths.wave import Rays
+from torchpt.physics.bsdfs.kinds.diffuse import Diffuse
+from torchpt.rendering import kernels_of, make_wave
+from torchpt.scene.formats.description import settings
 
 quiet = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 

@@ -12,9 +12,9 @@ import torch
 from few import few
 
 import torchpt
-from torchpt.errors import SceneError
-from torchpt.format.description import settings
-from torchpt.rendering import Rendering, render_scene
+from torchpt.core.errors import SceneError
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.scene.formats.description import settings
 
 DOWN = {"rotate": {"axis": [1, 0, 0], "angle": 90}}
 SHEAR = {"matrix": [[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}

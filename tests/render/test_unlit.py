@@ -13,12 +13,12 @@ from few import few
 from trials import film_of
 
 import torchpt
-from torchpt.cli import main
-from torchpt.errors import NoLightWarning
-from torchpt.format.description import settings
-from torchpt.forward.run import Run
-from torchpt.forward.unlit import Unlit, unlit
-from torchpt.rendering import Rendering, render_scene
+from torchpt.cli.main import main
+from torchpt.core.errors import NoLightWarning
+from torchpt.rendering.api import Rendering, render_scene
+from torchpt.rendering.run import Run
+from torchpt.rendering.unlit import Unlit, unlit
+from torchpt.scene.formats.description import settings
 
 FLOOR = {"type": "rectangle", "transform": [{"scale": 4}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}]}
 BULB = {"type": "sphere", "center": [0, 1, 0], "radius": 0.5, "material": {"type": "dielectric"}}
@@ -149,7 +149,7 @@ def test_few_dark_pixels_widen_the_interval(monkeypatch):
     """A black pixel may be off by 1 at most, in squared error over radiance squared."""
     scene = torchpt.load("cornell_box", device="cpu")
     plain = shot(scene, film=film_of(32))
-    monkeypatch.setattr("torchpt.forward.unlit.unlit", lambda *_: Unlit("", 0.003))
+    monkeypatch.setattr("torchpt.rendering.unlit.unlit", lambda *_: Unlit("", 0.003))
     wide = shot(scene, film=film_of(32))
     assert plain.relmse_interval is not None and wide.relmse_interval is not None and wide.relmse == plain.relmse
     low, high = plain.relmse_interval

@@ -7,8 +7,8 @@ import torch
 from few import few
 from torch import Tensor
 
-from torchpt.reports.bias import bias_of, tiles
-from torchpt.reports.reference import Truth
+from torchpt.reports.analysis import bias_of, tiles
+from torchpt.reports.runs import Truth
 
 SIDE, RUNS, SPP = 32, 5, 16
 TRUTHS, TRUTH_SPP = 8, 64

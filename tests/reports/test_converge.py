@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 import torch
 
-from torchpt.cli import main
-from torchpt.commands import progress
+from torchpt.cli import progress
+from torchpt.cli.main import main
 from torchpt.images import write_image
-from torchpt.reports import measure, report
-from torchpt.reports.measure import seed_of
+from torchpt.reports import report, runs
+from torchpt.reports.runs import seed_of
 
 SCENE = """\
 camera: {origin: [0, 1, 4], target: [0, 0.5, 0], fov: 50}
@@ -46,7 +46,7 @@ class Renders:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.seen: list[tuple[int, int]] = []
         self.most = 10**9
-        render = measure.render_scene
+        render = runs.render_scene
 
         def counted(scene: Any, wishes: Any, on_progress: Any) -> Any:
             if len(self.seen) >= self.most:
@@ -57,7 +57,7 @@ class Renders:
             self.seen.append((wishes.render.spp, wishes.render.seed))
             return render(scene, wishes, on_progress=on_progress)
 
-        monkeypatch.setattr(measure, "render_scene", counted)
+        monkeypatch.setattr(runs, "render_scene", counted)
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +210,7 @@ def test_progress_is_told_in_lines_where_no_terminal_shows_a_bar(
 
 
 def test_print_keeps_things_whole_and_small() -> None:
-    text = (Path(measure.__file__).parent / "report.html").read_text()
+    text = (Path(runs.__file__).parent / "report.html").read_text()
     style = text.partition("<style>")[2].partition("</style>")[0]
     printed = re.search(r"@media print \{(.*?)\n\}", style, re.DOTALL)
     assert printed is not None

@@ -13,15 +13,14 @@ from typing import Any
 import pytest
 import torch
 
-from torchpt.cli import main
-from torchpt.errors import SceneError
+from torchpt.cli.main import main
+from torchpt.core.errors import SceneError
 from torchpt.images import read_image
-from torchpt.rendering import render_scene
-from torchpt.reports import measure
+from torchpt.rendering.api import render_scene
+from torchpt.reports import runs
 from torchpt.reports.analysis import Topic, analyse
-from torchpt.reports.measure import Measured, prepare
 from torchpt.reports.plots import curves
-from torchpt.reports.store import Store
+from torchpt.reports.runs import Measured, Store, prepare
 from torchpt.reports.study import Study, study_of
 
 SCENE = """\
@@ -76,7 +75,7 @@ def measured(folder: Path) -> tuple[Study, Measured]:
     """The finished study, nothing rendered."""
     study = study_of({**RAW, "denoise": True})
     (scene,) = prepare(study)
-    measure.measure(study, [scene], Store(folder / "study" / "runs"))
+    runs.measure(study, [scene], Store(folder / "study" / "runs"))
     return study, scene
 
 
@@ -90,7 +89,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Topic:
     (scene,) = prepare(study)
     with pytest.MonkeyPatch.context() as patch:  # which pictures they are is not the question
         patch.setattr("torchpt.images.denoiser.denoise", lambda image, **_: 0.5 * (image + image.mean((0, 1))))
-        measure.measure(study, [scene], Store(place / "runs"))
+        runs.measure(study, [scene], Store(place / "runs"))
     return analyse(study, scene)
 
 
@@ -130,7 +129,7 @@ def test_what_is_denoised_is_the_run_to_the_bit_and_seconds_hold_all_of_it(folde
         for spp in (1, 4):
             noisy, run = curve.steps[spp][1], curve.denoised_steps[spp][1]
             wishes = curve.denoised.wishes
-            wishes = measure.replace(wishes, render=wishes.render.but(spp=spp, seed=noisy.facts["seed"]))
+            wishes = runs.replace(wishes, render=wishes.render.but(spp=spp, seed=noisy.facts["seed"]))
             again = render_scene(curve.job.scene, wishes)
             assert torch.equal(again.image.double(), noisy.image())
             assert set(again.guides) == {"albedo", "normal"} and again.relmse is None, "no pilots"
@@ -174,18 +173,18 @@ def test_no_figure_of_the_others_is_found_by_them(small: Topic) -> None:
 @pytest.mark.slow
 def test_denoised_pictures_are_kept_like_runs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[bool] = []
-    render = measure.render_scene
+    render = runs.render_scene
 
     def counted(scene: Any, wishes: Any, on_progress: Any) -> Any:
         seen.append(wishes.film.denoise)
         return render(scene, wishes, on_progress=on_progress)
 
-    monkeypatch.setattr(measure, "render_scene", counted)
+    monkeypatch.setattr(runs, "render_scene", counted)
     before = told(folder / "study")
     assert main(["converge", *WORDS, "denoise=true"]) == 0 and seen == []
     assert [curve["steps"] for curve in told(folder / "study")] == [curve["steps"] for curve in before]
     shutil.copytree(folder / "study" / "runs", folder / "newer" / "runs")
-    monkeypatch.setattr(measure, "denoiser_version", lambda: "pyoidn 3")
+    monkeypatch.setattr(runs, "denoiser_version", lambda: "pyoidn 3")
     words = [word.replace("out=study", "out=newer") for word in WORDS]
     assert main(["converge", *words, "denoise=true"]) == 0
     assert seen == [True] * (8 + 4), "another denoiser: only these, and one that is thrown away for each turn"

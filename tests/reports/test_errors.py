@@ -8,12 +8,12 @@ from importlib.util import find_spec
 import pytest
 import torch
 
-from torchpt.errors import AssetError
+from torchpt.core.errors import AssetError
 from torchpt.images import metrics, write_image
-from torchpt.reports.errors import error_map, measures, mse, relmse, relmse_trimmed
-from torchpt.reports.reference import Truth, from_file
+from torchpt.reports.analysis import error_map, measures, mse, relmse, relmse_trimmed
+from torchpt.reports.runs import Truth, from_file
 from torchpt.reports.study import MEASURES
-from torchpt.settings import Film
+from torchpt.scene.settings import Film
 
 SHAPE = (40, 50, 3)
 

@@ -8,9 +8,8 @@ import pytest
 import torch
 from textured_quad import repeated, textured_quad
 
-from torchpt.errors import OutputError
-from torchpt.reports.measure import prepare
-from torchpt.reports.store import Store, name_of, write_whole
+from torchpt.core.errors import OutputError
+from torchpt.reports.runs import Store, name_of, prepare, write_whole
 from torchpt.reports.study import study_of
 
 FACTS = {"spp": 4, "seed": 7, "seconds": 0.5, "nonfinite_samples": 0}

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from torchpt.commands.arguments import UsageError, parse
-from torchpt.commands.converge import HELP, raw_study
-from torchpt.errors import SceneError
+from torchpt.cli.arguments import UsageError, parse
+from torchpt.cli.converge import HELP, raw_study
+from torchpt.core.errors import SceneError
 from torchpt.reports.study import OWN_KEYS, read_study, study_of
 
 

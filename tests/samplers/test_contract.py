@@ -10,10 +10,10 @@ from outside import values_outside
 from torch import Tensor
 from trials import SIGNIFICANCE, grid_cells, uniform_p, z_limit
 
-from torchpt.errors import SceneError
-from torchpt.samplers import ADAPTIVE, KINDS, Dimension, Draws, Sampler, points_of, salts
+from torchpt.core.errors import SceneError
+from torchpt.physics.samplers import ADAPTIVE, KINDS, Dimension, Draws, Sampler, points_of, salts
 from torchpt.spec import parameters_of
-from torchpt.spec.declared import described
+from torchpt.spec.schema import described
 
 CPU = torch.device("cpu")
 PIXELS, COUNT, WIDTH = 1 << 12, 16, 64

@@ -8,11 +8,11 @@ from torch import Tensor
 from trials import SIGNIFICANCE, film_of, grid_cells, shoot, uniform_p, z_limit
 
 import torchpt
-from torchpt.errors import NotBuiltError, SceneError
-from torchpt.format.description import read_description, settings
-from torchpt.samplers import KINDS, Dimension, Sampler, points_of, salts
-from torchpt.samplers.kinds import zsobol
-from torchpt.samplers.shuffling import shuffle
+from torchpt.core.errors import NotBuiltError, SceneError
+from torchpt.physics.samplers import KINDS, Dimension, Sampler, points_of, salts
+from torchpt.physics.samplers.bits import shuffle
+from torchpt.physics.samplers.kinds import zsobol
+from torchpt.scene.formats.description import read_description, settings
 
 CPU = torch.device("cpu")
 COUNTED = [name for name, kind in KINDS.items() if kind.needs_count]

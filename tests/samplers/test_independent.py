@@ -7,7 +7,7 @@ import torch
 from trials import SIGNIFICANCE, grid_cells, uniform_p
 
 from torchpt.math.hashing import logical_shift, mix, mix_int, to_unit
-from torchpt.samplers import KINDS, Dimension, Sampler, points_of, salts
+from torchpt.physics.samplers import KINDS, Dimension, Sampler, points_of, salts
 
 CPU = torch.device("cpu")
 independent = points_of("independent")

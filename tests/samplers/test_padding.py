@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.samplers import Dimension, Draws, Sampler, salts
+from torchpt.physics.samplers import Dimension, Draws, Sampler, salts
 
 CPU = torch.device("cpu")
 

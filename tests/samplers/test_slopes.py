@@ -11,7 +11,7 @@ from few import few
 from trials import film_of, shoot, spread
 
 import torchpt
-from torchpt.samplers import KINDS
+from torchpt.physics.samplers import KINDS
 
 #: A floor that fills the picture under a lamp that nothing hides: smooth in the place within a pixel and on the lamp.
 SMOOTH = {

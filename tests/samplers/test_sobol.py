@@ -11,7 +11,8 @@ import torch
 from trials import SIGNIFICANCE, film_of, grid_cells, shoot, uniform_p
 
 import torchpt
-from torchpt.samplers import Dimension, Draws, Sampler, points_of, salts, scrambling
+from torchpt.physics.samplers import Dimension, Draws, Sampler, points_of, salts
+from torchpt.physics.samplers import bits as scrambling
 
 CPU = torch.device("cpu")
 sobol = points_of("sobol")

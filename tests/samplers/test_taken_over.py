@@ -7,9 +7,9 @@ import torch
 from few import few
 
 import torchpt.engines  # noqa: F401  (registers)
-from torchpt import samplers
-from torchpt.lanes.function import Lanewise
-from torchpt.samplers import KINDS, Dimension, Draws, Sampler, points_of, salts
+from torchpt.compiler.function import Lanewise
+from torchpt.physics import samplers
+from torchpt.physics.samplers import KINDS, Dimension, Draws, Sampler, points_of, salts
 
 CPU = torch.device("cpu")
 DRAWS = {"draw_1d": samplers.draw_1d, "draw_2d": samplers.draw_2d, "draw_further": samplers.draw_further}

@@ -15,10 +15,10 @@ from few import few
 from torch import Tensor
 
 import torchpt
-from torchpt import bsdfs, cameras, lights, shapes, textures
-from torchpt.errors import SceneError
-from torchpt.math.warps import cosine_hemisphere
-from torchpt.records import BsdfSample
+from torchpt.core.errors import SceneError
+from torchpt.math.sampling import cosine_hemisphere
+from torchpt.physics import bsdfs, cameras, lights, shapes, textures
+from torchpt.physics.bsdfs.records import BsdfSample
 from torchpt.spec import parameters_of
 
 RED = "materials.red.reflectance"

@@ -26,7 +26,7 @@ from trials import film_of, shoot
 
 import torchpt
 from torchpt.core import tree
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.scene.fingerprint import fingerprint, fingerprints
 
 #: A quad of 2 x 2 whose texture coordinates go from 0 to 2.

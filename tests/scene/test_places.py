@@ -12,7 +12,7 @@ import torch
 from few import few
 
 import torchpt
-from torchpt.errors import AssetError, SceneError
+from torchpt.core.errors import AssetError, SceneError
 from torchpt.math.transforms import is_usable
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
@@ -138,8 +138,8 @@ def test_a_map_turned_out_of_range(tmp_path: Path) -> None:
 
 
 def test_a_light_of_a_mesh_file_too_far() -> None:
-    from torchpt.meshes import FileLight
-    from torchpt.scene.parameters import Parameters
+    from torchpt.physics.parts import Parameters
+    from torchpt.scene.meshes import FileLight
     from torchpt.scene.sources import file_lights
 
     light = FileLight("bulb", "point", np.array([1e30, 0, 0]), np.array([0, 0, 1.0]), {})

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
 QUAD = [[-1.0, -1.0, 0.2], [1.0, -1.0, 0.0], [1.0, 1.0, 0.1], [-1.0, 1.0, 0.0]]

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 
 WALL, ROUGH = "materials.wall.reflectance", "materials.shiny.roughness"
 QUAD = {"vertices": [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], "faces": [[0, 1, 2], [0, 2, 3]]}

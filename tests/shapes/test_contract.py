@@ -13,13 +13,14 @@ from few import few
 from shape_rows import PLACES, ROWS, SIMILAR, Row, Vectors
 
 import torchpt
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.math.transforms import compose
-from torchpt.records import KINDS as STORED
-from torchpt.records import Hit, World
-from torchpt.shapes import KINDS, interact, quadrics, reattach, surface_uv
-from torchpt.shapes.primitive import PRIMITIVES
-from torchpt.shapes.quadrics import Quadric
+from torchpt.physics.shapes import KINDS, interact, quadrics, reattach, surface_uv
+from torchpt.physics.shapes.geometry import KINDS as STORED
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.physics.shapes.primitive import PRIMITIVES
+from torchpt.physics.shapes.quadrics import Quadric
+from torchpt.physics.world import World
 from torchpt.spec import parameters_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")

@@ -13,11 +13,11 @@ import torch
 from few import few
 
 import torchpt
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
+from torchpt.math.sampling import uniform_sphere
 from torchpt.math.vectors import dot
-from torchpt.math.warps import uniform_sphere
-from torchpt.records import Hit
-from torchpt.shapes import interact, offset_origin
+from torchpt.physics.shapes import interact, offset_origin
+from torchpt.physics.shapes.geometry import Hit
 
 BUNNY = Path(os.environ.get("TORCHPT_ASSETS", "")) / "bunny.ply"
 CAMERA = {"origin": [0, 2, 5], "target": [0, 0.4, 0], "fov": 45}
@@ -154,16 +154,16 @@ def test_bad_instances_are_one_line(name):
 
 
 def test_more_primitives_than_ids_are_refused(monkeypatch):
-    from torchpt.scene.assembly import copies
+    from torchpt.scene.world import primitives
 
-    monkeypatch.setattr(copies, "MOST_PRIMITIVES", 16)
+    monkeypatch.setattr(primitives, "MOST_PRIMITIVES", 16)
     with pytest.raises(SceneError, match="primitives"):
         torchpt.load(described(False), "cpu").world(torch.float32)
 
 
 def test_info_counts_instances():
     scene = torchpt.load(described(False), "cpu")
-    from torchpt.format.description import settings
+    from torchpt.scene.formats.description import settings
 
     told = scene.info(settings(scene.description))
     assert told["scene"]["instances"] == 3 and told["built"]["accel"]["instances"] == 3

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 import torchpt
+from torchpt.math.sampling import uniform_sphere
 from torchpt.math.vectors import dot
-from torchpt.math.warps import uniform_sphere
-from torchpt.records import Hit
-from torchpt.shapes import interact, offset_origin
+from torchpt.physics.shapes import interact, offset_origin
+from torchpt.physics.shapes.geometry import Hit
 
 G = torch.Generator().manual_seed(3)
 N = 20_000

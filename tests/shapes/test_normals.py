@@ -13,8 +13,8 @@ import torch
 from cubes import unit_cube
 
 import torchpt
-from torchpt.meshes import load_mesh
-from torchpt.shapes.normals import smooth_normals
+from torchpt.physics.shapes.normals import smooth_normals
+from torchpt.scene.meshes import load_mesh
 
 BUNNY = Path(os.environ.get("TORCHPT_ASSETS", "")) / "bunny.ply"
 

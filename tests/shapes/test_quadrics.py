@@ -12,11 +12,11 @@ from few import few
 from quadric_reference import CASES, TRANSFORMS, inside, thickness, trace
 
 import torchpt
+from torchpt.math.sampling import uniform_sphere
 from torchpt.math.transforms import compose
 from torchpt.math.vectors import dot
-from torchpt.math.warps import uniform_sphere
-from torchpt.records import Hit
-from torchpt.shapes import interact, offset_origin, quadrics
+from torchpt.physics.shapes import interact, offset_origin, quadrics
+from torchpt.physics.shapes.geometry import Hit
 
 BACKENDS = ("torch", "numba", "brute")
 CAMERA = {"origin": [0, 0, 9], "target": [0, 0, 0]}
@@ -163,7 +163,7 @@ def test_sizes_beyond_doubles_are_refused(shape):
 
 def test_bounds_are_tight():
     """Boxes touch what they hold: no ray through a surface is lost, and no wall of a box is far from it."""
-    from torchpt.accel.bounds import primitive_bounds
+    from torchpt.search.bounds import primitive_bounds
 
     for name in ("sphere", "tube", "funnel"):
         scene, _, _ = scene_of(name, "sheared")

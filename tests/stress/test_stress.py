@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from few import few
 
-from torchpt.cli import main
-from torchpt.errors import SceneError
+from torchpt.cli.main import main
+from torchpt.core.errors import SceneError
 from torchpt.stress import Bench, Case, Outcome, Reading, outcome_of
 from torchpt.stress.cases import all_cases
 from torchpt.stress.own_scene import cases_of, moved

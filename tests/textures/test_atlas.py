@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.textures.atlas import WRAPS, Atlas, ImageNode, atlas_of, look_up, slope
+from torchpt.physics.textures.atlas import WRAPS, Atlas, ImageNode, atlas_of, look_up, slope
 
 CPU = torch.device("cpu")
 SAME = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))

@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 import torchpt
-from torchpt.errors import SceneError
-from torchpt.format.textures import texture_of
-from torchpt.lanes.function import lanewise
+from torchpt.compiler.function import lanewise
+from torchpt.core.errors import SceneError
 from torchpt.math.vectors import luminance
-from torchpt.scene.parameters import Parameters
+from torchpt.physics.parts import Parameters
+from torchpt.physics.textures import KINDS, Node, Table, TexturePoint
+from torchpt.scene.formats.textures import texture_of
 from torchpt.scene.texels import Opener
 from torchpt.spec import Color, Moves, Scalar, Spec, Texels, parameters_of
-from torchpt.spec.declared import described
-from torchpt.textures import KINDS, Node, Table, TexturePoint
+from torchpt.spec.schema import described
 
 CPU = torch.device("cpu")
 COLOUR = Color((0.0, 0.0, 0.0), low=0.0, high=1.0, texture=True)

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from torchpt.math.hashing import mix_int
-from torchpt.spec.declared import values_of
-from torchpt.textures import KINDS, TexturePoint
-from torchpt.textures.computed import ComputedNode
-from torchpt.textures.kinds.noise import Noise
+from torchpt.physics.textures import KINDS, TexturePoint
+from torchpt.physics.textures.computed import ComputedNode
+from torchpt.physics.textures.kinds.noise import Noise
+from torchpt.spec.schema import values_of
 
 CPU = torch.device("cpu")
 COLORS = {"n.color0": torch.zeros(3), "n.color1": torch.ones(3)}

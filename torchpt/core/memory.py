@@ -24,7 +24,7 @@ from typing import TypeVar
 
 import torch
 
-from torchpt.errors import RenderError, SceneError, TorchptError, say_once
+from torchpt.core.errors import RenderError, SceneError, TorchptError, say_once
 
 __all__ = [
     "FEWEST",

@@ -27,8 +27,8 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
+from torchpt.core.errors import RenderError
 from torchpt.core.memory import check_room, suffices
-from torchpt.errors import RenderError
 
 __all__ = [
     "Crew",

@@ -10,16 +10,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt import samplers
-from torchpt.integrators import transmission
-from torchpt.integrators.surfaces import opacity_map
-from torchpt.lanes import bits
-from torchpt.lanes.function import Lanewise
-from torchpt.lanes.tracing import tracing
-from torchpt.lights import solid_angle, tree
+from torchpt.compiler import bits
+from torchpt.compiler.function import Lanewise
+from torchpt.compiler.tracing import tracing
 from torchpt.math import hashing
-from torchpt.records import Hit, World
-from torchpt.shapes import interact
+from torchpt.paths import transmission
+from torchpt.paths.surface import opacity_map
+from torchpt.physics import samplers
+from torchpt.physics.lights import solid_angle, tree
+from torchpt.physics.shapes import interact
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.physics.world import World
 
 __all__: list[str] = []
 

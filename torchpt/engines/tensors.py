@@ -1,7 +1,7 @@
 """The events of paths by tensor operations: any device, float32 or float64, under a tape or without, models of any kind.
 
 The readable reference for kernels. Each verb is a few operations on all lanes of a wave, or a stage
-(:mod:`torchpt.integrators.stages`) on those that it concerns.
+(:mod:`torchpt.paths.vertex`) on those that it concerns.
 """
 
 from __future__ import annotations
@@ -15,19 +15,18 @@ import torch
 from torch import Tensor
 
 from torchpt.core.tree import map_leaves
-from torchpt.film.splats import LARGEST, Splats
-from torchpt.integrators import LAYERS, aov
-from torchpt.integrators.base import check_fields, check_output
-from torchpt.integrators.path import Ends, partition, slides
-from torchpt.integrators.plate import Plate
-from torchpt.integrators.tally import Tally
-from torchpt.integrators.transmission import beyond, non_opaque, opacity_at
-from torchpt.integrators.vertex import Emission, Splat, StageContext, VertexInput, VertexOutput
-from torchpt.integrators.wave import Wave
-from torchpt.math.vectors import take
+from torchpt.math.vectors import joined, rows, take
+from torchpt.paths import layer as aov
+from torchpt.paths.integrators import LAYERS
+from torchpt.paths.integrators.base import check_fields, check_output
+from torchpt.paths.integrators.path import Ends, partition, slides
+from torchpt.paths.state import Emission, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
+from torchpt.paths.transmission import beyond, non_opaque, opacity_at
 from torchpt.paths.walk import Counts, Observer, find, walk
-from torchpt.records import Hit, PathState, Shadow, joined, rows
-from torchpt.samplers import salts
+from torchpt.paths.wave import Plate, Tally, Wave
+from torchpt.physics.film.splats import LARGEST, Splats
+from torchpt.physics.samplers import salts
+from torchpt.physics.shapes.geometry import Hit
 
 __all__ = ["Paths", "Tensors", "brought", "hits", "layers", "radiance", "seen", "trace"]
 

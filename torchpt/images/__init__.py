@@ -1,4 +1,11 @@
-"""Pictures: files in and out, colour, and how far one is from another."""
+"""Pictures: files in and out, colour, and how far one is from another.
+
+``read.py`` and ``write.py`` are the doors: start there. ``decode.py`` and ``header.py`` know the formats, ``layers.py`` the
+layers of an EXR, ``movie.py`` moving pictures, ``metrics.py`` the measures, ``colour.py`` tone mapping, ``denoiser.py`` the
+denoiser.
+
+May import: ``core``, ``math``, ``spec``.
+"""
 
 from torchpt.images.decode import EncodedImage
 from torchpt.images.header import read_header

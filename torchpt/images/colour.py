@@ -15,8 +15,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from torchpt.core.errors import SceneError
 from torchpt.core.threads import in_pieces
-from torchpt.errors import SceneError
 
 __all__ = ["TONEMAPS", "display", "linear_to_srgb", "srgb_to_linear"]
 

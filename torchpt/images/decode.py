@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpt.errors import AssetError
-from torchpt.files import as_path, read_regular
+from torchpt.core.errors import AssetError
+from torchpt.core.files import as_path, read_regular
 from torchpt.images.png import plain_png
 
 __all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "complaint", "existing", "pixels_of"]

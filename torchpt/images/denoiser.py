@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpt.errors import RenderError
+from torchpt.core.errors import RenderError
 
 __all__ = ["GUIDES", "check_denoiser", "denoise", "denoiser_version"]
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from os import PathLike
 from typing import Any
 
-from torchpt.errors import AssetError
+from torchpt.core.errors import AssetError
 from torchpt.images.decode import complaint, existing
 
 __all__ = ["Fact", "checked_header", "put_header", "read_header"]

@@ -13,7 +13,7 @@ from torchpt.spec import Kinds
 __all__ = ["channel_names", "group_channels"]
 
 #: The layers of ``film.aovs``, by their folder's name: nothing of that room is imported before such a layer is written.
-LAYERS: Kinds[Any] = Kinds("torchpt.integrators.layers")
+LAYERS: Kinds[Any] = Kinds("torchpt.paths.layers")
 _SUFFIXES = {2: "XY", 3: "RGB", 4: "RGBA"}
 _ORDER = "RGBXYZUVA"
 

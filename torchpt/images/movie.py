@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpt.errors import OutputError
+from torchpt.core.errors import OutputError
 from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
 
 __all__ = ["MOVIES", "check_movie", "write_movie"]

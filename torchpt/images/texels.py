@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchpt.errors import AssetError
-from torchpt.files import read_regular
+from torchpt.core.errors import AssetError
+from torchpt.core.files import read_regular
 from torchpt.images.colour import srgb_to_linear
 from torchpt.images.decode import MAX_PIXELS, EncodedImage, Pixels, existing, pixels_of
 from torchpt.images.layers import group_channels

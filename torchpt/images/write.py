@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.errors import OutputError
-from torchpt.files import as_path
+from torchpt.core.errors import OutputError
+from torchpt.core.files import as_path
 from torchpt.images.colour import display
 from torchpt.images.header import Fact, checked_header, put_header
 from torchpt.images.layers import channel_names

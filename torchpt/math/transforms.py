@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 
 __all__ = [
     "OPERATIONS",

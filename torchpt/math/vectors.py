@@ -1,16 +1,37 @@
-"""Component-first vectors ``(3, N)``: written out per component, which rounds alike at every lane position.
-
-``addcmul`` is one pass over memory where a product and a sum are two, and it too rounds alike everywhere (tested).
-"""
+"""Vectors ``(3, N)``, frames and angles between vectors; the lanes of records."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from torchpt.core.tree import map_leaves
 from torchpt.math.gathers import gatherer
 
-__all__ = ["affine", "cross", "dot", "largest", "luminance", "normalize", "safe_reciprocal", "take"]
+__all__ = [
+    "SERIES",
+    "Frame",
+    "affine",
+    "azimuth",
+    "cross",
+    "dot",
+    "joined",
+    "largest",
+    "luminance",
+    "normalize",
+    "rows",
+    "safe_reciprocal",
+    "take",
+]
+
+
+# ---- Component-first vectors ``(3, N)``: written out per component, which rounds alike at every lane position
+#
+# ``addcmul`` is one pass over memory where a product and a sum are two, and it too rounds alike everywhere (tested).
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -74,3 +95,99 @@ def take(table: Tensor, index: Tensor | None) -> Tensor:
         if taken is not None:
             return taken
     return torch.index_select(table, table.dim() - 1, index)
+
+
+T = TypeVar("T")
+
+
+def rows(record: T, index: Tensor | None) -> T:
+    """Return the lanes ``index`` of all tensors in a record (None: all); what is static stays."""
+    return record if index is None else map_leaves(lambda table: take(table, index), record)
+
+
+def joined(records: list[T]) -> T:
+    """Records joined along the lane axis."""
+    return records[0] if len(records) == 1 else map_leaves(lambda *parts: torch.cat(parts, -1), *records)
+
+
+# ---- Orthonormal frames about a normal: ``+z`` is the normal
+#
+# Duff, Burgess, Christensen, Hery, Kensler, Liani, Villemin: *Building an Orthonormal Basis, Revisited*, JCGT 6(1), 2017.
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Tangent, bitangent and normal, each ``(3, N)``."""
+
+    s: Tensor
+    t: Tensor
+    n: Tensor
+
+    @staticmethod
+    def about(n: Tensor) -> Frame:
+        """The frame about unit normals ``(3, N)``; continuous but for ``n.z = 0``, and never degenerate."""
+        sign = torch.copysign(torch.ones_like(n[2]), n[2])
+        a = -1.0 / (sign + n[2])
+        b = n[0] * n[1] * a
+        s = torch.stack((1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]))
+        t = torch.stack((b, sign + n[1] * n[1] * a, -n[1]))
+        return Frame(s, t, n)
+
+    @staticmethod
+    def along(n: Tensor, tangent: Tensor) -> Frame:
+        """The frame about unit normals ``n (3, N)`` whose ``s`` is next to ``tangent (3, N)``; any where that is along n."""
+        s = torch.addcmul(tangent, n, dot(n, tangent), value=-1)
+        square, whole = dot(s, s), dot(tangent, tangent)
+        usable = square > 1e-12 * whole
+        s = torch.where(usable, s / torch.where(usable, square, 1.0).sqrt(), Frame.about(n).s)
+        return Frame(s, cross(n, s), n)
+
+    def to_local(self, w: Tensor) -> Tensor:
+        """World ``(3, N)`` to local."""
+        return torch.stack((dot(self.s, w), dot(self.t, w), dot(self.n, w)))
+
+    def to_world(self, w: Tensor) -> Tensor:
+        """Local ``(3, N)`` to world."""
+        return affine(self.s * w[0], self.t, w[1], self.n, w[2])
+
+
+# ---- An angle that rounds alike at every lane position, which ``torch.atan2`` does not
+
+
+#: ``atan(x) / x`` in powers of ``x^2`` for ``|x| <= tan(pi / 8)``: Chebyshev interpolation, error below 3e-13.
+SERIES = (
+    0.9999999999992449,
+    -0.33333333276920757,
+    0.19999993053407192,
+    -0.1428538654655432,
+    0.11103456759179119,
+    -0.08992551401945466,
+    0.06974190432707487,
+    -0.03765497158862104,
+)
+_TURN = 2.0 * math.pi
+
+
+def azimuth(x: Tensor, y: Tensor) -> Tensor:
+    """Angles ``(N,)`` in ``[0, 2 pi)`` from +x to ``(x, y)``, counter-clockwise; 0, with finite derivatives, at the origin."""
+    # Signs as factors, and never 0: |x| would lose the derivative on an axis.
+    sign_x, sign_y = (torch.copysign(torch.ones_like(a), a).detach() for a in (x, y))
+    a, b = x * sign_x, y * sign_y
+    steep = b > a
+    low, high = torch.where(steep, a, b), torch.where(steep, b, a)
+    # Scaled by a constant, so that the sum below neither overflows nor vanishes.
+    scale = high.detach()
+    scale = torch.where(scale > 0, scale, 1.0)
+    low, high = low / scale, torch.where(high > 0, high / scale, 1.0)
+    # atan(r) = pi / 4 + atan((r - 1) / (r + 1)) brings the upper half of the octant to the lower one.
+    upper = low > (math.sqrt(2.0) - 1.0) * high
+    ratio = torch.where(upper, low - high, low) / torch.where(upper, low + high, high)
+    square = ratio * ratio
+    series = torch.full_like(square, SERIES[-1])
+    for coefficient in reversed(SERIES[:-1]):
+        series = series * square + coefficient
+    angle = ratio * series + upper.to(x.dtype) * (0.25 * math.pi)
+    angle = torch.where(steep, 0.5 * math.pi - angle, angle)
+    angle = torch.where(x < 0, math.pi - angle, angle)
+    angle = torch.where(y < 0, _TURN - angle, angle)
+    return torch.where(angle >= _TURN, angle - _TURN, angle)

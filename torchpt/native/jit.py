@@ -22,9 +22,9 @@ from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.event import Event, Listener, register
 
+from torchpt.core.errors import RenderError
 from torchpt.core.memory import MARGIN, check_room
 from torchpt.core.threads import share
-from torchpt.errors import RenderError
 from torchpt.native import cache, compile_time
 from torchpt.native.content import code_of_function
 

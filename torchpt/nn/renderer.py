@@ -10,13 +10,13 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor, nn
 
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.nn.ranges import range_of
-from torchpt.rendering import render
+from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
-from torchpt.settings import Common, Every
+from torchpt.scene.settings import Common, Every
 from torchpt.spec.arguments import check_names, spelled
 
 __all__ = ["Renderer"]

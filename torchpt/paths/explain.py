@@ -15,13 +15,14 @@ import torch
 from torch import Tensor
 
 from torchpt.core.tree import leaves
-from torchpt.integrators.lost import Place
-from torchpt.integrators.vertex import Emission, VertexOutput
-from torchpt.integrators.wave import Wave
 from torchpt.math.vectors import take
+from torchpt.paths.lost import Place
+from torchpt.paths.state import Emission, PathState, VertexOutput
 from torchpt.paths.walk import Observer, Population
-from torchpt.records import Hit, PathState, World
-from torchpt.samplers import Streams
+from torchpt.paths.wave import Wave
+from torchpt.physics.samplers import Streams
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.physics.world import World
 
 __all__ = ["CAUSES", "Bounced", "Event", "Explainer", "Fault", "Left", "Legible", "Met", "Shone", "Trace", "faults_of"]
 
@@ -92,7 +93,7 @@ class Shone:
     Attributes:
         depth: of the vertex.
         lanes: ``(n,)``.
-        slot: ``(n,)`` of the surface, see :class:`~torchpt.records.Interaction`; None: it is the environment.
+        slot: ``(n,)`` of the surface, see :class:`~torchpt.physics.shapes.geometry.Interaction`; None: it is the environment.
         light: what they met.
     """
 
@@ -195,7 +196,7 @@ class Fault:
         cause: a key of :data:`CAUSES`.
         nan: whether the first value that was not finite was NaN; else it was infinite.
         depth: of the vertex, from 1; 0: at the camera, or after the path.
-        slot: of the surface there, see :class:`~torchpt.records.Interaction`; -1: it was on none.
+        slot: of the surface there, see :class:`~torchpt.physics.shapes.geometry.Interaction`; -1: it was on none.
     """
 
     cause: str

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-from torchpt.integrators.base import Limits
+from torchpt.paths.integrators.base import Limits
 
 __all__ = ["Counts", "Engine", "Observer", "Population", "find", "walk"]
 

@@ -8,7 +8,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.ranks.group import Group
 
 __all__ = ["blocks", "dealt", "share"]

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.errors import LostRankError, OtherRankError, RenderError, SceneError
+from torchpt.core.errors import LostRankError, OtherRankError, RenderError, SceneError
 
 __all__ = ["TIMEOUT", "Group", "together"]
 

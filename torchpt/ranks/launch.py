@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from datetime import timedelta
 from typing import Any
 
-from torchpt.errors import LostRankError, RenderError, TorchptError
+from torchpt.core.errors import LostRankError, RenderError, TorchptError
 from torchpt.ranks.group import TIMEOUT, Group
 
 __all__ = ["Started"]

@@ -9,15 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from torchpt import __version__
+from torchpt.core.version import __version__
 from torchpt.reports.analysis import Topic, analyse
-from torchpt.reports.measure import Measured
-from torchpt.reports.page import Figure, page
-from torchpt.reports.pictures import sheet_of
+from torchpt.reports.page import Figure, page, sheet_of
 from torchpt.reports.plots import curves, encoded, overview
-from torchpt.reports.store import machine, write_whole
+from torchpt.reports.runs import Measured, machine, write_whole
 from torchpt.reports.study import Study
-from torchpt.spec.declared import Described
+from torchpt.spec.schema import Described
 
 __all__ = ["facts_of", "write_report"]
 

@@ -7,18 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchpt.format.description import Description
-from torchpt.lights import order
-from torchpt.records import KINDS
-from torchpt.scene.coordinates import check_coordinates, declare_corners
+from torchpt.physics.lights import order
+from torchpt.physics.parts import Copy, Parameters, Part, Source
+from torchpt.physics.shapes.geometry import KINDS
+from torchpt.scene.formats.description import Description
 from torchpt.scene.materials import declare, resolved
-from torchpt.scene.parameters import Parameters
-from torchpt.scene.parts import Copy, Part, Source
+from torchpt.scene.mesh_shapes import warn_of_touching
 from torchpt.scene.shapes import Owner, ShapeBuilder
-from torchpt.scene.sources import sources_of
+from torchpt.scene.sources import check_coordinates, declare_corners, sources_of
 from torchpt.scene.space import centre_and_unit
 from torchpt.scene.texels import Opener
-from torchpt.scene.touching import warn_of_touching
 
 __all__ = ["Built", "build_parts"]
 

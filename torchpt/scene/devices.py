@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from torchpt.errors import RenderError, SceneError
+from torchpt.core.errors import RenderError, SceneError
 
 __all__ = ["device_of"]
 

@@ -7,7 +7,7 @@ from weakref import ref
 
 from torch import Tensor
 
-from torchpt.errors import RenderError
+from torchpt.core.errors import RenderError
 
 __all__ = ["AFTER", "Editions", "changes", "check_unchanged"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.scene.scene import Scene
 
 __all__ = ["as_scene"]

@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 from torch import Tensor
 
 from torchpt.core import tree
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.scene.build import Built
 from torchpt.scene.scene import Scene
 

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchpt.errors import AssetError
+from torchpt.core.errors import AssetError
 from torchpt.math.transforms import is_usable
-from torchpt.meshes import FileLight, MeshPart
-from torchpt.meshes.mesh_part import checked
-from torchpt.meshes.trimesh_material import Looks
-from torchpt.meshes.trimesh_parts import lights_of, parts_of, placed_in
 from torchpt.scene.loading import load
+from torchpt.scene.meshes import FileLight, MeshPart
+from torchpt.scene.meshes.mesh import checked
+from torchpt.scene.meshes.trimesh_objects import Looks, lights_of, parts_of, placed_in
 from torchpt.scene.scene import Scene
 from torchpt.scene.sources import labels_of
 

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from torchpt import bsdfs
-from torchpt.accel import Accel
 from torchpt.core.tree import leaves
-from torchpt.film import FILTERS
-from torchpt.lights import KINDS as LIGHTS
-from torchpt.lights import SURFACES, Environment
-from torchpt.lights.choice import ByTree
-from torchpt.records import KINDS, Lights, World
-from torchpt.settings import Settings
+from torchpt.physics import bsdfs
+from torchpt.physics.film import FILTERS
+from torchpt.physics.lights import KINDS as LIGHTS
+from torchpt.physics.lights import SURFACES, Environment
+from torchpt.physics.lights.choice import ByTree
+from torchpt.physics.lights.records import Lights
+from torchpt.physics.shapes.geometry import KINDS
+from torchpt.physics.world import World
+from torchpt.scene.settings import Settings
+from torchpt.search import Accel
 
 if TYPE_CHECKING:
-    from torchpt.format.description import Description
     from torchpt.scene.build import Built
+    from torchpt.scene.formats.description import Description
 
 __all__ = ["describe"]
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
-from torchpt.bsdfs import Bsdf
 from torchpt.core.memory import needing
 from torchpt.core.threads import lasting
-from torchpt.format.description import Source, read_description, settings
-from torchpt.format.tensors import Tensors
+from torchpt.physics.bsdfs import Bsdf
 from torchpt.scene.devices import device_of
+from torchpt.scene.formats.description import Source, read_description, settings
+from torchpt.scene.formats.tensors import Tensors
 from torchpt.scene.scene import Scene
 from torchpt.scene.traced import corners_in, traced, widened
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from torchpt.bsdfs.base import made
-from torchpt.bsdfs.resolved import ResolvedMaterial
-from torchpt.format.materials import POINTS, inner_of
-from torchpt.format.textures import TextureInput
-from torchpt.scene.parameters import Parameters
+from torchpt.physics.bsdfs.base import made
+from torchpt.physics.bsdfs.resolved import ResolvedMaterial
+from torchpt.physics.parts import Parameters
+from torchpt.physics.textures import Node
+from torchpt.scene.formats.materials import POINTS, inner_of
+from torchpt.scene.formats.textures import TextureInput
 from torchpt.spec import parameters_of
-from torchpt.spec.declared import Described
-from torchpt.textures import Node
+from torchpt.spec.schema import Described
 
 __all__ = ["declare", "resolved"]
 

@@ -6,9 +6,9 @@ from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import accumulate
 
-from torchpt.records import World
+from torchpt.physics.parts import Copy, Part
+from torchpt.physics.world import World
 from torchpt.scene.build import Built
-from torchpt.scene.parts import Copy, Part
 
 __all__ = ["Names", "Surface"]
 
@@ -50,7 +50,7 @@ class Names:
             self._shining = slots[rows[slots].argsort()].tolist()
 
     def surface(self, slot: int, prim: int) -> Surface:
-        """A surface by its :class:`~torchpt.records.Interaction`'s slot and primitive."""
+        """A surface by its :class:`~torchpt.physics.shapes.geometry.Interaction`'s slot and primitive."""
         number = bisect_right(self._ends, prim) - 1
         part, first = self._parts[number], self._ends[number]
         copied = slot >= self._ends[-1]

@@ -16,28 +16,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt import accel as search
-from torchpt.accel import Accel
-from torchpt.bsdfs import Bsdf
-from torchpt.cameras import Camera, PinholeMatrices
-from torchpt.cameras.opencv import extrinsics
+from torchpt import search
+from torchpt.core.autograd import outside_transforms
+from torchpt.core.errors import SceneError
 from torchpt.core.memory import Meter, mb, retried
 from torchpt.core.threads import lasting, settle
-from torchpt.errors import SceneError
-from torchpt.format.description import Description, settings
-from torchpt.records import Geometry, World
-from torchpt.scene.assembly import assemble
+from torchpt.physics.bsdfs import Bsdf
+from torchpt.physics.cameras import Camera
+from torchpt.physics.cameras.opencv import PinholeMatrices, extrinsics
+from torchpt.physics.shapes.geometry import Geometry
+from torchpt.physics.world import World
 from torchpt.scene.build import Built, build_parts
 from torchpt.scene.devices import device_of
 from torchpt.scene.editions import Editions, changes
+from torchpt.scene.formats.description import Description, settings
 from torchpt.scene.info import describe
+from torchpt.scene.settings import Film, Settings
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, extent_of, middle_of
 from torchpt.scene.vetting import check_tensor, shared, vet
 from torchpt.scene.view import through
-from torchpt.settings import Film, Settings
+from torchpt.scene.world import assemble
+from torchpt.search import Accel
 from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
-from torchpt.taped import outside_transforms
 
 __all__ = ["Scene", "numbered"]
 
@@ -345,7 +346,7 @@ class Scene:
         film: Mapping[str, Any] | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> PinholeMatrices:
-        """The camera as OpenCV's matrices ``K`` in pixels, ``R`` and ``t``: see :mod:`torchpt.cameras.opencv`.
+        """The camera as OpenCV's matrices ``K`` in pixels, ``R`` and ``t``: see :mod:`torchpt.physics.cameras.opencv`.
 
         Args:
             params: tensors in place of the scene's, by name; gradients flow to those of the camera.

@@ -7,24 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from torchpt.bsdfs import KINDS as BSDFS
-from torchpt.bsdfs.resolved import ResolvedMaterial
-from torchpt.errors import AssetError, SceneError
-from torchpt.format.description import Description
-from torchpt.format.materials import check_material, plain_material, read_material
+from torchpt.core.errors import AssetError, SceneError
 from torchpt.math.transforms import WITHIN, is_usable
-from torchpt.meshes import FileMaterial, MeshPart
+from torchpt.physics.bsdfs import KINDS as BSDFS
+from torchpt.physics.bsdfs.resolved import ResolvedMaterial
+from torchpt.physics.parts import Copy, Parameters, Part, Source
+from torchpt.physics.shapes.base import Surface, Triangles
+from torchpt.physics.shapes.primitive import PRIMITIVES
+from torchpt.physics.textures import Node
+from torchpt.scene.formats.description import Description
+from torchpt.scene.formats.materials import check_material, plain_material, read_material
 from torchpt.scene.materials import declare, resolved
-from torchpt.scene.meshes import Mesh, ignored, mesh_of, solid
-from torchpt.scene.parameters import Parameters
-from torchpt.scene.parts import Copy, Part, Source
+from torchpt.scene.mesh_shapes import Mesh, ignored, mesh_of, solid
+from torchpt.scene.meshes import FileMaterial, MeshPart
 from torchpt.scene.sources import file_lights, labels_of
 from torchpt.scene.texels import Opener
-from torchpt.shapes.base import Surface, Triangles
-from torchpt.shapes.primitive import PRIMITIVES
 from torchpt.spec import Pose, Vertices, parameters_of
-from torchpt.spec.declared import Described
-from torchpt.textures import Node
+from torchpt.spec.schema import Described
 
 __all__ = ["Owner", "ShapeBuilder"]
 

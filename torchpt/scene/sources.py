@@ -1,4 +1,4 @@
-"""Lights that are no surfaces: those of the scene's block, and those that mesh files bring."""
+"""Texture coordinates and normals of meshes: those that gradients are wanted of, and meshes that lack what texels need."""
 
 from __future__ import annotations
 
@@ -9,18 +9,56 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from torchpt.errors import AssetError, SceneError
-from torchpt.format.description import Description
-from torchpt.lights import KINDS as LIGHTS
+from torchpt.core.errors import AssetError, SceneError
 from torchpt.math.transforms import apply_points
-from torchpt.meshes import FileLight
-from torchpt.scene.parameters import Parameters
-from torchpt.scene.parts import Source
-from torchpt.spec import Refused, parameters_of
-from torchpt.spec.declared import Described
-from torchpt.spec.validate import refused
+from torchpt.physics.lights import KINDS as LIGHTS
+from torchpt.physics.parts import Parameters, Part, Source
+from torchpt.scene.formats.description import Description
+from torchpt.scene.meshes import FileLight
+from torchpt.spec import Corners, Refused, parameters_of
+from torchpt.spec.schema import Described, refused
 
-__all__ = ["check_sources", "file_lights", "labels_of", "sources_of"]
+__all__ = ["check_coordinates", "check_sources", "declare_corners", "file_lights", "labels_of", "sources_of"]
+
+
+# ---- Texture coordinates and normals of meshes: those that gradients are wanted of, and meshes that lack what texels need
+
+
+def declare_corners(parts: Sequence[Part], traced: Collection[str], parameters: Parameters) -> None:
+    """Make normals and texture coordinates of meshes parameters, those that are asked for by name."""
+    for part in parts if traced else ():
+        for key, value in (("normals", part.normals), ("uvs", part.uvs)):
+            if value is not None and f"{part.name}.{key}" in traced:
+                parameters.declare(f"{part.name}.{key}", value, Corners())
+
+
+def check_coordinates(parts: Sequence[Part], stated: Collection[str], file: str | None) -> None:
+    """Refuse texels on a mesh that does not say where they lie.
+
+    A file's image goes over each triangle of such a mesh, as Mitsuba has it; nobody who writes down texels means that.
+
+    Args:
+        parts: all of the scene.
+        stated: names of texels that the scene states itself.
+        file: scene file for the error.
+
+    Raises:
+        SceneError: such a mesh, by the name of the texels.
+    """
+    if not stated:
+        return
+    from torchpt.physics.textures.atlas import ImageNode
+
+    for part in parts:
+        if part.kind != "triangle" or part.uvs is not None:
+            continue
+        for node in part.material.readings():
+            if isinstance(node, ImageNode) and node.texels in stated:
+                expected = f"uvs (texture coordinates) for {part.name}, over which the texels lie"
+                raise SceneError(node.texels, "texels on a mesh without uvs", expected, file)
+
+
+# ---- Lights that are no surfaces: those of the scene's block, and those that mesh files bring
 
 
 def sources_of(description: Description, parameters: Parameters) -> list[Source]:

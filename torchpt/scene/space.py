@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpt.errors import SceneError
-from torchpt.lights import KINDS as LIGHTS
-from torchpt.scene.parts import Copy, Part, Source
-from torchpt.spec.declared import Described
+from torchpt.core.errors import SceneError
+from torchpt.physics.lights import KINDS as LIGHTS
+from torchpt.physics.parts import Copy, Part, Source
+from torchpt.spec.schema import Described
 
 __all__ = ["FARTHEST", "Space", "centre_and_unit", "extent_of", "middle_of"]
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchpt.scene.parameters import Parameters
-from torchpt.spec.declared import Described
-from torchpt.textures import Named, Node, Opening, TextureInput, TexturePoint
+from torchpt.physics.parts import Parameters
+from torchpt.physics.textures import Named, Node, Opening, TextureInput, TexturePoint
+from torchpt.spec.schema import Described
 
 __all__ = ["Opener"]
 

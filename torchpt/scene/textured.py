@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.bsdfs.resolved import ResolvedMaterial
-from torchpt.errors import NotBuiltError, SceneError
-from torchpt.format.textures import texture_of
+from torchpt.core.autograd import in_transform, outside_transforms
+from torchpt.core.errors import NotBuiltError, SceneError
+from torchpt.physics.bsdfs.resolved import ResolvedMaterial
+from torchpt.physics.parts import Parameters
+from torchpt.physics.textures import Node
 from torchpt.scene.build import Built
-from torchpt.scene.coordinates import check_coordinates
-from torchpt.scene.parameters import Parameters
+from torchpt.scene.formats.textures import texture_of
 from torchpt.scene.scene import Scene
+from torchpt.scene.sources import check_coordinates
 from torchpt.scene.texels import Opener
 from torchpt.spec import Refused
-from torchpt.taped import in_transform, outside_transforms
-from torchpt.textures import Node
 
 __all__ = ["renew", "with_texels"]
 

@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchpt.cameras.opencv import USUAL, angles, numbers_of
-from torchpt.cameras.poses import POSES, posed
-from torchpt.errors import SceneError
-from torchpt.format.description import Description
-from torchpt.format.tensors import Key, Tensors
+from torchpt.core.errors import SceneError
 from torchpt.math.transforms import tensor_of
+from torchpt.physics.cameras.opencv import USUAL, angles, numbers_of
+from torchpt.physics.cameras.poses import POSES, posed
+from torchpt.physics.shapes.base import Place, Size
 from torchpt.scene.build import Built
-from torchpt.shapes.base import Place, Size
+from torchpt.scene.formats.description import Description
+from torchpt.scene.formats.tensors import Key, Tensors
 from torchpt.spec import parameters_of
-from torchpt.spec.declared import Described
 from torchpt.spec.reading import transform
+from torchpt.spec.schema import Described
 
 __all__ = ["corners_in", "traced", "widened"]
 

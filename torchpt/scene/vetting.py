@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.scene.editions import changes
 from torchpt.scene.sources import check_sources
 

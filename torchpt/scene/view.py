@@ -9,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.errors import SceneError
-from torchpt.format.cameras import read_camera
-from torchpt.format.description import Description
-from torchpt.format.tensors import Tensors
-from torchpt.format.yaml_file import plain
+from torchpt.core.errors import SceneError
+from torchpt.physics.parts import Parameters
 from torchpt.scene.build import Built
-from torchpt.scene.parameters import Parameters
+from torchpt.scene.formats.cameras import read_camera
+from torchpt.scene.formats.description import Description
+from torchpt.scene.formats.tensors import Tensors
+from torchpt.scene.formats.yaml import plain
 from torchpt.scene.traced import traced, widened
 
 __all__ = ["through"]

@@ -3,17 +3,41 @@
 A *kind* is a class with a ``name`` (its ``type`` in a scene file) and ``parameters`` (a :class:`Spec` by name), one a file in
 the folder ``kinds/`` of its room. Schema, errors, defaults, the checks of ``scene.params``, what a gradient must know, config
 files and the tables of the docs are made of these.
+
+``parameters.py`` has the specs: start there. ``schema.py`` has the tables of kinds and reads whole blocks; ``reading.py`` reads
+plain numbers; ``arguments.py`` spells the signatures of functions whose arguments are declared.
+
+May import: ``core``, ``math``.
 """
 
 from __future__ import annotations
 
-from torchpt.spec.base import REQUIRED, Moves, Role, Spec
-from torchpt.spec.choices import Choice, Flag, Map, Other, Pair, Path, Whole
-from torchpt.spec.kinds import Block, Kinds, parameters_of
-from torchpt.spec.numbers import Angle, Color, Index, Scalar, Texels, spec_of
-from torchpt.spec.places import Corners, Direction, Point, Pose, Vertices
+from torchpt.spec.parameters import (
+    REQUIRED,
+    Angle,
+    Choice,
+    Color,
+    Corners,
+    Direction,
+    Flag,
+    Index,
+    Map,
+    Moves,
+    Other,
+    Pair,
+    Path,
+    Point,
+    Pose,
+    Role,
+    Scalar,
+    Spec,
+    Texels,
+    Vertices,
+    Whole,
+    spec_of,
+)
 from torchpt.spec.reading import Refused
-from torchpt.spec.valued import Valued
+from torchpt.spec.schema import Block, Kinds, Valued, parameters_of
 
 __all__ = [
     "REQUIRED",

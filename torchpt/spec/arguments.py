@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, TypeVar, get_args, get_type_hints
 
-from torchpt.spec.base import Spec
+from torchpt.spec.parameters import Spec
 from torchpt.spec.reading import Refused
 
 __all__ = ["Argument", "Declared", "check_names", "declared", "spelled"]

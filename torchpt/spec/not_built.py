@@ -1,6 +1,6 @@
 """What the scene format knows but this version does not build: the one table.
 
-Whoever builds a thing deletes its row here. Until then giving it is a :class:`~torchpt.errors.NotBuiltError`; its keys
+Whoever builds a thing deletes its row here. Until then giving it is a :class:`~torchpt.core.errors.NotBuiltError`; its keys
 are listed so that a misspelt key is still named as unknown.
 """
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpt.errors import SceneError
+from torchpt.core.errors import SceneError
 from torchpt.math import transforms
 
 __all__ = [

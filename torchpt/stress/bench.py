@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.errors import RenderError
-from torchpt.rendering import render
+from torchpt.core.errors import RenderError
+from torchpt.rendering.api import render
 from torchpt.scene import load
 
 __all__ = ["Bench", "apart", "relative"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 
-from torchpt.errors import SceneError, TorchptError
+from torchpt.core.errors import SceneError, TorchptError
 from torchpt.stress.bench import Bench
 from torchpt.stress.case import Case, Outcome, Reading
 

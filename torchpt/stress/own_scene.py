@@ -11,14 +11,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpt.errors import RenderError
-from torchpt.format.description import Description, overridden, read_description
+from torchpt.core.errors import RenderError
 from torchpt.math.transforms import rotate
-from torchpt.rendering import render_scene
+from torchpt.rendering.api import render_scene
 from torchpt.scene.devices import device_of
+from torchpt.scene.formats.description import Description, overridden, read_description
 from torchpt.scene.scene import Scene
+from torchpt.scene.settings import Settings
 from torchpt.scene.space import extent_of
-from torchpt.settings import Settings
 from torchpt.spec import Role
 from torchpt.stress.bench import Bench, apart
 from torchpt.stress.case import Case, powers

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchpt.errors import OutputError
+from torchpt.core.errors import OutputError
 from torchpt.images.write import temporary_beside
 from torchpt.stress.case import Outcome
 

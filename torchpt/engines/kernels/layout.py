@@ -1,19 +1,195 @@
-"""What of a render decides the form of its kernels: which numbers a path carries, and which list of lanes is which."""
+"""What kernels read and write: the rows of a path in its arena, and the trace that turns a stage into a kernel."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from torch import Tensor
 
-from torchpt import lights
-from torchpt.engines.kernels.rows import HIT, PASS, SHADOW, SPLAT, Fields, Rows
-from torchpt.integrators.vertex import EXTRA
+from torchpt.compiler.form import CAPACITY
+from torchpt.compiler.graph import DTYPES
+from torchpt.compiler.sinks import Note, Scatter, Sinks
+from torchpt.compiler.tracing import Tracer
+from torchpt.paths.state import EXTRA, PathState
+from torchpt.physics import lights
+from torchpt.physics.samplers import Dimension
+from torchpt.physics.shapes.geometry import Hit
 
 if TYPE_CHECKING:
-    from torchpt.integrators.wave import Wave
+    from torchpt.paths.wave import Wave
 
-__all__ = ["Layout"]
+__all__ = [
+    "HIT",
+    "PASS",
+    "SHADOW",
+    "SPLAT",
+    "Fields",
+    "Layout",
+    "Memory",
+    "Rows",
+    "Trace",
+    "path_state",
+    "state_values",
+]
+
+
+# ---- What the rows of an arena hold: the numbers of a path's state, of a hit, of a shadow ray
+
+
+#: Shape without lanes and node type of each field.
+Fields = dict[str, tuple[tuple[int, ...], str]]
+
+#: Fields of a hit, of a shadow ray, and of a ray that goes on behind a surface that it passed.
+HIT: Fields = {"t": ((), "f"), "prim": ((), "l"), "u": ((), "f"), "v": ((), "f")}
+SHADOW: Fields = {
+    "shadow_o": ((3,), "f"),
+    "shadow_d": ((3,), "f"),
+    "shadow_t": ((), "f"),
+    "shadow_radiance": ((3,), "f"),
+}
+#: Fields of light to another pixel: its shadow ray, and how much of it gets through.
+SPLAT: Fields = {
+    "splat_pixel": ((), "l"),
+    "splat_o": ((3,), "f"),
+    "splat_d": ((3,), "f"),
+    "splat_t": ((), "f"),
+    "splat_radiance": ((3,), "f"),
+    "splat_clear": ((), "f"),
+}
+PASS: Fields = {
+    "pass_o": ((3,), "f"),
+    "pass_d": ((3,), "f"),
+    "pass_t": ((), "f"),
+    "before": ((), "f"),
+    "home": ((), "l"),
+}
+
+#: Fields of a path's state, those apart.
+_STATE = tuple(field.name for field in fields(PathState) if field.name != "extra")
+
+_DTYPES = {ty: dtype for dtype, ty in DTYPES.items()}
+
+
+def path_state(given: Mapping[str, Tensor]) -> PathState:
+    """Return paths from tensors by the names of rows; other names are passed over."""
+    extra = {name.removeprefix(EXTRA): value for name, value in given.items() if name.startswith(EXTRA)}
+    known: dict[str, Any] = {name: value for name, value in given.items() if name in _STATE}
+    return PathState(**known, extra=extra)
+
+
+def state_values(state: PathState) -> dict[str, Tensor]:
+    """Return tensors of paths by the names of rows."""
+    values = {name: getattr(state, name) for name in _STATE}
+    extra = {EXTRA + name: value for name, value in state.extra.items()}
+    return {name: value for name, value in values.items() if value is not None} | extra
+
+
+class Memory:
+    """Rows of 32-bit words, each with some to spare: kernels write whole vectors."""
+
+    def __init__(self, rows: int) -> None:
+        self.words = np.zeros((rows, CAPACITY), np.int32)
+        self.floats = self.words.view(np.float32)
+        self.address = self.words.ctypes.data
+
+
+class Rows:
+    """Rows of an arena by the names of the fields that they hold.
+
+    Args:
+        fields: of the arena.
+
+    Attributes:
+        count: how many rows there are.
+    """
+
+    def __init__(self, fields: Fields) -> None:
+        self._fields = fields
+        self._first: dict[str, int] = {}
+        self.count = 0
+        for name, (shape, _) in fields.items():
+            self._first[name] = self.count
+            self.count += math.prod(shape)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._fields
+
+    @property
+    def state(self) -> tuple[str, ...]:
+        """Names of the rows that hold a path's state."""
+        return tuple(name for name in self._fields if name in _STATE or name.startswith(EXTRA))
+
+    def first(self, name: str) -> int:
+        """The first row of a field."""
+        return self._first[name]
+
+    def read(self, tracer: Tracer, *names: str, place: int | None = None) -> dict[str, Tensor]:
+        """Fields as inputs of a trace; those that there are not are left out.
+
+        ``place``: node of where they lie in the slots; None: they are the arena's, at the lane's own place.
+        """
+        inputs: dict[str, Tensor] = {}
+        for name in names:
+            if name not in self._fields:
+                continue
+            shape, ty = self._fields[name]
+            first, size = self._first[name], (*shape, tracer.lanes)
+            dtype = _DTYPES[ty]
+            # The numbers are of no consequence: a trace asks for what is done, not for what comes out.
+            like = torch.rand(size) + 0.25 if dtype.is_floating_point else torch.zeros(size, dtype=dtype)
+
+            def node(k: int, first: int = first, ty: str = ty) -> int:
+                if place is not None:
+                    return tracer.graph.node("slot", ty, place, extra=first + k)
+                return tracer.graph.node("arena", ty, extra=first + k)
+
+            inputs[name] = tracer.lane(like, node)
+        return inputs
+
+    def take(self, memory: Memory, lanes: np.ndarray, names: tuple[str, ...]) -> dict[str, Tensor]:
+        """Fields of some lanes as tensors; those that there are not are left out."""
+        values = {}
+        for name in names:
+            if name in self._fields:
+                shape, ty = self._fields[name]
+                held = memory.floats if ty == "f" else memory.words
+                first = self._first[name]
+                value = torch.from_numpy(held[first : first + math.prod(shape), lanes]).to(_DTYPES[ty])
+                values[name] = value.view(*shape, len(lanes))
+        return values
+
+    def put(self, memory: Memory, start: int, values: dict[str, Tensor | None]) -> None:
+        """Fields of consecutive lanes from tensors; those that there are not are left out."""
+        for name, value in values.items():
+            if name in self._fields and value is not None:
+                shape, ty = self._fields[name]
+                held = memory.floats if ty == "f" else memory.words
+                first = self._first[name]
+                rows = value.reshape(math.prod(shape), -1)
+                held[first : first + len(rows), start : start + rows.shape[1]] = rows.numpy()
+
+    def nodes(self, tracer: Tracer, **fields: Tensor) -> list[tuple[int, int]]:
+        """Rows and nodes of results by field; numbers that all lanes share are spread."""
+        pairs = []
+        for name, value in fields.items():
+            shape, ty = self._fields[name]
+            nodes = tracer.nodes(value)
+            if len(nodes) != math.prod(shape):
+                raise ValueError(f"{name}: {len(nodes)} numbers for {math.prod(shape)} rows")
+            held = ty if ty != "l" else None
+            pairs += [
+                (self._first[name] + k, node if held is None else tracer.graph.cast(node, held))
+                for k, node in enumerate(nodes)
+            ]
+        return pairs
+
+
+# ---- What of a render decides the form of its kernels: which numbers a path carries, and which list of lanes is which
 
 
 class Layout:
@@ -99,3 +275,96 @@ def _path_fields(layout: Layout) -> Fields:
         if not (layout.has_opacity and layout.packets):
             fields["blocked"] = ((), "i")
     return fields
+
+
+# ---- A stage on its way to become a kernel: what it reads of the arena, and how its results go back
+#
+# The functions of :mod:`~torchpt.engines.kernels.stages`, :mod:`~torchpt.engines.kernels.stages`,
+# :mod:`~torchpt.engines.kernels.stages` and :mod:`~torchpt.engines.kernels.stages` take a :class:`Trace` and return sinks.
+
+
+class Trace:
+    """One stage being traced.
+
+    Args:
+        tracer: records what is done to lanes, inside of ``with trace.tracer``.
+        layout: of the render.
+
+    Attributes:
+        uniforms: names of the inputs that all lanes share, in the order of their slots.
+        tensors: how many inputs are tensors instead of rows of an arena.
+        sums: of :class:`torchpt.compiler.program.Program`.
+    """
+
+    def __init__(self, tracer: Tracer, layout: Layout) -> None:
+        self.tracer, self.layout = tracer, layout
+        self.uniforms: list[str] = []
+        self.tensors = 0
+        self.sums: list[tuple[Any, ...]] = []
+
+    # -- what a stage reads
+
+    def uniform(self, name: str, like: Tensor) -> Tensor:
+        """An input that all lanes share; callers find it by its name."""
+        self.uniforms.append(name)
+        return self.tracer.uniform(like)
+
+    def salts(self) -> Tensor:
+        """Names of the depth's random dimensions."""
+        return self.uniform("salts", torch.zeros(len(Dimension), dtype=torch.int32))
+
+    def state(self) -> tuple[PathState, dict[str, Tensor]]:
+        """The state of the paths, and what travels with them unseen by stages: the filter's ``weight``."""
+        rows = self.layout.state
+        return path_state(rows.read(self.tracer, *rows.state)), rows.read(self.tracer, "weight")
+
+    def hit(self, rows: Rows | None = None) -> Hit:
+        """Return what the rays met."""
+        return Hit(**(rows or self.layout.state).read(self.tracer, *HIT))
+
+    def place(self) -> Tensor:
+        """Return where in the arena each lane is."""
+        numbers = torch.zeros(self.tracer.lanes, dtype=torch.int64)
+        return self.tracer.lane(numbers, lambda _: self.tracer.graph.node("place", "l"))
+
+    # -- where results go
+
+    def node(self, result: Tensor) -> int:
+        """The node of a result that has one number a lane."""
+        return self.tracer.nodes(result)[0]
+
+    def kept(self, state: PathState, unseen: dict[str, Tensor]) -> list[tuple[int, int]]:
+        """The state as rows and nodes."""
+        return self.layout.state.nodes(self.tracer, **state_values(state), **unseen)
+
+    def ended(self, mask: int, lane: Tensor, radiance: Tensor, unseen: dict[str, Tensor]) -> Scatter:
+        """Paths that end where the node ``mask`` holds (-1: all): their radiance goes to the slots of their samples."""
+        if "weight" in unseen:
+            with self.tracer:
+                radiance = radiance * unseen["weight"]
+        rows = tuple(enumerate(self.tracer.nodes(radiance)))
+        return Scatter(mask, self.node(lane), rows, slots=True)
+
+    def sorted(self, sinks: Sinks, state: PathState, prim: Tensor, unseen: dict[str, Tensor]) -> tuple[int, list[Note]]:
+        """Sort the lanes by the surfaces that they met, and end those that do not go on.
+
+        Returns:
+            The mask of the lanes that go on, and the notes of their places.
+        """
+        layout, world = self.layout, self.layout.world
+        with self.tracer:
+            key = torch.index_select(world.materials.key, 0, world.geometry.slot(prim) + 1)
+            met, alive = prim >= 0, state.t_max > 0
+            masks = [(key == m) | (key == layout.models + m) for m in range(layout.models)]
+            shining = (key < layout.models) & met
+            out = ~met & alive
+            on = met | out if layout.has_environment else met
+            off = ~on
+        lists: list[tuple[int, Tensor]] = list(enumerate(masks)) if layout.listed else []
+        if layout.has_emitters:
+            lists.append((layout.emissive, shining))
+        if layout.has_environment:
+            lists.append((layout.missed, out))
+        notes = [Note(self.node(mask), number, number + 1) for number, mask in lists]
+        sinks.scatter.append(self.ended(self.node(off), state.lane, state.radiance, unseen))
+        return self.node(on), notes

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.errors import EdgeWarning
-from torchpt.rendering import render
+from torchpt.core.errors import EdgeWarning
+from torchpt.rendering.api import render
 from torchpt.scene import load
 from torchpt.stress.bench import Bench
 from torchpt.stress.case import Case, powers

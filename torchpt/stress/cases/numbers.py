@@ -6,9 +6,9 @@ import math
 
 import torch
 
-from torchpt.film import Film
-from torchpt.math.mis import power_heuristic
-from torchpt.samplers import KINDS, Dimension, Draws, Sampler, salts
+from torchpt.math.sampling import power_heuristic
+from torchpt.physics.film import Film
+from torchpt.physics.samplers import KINDS, Dimension, Draws, Sampler, salts
 from torchpt.stress.bench import Bench
 from torchpt.stress.case import Case, powers
 

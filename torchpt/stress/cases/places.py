@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from torchpt.rendering import render
+from torchpt.rendering.api import render
 from torchpt.scene import load
 from torchpt.stress.bench import Bench, apart, relative
 from torchpt.stress.case import Case, powers

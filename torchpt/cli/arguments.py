@@ -1,0 +1,239 @@
+"""Take a command line apart: what belongs to torchpt itself, and what is left for Hydra.
+
+File names never enter Hydra's grammar, in which blanks, brackets, commas and ``=`` mean something: ``scene=``, ``out=``
+and the settings that are files (:func:`path_keys`) are taken out here, as they are written.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+from torchpt.core.errors import TorchptError
+from torchpt.core.files import configs
+
+__all__ = ["COMMANDS", "DEBUG_KEYS", "GROUPS", "Arguments", "UsageError", "parse", "path_keys"]
+
+COMMANDS = ("render", "orbit", "info", "converge", "compare", "stress")  # the last two take their words themselves
+GROUPS = ("film", "integrator", "sampler", "render")
+#: Keys of `torchpt orbit` alone.
+TURN_KEYS = ("frames", "degrees", "fps", "keep")
+_TURN = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)
+#: Keys of `torchpt render` alone: one path in place of a picture. No scene file has them.
+DEBUG_KEYS = ("debug.pixel", "debug.sample")
+_DEBUG = re.compile(r"\+{0,2}(debug\.[^=]*)=(.*)\Z", re.DOTALL)
+_TAKEN = re.compile(r"\+{0,2}([\w.]+)=(.*)\Z", re.DOTALL)
+#: A line of a group's file, as ``scripts/make_configs.py`` writes it of a setting that is a file.
+_PATH = re.compile(r"^(\w+): .*\(null or a file path\)$", re.MULTILINE)
+
+# option -> (its other name, whether a value follows)
+_OPTIONS = {
+    "--multirun": ("-m", False),
+    "--cfg": ("-c", True),
+    "--package": ("-p", True),
+    "--resolve": ("", False),
+    "--json": ("", False),
+    "--help": ("-h", False),
+    "--hydra-help": ("", False),
+}
+_CHOICE = re.compile(r"[A-Za-z_][\w,-]*\Z|\[[\w,-]+\]\Z|\{")
+_CONFIGS = ("job", "hydra", "all")
+
+
+class UsageError(TorchptError):
+    """A command line that cannot be understood."""
+
+
+@dataclass
+class Arguments:
+    """A command line in parts.
+
+    Attributes:
+        command: one of `COMMANDS`.
+        scenes: names or paths; several only with ``multirun``.
+        outs: pictures to write, as given; empty where nothing was said.
+        paths: values of the settings that are files.
+        turn: values of the keys in `TURN_KEYS`, as written.
+        debug: values of the keys in `DEBUG_KEYS`, as written.
+        study: of `converge` all words by key, as written: its lists are axes, which Hydra has no part in.
+        overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``.
+        options: what Hydra gets besides, such as ``--multirun`` or ``--cfg job``.
+        multirun: whether this is a sweep.
+        json: print `info`, or the path of `render debug.pixel=...`, as JSON.
+        help: print help and stop.
+    """
+
+    command: str
+    scenes: list[str] = field(default_factory=list)
+    outs: list[str] = field(default_factory=list)
+    paths: dict[str, str | None] = field(default_factory=dict)
+    turn: dict[str, str] = field(default_factory=dict)
+    debug: dict[str, str] = field(default_factory=dict)
+    study: dict[str, str] = field(default_factory=dict)
+    overrides: list[str] = field(default_factory=list)
+    options: list[str] = field(default_factory=list)
+    multirun: bool = False
+    json: bool = False
+    help: bool = False
+
+    @property
+    def only_shows(self) -> bool:
+        """Hydra prints something and no job runs."""
+        return any(option in ("--cfg", "--hydra-help") for option in self.options)
+
+
+@cache
+def path_keys() -> tuple[str, ...]:
+    """Return the settings that are files, by the groups' files: importing what declares them would take seconds."""
+    files = [(group, configs() / group / "default.yaml") for group in GROUPS]
+    return tuple(f"{group}.{key}" for group, file in files for key in _PATH.findall(file.read_text(encoding="utf-8")))
+
+
+def parse(argv: list[str]) -> Arguments:
+    """Take the words after ``torchpt`` apart.
+
+    Raises:
+        UsageError: an unknown command or option, a word that is no ``key=value``, a key that is given twice.
+    """
+    if not argv or argv[0] not in COMMANDS:
+        raise UsageError(f"{argv[0] if argv else 'no command'}: expected one of the commands {', '.join(COMMANDS)}")
+    arguments = Arguments(argv[0])
+    if arguments.command == "converge":
+        return _study(arguments, argv[1:])
+    taken: dict[str, str] = {}
+    words = iter(argv[1:])
+    for word in words:
+        if word.startswith("-"):
+            _option(arguments, word, words)
+            continue
+        match = _TAKEN.match(word)
+        if match is None or match[1] not in ("scene", "out", *path_keys()):
+            match = _TURN.match(word) if arguments.command == "orbit" else _DEBUG.match(word)
+        if match is None:
+            _override(arguments, word)
+            continue
+        key, value = match.groups()
+        if key in taken:
+            raise UsageError(f"{key}: given twice, as {taken[key]!r} and {value!r}")
+        if not value:
+            raise UsageError(f"{key}: expected a name, got nothing")
+        taken[key] = value
+        if key == "scene":
+            arguments.overrides.append("scene")  # keeps its place among the sweeps
+    arguments.multirun |= any(word.replace(" ", "") == "hydra.mode=MULTIRUN" for word in arguments.overrides)
+    if arguments.multirun and arguments.only_shows:
+        raise UsageError("--multirun: cannot be combined with --cfg or --hydra-help")
+    arguments.debug = _debug(arguments, taken)
+    if arguments.json and arguments.command != "info" and not arguments.debug:
+        raise UsageError(
+            "--json: only `torchpt info`, `torchpt compare` and `torchpt render debug.pixel=[x,y]` take it; "
+            f"the last line of `torchpt {arguments.command}` is JSON anyway"
+        )
+    if arguments.command == "info" and "out" in taken:
+        raise UsageError("out: `torchpt info` writes no picture")
+    arguments.scenes = _scenes(taken.get("scene"), arguments.multirun)
+    arguments.outs = _names("out", taken.get("out"))
+    arguments.paths = {key: None if taken[key] == "null" else taken[key] for key in path_keys() if key in taken}
+    arguments.turn = {key: taken[key] for key in TURN_KEYS if key in taken}
+    sweep = f"+scene_number={','.join(map(str, range(len(arguments.scenes))))}"
+    arguments.overrides = [sweep if word == "scene" else word for word in arguments.overrides]
+    if len(arguments.scenes) < 2:
+        arguments.overrides = [word for word in arguments.overrides if word != sweep]
+    return arguments
+
+
+def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
+    """The words about one path."""
+    found = {key: value for key, value in taken.items() if key.startswith("debug.")}
+    for key in found:
+        if key not in DEBUG_KEYS:
+            raise UsageError(f"{key}: unknown key; known: {', '.join(DEBUG_KEYS)}")
+        if arguments.command != "render":
+            raise UsageError(f"{key}: only `torchpt render` takes it")
+    if "debug.sample" in found and "debug.pixel" not in found:
+        raise UsageError("debug.sample: expected debug.pixel=[x,y] beside it, whose sample it is")
+    if found and "out" in taken:
+        raise UsageError("out: no picture is rendered where debug.pixel is given")
+    return found
+
+
+def _study(arguments: Arguments, words: list[str]) -> Arguments:
+    """The words of `torchpt converge`."""
+    for word in words:
+        key, equals, value = word.partition("=")
+        if word in ("--help", "-h"):
+            arguments.help = True
+        elif word in ("--multirun", "-m"):
+            raise UsageError(f"{word}: `torchpt converge` takes lists without it, such as sampler=[independent,sobol]")
+        elif word.startswith("-"):
+            raise UsageError(f"{word}: unknown option; `torchpt converge` knows --help")
+        elif not equals or not re.match(r"[A-Za-z_][\w.]*\Z", key) or "_target_" in key:
+            raise UsageError(f"{word}: expected key=value, for example sampler=[independent,sobol]")
+        elif key in arguments.study:
+            raise UsageError(f"{key}: given twice, as {arguments.study[key]!r} and {value!r}")
+        elif not value:
+            raise UsageError(f"{key}: expected a value, got nothing")
+        else:
+            arguments.study[key] = value
+    return arguments
+
+
+def _option(arguments: Arguments, word: str, rest: object) -> None:
+    name, _, value = word.partition("=")
+    long = next((option for option, (short, _) in _OPTIONS.items() if name in (option, short)), None)
+    if long is None:
+        raise UsageError(f"{word}: unknown option; known: {', '.join(_OPTIONS)}")
+    if _OPTIONS[long][1]:
+        value = value or next(rest, "")  # type: ignore[call-overload]
+        if long == "--cfg" and value not in _CONFIGS:
+            raise UsageError(f"--cfg: expected one of {', '.join(_CONFIGS)}, got {value!r}")
+        arguments.options += [long, value]
+    elif value:
+        raise UsageError(f"{word}: {long} takes no value")
+    elif long == "--help":
+        arguments.help = True
+    elif long == "--json":
+        arguments.json = True
+    else:
+        arguments.multirun |= long == "--multirun"
+        arguments.options.append(long)
+
+
+def _override(arguments: Arguments, word: str) -> None:
+    if "=" not in word and not word.startswith("~"):
+        raise UsageError(
+            f"{word}: expected key=value, for example scene={word if word.isidentifier() else 'cornell_box'}"
+        )
+    if "_target_" in word or word.lstrip("+").startswith("hydra.callbacks"):
+        raise UsageError(f"{word}: no setting names a Python object to call: `_target_` and callbacks are refused")
+    key, _, value = word.lstrip("+~").partition("=")
+    if not key.strip() or key in ("out", "scene_number") or re.match(r"scene\b", key):
+        raise UsageError(f"{word}: expected key=value")
+    if key in GROUPS and (value == "null" or not _CHOICE.match(value)):  # nor a way out of the group's folder
+        raise UsageError(f"{key}: expected the name of a file in configs/{key}, got {value!r}")
+    arguments.overrides.append(word)
+
+
+def _scenes(value: str | None, multirun: bool) -> list[str]:
+    if value is None:
+        return []
+    if not multirun or "," not in value or Path(value).exists():
+        return [value]
+    return _names("scene", f"[{value}]")
+
+
+def _names(key: str, value: str | None) -> list[str]:
+    """``a b.exr`` is one name; ``[a.exr, 'b,c.png']`` is a list, whose names are quoted where they hold a comma."""
+    if value is None:
+        return []
+    if not (value.startswith("[") and value.endswith("]")):
+        return [value]
+    parts = re.findall(r"""\s*("[^"]*"|'[^']*'|[^,]*?)\s*(?:,|\Z)""", value[1:-1])
+    names = [part[1:-1] if part[:1] in "'\"" and part[:1] == part[-1:] and len(part) > 1 else part for part in parts]
+    if len(names) > 1 and not names[-1]:
+        names.pop()  # what the pattern finds at the very end
+    if not all(names):
+        raise UsageError(f"{key}: expected names between commas, got {value!r}")
+    return names

@@ -1,0 +1,373 @@
+"""`torchpt compare`: how far a picture is from its reference, in numbers and as a map."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import sys
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from torchpt.cli import collector
+from torchpt.cli.arguments import UsageError
+from torchpt.cli.render import plain
+from torchpt.cli.streams import speaking
+from torchpt.core.errors import AssetError, OutputError, SceneError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchpt.images.comparison import Comparison, Shown
+
+__all__ = ["HELP", "Wishes", "compare"]
+
+HELP = """\
+torchpt compare TEST REFERENCE [--json] [map=FILE.png|FILE.exr] [key=value ...]
+
+  Every measure of the error of TEST against REFERENCE, two pictures of one size and as many channels.
+  torchpt compare test.exr reference.exr map=error.png
+
+  map=       write where the error lies: .png in colours, .exr as numbers
+  metric=    what the map shows: relmse mse smape ssim flip                                             relmse
+  range=     what the brightest colour of a .png stands for         1 for smape ssim flip, else 99 % are below it
+  layer=     of .exr files: albedo, normal, ...                                                    the picture
+  exposure= tonemap= gamma=   how a screen shows them, for psnr and ssim; values as of film.*           0 none srgb
+  --json     print one JSON object in place of the table; null where there is no number, and `reasons` says why
+  --         what follows are names of files, whatever they look like
+
+flip needs the extra `compare`. Exit codes: 0 compared, however far apart; 2 bad input.
+"""
+_KEYS = ("map", "metric", "range", "layer", "exposure", "tonemap", "gamma")
+_KEY = re.compile(rf"({'|'.join(_KEYS)})=(.*)\Z", re.DOTALL)
+_MAPS = (".exr", ".png")
+_SHOWN = ("exposure", "tonemap", "gamma")
+#: Measures whose map ends at 1.
+_UP_TO_ONE = ("smape", "ssim", "flip")
+
+
+@dataclass
+class Wishes:
+    """The words after ``torchpt compare``.
+
+    Attributes:
+        pictures: the picture and its reference, as written.
+        given: key to value, as written.
+        json: print JSON.
+        help: print help and stop.
+    """
+
+    pictures: list[str] = field(default_factory=list)
+    given: dict[str, str] = field(default_factory=dict)
+    json: bool = False
+    help: bool = False
+
+    @classmethod
+    def read(cls, words: list[str]) -> Wishes:
+        """Take the words apart; a name of a file may hold whatever it likes.
+
+        Raises:
+            UsageError: an unknown option or key, a key given twice or without a value or without ``map=``, other than
+                two pictures.
+        """
+        wishes = cls()
+        end = words.index("--") if "--" in words else len(words)
+        for word in words[:end]:
+            if word in ("--help", "-h"):
+                wishes.help = True
+            elif word == "--json":
+                wishes.json = True
+            elif word.startswith("-"):
+                raise UsageError(f"{word}: unknown option; known: --json, --help, -- (before names of files)")
+            elif match := _KEY.match(word):
+                key, value = match.groups()
+                if key in wishes.given:
+                    raise UsageError(f"{key}: given twice, as {wishes.given[key]!r} and {value!r}")
+                if not value:
+                    raise UsageError(f"{key}: expected a value, got nothing")
+                wishes.given[key] = value
+            elif re.match(r"[\w.]+=", word) and not os.path.exists(word):
+                raise UsageError(f"{word}: unknown key, and no file of this name; known: {', '.join(_KEYS)}")
+            else:
+                wishes.pictures.append(word)
+        wishes.pictures += words[end + 1 :]
+        if not wishes.help:
+            wishes._check()
+        return wishes
+
+    def _check(self) -> None:
+        if len(self.pictures) != 2:
+            names = f": {', '.join(self.pictures)}" if self.pictures else ""
+            raise UsageError(f"expected two pictures, torchpt compare TEST REFERENCE, got {len(self.pictures)}{names}")
+        for key in ("metric", "range"):
+            if key in self.given and "map" not in self.given:
+                raise UsageError(f"{key}: says what the error map shows, and there is none; add map=FILE.png")
+
+
+@dataclass(frozen=True)
+class _Map:
+    """The error map that is asked for: file, measure, and the value of the brightest colour where one is given."""
+
+    file: str
+    metric: str
+    top: float | None
+
+
+def compare(words: list[str]) -> int:
+    """Compare two files, print what came of it, write the map; returns the exit code.
+
+    Raises:
+        TorchptError: bad input.
+    """
+    wishes = Wishes.read(words)
+    if wishes.help:
+        with speaking():
+            print(HELP, end="")
+        return 0
+    from torchpt.images.comparison import compare as measure
+
+    collector.resume()
+    shown, chart = _shown(wishes.given), _map(wishes)
+    layer = wishes.given.get("layer")
+    (name, first), (_, second) = (_picture(path, layer) for path in wishes.pictures)
+    _agree(wishes.pictures, first, second)
+    height, width, channels = first.shape
+    colours = _is_colour(name, channels)
+    if not colours:
+        _refuse_colour_keys(wishes, name)
+    (image, alpha), (reference, other) = (_apart(picture, colours) for picture in (first, second))
+    found = measure(image, reference, shown, colours)
+    facts: dict[str, Any] = {"test": wishes.pictures[0], "reference": wishes.pictures[1], "layer": name}
+    facts |= {"width": width, "height": height, "channels": channels, "metrics": found.metrics}
+    facts |= {"reasons": found.reasons, "mean": dict(zip(("test", "reference"), found.means, strict=True))}
+    facts["mean_ratio"] = found.ratio
+    facts["nonfinite_pixels"] = dict(zip(("test", "reference"), found.nonfinite, strict=True))
+    if colours:
+        facts["display"] = vars(shown)
+    if alpha is not None and other is not None:
+        facts["largest_alpha_difference"] = float((alpha.double() - other.double()).abs().max())
+    if chart is not None:
+        facts["map"] = _write_map(chart, image, reference, shown)
+    with speaking():
+        if wishes.json:
+            print(json.dumps(plain(facts), allow_nan=False))
+        else:
+            _print(facts, found)
+    return 0
+
+
+def _shown(given: dict[str, str]) -> Shown:
+    """How a screen shows the pictures; the values are those of ``film``.
+
+    Raises:
+        SceneError: a value that is not accepted.
+    """
+    from torchpt.images.comparison import Shown
+    from torchpt.scene.settings import Film
+    from torchpt.spec.reading import Refused
+
+    values: dict[str, Any] = {}
+    for key in _SHOWN:
+        if key in given:
+            number = _number(given[key])
+            try:
+                values[key] = Film.parameters[key].read(given[key] if math.isnan(number) else number)
+            except Refused as refused:
+                raise SceneError(key, given[key], refused.expected) from None
+    return Shown(**values)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _map(wishes: Wishes) -> _Map | None:
+    """The map that is asked for, found out to be possible before the pictures are read.
+
+    Raises:
+        TorchptError: a map that cannot be written, an unknown measure, a range that is none.
+    """
+    from torchpt.images import check_writable
+    from torchpt.images.metrics import MAPS
+
+    given = wishes.given
+    if "map" not in given:
+        return None
+    metric = given.get("metric", "relmse")
+    if metric not in MAPS:
+        raise SceneError("metric", metric, f"one of {', '.join(MAPS)}")
+    place = check_writable(given["map"], _MAPS)
+    if str(place) in map(os.path.realpath, wishes.pictures):
+        raise OutputError(given["map"], "is one of the pictures that are compared; give map= another name")
+    if "range" not in given:
+        return _Map(given["map"], metric, None)
+    if place.suffix.lower() == ".exr":
+        raise UsageError("range: an .exr map holds the numbers themselves; only .png has a range")
+    top = _number(given["range"])
+    if not 0.0 < top < math.inf:
+        raise SceneError("range", given["range"], "a number above 0")
+    return _Map(given["map"], metric, top)
+
+
+def _picture(path: str, layer: str | None) -> tuple[str, Tensor]:
+    """A layer ``(H, W, C)`` of a file and its name; by default the picture, or the one layer that there is.
+
+    Raises:
+        AssetError: a file that cannot be read or has no such layer.
+    """
+    import torch
+
+    from torchpt.images import read_layers
+
+    layers = read_layers(path)
+    if layer is None and len(layers) == 1:
+        return next(iter(layers.items()))
+    wanted = layer or "image"
+    if wanted not in layers:
+        what = f"has no layer {wanted!r}" if layer else "has no picture among its layers; choose one with layer="
+        raise AssetError(path, f"{what}; it has {', '.join(layers)}")
+    if layer is None and "alpha" in layers and layers[wanted].shape[2] == 3:
+        return wanted, torch.cat((layers[wanted], layers["alpha"]), 2)
+    return wanted, layers[wanted]
+
+
+def _agree(paths: list[str], first: Tensor, second: Tensor) -> None:
+    sizes = [f"{picture.shape[1]} x {picture.shape[0]}" for picture in (first, second)]
+    if sizes[0] != sizes[1]:
+        raise AssetError(paths[0], f"is {sizes[0]} pixels, and {paths[1]} is {sizes[1]}: sizes must agree")
+    counts = [f"{picture.shape[2]} channel{'s' * (picture.shape[2] > 1)}" for picture in (first, second)]
+    if counts[0] != counts[1]:
+        raise AssetError(paths[0], f"has {counts[0]}, and {paths[1]} has {counts[1]}: channels must agree")
+
+
+def _is_colour(layer: str, channels: int) -> bool:
+    """Whether a layer holds colours, and not normals, distances or other numbers: its channels are R G B [A], or grey."""
+    from torchpt.images.layers import channel_names
+
+    if layer == "image":
+        return channels <= 4
+    return [name.rpartition(".")[2] for name in channel_names(layer, channels)][:3] == ["R", "G", "B"]
+
+
+def _refuse_colour_keys(wishes: Wishes, layer: str) -> None:
+    from torchpt.images.comparison import OF_COLOURS
+
+    for key in _SHOWN:
+        if key in wishes.given:
+            raise UsageError(f"{key}: the layer {layer} holds no colours, so it is not shown on a screen")
+    if wishes.given.get("metric") in OF_COLOURS:
+        raise UsageError(f"metric: the layer {layer} holds no colours; expected relmse, mse or smape")
+
+
+def _apart(picture: Tensor, colours: bool) -> tuple[Tensor, Tensor | None]:
+    """The colours and the alpha channel, where there is one."""
+    if colours and picture.shape[2] in (2, 4):
+        return picture[..., :-1], picture[..., -1]
+    return picture, None
+
+
+def _write_map(chart: _Map, image: Tensor, reference: Tensor, shown: Shown) -> dict[str, Any]:
+    """Write the map whole or not at all; returns what it shows.
+
+    Raises:
+        OutputError: a measure that has no map of these pictures, a file that cannot be written.
+    """
+    import torch
+
+    from torchpt.images import write_image
+    from torchpt.images.comparison import map_of
+    from torchpt.images.false_colour import false_colour
+
+    try:
+        errors = map_of(chart.metric, image, reference, shown)
+    except (ImportError, ValueError) as problem:
+        raise OutputError(chart.file, f"there is no such map: {problem}") from None
+    finite = errors[torch.isfinite(errors)]
+    most = float(finite.max()) if finite.numel() else math.nan
+    facts = {"file": chart.file, "metric": chart.metric, "largest": most}
+    if chart.file.lower().endswith(".exr"):
+        write_image(chart.file, errors[..., None])
+        return facts
+    top = chart.top or (1.0 if chart.metric in _UP_TO_ONE else _most_of(finite))
+    write_image(chart.file, false_colour(errors, top), gamma=1.0)
+    return facts | {"range": [0.0, top]}
+
+
+def _most_of(values: Tensor) -> float:
+    """What 99 % of the values do not exceed; their largest where that is 0, and 1 where all are."""
+    if not values.numel():
+        return 1.0
+    ordered = values.sort().values
+    return float(ordered[math.ceil(0.99 * len(ordered)) - 1]) or float(ordered[-1]) or 1.0
+
+
+def _print(facts: dict[str, Any], found: Comparison) -> None:
+    """The same for people: a table of measures, a table of means, and what is to be said about them."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    class Piped(Console):
+        def on_broken_pipe(self) -> None:  # rich itself would end the process
+            raise BrokenPipeError
+
+    console = Piped(highlight=False, width=None if sys.stdout.isatty() else 120)
+
+    def say(text: str) -> None:
+        code = console.encoding  # a name of a file may hold what it does not
+        console.print(Text(text.encode(code, "backslashreplace").decode(code)), soft_wrap=True)
+
+    def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+        drawn = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False)
+        for index, title in enumerate(head):
+            drawn.add_column(title, justify="right" if 0 < index < 4 else "left")
+        for row in rows:
+            drawn.add_row(*map(Text, row))
+        console.print()
+        console.print(drawn)
+
+    say(f"test       {facts['test']}\nreference  {facts['reference']}")
+    say(f"           {facts['layer']}, {facts['width']} x {facts['height']} pixels, channels: {facts['channels']}")
+    table(("measure", "value"), [(name, _told(value)) for name, value in found.metrics.items()])
+    table(("", "test", "reference", "ratio"), _means(facts, found))
+    say("")
+    for reason in dict.fromkeys(found.reasons.values()):
+        say(f"{', '.join(name for name in found.reasons if found.reasons[name] == reason)}: {reason}")
+    if display := facts.get("display"):
+        say(
+            "psnr, ssim: of what a screen shows; "
+            + ", ".join(f"{key} {_told(value)}" for key, value in display.items())
+        )
+    if "largest_alpha_difference" in facts:
+        say(f"alpha is in no measure; its largest difference is {_told(facts['largest_alpha_difference'])}")
+    if chart := facts.get("map"):
+        shows = (
+            f"; black 0, brightest {_told(chart['range'][1])} and more, green not finite" if "range" in chart else ""
+        )
+        say(f"map: {chart['metric']}, largest {_told(chart['largest'])}{shows}, in {chart['file']}")
+
+
+def _means(facts: dict[str, Any], found: Comparison) -> list[tuple[str, ...]]:
+    """Rows: the mean of each channel and of all, and how many pixels are in none of them."""
+    one, two = found.means
+    names = ("red", "green", "blue") if len(one) == 3 and "display" in facts else [str(k) for k in range(len(one))]
+    rows = [
+        (f"mean, {name}", _told(a), _told(b), _told(a / b if b else math.nan))
+        for name, a, b in zip(names, one, two, strict=True)
+    ]
+    whole = (sum(one) / len(one), sum(two) / len(two))
+    rows = [("mean", *map(_told, whole), _told(found.ratio)), *(rows if len(one) > 1 else [])]
+    return [*rows, ("pixels not finite", *(f"{count:,}" for count in found.nonfinite), "")]
+
+
+def _told(value: float | str) -> str:
+    if isinstance(value, str):
+        return value
+    if math.isinf(value):
+        return "infinite"
+    return "none" if math.isnan(value) else f"{value:.6g}"

@@ -1,0 +1,220 @@
+"""`torchpt converge`: words to a study, a bar over all of it, its files, one line of JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from torchpt.cli import collector
+from torchpt.cli.interrupt import Interrupt, Interrupted
+from torchpt.cli.notices import notices
+from torchpt.cli.progress import Bar
+from torchpt.cli.streams import speaking
+from torchpt.core.errors import OutputError, SceneError
+
+__all__ = ["HELP", "converge", "raw_study"]
+
+#: What a folder says that it is of.
+_STUDY = "study.json"
+#: Keys by which the report shows the same runs otherwise.
+_SHOWN = ("title", "metrics", "target", "extra")
+
+HELP = """\
+torchpt converge scene=NAME|[A,B] [out=FOLDER] [key=value|key=[a,b] ...]
+torchpt converge study=NAME|FILE.yaml [key=value ...]
+
+  Error against run time: several independent runs of every combination of settings at growing samples a pixel, each timed
+  without set-up, compared with a reference. A list makes an axis of the grid: sampler=[independent,sobol].
+  scene=      a file ending in .yaml, or a scene that ships, or a list of them:
+{scenes}
+  out=        the folder of report.html, report.json, plots/ and runs/; where nothing is said SCENE_converge, or, where
+              that holds another study, SCENE_converge_2, ...
+  study=      a YAML file with the same keys, or a study that ships (samplers); words of the command line win over it
+  spp=        samples a pixel of each step                                                   [4,16,64,256]
+  seeds=      independent runs of each step                                                  5
+  seed=       the seeds of all runs follow from it                                           0
+  reference=  a linear picture such as ref.exr; else it is made of independent runs:
+              reference.spp=, reference.seeds=, reference.KEY= for its settings              4 times the largest step, 8
+  metrics=    of relmse relmse_trimmed mse smape psnr ssim flip; curves show the first       all
+  target=     errors whose times are told, such as [0.01,0.001]                              one that all curves reach
+  extra=      others' pictures beside ours: [{{name: theirs, seconds: 12.5, file: theirs.exr}}]
+  denoise=    true: beside every curve a second one, of its runs' denoised pictures            false
+  title=      of the page
+  {keys}
+
+A study that was stopped resumes: the same command takes up the runs that are in FOLDER/runs. The last line on stdout is a
+summary in JSON. Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the finished runs kept.
+"""
+
+
+def raw_study(words: Mapping[str, str]) -> tuple[dict[str, Any], str | None]:
+    """The keys of a study and its file, from the words of the command line by key.
+
+    Raises:
+        TorchptError: a file or value that cannot be read.
+    """
+    from torchpt.reports.study import read_study
+
+    raw, file = read_study(words["study"]) if "study" in words else ({}, None)
+    for key, text in words.items():
+        if key == "study":
+            continue
+        if key == "scene":
+            value: Any = _names(text)
+        elif key == "title" or (key == "reference" and not text.startswith("{")):
+            value = text  # a file's name may hold whatever YAML gives a meaning
+        else:
+            value = _value(key, text)
+        head, _, name = key.partition(".")
+        if head == "reference" and name:
+            before = raw.get("reference")
+            raw["reference"] = {**(before if isinstance(before, Mapping) else {}), name: value}
+        else:
+            raw[key] = value
+    return raw, file
+
+
+def _value(key: str, text: str) -> Any:
+    """A value as YAML has it."""
+    from torchpt.scene.formats.yaml import parse_yaml, plain
+
+    try:
+        parsed = parse_yaml(text)
+    except SceneError:
+        raise SceneError(key, text, "a value, or a list [a,b] of values (quote text that holds marks)") from None
+    return plain({key: parsed})[key]
+
+
+def _names(text: str) -> list[str]:
+    if Path(text).exists() or not (text.startswith("[") and text.endswith("]")):
+        return [text]
+    return [name.strip().strip("'\"") for name in text[1:-1].split(",")]
+
+
+def converge(words: Mapping[str, str], interrupt: Interrupt) -> int:
+    """Run what is missing, write the report, print the summary; returns the exit code.
+
+    Raises:
+        TorchptError: bad input, found before anything is rendered.
+        Interrupted: a signal came before the first run.
+    """
+    from torchpt.reports.analysis import check_files
+    from torchpt.reports.report import plain, write_report
+    from torchpt.reports.runs import Stopped, Store, measure, prepare, write_whole
+    from torchpt.reports.study import study_of
+
+    collector.resume()
+    start = time.perf_counter()
+    raw, file = raw_study({key: text for key, text in words.items() if key != "out"})
+    with notices():
+        study = study_of(raw, file)
+        told = _told(raw, study.asked)
+        folder, note = _folder(words.get("out"), f"{_stem(study.scenes, file)}_converge", told)
+        prepared = prepare(study)
+        check_files(study, prepared)
+        store = Store(folder / "runs")
+        write_whole(folder / _STUDY, json.dumps(told, indent=1).encode())
+    if note:
+        print(f"torchpt: {note}", file=sys.stderr)
+    interrupt.check()
+    interrupt.deferred = True
+    with Bar(folder.name, lines=True) as bar:
+
+        def on_progress(done: int, total: int, rays: int, seconds: float) -> bool:
+            bar.update(done, total, rays, seconds)
+            return interrupt.signum is not None
+
+        try:
+            measure(study, prepared, store, on_progress)
+        except Stopped as stopped:
+            print(
+                f"torchpt: stopped by a signal; {stopped.done} of {stopped.total} runs are in {store.folder}, and the same "
+                "command takes up there",
+                file=sys.stderr,
+            )
+            return Interrupted(interrupt.signum or 2).exit_code
+    topics = write_report(study, prepared, folder)
+    facts = {
+        "out": str(folder / "report.html"),
+        "seconds": round(time.perf_counter() - start, 4),
+        "scenes": [
+            {
+                "scene": topic.name,
+                "curves": [
+                    {
+                        "label": line.label,
+                        "denoised": line.of is not None,
+                        "slope": line.by_spp.slope.mean if line.by_spp else None,
+                        "times": line.times,
+                        "biased": line.bias["biased"] if line.bias else None,
+                        "nonfinite_samples": sum(step.nonfinite for step in line.steps),
+                    }
+                    for line in topic.lines
+                ],
+            }
+            for topic in topics
+        ],
+    }
+    with speaking():
+        print(json.dumps(plain(facts), allow_nan=False))
+    return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
+
+
+def _folder(out: str | None, name: str, told: dict[str, Any]) -> tuple[Path, str]:
+    """Return the folder of a study, and what is to be said of it: where it holds another study, that.
+
+    Args:
+        out: the folder that was asked for.
+        name: where none was; ``NAME_2``, ``NAME_3``, ... where those before hold other studies.
+        told: of :func:`_told`.
+
+    Raises:
+        OutputError: a file is there.
+    """
+    first = Path(name if out is None else out).expanduser()
+    if first.exists() and not first.is_dir():
+        raise OutputError(first, "is a file; expected a folder")
+    if not _holds_another(first, told):
+        return first, ""
+    if out is not None:
+        return first, f"{first} holds the report of another study, which this one's replaces; its runs stay"
+    later = (first.with_name(f"{first.name}_{number}") for number in count(2))
+    folder = next(path for path in later if not _holds_another(path, told))
+    return folder, f"{first} holds another study; this one is in {folder} (out= names another folder)"
+
+
+def _holds_another(folder: Path, told: dict[str, Any]) -> bool:
+    """Return whether a folder holds what this study would write over; one that only grew by runs is the same study."""
+    note = folder / _STUDY
+    if not note.exists():
+        return (folder / "report.html").exists() or (folder.exists() and not folder.is_dir())
+    try:
+        known = json.loads(note.read_text(encoding="utf-8"))
+        grown = set(known["spp"]) <= set(told["spp"]) and known["seeds"] <= told["seeds"]
+    except (OSError, ValueError, KeyError, TypeError):  # somebody else's file
+        return True
+    return {**known, "spp": 0, "seeds": 0} != {**told, "spp": 0, "seeds": 0} or not grown
+
+
+def _told(raw: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all that the runs of a study depend on, as JSON has it.
+
+    Args:
+        raw: its keys as written.
+        asked: its own keys as read, see :class:`torchpt.reports.study.Study`.
+    """
+    from torchpt.reports.report import plain
+
+    told = {key: value for key, value in raw.items() if key not in _SHOWN}
+    return json.loads(json.dumps(plain({**told, "spp": asked["spp"], "seeds": asked["seeds"]}), sort_keys=True))
+
+
+def _stem(scenes: tuple[str, ...], file: str | None) -> str:
+    if file is not None:
+        return Path(file).stem
+    return "_".join(Path(name).stem if name.endswith((".yaml", ".yml")) else name for name in scenes)

@@ -1,0 +1,155 @@
+"""`torchpt render ... debug.pixel=[x,y] debug.sample=k`: one path of the picture, vertex by vertex, as text or as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from torchpt.cli import collector
+from torchpt.cli.arguments import UsageError
+from torchpt.cli.interrupt import Interrupt
+from torchpt.cli.notices import notices
+from torchpt.cli.render import Job, described
+from torchpt.cli.streams import speaking
+
+if TYPE_CHECKING:
+    from torchpt.rendering.one_path import Chosen, Emission, Path, Scattered, Vertex
+
+__all__ = ["Wish", "debug", "lines"]
+
+_PIXEL = re.compile(r"\[?\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\]?\Z")
+_SAMPLE = re.compile(r"\d{1,18}\Z")
+
+
+@dataclass(frozen=True)
+class Wish:
+    """Which path.
+
+    Attributes:
+        pixel: ``(x, y)`` on the whole film.
+        sample: its number in the pixel.
+    """
+
+    pixel: tuple[int, int]
+    sample: int = 0
+
+    @staticmethod
+    def read(words: Mapping[str, str]) -> Wish:
+        """From the values of ``arguments.DEBUG_KEYS``.
+
+        Raises:
+            UsageError: something that is no pixel, or no sample.
+        """
+        pixel, sample = _PIXEL.match(words["debug.pixel"]), words.get("debug.sample", "0")
+        if pixel is None:
+            raise UsageError(f"debug.pixel: expected [x,y], two whole numbers from 0, got {words['debug.pixel']!r}")
+        if not _SAMPLE.match(sample):
+            raise UsageError(f"debug.sample: expected a whole number from 0, got {sample!r}")
+        return Wish((int(pixel[1]), int(pixel[2])), int(sample))
+
+
+def debug(job: Job, wish: Wish, interrupt: Interrupt, as_json: bool = False) -> int:
+    """Load the scene, trace the path, print it; returns the exit code.
+
+    Raises:
+        TorchptError: bad input.
+        Interrupted: a signal came.
+    """
+    from torchpt.rendering.one_path import one_path
+    from torchpt.scene.devices import device_of
+    from torchpt.scene.scene import Scene
+
+    collector.resume()
+    with notices():
+        description, wishes = described(job)
+        scene = Scene(description, device_of(wishes.render.device))
+        path = one_path(scene, wishes, wish.pixel, wish.sample)
+    interrupt.check()
+    with speaking():
+        print(json.dumps(_plain(asdict(path)), allow_nan=False) if as_json else "\n".join(lines(path)))
+    return 0
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no word for what is not finite, which matters here: it is told as text."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
+
+
+def lines(path: Path) -> Iterator[str]:
+    """A path as text."""
+    x, y = path.pixel
+    yield f"scene {path.scene}, pixel ({x}, {y}), sample {path.sample}, seed {path.seed}"
+    yield f"camera at {_three(path.origin)}, looking along {_three(path.direction)}"
+    for vertex in path.vertices:
+        yield from _vertex(vertex)
+    yield f"ended: {path.ended}"
+    yield f"radiance {_three(path.radiance, 9)}"
+    if path.value != path.radiance:
+        yield f"in the picture {_three(path.value, 9)}"
+
+
+def _vertex(vertex: Vertex) -> Iterator[str]:
+    if vertex.position is None:
+        yield f"{vertex.depth}  escaped"
+    else:
+        assert vertex.normal is not None and vertex.geometric_normal is not None
+        where = f"{vertex.shape}, {vertex.kind} {vertex.primitive}"
+        yield f"{vertex.depth}  {where}, material {vertex.material} ({vertex.model})"
+        yield _row("position", _three(vertex.position))
+        yield _row("normal", f"{_three(vertex.normal)}, geometric {_three(vertex.geometric_normal)}")
+        yield _row("wo", _three(vertex.wo))
+    if vertex.emission is not None:
+        yield _row("emission" if vertex.position else "environment", _emission(vertex.emission))
+    if vertex.light is not None:
+        yield _row("light", _light(vertex.light))
+    if vertex.scattered is not None:
+        yield from _scattered(vertex.scattered)
+    yield _row("radiance", _three(vertex.radiance))
+
+
+def _emission(found: Emission) -> str:
+    parts = f"radiance {_three(found.radiance)}, pdf {_number(found.pdf)}, MIS weight {_number(found.mis_weight)}"
+    return f"{found.light}: {parts}, contribution {_three(found.contribution)}"
+
+
+def _light(light: Chosen) -> str:
+    seen = "not asked" if light.visible is None else _number(light.visible)
+    return (
+        f"{light.light}: wi {_three(light.wi)}, {_density(light.pdf)}, radiance/pdf {_three(light.arriving)}, "
+        f"bsdf {_three(light.bsdf)}, MIS weight {_number(light.mis_weight)}, visible {seen}, "
+        f"contribution {_three(light.contribution)}"
+    )
+
+
+def _scattered(found: Scattered) -> Iterator[str]:
+    eta = "" if found.eta is None else f", eta {_number(found.eta)}"
+    yield _row("scattered", f"wi {_three(found.wi)}, {_density(found.pdf)}, weight {_three(found.weight)}{eta}")
+    if found.survival is not None:
+        yield _row("roulette", f"survives with {_number(found.survival)}")
+    yield _row("throughput", _three(found.throughput))
+
+
+def _row(name: str, text: str) -> str:
+    return f"   {name:11} {text}"
+
+
+def _density(pdf: float) -> str:
+    return "pdf inf (a delta)" if pdf == math.inf else f"pdf {_number(pdf)}"
+
+
+def _number(value: float, digits: int = 6) -> str:
+    return f"{value + 0.0:.{digits}g}"  # -0 is told as 0
+
+
+def _three(values: Sequence[float], digits: int = 6) -> str:
+    return f"({', '.join(_number(value, digits) for value in values)})"

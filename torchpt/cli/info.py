@@ -1,0 +1,105 @@
+"""`torchpt info`: what a scene holds, what was built for it, what was left out and why."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+from torchpt.cli import collector
+from torchpt.cli.interrupt import Interrupt
+from torchpt.cli.notices import notices, which_job
+from torchpt.cli.render import Job, described, knowing, plain
+from torchpt.cli.streams import speaking
+from torchpt.core.errors import TorchptError
+
+__all__ = ["info", "lines"]
+
+
+def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:
+    """Load and build the scene, print what came of it; returns the exit code.
+
+    Raises:
+        TorchptError: bad input.
+        Interrupted: a signal came.
+    """
+    from torchpt.rendering import loop_facts
+    from torchpt.scene.devices import device_of
+    from torchpt.scene.scene import Scene
+
+    collector.resume()
+    with notices():
+        description, wishes = described(job)
+        scene = Scene(description, device_of(wishes.render.device))
+        facts = scene.info(wishes)
+        facts["built"]["loop"] = loop_facts(scene, wishes)
+        facts = {**job.facts(), **facts}
+        if wishes.render.max_memory is not None:
+            facts["memory"] = _memory(scene, wishes)
+    which_job(job)
+    interrupt.check()
+    if "refused" in facts.get("memory", ()):
+        print(f"torchpt: warning: no render could run: {facts['memory']['refused']}", file=sys.stderr)
+    with speaking():
+        if as_json:
+            print(json.dumps(plain(facts), allow_nan=False))
+        elif not sys.stdout.isatty():
+            print("\n".join(key + value for key, value in lines(facts)))
+        else:
+            from rich.console import Console
+            from rich.text import Text
+
+            for key, value in lines(facts):
+                Console().print(Text(key, style="bold") + Text(value), soft_wrap=True)
+    return 0
+
+
+def _memory(scene: Any, wishes: Any) -> dict[str, Any]:
+    """Return whether ``render.max_memory`` is enough for a render, and what a render would say where it is not."""
+    import torch
+
+    from torchpt.rendering import Run
+
+    wishes = knowing(wishes)  # as `torchpt render`
+    wishes = replace(wishes, render=wishes.render.but(checkpoint=None, resume=False))
+    try:
+        with torch.no_grad():
+            Run(scene, wishes, None, torch.float32)
+    except TorchptError as error:
+        return {"enough": False, "refused": str(error)}
+    return {"enough": True}
+
+
+def lines(facts: dict[str, Any], depth: int = 0) -> Iterator[tuple[str, str]]:
+    """A nested dict as indented lines: ``("  key:", " value")`` each."""
+    pad = "  " * depth
+    for key, value in facts.items():
+        if isinstance(value, dict) and value:
+            yield f"{pad}{key}:", ""
+            yield from lines(value, depth + 1)
+        elif isinstance(value, list | tuple) and any(isinstance(item, dict | str) for item in value):
+            yield f"{pad}{key}:", ""
+            for item in value:
+                if isinstance(item, dict):
+                    yield f"{pad}  - ", ", ".join(f"{name}: {_shown(part)}" for name, part in item.items())
+                else:
+                    yield f"{pad}  - ", _shown(item)
+        else:
+            yield f"{pad}{key}:", f" {_shown(value)}"
+
+
+def _shown(value: Any) -> str:
+    value = plain(value)
+    if value is None or value == {} or value == []:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ", ".join(_shown(item) for item in value)
+    return str(value)

@@ -1,0 +1,80 @@
+"""The keys of the settings, for help and errors, from the groups' files: importing what they are made of would take seconds.
+
+``scripts/make_configs.py`` writes those files from what the kinds declare.
+"""
+
+from __future__ import annotations
+
+import difflib
+import textwrap
+from collections.abc import Iterable
+from functools import cache
+from typing import Any
+
+from torchpt.cli.arguments import GROUPS
+from torchpt.core.files import configs
+
+__all__ = ["known_keys", "listed", "options", "scenes", "types", "unknown"]
+
+
+def options(group: str) -> list[str]:
+    """The files of a group, or of the scenes, by name."""
+    return sorted(path.stem for path in (configs() / group).glob("*.yaml"))
+
+
+@cache
+def known_keys(group: str, name: str = "default") -> tuple[str, ...]:
+    """The keys in a group's file, nested ones dotted; by default those of all its types."""
+    import yaml
+
+    block: dict[str, Any] = yaml.safe_load((configs() / group / f"{name}.yaml").read_text(encoding="utf-8"))
+    nested = {key: value if isinstance(value, dict) else {"": None} for key, value in block.items()}
+    return tuple(f"{key}.{inner}" if inner else key for key, inners in nested.items() for inner in inners)
+
+
+def types(group: str) -> list[str]:
+    """The types that a group's files are named by."""
+    return [name for name in options(group) if name != "default"]
+
+
+def listed() -> str:
+    """All keys, a group after the other; of a group whose types have different ones, type by type."""
+    lines: list[str] = []
+    for group in GROUPS:
+        own = {name: " ".join(known_keys(group, name)[1:]) for name in types(group)}
+        if len(set(own.values())) > 1:
+            wide = max(map(len, own))
+            rows = [f"type={name:{wide}}  {keys}" for name, keys in own.items()]
+        else:
+            rows = [" ".join(known_keys(group)) + (f" (type: {', '.join(own)})" if own else "")]
+        lines += [f"{group + '.' if k == 0 else '':12}{row}".rstrip() for k, row in enumerate(rows)]
+    return "\n".join(lines)
+
+
+def unknown(key: str, words: Iterable[str] = ()) -> str:
+    """The line for a key that does not exist, or not where the words of the command line choose a type.
+
+    Args:
+        key: dotted.
+        words: of the command line.
+    """
+    group, _, name = key.partition(".")
+    if group in GROUPS:
+        chosen = next((word.partition("=")[2] for word in words if word.startswith(f"{group}=")), "default")
+        for kind in chosen.split(","):
+            if kind in types(group) and name not in known_keys(group, kind) and name in known_keys(group):
+                own = ", ".join(known_keys(group, kind))
+                owners = ", ".join(other for other in types(group) if name in known_keys(group, other))
+                return f"{key}: expected only keys of {group}={kind} ({own}); {name} belongs to {owners}"
+        return f"{key}: unknown key; known: {', '.join(f'{group}.{known}' for known in known_keys(group))}"
+    every = [f"{group}.{known}" for group in GROUPS for known in known_keys(group)]
+    same = [known for known in every if known.endswith(f".{key}")]
+    near = same or difflib.get_close_matches(key, [*every, *GROUPS, "scene", "out"], 1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    return f"{key}: unknown key; known: scene, out, {', '.join(f'{group}.*' for group in GROUPS)}{hint}"
+
+
+def scenes() -> str:
+    """The scenes that ship, as lines of the help."""
+    names = ", ".join(options("scene"))
+    return textwrap.fill(names, 110, initial_indent=" " * 11, subsequent_indent=" " * 11, break_on_hyphens=False)

@@ -1,0 +1,77 @@
+"""Warnings on the command line: one line each on stderr, once it is certain that no error line takes their place."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TextIO
+
+from torchpt.core.errors import EnergyWarning
+
+if TYPE_CHECKING:
+    from torchpt.cli.render import Job
+
+__all__ = ["not_finite", "notices", "unknown_error", "which_job"]
+
+
+@contextmanager
+def notices() -> Iterator[None]:
+    """Context whose warnings about the scene are printed where it ends well; other warnings are Python's as before."""
+    lines: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", EnergyWarning)
+        show = warnings.showwarning
+
+        def keep(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, EnergyWarning):
+                lines.append(f"torchpt: warning: {' '.join(str(message).split())}")
+            else:
+                show(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = keep
+        yield
+    for text in dict.fromkeys(lines):
+        print(text, file=sys.stderr)
+
+
+def which_job(job: Job, outs: Sequence[str] = ()) -> None:
+    """Say on stderr which files are of which settings: of a job of a sweep its number, overrides and pictures."""
+    if job.number is not None:
+        files = f" -> {', '.join(outs)}" if outs else ""
+        print(f"torchpt: job {job.number}: {' '.join(job.words)}{files}", file=sys.stderr)
+
+
+def not_finite(facts: Mapping[str, Any]) -> None:
+    """Say on stderr that samples of a picture are not finite, why, and where to look; nothing where all are.
+
+    Args:
+        facts: of :meth:`torchpt.Rendering.summary`.
+    """
+    causes = facts.get("nonfinite_causes")
+    if not causes:
+        return
+    told = "; ".join(f"{count:,} {name}" for name, count in causes.items())
+    print(
+        f"torchpt: warning: {facts['nonfinite_samples']:,} samples are not finite and count as black ({told}); the first is "
+        f"{facts['nonfinite_first']}; debug.pixel=[x,y] debug.sample=k prints a path",
+        file=sys.stderr,
+    )
+
+
+def unknown_error(facts: Mapping[str, Any]) -> None:
+    """Say on stderr why a picture's error is not known; nothing where it is, or where nobody asked.
+
+    Args:
+        facts: of :meth:`torchpt.Rendering.summary`.
+    """
+    if facts.get("relmse_unknown"):
+        print(f"torchpt: warning: the picture's error is not known: {facts['relmse_unknown']}", file=sys.stderr)

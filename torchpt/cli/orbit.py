@@ -1,0 +1,333 @@
+"""`torchpt orbit`: the camera goes round the scene, and the frames become a moving picture.
+
+Frames are kept as pictures in a folder beside the first `out` until that is written, so that a run which was stopped goes
+on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchpt.cli import collector
+from torchpt.cli.interrupt import Interrupt, Interrupted
+from torchpt.cli.notices import notices, which_job
+from torchpt.cli.progress import Bar
+from torchpt.cli.render import Job, check_distinct, described, knowing, numbered, plain
+from torchpt.cli.streams import speaking
+from torchpt.core.errors import OutputError, SceneError
+from torchpt.core.version import __version__
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from torchpt.scene import Scene
+    from torchpt.scene.settings import Settings
+
+__all__ = ["HELP", "Turn", "orbit", "poses"]
+
+HELP = """\
+torchpt orbit scene=NAME|FILE.yaml [out=FILE.gif|FILE.mp4] [frames=48] [degrees=360] [key=value ...]
+
+  Turns the camera about what it looks at (its target, about its up axis; a camera placed by to_world: the middle of the
+  scene, about the axis of the scene nearest to its up) and writes the frames as a moving picture.
+  scene=    a file ending in .yaml, or a scene that ships:
+{scenes}
+  out=      .gif, or .mp4 (extra `video`); several as out=[a.gif,a.mp4]; NAME.gif where nothing is said
+  frames=   how many; frame k stands at degrees * k / frames                                                48
+  degrees=  of the whole turn, counter-clockwise seen from above; negative: the other way around             360
+  fps=      frames a second                                                                                 24
+  keep=     true: leave the frames where they are, as pictures in OUT.frames                             false
+  {keys}
+
+Frame k is what `torchpt render` gives of its camera with render.seed + k. While the run goes on frames lie in OUT.frames;
+stopped, the same command takes up where it was. The last line on stdout is a summary in JSON.
+Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the finished frames kept.
+"""
+_MOST_FRAMES = 100_000
+_MANIFEST = "orbit.json"
+
+
+@dataclass(frozen=True)
+class Turn:
+    """How the camera goes round.
+
+    Attributes:
+        frames: how many.
+        degrees: of the whole turn.
+        fps: frames a second.
+        keep: whether the frames stay as pictures.
+    """
+
+    frames: int = 48
+    degrees: float = 360.0
+    fps: float = 24.0
+    keep: bool = False
+
+    @classmethod
+    def read(cls, words: Mapping[str, str]) -> Turn:
+        """From the words of the command line, by key.
+
+        Raises:
+            SceneError: a value that is not accepted.
+        """
+        numbers: dict[str, Any] = {}
+        for key, kind, expected, accept in (
+            ("frames", int, f"a whole number 1..{_MOST_FRAMES}", lambda x: 1 <= x <= _MOST_FRAMES),
+            ("degrees", float, "an angle in degrees", lambda x: abs(x) <= 1e6),
+            ("fps", float, "a number above 0", lambda x: 1e-2 <= x <= 1e3),
+        ):
+            if key in words:
+                try:
+                    numbers[key] = kind(words[key])
+                except ValueError:
+                    numbers[key] = math.nan
+                if not accept(numbers[key]):
+                    raise SceneError(key, words[key], expected)
+        if words.get("keep", "false") not in ("true", "false"):
+            raise SceneError("keep", words["keep"], "true or false")
+        return cls(**numbers, keep=words.get("keep") == "true")
+
+
+def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
+    """Camera to world ``(4, 4)`` of every frame; the first is the scene's own."""
+    import numpy as np
+
+    from torchpt.math.transforms import look_at, rotate
+
+    told = scene.description.camera.values
+    start = np.asarray(scene.built.parameters["camera.to_world"], np.float64)
+    aimed = told["target"] is not None
+    if aimed:
+        axis = np.asarray(told["up"] or (0.0, 1.0, 0.0), np.float64)
+        centre = np.asarray(told["target"], np.float64)
+    else:
+        nearest = int(np.abs(start[:3, 1]).argmax())
+        axis, centre = np.sign(start[nearest, 1]) * np.eye(3)[nearest], scene.middle()
+    for frame in range(turn.frames):
+        if frame * turn.degrees % (360.0 * turn.frames) == 0.0:
+            yield start
+            continue
+        by = rotate({"axis": axis.tolist(), "angle": turn.degrees * frame / turn.frames})[:3, :3]
+        place = centre + by @ ((np.asarray(told["origin"]) if aimed else start[:3, 3]) - centre)
+        if aimed:
+            yield look_at(place.tolist(), centre.tolist(), axis.tolist(), key="")
+            continue
+        pose = start.copy()
+        pose[:3, :3], pose[:3, 3] = by @ start[:3, :3], place
+        yield pose
+
+
+def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
+    """Render the frames that are missing, write the moving picture, print the summary; returns the exit code.
+
+    Raises:
+        TorchptError: bad input, a folder of frames of other settings, a file that cannot be written.
+        Interrupted: a signal came before the first frame.
+    """
+    from torchpt.images.movie import check_movie, write_movie
+    from torchpt.scene.devices import device_of
+    from torchpt.scene.scene import Scene
+    from torchpt.scene.settings import MOST_SEED
+
+    collector.resume()
+    start = time.perf_counter()
+    with notices():
+        description, wishes = described(job)
+        for group, key in (
+            ("render", "preview"),
+            ("render", "checkpoint"),
+            ("film", "aovs"),
+            ("film", "denoise"),
+        ):
+            if job.overrides.get(group, {}).get(key):
+                what = "nothing: torchpt orbit writes frames only"
+                if key == "denoise":
+                    what = "false: torchpt orbit writes frames as rendered (denoised one by one they flicker)"
+                raise SceneError(f"{group}.{key}", job.overrides[group][key], what)
+        if wishes.render.seed > (last := MOST_SEED - turn.frames + 1):
+            expected = f"a whole number 0..{last} where frames={turn.frames} (frame k has the seed render.seed + k)"
+            raise SceneError("render.seed", wishes.render.seed, expected)
+        outs = _outputs(job)
+        check_distinct([("out", path) for path in outs])
+        for path in outs:
+            check_movie(path, turn.fps)
+        scene = Scene(description, device_of(wishes.render.device))
+        frames = Frames(Path(f"{outs[0]}.frames"), _facts(scene, wishes, turn))
+        before = frames.count(turn.frames)
+    load_seconds = time.perf_counter() - start
+    which_job(job, outs)
+    interrupt.check()
+    interrupt.deferred = True
+    totals = _render(job, scene, turn, frames, interrupt)
+    ready = frames.count(turn.frames)
+    facts: dict[str, Any] = {
+        "out": outs[0] if len(outs) == 1 else outs,
+        **job.facts(),
+        "frames": turn.frames,
+        "rendered": ready - before,
+    }
+    facts |= {"load_seconds": round(load_seconds, 4), **totals}
+    if ready == turn.frames:
+        for path in outs:
+            write_movie(path, frames.pictures(turn.frames), turn.fps)
+        if not turn.keep:
+            frames.remove(turn.frames)
+    else:
+        facts["complete"] = False
+    facts["seconds"] = round(time.perf_counter() - start, 4)
+    with speaking():
+        print(json.dumps(plain(facts), allow_nan=False))
+    if interrupt.signum is None:
+        return 0
+    kept = (
+        f"{outs[0]} is written" if ready == turn.frames else f"{ready} of {turn.frames} frames are in {frames.folder}"
+    )
+    print(f"torchpt: stopped by a signal; {kept}", file=sys.stderr)
+    return Interrupted(interrupt.signum).exit_code
+
+
+def _outputs(job: Job) -> list[str]:
+    path = Path(job.scene)
+    name = path.stem if path.suffix in (".yaml", ".yml") else path.name
+    return [numbered(str(Path(out).expanduser()), job.number) for out in job.outs or (f"{name}.gif",)]
+
+
+def _render(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Interrupt) -> dict[str, Any]:
+    """Render the frames that are not there, until a signal comes; what they came to."""
+    import torch
+
+    from torchpt.rendering.api import render_scene
+    from torchpt.scene.formats.description import settings
+
+    place, seed = scene.params["camera.to_world"], settings(scene.description, job.overrides).render.seed
+    totals: dict[str, int] = {"rays": 0, "nonfinite_samples": 0}
+    causes: Counter[str] = Counter()
+    begun = time.perf_counter()
+    with Bar(frames.folder.stem) as bar:
+
+        def on_progress(number: int, rays: int, state: Any) -> bool:
+            done, seconds = number * state.total + state.done, time.perf_counter() - begun
+            bar.update(done, turn.frames * state.total, rays + state.rays, seconds)
+            return interrupt.signum is not None
+
+        for number, pose in enumerate(poses(scene, turn)):
+            if interrupt.signum is not None:
+                break
+            if frames.has(number):
+                continue
+            once = {**job.overrides, "render": {**job.overrides.get("render", {}), "seed": seed + number}}
+            wishes = knowing(settings(scene.description, once))  # a frame is what `torchpt render` gives
+            # A scene file's wishes of these are about `torchpt render`.
+            film, render = wishes.film.but(denoise=False), wishes.render.but(checkpoint=None, resume=False)
+            wishes = replace(wishes, film=film, render=render)
+            scene.params["camera.to_world"] = torch.from_numpy(pose.copy()).to(place)
+            rendering = render_scene(scene, wishes, on_progress=partial(on_progress, number, totals["rays"]))
+            if not rendering.complete:
+                break
+            frames.write(number, rendering.image, wishes.film)
+            summary = rendering.summary()
+            totals = {name: count + summary[name] for name, count in totals.items()}
+            causes.update(summary.get("nonfinite_causes", {}))
+    return {**totals, "nonfinite_causes": dict(causes)} if causes else totals
+
+
+class Frames:
+    """The folder of the frames, with a note of what they are frames of.
+
+    Args:
+        folder: made where it is not there.
+        facts: by dotted name, what frames depend on.
+
+    Raises:
+        OutputError: it holds something else, frames of other settings, or cannot be made.
+    """
+
+    def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
+        self.folder = folder
+        note = folder / _MANIFEST
+        try:
+            if not folder.exists():
+                folder.mkdir()
+            if not note.exists():
+                if any(folder.iterdir()):
+                    raise OutputError(folder, f"is in the way: it holds no {_MANIFEST}, so it is no folder of frames")
+                unfinished = folder / f".{_MANIFEST}"
+                unfinished.write_text(json.dumps(facts, indent=1))
+                unfinished.replace(note)
+            known = json.loads(note.read_text())
+        except ValueError:
+            raise OutputError(folder, f"{_MANIFEST} is malformed; remove the folder to begin anew") from None
+        except OSError as error:
+            raise OutputError(folder, f"cannot be used for frames ({error.strerror or error})") from None
+        facts = json.loads(json.dumps(facts))
+        if known != facts:
+            known = known if isinstance(known, dict) else {}
+            name = next(name for name in (*facts, *known) if known.get(name, ...) != facts.get(name, ...))
+            other = f"{name} {known.get(name)}, now {facts.get(name)}" if name != "scene" else "the scene was another"
+            how = "remove it to begin anew, or give another out="
+            raise OutputError(folder, f"holds frames of other settings ({other}); {how}")
+
+    def file(self, number: int) -> Path:
+        """Where a frame lies."""
+        return self.folder / f"{number:06d}.png"
+
+    def has(self, number: int) -> bool:
+        """Whether a frame is there; they are written whole."""
+        return self.file(number).exists()
+
+    def count(self, frames: int) -> int:
+        """How many of so many are there."""
+        return sum(map(self.has, range(frames)))
+
+    def write(self, number: int, image: Any, film: Any) -> None:
+        """Keep a frame as a screen shows it."""
+        from torchpt.images import write_image
+
+        write_image(self.file(number), image, exposure=film.exposure, tonemap=film.tonemap, gamma=film.gamma)
+
+    def pictures(self, frames: int) -> Iterator[Any]:
+        """The frames ``(H, W, 3)`` uint8, in order."""
+        from torchpt.images import read_texels
+
+        for number in range(frames):
+            values = read_texels(self.file(number)).values  # whole numbers over 255
+            yield (values[..., :3] * 255.0 + 0.5).astype("uint8")
+
+    def remove(self, frames: int) -> None:
+        """Remove what was written here, and the folder where nothing else is in it."""
+        with suppress(OSError):
+            for number in range(frames):
+                self.file(number).unlink(missing_ok=True)
+            (self.folder / _MANIFEST).unlink()
+            self.folder.rmdir()
+
+
+def _facts(scene: Scene, wishes: Settings, turn: Turn) -> dict[str, Any]:
+    """Return what frames depend on, by dotted name: the turn, the settings, and a hash of the scene."""
+    from torchpt.scene.fingerprint import fingerprint
+    from torchpt.scene.settings import having
+    from torchpt.spec import Role
+
+    facts = {"torchpt": __version__, "frames": turn.frames, "degrees": turn.degrees}
+    free = {"render": having(Role.FREE, but=Role.ENDS)["render"]}  # which leave a frame as it is
+    return {**facts, **dict(_dotted(wishes.plain(free))), "scene": fingerprint(scene)}
+
+
+def _dotted(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested mappings with their dotted names."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value

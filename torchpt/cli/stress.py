@@ -1,0 +1,208 @@
+"""`torchpt stress`: stiff and extreme cases, measured; a table, figures as JSON, and pictures of the sweeps."""
+
+from __future__ import annotations
+
+import fnmatch
+import json
+import time
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchpt.cli import collector
+from torchpt.cli.arguments import GROUPS, UsageError
+from torchpt.cli.streams import speaking
+from torchpt.core.errors import OutputError, SceneError
+
+if TYPE_CHECKING:
+    from torchpt.stress import Bench, Case, Outcome
+
+__all__ = ["HELP", "stress"]
+
+HELP = """\
+torchpt stress [quick=true] [case=PATTERN] [out=FOLDER] [key=value|key=[a,b] ...]
+torchpt stress scene=NAME|FILE.yaml [key=value ...]
+
+  What breaks path tracers, measured against closed forms and float64: roughness, index, albedo, sizes, distances, radiance,
+  lights and path lengths swept over all that float32 holds. With scene= the same of a scene of yours: moved, scaled, turned,
+  in float64 and by every search it has to be the same picture.
+  quick=    true: a few places of each sweep                                    false
+  case=     names of cases or topics, with * and ?: case=*glass*, case=places   all
+  device=   cpu, cuda, cuda:N                                                   cpu
+  accel=    auto, numba, torch, brute, or a list of them                        auto
+  compile=  auto, on, off, or a list of them                                    auto
+  dtype=    float32 or float64                                                  float32
+  out=      a folder for stress.json, stress.md and pictures of the sweeps      none
+  --json    the figures as one JSON object in place of the table
+
+Exit codes: 0 all passed; 1 some failed; 2 bad input.
+"""
+_CHOICES = {
+    "accel": ("auto", "numba", "torch", "brute"),
+    "compile": ("auto", "on", "off"),
+    "dtype": ("float32", "float64"),
+    "quick": ("false", "true"),
+}
+_KEYS = ("quick", "case", "device", "accel", "compile", "dtype", "out", "scene")
+
+
+@dataclass
+class Wishes:
+    """A command line, read."""
+
+    given: dict[str, str] = field(default_factory=dict)
+    settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    json: bool = False
+    help: bool = False
+
+    @classmethod
+    def read(cls, words: list[str]) -> Wishes:
+        """From the words after ``stress``.
+
+        Raises:
+            UsageError: an unknown word.
+        """
+        import yaml
+
+        found = cls()
+        for word in words:
+            key, equals, value = word.partition("=")
+            group, dot, name = key.partition(".")
+            if word in ("-h", "--help", "--json"):
+                found.help, found.json = found.help or word != "--json", found.json or word == "--json"
+            elif equals and key in _KEYS:
+                if key in found.given:
+                    raise UsageError(f"{key}: given twice")
+                found.given[key] = value
+            elif equals and dot and group in GROUPS:
+                try:
+                    found.settings.setdefault(group, {})[name] = yaml.safe_load(value)
+                except yaml.YAMLError:
+                    raise UsageError(f"{word}: the value cannot be read") from None
+            else:
+                raise UsageError(f"{word}: expected one of {', '.join(f'{k}=' for k in _KEYS)}, --json or --help")
+        if found.settings and "scene" not in found.given:
+            raise UsageError(f"{next(iter(found.settings))}: settings are of a scene: expected scene= beside them")
+        for key, accepted in _CHOICES.items():
+            wrong = [value for value in found.list(key, accepted[0]) if value not in accepted]
+            if wrong or (key in ("dtype", "quick") and len(found.list(key, accepted[0])) > 1):
+                raise SceneError(key, found.given[key], f"one of {', '.join(accepted)}")
+        return found
+
+    def list(self, key: str, default: str) -> list[str]:
+        """A value, or the values of a list."""
+        text = self.given.get(key, default)
+        return [part.strip() for part in text[1:-1].split(",")] if text[:1] == "[" and text[-1:] == "]" else [text]
+
+
+def stress(words: list[str]) -> int:
+    """Run the cases that are asked for, print what came of each; returns the exit code.
+
+    Raises:
+        TorchptError: bad input.
+    """
+    wishes = Wishes.read(words)
+    if wishes.help:
+        with speaking():
+            print(HELP, end="")
+        return 0
+    from torchpt.stress.outcome import outcome_of
+    from torchpt.stress.table import facts, heading, line
+
+    collector.resume()
+    topics, benches, folder = _topics(wishes), _benches(wishes), _folder(wishes)
+    quick, begun = wishes.given.get("quick") == "true", time.perf_counter()
+    found: dict[str, dict[str, list[Outcome]]] = {}
+    for number, (label, bench) in enumerate(benches.items()):
+        _tell(wishes, f"{label}\n{heading()}")
+        for topic, cases in topics.items():
+            for case in cases:
+                if number and not case.backend:
+                    continue  # the first run tells for all
+                outcome = outcome_of(case, bench, quick)
+                found.setdefault(label, {}).setdefault(topic, []).append(outcome)
+                _tell(wishes, line(outcome))
+    every = [one for by_topic in found.values() for row in by_topic.values() for one in row]
+    failed, refused = sum(not one.passed for one in every), sum(one.refused > 0 for one in every)
+    told = {
+        "cases": len(every),
+        "failed": failed,
+        "refused": refused,
+        "seconds": round(time.perf_counter() - begun, 1),
+        "runs": {label: facts(by_topic) for label, by_topic in found.items()},
+    }
+    if folder is not None:
+        _keep(folder, told, found)
+    beside = f", {refused} refused wholly or in part by the search" if refused else ""
+    _tell(wishes, f"{len(every)} cases, {failed} failed{beside}")
+    if wishes.json:
+        with speaking():
+            print(json.dumps(told, allow_nan=False))
+    return 1 if failed else 0
+
+
+def _tell(wishes: Wishes, text: str) -> None:
+    if not wishes.json:
+        with speaking():
+            print(text)
+
+
+def _benches(wishes: Wishes) -> dict[str, Bench]:
+    """One for each combination of what is asked for, by what it is called."""
+    import torch
+
+    from torchpt.scene.devices import device_of
+    from torchpt.stress import Bench
+
+    device, dtype = wishes.given.get("device", "cpu"), wishes.given.get("dtype", "float32")
+    if not (device in ("cpu", "cuda") or (device.startswith("cuda:") and device[5:].isdigit())):
+        raise SceneError("device", device, "cpu, cuda or cuda:N")
+    device_of(device)
+    if "on" in wishes.list("compile", "auto") and (device, dtype) != ("cpu", "float32"):
+        raise SceneError("compile", "on", f"auto or off (there are no kernels for {dtype} on {device})")
+    return {
+        f"accel {accel}, compile {compiled}, {dtype} on {device}": Bench(device, accel, compiled, getattr(torch, dtype))
+        for accel, compiled in product(wishes.list("accel", "auto"), wishes.list("compile", "auto"))
+    }
+
+
+def _topics(wishes: Wishes) -> dict[str, tuple[Case, ...]]:
+    """The cases that are asked for."""
+    from torchpt.stress.cases import all_cases
+    from torchpt.stress.own_scene import cases_of
+
+    scene = wishes.given.get("scene")
+    every = all_cases() if scene is None else {"scene": cases_of(scene, wishes.settings)}
+    pattern = wishes.given.get("case", "*")
+    found = {
+        topic: tuple(one for one in cases if fnmatch.fnmatch(one.name, pattern) or fnmatch.fnmatch(topic, pattern))
+        for topic, cases in every.items()
+    }
+    if not any(found.values()):
+        raise SceneError("case", pattern, f"a topic ({', '.join(every)}) or a case, with * and ?")
+    return found
+
+
+def _folder(wishes: Wishes) -> Path | None:
+    if "out" not in wishes.given:
+        return None
+    folder = Path(wishes.given["out"]).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(folder, f"cannot be made ({error.strerror or error})") from None
+    return folder
+
+
+def _keep(folder: Path, told: dict[str, Any], found: dict[str, dict[str, list[Outcome]]]) -> None:
+    """Write the figures, the table, and a picture of each topic by the first backend."""
+    from torchpt.reports.runs import write_whole
+    from torchpt.stress.plots import draw
+    from torchpt.stress.table import markdown
+
+    write_whole(folder / "stress.json", json.dumps(told, indent=1, allow_nan=False).encode())
+    pages = [f"### {label}\n\n{markdown(by_topic)}\n" for label, by_topic in found.items()]
+    write_whole(folder / "stress.md", "\n".join(pages).encode())
+    for topic, outcomes in next(iter(found.values())).items():
+        draw(outcomes, folder / f"{topic}.svg")

@@ -1,0 +1,274 @@
+"""Writing LLVM IR as text, in any form: one operation a line, on the numbers of all lanes that a value holds."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from torchpt.compiler.form import Form
+
+__all__ = ["ELEMENTS", "Block"]
+
+#: How a node's type is held in a register.
+ELEMENTS = {"f": "float", "d": "double", "i": "i32", "l": "i32", "u": "i32", "L": "i64", "b": "i1"}
+_SUFFIX = {"float": "f32", "double": "f64", "i32": "i32", "i64": "i64", "i1": "i1", "i8": "i8"}
+
+
+class Block:
+    """Lines of IR in the body of a function, and the declarations that they need.
+
+    Attributes:
+        form: how lanes are held.
+        width: lanes of a value.
+        lines: of the body.
+        declarations: of the functions that it calls.
+        label: of the basic block that lines are added to.
+    """
+
+    def __init__(self, form: Form) -> None:
+        self.form, self.width = form, form.width
+        self.lines: list[str] = []
+        self.declarations: set[str] = set()
+        self.label = "entry"
+        self._count = 0
+
+    def name(self) -> str:
+        """A name for a new value."""
+        self._count += 1
+        return f"%v{self._count}"
+
+    def op(self, text: str) -> str:
+        """A line that gives a value; returns its name."""
+        name = self.name()
+        self.lines.append(f"  {name} = {text}")
+        return name
+
+    def do(self, text: str) -> None:
+        """A line that gives none."""
+        self.lines.append(f"  {text}")
+
+    def let(self, name: str, type_: str, value: str) -> None:
+        """Give a value a name of its own."""
+        self.do(f"%{name} = bitcast {type_} {value} to {type_}")
+
+    @contextmanager
+    def when(self, condition: str) -> Iterator[None]:
+        """Write lines that run where a condition holds: a branch, so for values of one lane."""
+        assert self.width == 1
+        self._count += 1
+        then, after = f"then{self._count}", f"after{self._count}"
+        self.do(f"br i1 {condition}, label %{then}, label %{after}")
+        self.lines.append(f"{then}:")
+        self.label = then
+        yield
+        self.do(f"br label %{after}")
+        self.lines.append(f"{after}:")
+        self.label = after
+
+    # -- types and constants
+
+    def each(self, element: str) -> str:
+        """Return LLVM's type of an element for each lane."""
+        return f"<{self.width} x {element}>" if self.width > 1 else element
+
+    def vector(self, ty: str) -> str:
+        """Return the type of the numbers of a node of type ``ty``."""
+        return self.each(ELEMENTS[ty])
+
+    def suffix(self, element: str) -> str:
+        """Return what LLVM's functions have behind their names for :meth:`each`."""
+        return (f"v{self.width}" if self.width > 1 else "") + _SUFFIX[element]
+
+    def numbers(self) -> str:
+        """Return 0, 1, 2, ... for the lanes of a value: int32."""
+        return f"<{', '.join(f'i32 {k}' for k in range(self.width))}>" if self.width > 1 else "0"
+
+    def places(self, first: str) -> str:
+        """Return consecutive places from an i64 on: int32."""
+        start = self.splat("i", self.op(f"trunc i64 {first} to i32"))
+        return self.op(f"add {self.each('i32')} {start}, {self.numbers()}")
+
+    def constant(self, ty: str, value: float | int | bool) -> str:
+        """The same number in all lanes."""
+        return f"splat ({ELEMENTS[ty]} {scalar(ty, value)})" if self.width > 1 else scalar(ty, value)
+
+    def splat(self, ty: str, name: str) -> str:
+        """A scalar in all lanes."""
+        if self.width == 1:
+            return name
+        vector = self.vector(ty)
+        one = self.op(f"insertelement {vector} poison, {ELEMENTS[ty]} {name}, i64 0")
+        return self.op(f"shufflevector {vector} {one}, {vector} poison, {self.each('i32')} zeroinitializer")
+
+    def some(self, mask: str) -> str:
+        """Return whether a mask holds in any lane: an i1."""
+        if self.width == 1:
+            return mask
+        bits = self.op(f"bitcast {self.each('i1')} {mask} to i{self.width}")
+        return self.op(f"icmp ne i{self.width} {bits}, 0")
+
+    # -- arithmetic
+
+    def call(self, function: str, ty: str, *arguments: str, result: str | None = None) -> str:
+        """An intrinsic on vectors of one type, such as ``llvm.fabs``; the suffix is put behind it."""
+        vector = self.vector(ty)
+        name = f"{function}.{self.suffix(ELEMENTS[ty])}"
+        self.declarations.add(f"declare {result or vector} @{name}({', '.join([vector] * len(arguments))})")
+        given = ", ".join(f"{vector} {a}" for a in arguments)
+        return self.op(f"call {result or vector} @{name}({given})")
+
+    def binary(self, op: str, ty: str, a: str, b: str) -> str:
+        """An instruction of LLVM. No flag allows to fuse or to reorder those on floats."""
+        return self.op(f"{op} {self.vector(ty)} {a}, {b}")
+
+    def add(self, ty: str, a: str, b: str) -> str:
+        """``a + b``."""
+        return self.binary("fadd" if ty in "fd" else "add", ty, a, b)
+
+    def sub(self, ty: str, a: str, b: str) -> str:
+        """``a - b``."""
+        return self.binary("fsub" if ty in "fd" else "sub", ty, a, b)
+
+    def mul(self, ty: str, a: str, b: str) -> str:
+        """``a b``."""
+        return self.binary("fmul" if ty in "fd" else "mul", ty, a, b)
+
+    def div(self, ty: str, a: str, b: str) -> str:
+        """``a / b`` of floats."""
+        return self.binary("fdiv", ty, a, b)
+
+    def fma(self, ty: str, a: str, b: str, c: str) -> str:
+        """``a b + c``, rounded once: an instruction, and on machines that have none a call of the C library."""
+        return self.call("llvm.fma", ty, a, b, c)
+
+    def negative(self, ty: str, a: str) -> str:
+        """``-a``."""
+        if ty in "fd":
+            return self.op(f"fneg {self.vector(ty)} {a}")
+        return self.op(f"sub {self.vector(ty)} zeroinitializer, {a}")
+
+    def compare(self, op: str, ty: str, a: str, b: str) -> str:
+        """``fcmp`` or ``icmp``."""
+        return self.op(f"{'fcmp' if ty in 'fd' else 'icmp'} {op} {self.vector(ty)} {a}, {b}")
+
+    def select(self, ty: str, condition: str, a: str, b: str) -> str:
+        """``a`` in lanes where the condition holds, else ``b``."""
+        vector = self.vector(ty)
+        return self.op(f"select {self.each('i1')} {condition}, {vector} {a}, {vector} {b}")
+
+    def convert(self, op: str, source: str, target: str, a: str) -> str:
+        """``sitofp``, ``bitcast``, ..."""
+        return self.op(f"{op} {self.vector(source)} {a} to {self.vector(target)}")
+
+    def polynomial(self, ty: str, x: str, coefficients: tuple[float, ...]) -> str:
+        """Horner's scheme, the highest power first."""
+        value = self.constant(ty, coefficients[0])
+        for c in coefficients[1:]:
+            value = self.fma(ty, value, x, self.constant(ty, c))
+        return value
+
+    def extreme(self, op: str, ty: str, a: str, b: str) -> str:
+        """``max`` or ``min``; of floats NaN where either is, as torch has it."""
+        if ty not in "fd":
+            sign = "u" if ty == "b" else "s"  # a bit that is set is -1 to signed comparisons
+            return self.select(ty, self.compare(sign + ("gt" if op == "max" else "lt"), ty, a, b), a, b)
+        better = "ogt" if op == "max" else "olt"
+        if not b.startswith("%"):  # a constant, no NaN: the other one is kept where it is
+            return self.select(ty, self.compare(better, ty, b, a), b, a)
+        chosen = self.select(ty, self.compare(better, ty, a, b), a, b)
+        if not a.startswith("%"):
+            return chosen
+        return self.select(ty, self.compare("uno", ty, a, a), a, chosen)
+
+    # -- memory
+
+    def load(self, element: str, pointer: str, invariant: bool = True) -> str:
+        """A scalar; ``invariant``: nothing writes there while the kernel runs."""
+        return self.op(f"load {element}, ptr {pointer}{', !invariant.load !0' if invariant else ''}")
+
+    def at(self, pointer: str, element: str, index: str | int) -> str:
+        """The address of an element; ``index`` is a 64-bit number, or a vector's text with its type."""
+        index = index if isinstance(index, str) and index.startswith(("<", "i32 ")) else f"i64 {index}"
+        return self.op(f"getelementptr {element}, ptr {pointer}, {index}")
+
+    def gather(self, element: str, pointer: str, index: str, invariant: bool = False) -> str:
+        """Elements at the lanes' indices; ``invariant`` as in :meth:`load`."""
+        if self.width == 1:
+            return self.load(element, self.at(pointer, element, f"i32 {index}"), invariant)
+        vector, suffix = self.each(element), self.suffix(element)
+        name = f"llvm.masked.gather.{suffix}.v{self.width}p0"
+        self.declarations.add(f"declare {vector} @{name}({self.each('ptr')}, i32, {self.each('i1')}, {vector})")
+        places = self.at(pointer, element, f"{self.each('i32')} {index}")
+        size = 8 if element in ("double", "i64") else 4
+        return self.op(
+            f"call {vector} @{name}({self.each('ptr')} {places}, i32 {size}, {self.each('i1')} splat (i1 true), "
+            f"{vector} zeroinitializer)"
+        )
+
+    def scatter(self, element: str, value: str, pointer: str, index: str, mask: str) -> None:
+        """Write elements at the lanes' indices where the mask holds."""
+        if self.width == 1:
+            with self.when(mask):
+                self.do(f"store {element} {value}, ptr {self.at(pointer, element, f'i32 {index}')}")
+            return
+        vector, suffix = self.each(element), self.suffix(element)
+        name = f"llvm.masked.scatter.{suffix}.v{self.width}p0"
+        self.declarations.add(f"declare void @{name}({vector}, {self.each('ptr')}, i32, {self.each('i1')})")
+        places = self.at(pointer, element, f"{self.each('i32')} {index}")
+        self.do(f"call void @{name}({vector} {value}, {self.each('ptr')} {places}, i32 4, {self.each('i1')} {mask})")
+
+    def masked_load(self, element: str, pointer: str, mask: str) -> str:
+        """Consecutive elements; zero where the mask does not hold."""
+        if self.width == 1:  # lanes go one by one to the last: the mask holds
+            return self.load(element, pointer, False)
+        vector, suffix = self.each(element), self.suffix(element)
+        name = f"llvm.masked.load.{suffix}.p0"
+        self.declarations.add(f"declare {vector} @{name}(ptr, i32, {self.each('i1')}, {vector})")
+        return self.op(
+            f"call {vector} @{name}(ptr {pointer}, i32 1, {self.each('i1')} {mask}, {vector} zeroinitializer)"
+        )
+
+    def masked_store(self, element: str, value: str, pointer: str, mask: str) -> None:
+        """Consecutive elements where the mask holds."""
+        if self.width == 1:
+            with self.when(mask):
+                self.do(f"store {element} {value}, ptr {pointer}")
+            return
+        vector, suffix = self.each(element), self.suffix(element)
+        name = f"llvm.masked.store.{suffix}.p0"
+        self.declarations.add(f"declare void @{name}({vector}, ptr, i32, {self.each('i1')})")
+        self.do(f"call void @{name}({vector} {value}, ptr {pointer}, i32 1, {self.each('i1')} {mask})")
+
+    def compress(self, element: str, value: str, mask: str, rest: str = "poison") -> str:
+        """Return the elements where the mask holds, moved together; ``rest``, of the same type, lies behind them."""
+        vector, suffix = self.each(element), self.suffix(element)
+        name = f"llvm.experimental.vector.compress.{suffix}"
+        self.declarations.add(f"declare {vector} @{name}({vector}, {self.each('i1')}, {vector})")
+        return self.op(f"call {vector} @{name}({vector} {value}, {self.each('i1')} {mask}, {vector} {rest})")
+
+    def count(self, mask: str) -> str:
+        """Count the lanes where a mask holds: an i64."""
+        word = f"i{self.width}"
+        self.declarations.add(f"declare {word} @llvm.ctpop.{word}({word})")
+        bits = self.op(f"bitcast {self.each('i1')} {mask} to {word}")
+        return self.op(f"zext {word} {self.op(f'call {word} @llvm.ctpop.{word}({word} {bits})')} to i64")
+
+
+def scalar(ty: str, value: float | int | bool) -> str:
+    """A number in LLVM's notation."""
+    if ty in "fd":
+        value = float(value)
+        if math.isnan(value):
+            return "0x7FF8000000000000"
+        if ty == "f" and math.isfinite(value):
+            value = float(np.float32(value))
+        return f"0x{struct.unpack('<Q', struct.pack('<d', value))[0]:016X}"
+    if ty == "b":
+        return "true" if value else "false"
+    bits = 64 if ty == "L" else 32
+    half = 1 << (bits - 1)
+    return str(((int(value) + half) & ((1 << bits) - 1)) - half)

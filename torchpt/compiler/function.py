@@ -1,0 +1,280 @@
+"""Functions of whole tensors by lanes as kernels of their own, where no stage is traced.
+
+:class:`Lanewise` compiles a function for the arguments that it is called with, and keeps what was made; :func:`lanewise`
+compiles one now.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import inspect
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.compiler import cache
+from torchpt.compiler.cpu import Target
+from torchpt.compiler.graph import DTYPES, Unsupported
+from torchpt.compiler.kernel import HEAD
+from torchpt.compiler.program import Program, Tables, TracedStage, bound
+from torchpt.compiler.prologue import pruned
+from torchpt.compiler.sinks import Sinks, Store
+from torchpt.compiler.tracing import Tracer, lanes_for, tracing
+from torchpt.core.threads import share, thread_count
+from torchpt.core.tree import leaves, signature
+from torchpt.native import compile_time
+
+__all__ = ["Lanewise", "lanewise"]
+
+#: Lanes that a thread takes together.
+BLOCK = 64
+#: Operations times lanes that repay another thread: some 50 microseconds.
+GRAIN = 3_000_000
+#: Of one function more structures than this are not kept.
+_MOST = 32
+_TABLES = HEAD.index("tables")
+
+
+class Lanewise:
+    """A function of tensors ``(..., N)``, each result lane made of the arguments' lanes alone, as one loop over threads.
+
+    It is traced and compiled once for all arguments of one structure: dtypes and shapes but for N, and what else is no number
+    in a tensor. Calls return NotImplemented for what is better left to the function: tensors on other devices or under a
+    tape, no lanes at all, stages that are being traced, and what the lane compiler does not know.
+
+    Args:
+        function: gives a tensor ``(..., N)`` or a tuple of such.
+        lanes: names of the parameters that are tensors ``(..., N)`` or None.
+        uniforms: names of those that are small tensors whose numbers change from call to call. Tensors in all others are
+            tables: laid out again where another takes their place.
+        detached: whether results have no derivatives, so that tensors under a tape are taken as well.
+
+    Attributes:
+        refused: why the lane compiler did not take arguments, by their structure.
+    """
+
+    def __init__(
+        self, function: Callable[..., Any], lanes: Sequence[str], uniforms: Sequence[str] = (), detached: bool = False
+    ) -> None:
+        self._function, self._signature, self._detached = function, inspect.signature(function), detached
+        kinds = dict.fromkeys(lanes, "lane") | dict.fromkeys(uniforms, "uniform")
+        self._kinds = [kinds.pop(name, "table") for name in self._signature.parameters]
+        if kinds:
+            raise ValueError(f"no parameters {', '.join(kinds)}")
+        name = f"{function.__module__}.{getattr(function, '__qualname__', '<')}"
+        # A name tells the package's own functions from others, on disk too: an entry there is of the package's code.
+        self._name = name if name.startswith("torchpt.") and "<" not in name else function
+        self._made: dict[Any, _Made] = {}
+        self.refused: dict[Any, str] = {}
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call the function, or return NotImplemented."""
+        if tracing():
+            return NotImplemented
+        if kwargs or len(args) < len(self._kinds):
+            given = self._signature.bind(*args, **kwargs)
+            given.apply_defaults()
+            args = given.args
+        structure: list[Any] = []
+        inputs: list[Tensor] = []
+        uniforms: list[Tensor] = []
+        records: list[Any] = []
+        count = -1
+        for kind, value in zip(self._kinds, args, strict=True):
+            if kind == "table" or not isinstance(value, Tensor):
+                records.append(value)
+                structure.append(signature(value))
+                continue
+            if self._unfit(value):
+                return NotImplemented
+            if kind == "uniform":
+                uniforms.append(value)
+                structure.append((value.dtype, value.shape))
+            else:
+                if count not in (-1, value.shape[-1]):
+                    return NotImplemented
+                inputs.append(value)
+                structure.append((value.dtype, value.shape[:-1]))
+                count = value.shape[-1]
+        key = tuple(structure)
+        if count < 1 or key in self.refused:
+            return NotImplemented
+        tables = leaves(records)
+        made = self._made.get(key)
+        if made is None or not made.serves(tables):
+            if any(map(self._unfit, tables)):
+                return NotImplemented
+            compile_time.begun()
+            try:
+                made = self._make(key, args, tables)
+            except Unsupported as error:
+                self.refused[key] = str(error)
+                return NotImplemented
+            finally:
+                compile_time.ended()
+        return made.run(inputs, uniforms, count, thread_count(None))
+
+    def _unfit(self, tensor: Tensor) -> bool:
+        return tensor.device.type != "cpu" or (tensor.requires_grad and not self._detached)
+
+    def _make(self, key: tuple[Any, ...], args: Sequence[Any], tables: list[Tensor]) -> _Made:
+        paths = {str(k): table for k, table in enumerate(tables)}
+        whole = self._name, tuple(self._kinds), key
+        program = cache.program_of(whole, paths, lambda: self._traced(args, paths))
+        states = [(table, _version(table)) for table in tables]
+        before = self._made.get(key)
+        results = self._results(args) if before is None else before.results
+        made = _Made(program, bound(program.tables, program.steps, program.held, paths), states, results)
+        if before is None and len(self._made) >= _MOST:
+            self._made.pop(next(iter(self._made)), None)
+        self._made[key] = made
+        return made
+
+    def _changed(
+        self, args: Sequence[Any], lane: Callable[[Tensor], Tensor], uniform: Callable[[Tensor], Tensor]
+    ) -> Any:
+        """Return arguments with other lanes and uniforms."""
+        change = {"lane": lane, "uniform": uniform}
+        return [
+            change[kind](value) if kind != "table" and isinstance(value, Tensor) else value
+            for kind, value in zip(self._kinds, args, strict=True)
+        ]
+
+    def _results(self, args: Sequence[Any]) -> Tensor | tuple[Tensor, ...]:
+        """Return what the function makes of no lanes: as many tensors, of the same dtypes and shapes."""
+        with torch.no_grad():
+            return self._function(*self._changed(args, lambda x: x[..., :0], lambda x: x))
+
+    def _traced(self, args: Sequence[Any], paths: dict[str, Tensor]) -> TracedStage:
+        near = self._changed(args, lambda x: x[..., 0], lambda x: x)
+        lanes = lanes_for(leaves(near))
+        tracer = Tracer(lanes, {id(table): (path, table) for path, table in paths.items()})
+        slots = 0
+
+        def lane(x: Tensor) -> Tensor:
+            nonlocal slots
+            slots += 1
+            return _input(tracer, slots - 1, _sample(x, lanes))
+
+        given = self._changed(args, lane, lambda x: tracer.uniform(x.clone()))
+        with torch.no_grad(), tracer:
+            results = self._function(*given)
+        stores = _stores(tracer, [results] if isinstance(results, Tensor) else results)
+        if any(op == "iota" for op, *_ in tracer.graph.nodes):
+            raise Unsupported("lanes that ask for their own number")
+        tables, steps, guards = pruned(tracer.tables, tracer.steps, tracer.guards)
+        names = [str(k) for k in range(len(tracer.uniforms))]
+        sinks = Sinks(store=stores)
+        return TracedStage(tracer.graph, sinks, tables, steps, tuple(tracer.held), guards, names, slots)
+
+
+@dataclass
+class _Made:
+    """A function compiled for arguments of one structure.
+
+    Attributes:
+        program: its program.
+        tables: those of the last call.
+        states: the tensors that they are made of, and which of their contents.
+        results: without lanes; a tuple where the function gives one.
+    """
+
+    program: Program
+    tables: Tables
+    states: list[tuple[Tensor, object]]
+    results: Tensor | tuple[Tensor, ...]
+
+    def __post_init__(self) -> None:
+        each = [self.results] if isinstance(self.results, Tensor) else self.results
+        self.outputs = [(x.shape[:-1], x.dtype) for x in each]
+        self.block = ctypes.c_int64 * (
+            len(HEAD) + len(self.program.uniforms) + 2 * (self.program.tensors + len(self.outputs))
+        )
+        work = max(self.program.nodes.values(), default=1)
+        self.grain = max(GRAIN // work // BLOCK, 1)
+
+    def serves(self, tables: list[Tensor]) -> bool:
+        """Return True where its tables are those of these tensors, as they are now."""
+        return all(
+            table is known and _version(table) == version
+            for table, (known, version) in zip(tables, self.states, strict=True)
+        )
+
+    def run(self, inputs: Sequence[Tensor], uniforms: Sequence[Tensor], count: int, threads: int) -> Any:
+        """Return the results for ``count`` lanes, taken by as many threads as repay."""
+        inputs, uniforms = [x.detach().contiguous() for x in inputs], [x.detach().contiguous() for x in uniforms]
+        outputs = [torch.empty((*shape, count), dtype=dtype) for shape, dtype in self.outputs]
+        head = [0] * len(HEAD)
+        head[_TABLES] = self.tables.address
+        head += [x.data_ptr() for x in uniforms]
+        rows = [(x.data_ptr(), x.element_size()) for x in (*inputs, *outputs)]
+
+        def part(first: int, last: int) -> None:
+            start, end = first * BLOCK, min(last * BLOCK, count)
+            words = head.copy()
+            for address, size in rows:
+                words += (address + start * size, count)
+            block = self.block(*words)
+            self.program.call(ctypes.addressof(block), end - start)
+
+        blocks = -(-count // BLOCK)
+        share(part, blocks, min(threads, max(blocks // self.grain, 1)))
+        return outputs[0] if isinstance(self.results, Tensor) else tuple(outputs)
+
+
+def lanewise(
+    function: Callable[..., Sequence[Tensor]], like: Sequence[Tensor], target: Target | None = None
+) -> Callable[..., list[Tensor]]:
+    """Compile a function of tensors ``(..., N)`` now, for one thread.
+
+    Args:
+        function: gives a sequence of tensors ``(..., N)``.
+        like: arguments of the shapes and dtypes to come; N may differ.
+        target: machine to compile for; this one where None.
+
+    Raises:
+        Unsupported: for what the lane compiler does not know.
+    """
+    lanes = lanes_for([x[..., 0] for x in like if x.numel()])
+    tracer = Tracer(lanes, {})
+    given = [_input(tracer, slot, _sample(x, lanes)) for slot, x in enumerate(like)]
+    with torch.no_grad(), tracer:
+        results = list(function(*given))
+    sinks = Sinks(store=_stores(tracer, results))
+    stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.held, tensors=len(given))
+    tables = bound(stage.tables, stage.steps, stage.held, {})
+    program = cache.compiled(stage, target)
+    made = _Made(program, tables, [], tuple(x[..., :0] for x in results))
+
+    def run(*arguments: Tensor) -> list[Tensor]:
+        return list(made.run(arguments, (), arguments[0].shape[-1], 1))
+
+    return run
+
+
+def _input(tracer: Tracer, slot: int, x: Tensor) -> Tensor:
+    """Declare a tensor an input of the trace."""
+    ty = DTYPES[x.dtype]
+    return tracer.lane(x, lambda k: tracer.graph.node("tensor", ty, extra=(slot, k)))
+
+
+def _stores(tracer: Tracer, results: Sequence[Tensor]) -> list[Store]:
+    return [Store(tuple(tracer.nodes(x)), DTYPES[x.dtype]) for x in results]
+
+
+def _version(tensor: Tensor) -> object:
+    """Return which of its contents a tensor has; of inference tensors that cannot be known."""
+    return object() if tensor.is_inference() else tensor._version
+
+
+def _sample(x: Tensor, lanes: int) -> Tensor:
+    """Return an argument's first lanes, repeated as often as it takes."""
+    columns = torch.arange(lanes) % max(x.shape[-1], 1)
+    if not x.numel():
+        return torch.zeros(*x.shape[:-1], lanes, dtype=x.dtype)
+    assert math.prod(x.shape)
+    return x[..., columns].contiguous()

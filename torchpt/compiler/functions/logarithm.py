@@ -1,0 +1,108 @@
+"""Logarithms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from torchpt.compiler.block import Block
+from torchpt.compiler.functions.double import double_product, two_sum
+from torchpt.compiler.functions.values import absolute, narrow, wide
+
+__all__ = ["log", "log1p", "log_by", "log_ends", "log_parts", "log_wide"]
+
+#: ln 2 in two parts, the first of 32 bits.
+_LN2_PARTS = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+
+
+def log(b: Block, ty: str, x: str) -> str:
+    """The natural logarithm."""
+    if ty == "f":
+        return log_ends(b, ty, x, narrow(b, ty, _log_series(b, wide(b, ty, x), 5)))
+    return log_ends(b, ty, x, b.add(ty, *log_parts(b, x)))
+
+
+def log_wide(b: Block, x: str) -> str:
+    """The logarithm of a float64 that need be good to 50 bits only; denormals are not meant."""
+    return log_ends(b, "d", x, _log_series(b, x, 11))
+
+
+def log_ends(b: Block, ty: str, x: str, value: str) -> str:
+    """Put in the logarithms of what is not positive and finite."""
+    zero, inf = b.constant(ty, 0.0), b.constant(ty, math.inf)
+    value = b.select(ty, b.compare("oeq", ty, x, zero), b.constant(ty, -math.inf), value)
+    value = b.select(ty, b.compare("ult", ty, x, zero), b.constant(ty, math.nan), value)
+    return b.select(ty, b.compare("oeq", ty, x, inf), inf, value)
+
+
+def _mantissa(b: Block, y: str) -> tuple[str, str]:
+    """A positive float64 as ``m 2^e``: ``m`` between the square roots of 1/2 and 2, and ``e`` as a float64."""
+    bits = b.convert("bitcast", "d", "L", y)
+    e = b.binary("ashr", "L", b.sub("L", bits, b.constant("L", 0x3FE6A09E00000000)), b.constant("L", 52))
+    m = b.convert("bitcast", "L", "d", b.sub("L", bits, b.binary("shl", "L", e, b.constant("L", 52))))
+    return m, b.convert("sitofp", "i", "d", b.convert("trunc", "L", "i", e))
+
+
+def _log_series(b: Block, x: str, terms: int) -> str:
+    """``ln m = 2 atanh(s)``, ``s = (m - 1) / (m + 1)``, ``|s| < 0.172``: the series."""
+    m, e = _mantissa(b, x)
+    f = b.sub("d", m, b.constant("d", 1.0))
+    s = b.div("d", f, b.add("d", m, b.constant("d", 1.0)))
+    z = b.mul("d", s, s)
+    p = b.polynomial("d", z, tuple(2.0 / k for k in range(2 * terms + 1, 2, -2)))
+    r = b.fma("d", b.mul("d", z, p), s, b.mul("d", s, b.constant("d", 2.0)))
+    r = b.fma("d", e, b.constant("d", _LN2_PARTS[1]), r)
+    return b.fma("d", e, b.constant("d", _LN2_PARTS[0]), r)
+
+
+def log_parts(b: Block, x: str) -> tuple[str, str]:
+    """The logarithm of positive finite float64 as a sum of two, good to about 63 bits: the series of :func:`_log_series`."""
+    tiny = b.compare("olt", "d", x, b.constant("d", 2.0**-1022))
+    m, e = _mantissa(b, b.select("d", tiny, b.mul("d", x, b.constant("d", 2.0**54)), x))
+    e = b.select("d", tiny, b.sub("d", e, b.constant("d", 54.0)), e)
+    one = b.constant("d", 1.0)
+    f = b.sub("d", m, one)
+    # s = f / (2 + f), with the rest of the division.
+    d = two_sum(b, b.constant("d", 2.0), f)
+    sh = b.div("d", f, d[0])
+    off = b.fma("d", b.negative("d", sh), d[1], b.fma("d", b.negative("d", sh), d[0], f))
+    s = sh, b.div("d", off, d[0])
+    z = double_product(b, s, s)
+    # 2 + z (2/3 + z (2/5 + ...)): the last bracket needs no more than float64 has.
+    p = b.polynomial("d", z[0], tuple(2.0 / k for k in range(23, 4, -2)))
+    w = two_sum(b, b.constant("d", 2.0 / 3.0), b.mul("d", z[0], p))
+    w = w[0], b.add("d", w[1], b.constant("d", 3.700743415417188e-17))  # what 2/3 lacks
+    w = double_product(b, z, w)
+    h = two_sum(b, b.constant("d", 2.0), w[0])
+    r = double_product(b, s, (h[0], b.add("d", h[1], w[1])))
+    t = two_sum(b, b.mul("d", e, b.constant("d", _LN2_PARTS[0])), r[0])
+    rest = b.fma("d", e, b.constant("d", _LN2_PARTS[1]), b.add("d", t[1], r[1]))
+    return two_sum(b, t[0], rest)
+
+
+def log_by(factor: float, rest: float) -> Callable[[Block, str, str], str]:
+    """Logarithms times ``factor + rest``."""
+
+    def function(b: Block, ty: str, x: str) -> str:
+        if ty == "f":
+            return narrow(b, ty, b.mul("d", log_wide(b, wide(b, ty, x)), b.constant("d", factor)))
+        parts = double_product(b, log_parts(b, x), (b.constant("d", factor), b.constant("d", rest)))
+        return log_ends(b, ty, x, b.add(ty, *parts))
+
+    return function
+
+
+def log1p(b: Block, ty: str, x: str) -> str:
+    """``ln(1 + x)``."""
+    small = b.compare("olt", ty, absolute(b, ty, x), b.constant(ty, 1e-8 if ty == "f" else 1e-17))
+    one = b.constant("d", 1.0)
+    if ty == "f":
+        value = narrow(b, ty, log_wide(b, b.add("d", wide(b, ty, x), one)))
+        return b.select(ty, small, x, value)
+    # The logarithm of the rounded sum u, and what rounding took: ln(u + c) = ln u + c / u.
+    u = b.add("d", x, one)
+    less = b.sub("d", u, x)
+    c = b.add("d", b.sub("d", x, b.sub("d", u, less)), b.sub("d", one, less))
+    high, low = log_parts(b, u)
+    value = b.add(ty, high, b.add(ty, low, b.div(ty, c, u)))
+    return b.select(ty, small, x, log_ends(b, ty, u, value))

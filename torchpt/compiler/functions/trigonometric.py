@@ -1,0 +1,168 @@
+"""Sines, cosines, tangents and their inverses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from torchpt.compiler.block import Block
+from torchpt.compiler.functions.values import absolute, clamped, narrow, negative, wide
+
+__all__ = ["acos", "asin", "atan", "atan2", "tan", "trigonometric"]
+
+#: pi / 2 in parts of 33 bits, so that their products with up to 20 bits are exact.
+_HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
+
+
+def _quadrant(b: Block, ty: str, x: str) -> tuple[str, str]:
+    """The multiple of pi / 2 next to ``x`` modulo 4 (int32), and what is left."""
+    y = wide(b, ty, x)
+    q = b.call("llvm.rint", "d", b.mul("d", y, b.constant("d", 2.0 / math.pi)))
+    for part in _HALF_PI[: 2 if ty == "f" else 3]:
+        y = b.fma("d", q, b.constant("d", -part), y)
+    # Modulo 4 before it becomes an integer, so that no argument is too large for that.
+    turns = b.call("llvm.floor", "d", b.mul("d", q, b.constant("d", 0.25)))
+    q = b.fma("d", turns, b.constant("d", -4.0), q)
+    finite = b.compare("olt", "d", absolute(b, "d", q), b.constant("d", 5.0))
+    q = b.select("d", finite, q, b.constant("d", 0.0))
+    # Beyond 2^20 digits are lost, and far beyond any angle will do: one no larger than rounding leaves it.
+    y = clamped(b, "d", y, -0.79, 0.79)
+    return b.convert("fptosi", "d", "i", q), narrow(b, ty, y)
+
+
+def _sine(b: Block, ty: str, x: str) -> str:
+    """On [-pi / 4, pi / 4]."""
+    z = b.mul(ty, x, x)
+    if ty == "f":
+        p = b.polynomial(ty, z, (-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1))
+    else:
+        p = b.polynomial(
+            ty,
+            z,
+            (
+                1.58962301576546568060e-10, -2.50507477628578072866e-8, 2.75573136213857245213e-6,
+                -1.98412698295895385996e-4, 8.33333333332211858878e-3, -1.66666666666666307295e-1,
+            ),
+        )  # fmt: skip
+    return b.fma(ty, b.mul(ty, p, z), x, x)
+
+
+def _cosine(b: Block, ty: str, x: str) -> str:
+    """On [-pi / 4, pi / 4]."""
+    z = b.mul(ty, x, x)
+    if ty == "f":
+        p = b.polynomial(ty, z, (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2))
+    else:
+        p = b.polynomial(
+            ty,
+            z,
+            (
+                -1.13585365213876817300e-11, 2.08757008419747316778e-9, -2.75573141792967388112e-7,
+                2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.16666666666665929218e-2,
+            ),
+        )  # fmt: skip
+    return b.fma(ty, b.mul(ty, z, z), p, b.fma(ty, z, b.constant(ty, -0.5), b.constant(ty, 1.0)))
+
+
+def _turned(b: Block, ty: str, q: str, s: str, c: str) -> str:
+    """Sine or cosine of the quadrant ``q``, from both of the rest."""
+    one, zero = b.constant("i", 1), b.constant("i", 0)
+    odd = b.compare("ne", "i", b.binary("and", "i", q, one), zero)
+    value = b.select(ty, odd, c, s)
+    below = b.compare("ne", "i", b.binary("and", "i", q, b.constant("i", 2)), zero)
+    return b.select(ty, below, b.negative(ty, value), value)
+
+
+def trigonometric(shift: int) -> Callable[[Block, str, str], str]:
+    """The sine; the cosine where ``shift`` is 1, a quarter of a turn."""
+
+    def function(b: Block, ty: str, x: str) -> str:
+        q, rest = _quadrant(b, ty, x)
+        if shift:
+            q = b.add("i", q, b.constant("i", shift))
+        value = _turned(b, ty, q, _sine(b, ty, rest), _cosine(b, ty, rest))
+        if not shift:  # its zeros keep their sign
+            value = b.select(ty, b.compare("oeq", ty, x, b.constant(ty, 0.0)), x, value)
+        # Of infinity and of NaN there is none.
+        none = b.compare("uge", ty, absolute(b, ty, x), b.constant(ty, math.inf))
+        return b.select(ty, none, b.constant(ty, math.nan), value)
+
+    return function
+
+
+def tan(b: Block, ty: str, x: str) -> str:
+    """The tangent."""
+    return b.div(ty, trigonometric(0)(b, ty, x), trigonometric(1)(b, ty, x))
+
+
+def _atan_positive(b: Block, ty: str, x: str) -> str:
+    """On [0, inf]."""
+    one = b.constant(ty, 1.0)
+    steep = b.compare("ogt", ty, x, b.constant(ty, 1.0 + math.sqrt(2.0)))
+    middle = b.compare("ogt", ty, x, b.constant(ty, math.sqrt(2.0) - 1.0 if ty == "f" else 0.66))
+    top = b.select(ty, middle, b.sub(ty, x, one), x)
+    bottom = b.select(ty, middle, b.add(ty, x, one), one)
+    top = b.select(ty, steep, b.constant(ty, -1.0), top)
+    bottom = b.select(ty, steep, x, bottom)
+    r = b.div(ty, top, bottom)
+    z = b.mul(ty, r, r)
+    if ty == "f":
+        p = b.polynomial(ty, z, (8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1))
+        p = b.mul(ty, p, z)
+    else:
+        p = b.polynomial(
+            ty,
+            z,
+            (
+                -8.750608600031904122785e-1, -1.615753718733365076637e1, -7.500855792314704667340e1,
+                -1.228866684490136173410e2, -6.485021904942025371773e1,
+            ),
+        )  # fmt: skip
+        q = b.polynomial(
+            ty,
+            z,
+            (
+                1.0, 2.485846490142306297962e1, 1.650270098316988542046e2, 4.328810604912902668951e2,
+                4.853903996359136964868e2, 1.945506571482613964425e2,
+            ),
+        )  # fmt: skip
+        p = b.div(ty, b.mul(ty, z, p), q)
+    angle = b.fma(ty, p, r, r)
+    start = b.select(ty, middle, b.constant(ty, math.pi / 4), b.constant(ty, 0.0))
+    start = b.select(ty, steep, b.constant(ty, math.pi / 2), start)
+    return b.add(ty, start, angle)
+
+
+def atan(b: Block, ty: str, x: str) -> str:
+    """The inverse tangent."""
+    return b.call("llvm.copysign", ty, _atan_positive(b, ty, absolute(b, ty, x)), x)
+
+
+def atan2(b: Block, ty: str, y: str, x: str) -> str:
+    """The angle of ``(x, y)``, with C's signs of zeros and infinities."""
+    u, v = absolute(b, ty, y), absolute(b, ty, x)
+    inf = b.constant(ty, math.inf)
+    # Both infinite: as if both were 1. Both zero: as if the quotient were 0.
+    both = b.op(f"and {b.each('i1')} {b.compare('oeq', ty, u, inf)}, {b.compare('oeq', ty, v, inf)}")
+    u, v = (b.select(ty, both, b.constant(ty, 1.0), w) for w in (u, v))
+    none = b.compare("oeq", ty, b.extreme("max", ty, u, v), b.constant(ty, 0.0))
+    v = b.select(ty, none, b.constant(ty, 1.0), v)
+    r = _atan_positive(b, ty, b.div(ty, u, v))
+    r = b.select(ty, negative(b, ty, x), b.sub(ty, b.constant(ty, math.pi), r), r)
+    return b.call("llvm.copysign", ty, r, y)
+
+
+def acos(b: Block, ty: str, x: str) -> str:
+    """The inverse cosine."""
+    return atan2(b, ty, _other_leg(b, ty, x), x)
+
+
+def asin(b: Block, ty: str, x: str) -> str:
+    """The inverse sine."""
+    return atan2(b, ty, x, _other_leg(b, ty, x))
+
+
+def _other_leg(b: Block, ty: str, x: str) -> str:
+    """``sqrt(1 - x^2)``, NaN beyond 1."""
+    one = b.constant(ty, 1.0)
+    return b.call("llvm.sqrt", ty, b.mul(ty, b.sub(ty, one, x), b.add(ty, one, x)))

@@ -1,0 +1,123 @@
+"""How comparisons, choices by them, casts and constants are lowered."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.compiler.graph import DTYPES, FLOATS
+from torchpt.compiler.operators.nodes import apply, type_of
+from torchpt.compiler.tracing import Tracer, handles
+
+__all__ = ["masked_fill"]
+
+
+@handles("bitwise_not", "logical_not")
+def _not(tracer: Tracer, out: Tensor, a: Tensor) -> None:
+    graph = tracer.graph
+
+    def function(x: int) -> int:
+        ty = type_of(tracer, out.dtype, x)
+        if ty == "b":
+            return graph.node("xor", "b", graph.cast(x, "b"), graph.constant("b", True))
+        return graph.node("xor", ty, x, graph.constant(ty, -1))
+
+    apply(tracer, out, function, a)
+
+
+@handles("isinf")
+def _isinf(tracer: Tracer, out: Tensor, a: Tensor) -> None:
+    graph, ty = tracer.graph, DTYPES[a.dtype]
+    if ty not in FLOATS:
+        return tracer.put(out, np.array(graph.constant("b", False), object))
+    apply(tracer, out, lambda x: graph.node("eq", "b", graph.node("abs", ty, x), graph.constant(ty, math.inf)), a)
+
+
+@handles("isnan")
+def _isnan(tracer: Tracer, out: Tensor, a: Tensor) -> None:
+    apply(tracer, out, lambda x: tracer.graph.node("ne", "b", x, x), a)
+
+
+@handles("isfinite")
+def _isfinite(tracer: Tracer, out: Tensor, a: Tensor) -> None:
+    graph, ty = tracer.graph, DTYPES[a.dtype]
+    apply(tracer, out, lambda x: graph.node("lt", "b", graph.node("abs", ty, x), graph.constant(ty, math.inf)), a)
+
+
+@handles("where")
+def _where(tracer: Tracer, out: Tensor, condition: Tensor, a: Any, b: Any) -> None:
+    graph = tracer.graph
+
+    def function(c: int, x: int, y: int) -> int:
+        ty = type_of(tracer, out.dtype, x, y)
+        return graph.select(graph.cast(c, "b"), graph.cast(x, ty), graph.cast(y, ty))
+
+    apply(tracer, out, function, condition, a, b)
+
+
+@handles("masked_fill")
+def masked_fill(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any) -> None:
+    """Another number where a mask holds."""
+    _where(tracer, out, mask, value, a)
+
+
+def _compare(op: str) -> Any:
+    def handler(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
+        graph, dtype = tracer.graph, torch.result_type(a, b)
+
+        def function(x: int, y: int) -> int:
+            ty = type_of(tracer, dtype, x, y)
+            return graph.node(op, "b", graph.cast(x, ty), graph.cast(y, ty))
+
+        apply(tracer, out, function, a, b)
+
+    return handler
+
+
+for _name in ("gt", "lt", "ge", "le", "eq", "ne"):
+    handles(_name)(_compare(_name))
+
+
+@handles("clamp", "clip")
+def _clamp(tracer: Tracer, out: Tensor, a: Tensor, low: Any = None, high: Any = None) -> None:
+    def function(x: int, *ends: int) -> int:
+        graph, rest = tracer.graph, list(ends)
+        ty = type_of(tracer, out.dtype, x)
+        x = graph.cast(x, ty)
+        for op, end in (("max", low), ("min", high)):
+            if end is not None:
+                x = graph.binary(op, ty, x, graph.cast(rest.pop(0), ty))
+        return x
+
+    apply(tracer, out, function, a, *(end for end in (low, high) if end is not None))
+
+
+@handles("_to_copy", "to")
+def _to_copy(tracer: Tracer, out: Tensor, a: Tensor, *_: Any, **__: Any) -> None:
+    def function(x: int) -> int:
+        own, ty = tracer.graph.type(x), DTYPES[out.dtype]
+        if ty == "l" and own in "iL":
+            ty = "L"  # products of what was 32 bits may need all 64
+        return tracer.graph.cast(x, ty)
+
+    apply(tracer, out, function, a)
+
+
+def _like(value: float) -> Any:
+    def handler(tracer: Tracer, out: Tensor, *_: Any, **__: Any) -> None:
+        tracer.put(out, np.array(tracer.graph.constant(DTYPES[out.dtype], value), object))
+
+    return handler
+
+
+handles("ones_like", "new_ones")(_like(1))
+handles("zeros_like", "new_zeros")(_like(0))
+
+
+@handles("full_like", "new_full")
+def _full_like(tracer: Tracer, out: Tensor, a: Tensor, *rest: Any, **_: Any) -> None:
+    tracer.put(out, np.array(tracer.graph.constant(DTYPES[out.dtype], rest[-1]), object))

@@ -1,0 +1,51 @@
+"""What lowerings of operators share: applying a function of nodes to broadcast operands, and types."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.compiler.graph import DTYPES
+from torchpt.compiler.tracing import Tracer
+
+__all__ = ["apply", "cast_all", "type_of"]
+
+
+Nodes = Callable[..., int]
+
+
+def apply(tracer: Tracer, out: Tensor, function: Nodes, *operands: Any) -> None:
+    """``out`` is ``function`` of the operands' nodes, which are broadcast; operands that are numbers become constants."""
+    graph = tracer.graph
+    columns = [tracer.get(x).nodes if isinstance(x, Tensor) else np.array(_number(graph, x), object) for x in operands]
+    shape = np.broadcast_shapes(*(c.shape for c in columns))
+    columns = [np.broadcast_to(c, shape) for c in columns]
+    result = np.empty(shape, object)
+    for entry in np.ndindex(*shape):
+        result[entry] = function(*(c[entry] for c in columns))
+    tracer.put(out, result)
+
+
+def _number(graph: Any, x: float | int | bool) -> int:
+    if isinstance(x, bool):
+        return graph.constant("b", x)
+    return graph.constant("l", x) if isinstance(x, int) else graph.constant("d", x)
+
+
+def type_of(tracer: Tracer, dtype: torch.dtype, *nodes: int) -> str:
+    """The type in which numbers of a dtype are computed from nodes."""
+    ty = DTYPES[dtype]
+    return "L" if ty == "l" and any(tracer.graph.type(node) in "iL" for node in nodes) else ty
+
+
+def cast_all(tracer: Tracer, nodes: Any, ty: str) -> Any:
+    """Nodes as numbers of a type; indices that have grown to 64 bits stay."""
+    cast = np.empty(nodes.shape, object)
+    for entry in np.ndindex(*nodes.shape):
+        node = nodes[entry]
+        cast[entry] = node if ty == "l" and tracer.graph.type(node) == "L" else tracer.graph.cast(node, ty)
+    return cast

@@ -1,0 +1,138 @@
+"""How operators that move numbers about without changing them are lowered: they cost nothing in a kernel."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from torchpt.compiler.graph import DTYPES, Unsupported
+from torchpt.compiler.operators.nodes import cast_all
+from torchpt.compiler.tracing import Tracer, handles
+
+__all__: list[str] = []
+
+
+@handles("detach", "alias", "clone", "contiguous", "lift_fresh")
+def _same(tracer: Tracer, out: Tensor, a: Tensor, *_: Any, **__: Any) -> None:
+    tracer.alias(out, a)
+
+
+@handles("select")
+def _select(tracer: Tracer, out: Tensor, a: Tensor, axis: int, index: int) -> None:
+    value = tracer.get(a)
+    if axis % a.dim() == value.lane:
+        raise Unsupported("one lane taken out")
+    tracer.put(out, np.take(value.nodes, index, axis % a.dim()))
+
+
+@handles("narrow")
+def _narrow(tracer: Tracer, out: Tensor, a: Tensor, axis: int, start: int, length: int) -> None:
+    start %= max(a.shape[axis], 1)
+    _slice(tracer, out, a, axis, start, start + length)
+
+
+@handles("slice")
+def _slice(
+    tracer: Tracer, out: Tensor, a: Tensor, axis: int = 0, start: Any = None, end: Any = None, step: int = 1
+) -> None:
+    value, axis = tracer.get(a), axis % a.dim()
+    if axis == value.lane:
+        if out.shape != a.shape:
+            raise Unsupported("a part of the lanes")
+        return tracer.alias(out, a)
+    part: list[Any] = [slice(None)] * a.dim()
+    part[axis] = slice(start, None if end is not None and end > 1 << 40 else end, step)
+    tracer.put(out, value.nodes[tuple(part)])
+
+
+@handles("unbind")
+def _unbind(tracer: Tracer, out: Any, a: Tensor, axis: int = 0) -> None:
+    for k, one in enumerate(out):
+        _select(tracer, one, a, axis, k)
+
+
+@handles("split", "split_with_sizes", "chunk")
+def _split(tracer: Tracer, out: Any, a: Tensor, sizes: Any, axis: int = 0) -> None:
+    start = 0
+    for one in out:
+        _slice(tracer, one, a, axis, start, start + one.shape[axis])
+        start += one.shape[axis]
+
+
+@handles("unsqueeze")
+def _unsqueeze(tracer: Tracer, out: Tensor, a: Tensor, axis: int) -> None:
+    tracer.put(out, np.expand_dims(tracer.get(a).nodes, axis % (a.dim() + 1)))
+
+
+@handles("squeeze")
+def _squeeze(tracer: Tracer, out: Tensor, a: Tensor, axis: Any = None) -> None:
+    axes = range(a.dim()) if axis is None else [axis] if isinstance(axis, int) else axis
+    gone = tuple(k % a.dim() for k in axes if a.shape[k] == 1)
+    tracer.put(out, np.squeeze(tracer.get(a).nodes, gone) if gone else tracer.get(a).nodes)
+
+
+@handles("permute")
+def _permute(tracer: Tracer, out: Tensor, a: Tensor, axes: Any) -> None:
+    tracer.put(out, np.transpose(tracer.get(a).nodes, [k % a.dim() for k in axes]))
+
+
+@handles("t", "numpy_T")
+def _t(tracer: Tracer, out: Tensor, a: Tensor) -> None:
+    tracer.put(out, tracer.get(a).nodes.T)
+
+
+@handles("transpose")
+def _transpose(tracer: Tracer, out: Tensor, a: Tensor, i: int, j: int) -> None:
+    tracer.put(out, np.swapaxes(tracer.get(a).nodes, i, j))
+
+
+@handles("flip")
+def _flip(tracer: Tracer, out: Tensor, a: Tensor, axes: Any) -> None:
+    if tracer.get(a).lane in [k % a.dim() for k in axes]:
+        raise Unsupported("lanes turned around")
+    tracer.put(out, np.flip(tracer.get(a).nodes, axes))
+
+
+@handles("roll")
+def _roll(tracer: Tracer, out: Tensor, a: Tensor, shifts: Any, axes: Any = ()) -> None:
+    if not axes or tracer.get(a).lane in [k % a.dim() for k in axes]:
+        raise Unsupported("lanes rolled")
+    tracer.put(out, np.roll(tracer.get(a).nodes, shifts, axes))
+
+
+@handles("expand")
+def _expand(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any, implicit: bool = False) -> None:
+    tracer.put(out, tracer.get(a).nodes)
+
+
+@handles("view", "_unsafe_view", "reshape")
+def _view(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any) -> None:
+    value, lane = tracer.get(a), tracer.lane_axis(out.shape)
+    if value.lane is not None and lane is not None:
+        # Lanes are next to each other along their axis: what follows it must stay what follows.
+        if math.prod(a.shape[value.lane + 1 :]) != math.prod(out.shape[lane + 1 :]):
+            raise Unsupported(f"lanes of shape {tuple(a.shape)} mixed into shape {tuple(out.shape)}")
+    tracer.put(out, value.nodes.reshape(tracer.inner(out.shape, lane)))
+
+
+def _cast(tracer: Tracer, tensor: Tensor, out: Tensor) -> np.ndarray:
+    """The nodes of a part in the type of the whole."""
+    return cast_all(tracer, tracer.get(tensor).nodes, DTYPES[out.dtype])
+
+
+@handles("stack")
+def _stack(tracer: Tracer, out: Tensor, tensors: Any, axis: int = 0) -> None:
+    parts = np.broadcast_arrays(*(_cast(tracer, tensor, out) for tensor in tensors))
+    tracer.put(out, np.stack(parts, axis))
+
+
+@handles("cat", "concat")
+def _cat(tracer: Tracer, out: Tensor, tensors: Any, axis: int = 0) -> None:
+    if tracer.lane_axis(out.shape) == axis % out.dim():
+        raise Unsupported("lanes joined")
+    rank = out.dim()
+    parts = [_cast(tracer, tensor, out) for tensor in tensors if tensor.dim() == rank]
+    tracer.put(out, np.concatenate(parts, axis))

@@ -1,0 +1,332 @@
+"""Searches inside a kernel: rays among few primitives, and values in a sorted table by bisection."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from torch import Tensor
+
+from torchpt.compiler.block import Block
+from torchpt.compiler.emission import MEMORY
+from torchpt.compiler.form import Form
+from torchpt.compiler.graph import Graph
+
+__all__ = ["KINDS", "packet_search", "packet_words", "search_functions"]
+
+
+# ---- Binary searches in sorted tables, as LLVM IR: functions that kernels call
+
+
+def search_functions(graph: Graph, needed: list[int], form: Form) -> Block:
+    """Binary searches: all lanes take as many steps, which are as many as the table's length asks for."""
+    asked = {extra[1:] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op == "search"}
+    whole = Block(form)
+    for ty, right in sorted(asked):
+        block, element = Block(form), MEMORY[ty]
+        vector, places = block.vector(ty), block.each("i32")
+        block.lines += [
+            f"define internal {places} @sorted_{ty}_{'right' if right else 'left'}"
+            f"(ptr %table, i64 %count, {vector} %value) #0 {{",
+            "entry:",
+            "  %count32 = trunc i64 %count to i32",
+            "  %last = sub i32 %count32, 1",
+        ]
+        last, most = block.splat("i", "%last"), block.splat("i", "%count32")
+        block.lines += [
+            "  %none = icmp eq i32 %count32, 0",
+            "  br i1 %none, label %exit, label %loop",
+            "loop:",
+            f"  %base = phi {places} [ zeroinitializer, %entry ], [ %better, %loop ]",
+            "  %length = phi i32 [ %count32, %entry ], [ %rest, %loop ]",
+            "  %more = add i32 %length, 1",
+            "  %half = lshr i32 %more, 1",
+            "  %step = sub i32 %half, 1",
+        ]
+        middle = block.call("llvm.umin", "i", block.add("i", "%base", block.splat("i", "%step")), last)
+        entry = block.gather(element, "%table", middle)
+        below = block.compare(
+            ("ule" if right else "ult") if ty in "fd" else ("sle" if right else "slt"), ty, entry, "%value"
+        )
+        further = block.add("i", "%base", block.splat("i", "%half"))
+        block.lines += [
+            f"  %better = select {block.each('i1')} {below}, {places} {further}, {places} %base",
+            "  %rest = lshr i32 %length, 1",
+            "  %done = icmp eq i32 %rest, 0",
+            "  br i1 %done, label %exit, label %loop",
+            "exit:",
+            f"  %found = phi {places} [ zeroinitializer, %entry ], [ %better, %loop ]",
+        ]
+        block.do(f"ret {places} {block.call('llvm.umin', 'i', '%found', most)}")
+        block.lines.append("}")
+        whole.lines += block.lines
+        whole.declarations |= block.declarations
+    return whole
+
+
+# ---- A packet of rays against every primitive, as functions inside a kernel: the search for scenes of few primitives
+#
+# Planar primitives are affine rows with their own rounding error as tolerance (:func:`torchpt.search.tables.tolerances`);
+# spheres are met by perpendiculars in float64. Ascending ids and a strict comparison settle ties.
+
+
+#: Kinds of primitives that are searched here, in the order of their ids.
+KINDS = ("triangle", "rectangle", "disk", "sphere")
+#: Numbers of a planar primitive's row.
+_ROW = 13
+_RAY = ("ox", "oy", "oz", "dx", "dy", "dz")
+
+
+def packet_search(kinds: Sequence[str], form: Form) -> Block:
+    """Functions ``nearest`` and ``occluded`` of rays and the address of what is searched, see :func:`packet_words`.
+
+    Args:
+        kinds: those that the scene has.
+        form: a packet has as many rays as a value has lanes.
+    """
+    whole = Block(form)
+    for any_hit in (False, True):
+        block = _Search(kinds, any_hit, form)
+        block.write()
+        whole.lines += block.lines
+        whole.declarations |= block.declarations
+    return whole
+
+
+def packet_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: float) -> Any:
+    """Return what the functions read of a scene, as an array of ctypes; the tensors must live as long.
+
+    There lie, 64 bits each: the address of the rows of planar primitives, that of the spheres, for each of :data:`KINDS` the
+    id after its last primitive, and the scene's extent as a float64.
+
+    Args:
+        rows: ``(P, 13)`` float32: ``n c a ca b cb`` and the tolerance of each planar primitive.
+        balls: ``(S, 4)`` float64: centres and radii.
+        counts: primitives of each kind; those of further kinds are not searched.
+        extent: see :func:`torchpt.search.tables.extent`.
+    """
+    ends = [sum(counts[: k + 1]) for k in range(len(KINDS))]
+    words = (ctypes.c_int64 * (3 + len(ends)))(rows.data_ptr(), balls.data_ptr(), *ends)
+    ctypes.c_double.from_buffer(words, 8 * (2 + len(ends))).value = extent
+    return words
+
+
+class _Search(Block):
+    def __init__(self, kinds: Sequence[str], any_hit: bool, form: Form) -> None:
+        super().__init__(form)
+        self.f, self.i, self.d, self.b = (self.vector(ty) for ty in "fidb")
+        self.hit = f"{{{self.f}, {self.i}, {self.f}, {self.f}}}"
+        self.kinds, self.any_hit = kinds, any_hit
+
+    def write(self) -> None:
+        """The function."""
+        given = ", ".join(f"{self.f} %{name}" for name in (*_RAY, "t_max"))
+        name, result = ("occluded", self.b) if self.any_hit else ("nearest", self.hit)
+        self.lines.append(f"define internal {result} @{name}({given}, ptr %search) noinline #0 {{\nentry:")
+        self._start()
+        t, prim, before = "%t0", self.constant("i", -1), "entry"
+        for kind in self.kinds:
+            t, prim, before = self._loop(kind, t, prim, before)
+        if self.any_hit:
+            self.do(f"ret {self.b} {self.op(f'icmp sge {self.i} {prim}, zeroinitializer')}")
+        else:
+            self._finish(t, prim)
+        self.lines.append("}")
+
+    def _start(self) -> None:
+        words = ("rows", "balls", *(f"end_{kind}" for kind in KINDS))
+        for k, word in enumerate(words):
+            self.lines.append(f"  %{word}p = getelementptr i64, ptr %search, i64 {k}")
+            self.lines.append(f"  %{word} = load {'ptr' if k < 2 else 'i64'}, ptr %{word}p, !invariant.load !0")
+        extent = self.load("double", self.at("%search", "i64", len(words)))
+        extent = self.splat("f", self.op(f"fptrunc double {extent} to float"))
+        zero = self.constant("f", 0.0)
+        # NaN unless all are finite.
+        nothing = None
+        for name in _RAY:
+            product = self.mul("f", f"%{name}", zero)
+            nothing = product if nothing is None else self.add("f", nothing, product)
+        assert nothing is not None
+        good = self.op(
+            f"and {self.b} {self.compare('oeq', 'f', nothing, zero)}, {self.compare('ogt', 'f', '%t_max', zero)}"
+        )
+        self.lines.append(f"  %t0 = select {self.b} {good}, {self.f} %t_max, {self.f} {self.constant('f', -1.0)}")
+        far_o, far_d = self._size(_RAY[:3]), self._size(_RAY[3:])
+        self.lines.append(f"  %reach = fmul {self.f} {far_d}, {self._larger(far_o, extent)}")
+        self.let("live", "i1", self.some(good))
+        if "sphere" in self.kinds:
+            d = [self.convert("fpext", "f", "d", f"%{name}") for name in _RAY[3:]]
+            self.lines.append(f"  %square = fadd {self.d} {self._dot(d, d)}, {self.constant('d', 0.0)}")
+            self.lines.append(f"  %shrink = fdiv {self.d} {self.constant('d', 1.0)}, %square")
+            self.lines.append(f"  %shrink32 = fptrunc {self.d} %shrink to {self.f}")
+
+    def _larger(self, a: str, b: str) -> str:
+        return self.select("f", self.compare("ogt", "f", a, b), a, b)
+
+    def _size(self, names: tuple[str, ...]) -> str:
+        a, b, c = (self.call("llvm.fabs", "f", f"%{name}") for name in names)
+        return self._larger(self._larger(a, b), c)
+
+    def _loop(self, kind: str, t: str, prim: str, before: str) -> tuple[str, str, str]:
+        """All primitives of a kind; returns the names of distance and primitive after them, and the block that ends it."""
+        number = KINDS.index(kind)
+        first = "0" if number == 0 else f"%end_{KINDS[number - 1]}"
+        last = f"{kind}_last" if kind == "sphere" else kind
+        self.lines += [
+            f"  %{kind}_some = icmp slt i64 {first}, %end_{kind}",
+            f"  %{kind}_go = and i1 %{kind}_some, %live",
+            f"  br i1 %{kind}_go, label %{kind}, label %{kind}_done",
+            f"{kind}:",
+            f"  %{kind}_id = phi i64 [ {first}, %{before} ], [ %{kind}_next, %{last} ]",
+            f"  %{kind}_t = phi {self.f} [ {t}, %{before} ], [ %{kind}_t1, %{last} ]",
+            f"  %{kind}_p = phi {self.i} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
+        ]
+        if kind == "sphere":
+            self._near_ball(kind)
+        distance, hit = self._ball(kind) if kind == "sphere" else self._planar(kind)
+        tests = [
+            self.compare("ogt", "f", distance, self.constant("f", 0.0)),
+            self.compare("olt", "f", distance, f"%{kind}_t"),
+        ]
+        for test in tests:
+            hit = test if hit is None else self.op(f"and {self.b} {hit}, {test}")
+        # A ray that meets anything at all is done: no distance is below the one it has then.
+        better = self.constant("f", -1.0) if self.any_hit else distance
+        number_ = self.splat("i", self.op(f"trunc i64 %{kind}_id to i32"))
+        tail = "e" if kind == "sphere" else "1"
+        self.lines += [
+            f"  %{kind}_t{tail} = select {self.b} {hit}, {self.f} {better}, {self.f} %{kind}_t",
+            f"  %{kind}_p{tail} = select {self.b} {hit}, {self.i} {number_}, {self.i} %{kind}_p",
+        ]
+        if kind == "sphere":
+            self.lines += [
+                f"  br label %{kind}_last",
+                f"{kind}_last:",
+                f"  %{kind}_t1 = phi {self.f} [ %{kind}_t, %{kind} ], [ %{kind}_te, %{kind}_exact ]",
+                f"  %{kind}_p1 = phi {self.i} [ %{kind}_p, %{kind} ], [ %{kind}_pe, %{kind}_exact ]",
+            ]
+        self.lines += [
+            f"  %{kind}_next = add i64 %{kind}_id, 1",
+            f"  %{kind}_more = icmp slt i64 %{kind}_next, %end_{kind}",
+            f"  br i1 %{kind}_more, label %{kind}, label %{kind}_done",
+            f"{kind}_done:",
+            f"  %{kind}_t2 = phi {self.f} [ {t}, %{before} ], [ %{kind}_t1, %{last} ]",
+            f"  %{kind}_p2 = phi {self.i} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
+        ]
+        return f"%{kind}_t2", f"%{kind}_p2", f"{kind}_done"
+
+    def _affine(self, row: list[str], x: tuple[str, ...]) -> str:
+        value = row[3]
+        for a, b in zip(row, x, strict=False):
+            value = self.fma("f", a, b, value)
+        return value
+
+    def _planar(self, kind: str) -> tuple[str, str]:
+        base = self.op(f"getelementptr [{_ROW} x float], ptr %rows, i64 %{kind}_id")
+        row = [self.splat("f", self.load("float", self.at(base, "float", k))) for k in range(_ROW)]
+        o, d = tuple(f"%{name}" for name in _RAY[:3]), tuple(f"%{name}" for name in _RAY[3:])
+        slope = self.mul("f", row[0], d[0])
+        for k in (1, 2):
+            slope = self.fma("f", row[k], d[k], slope)
+        inverse = self.div("f", self.constant("f", 1.0), slope)
+        t = self.mul("f", self.negative("f", self._affine(row[:4], o)), inverse)
+        p = tuple(self.fma("f", t, d[k], o[k]) for k in range(3))
+        u, v = self._affine(row[4:8], p), self._affine(row[8:12], p)
+        if kind == "disk":
+            square = self.fma("f", u, u, self.mul("f", v, v))
+            return t, self.compare("ole", "f", square, self.constant("f", 1.0))
+        slack = self.mul("f", self.call("llvm.fabs", "f", self.mul("f", "%reach", inverse)), row[12])
+        low = self.select("f", self.compare("olt", "f", u, v), u, v)
+        inside = self.compare("oge", "f", low, self.negative("f", slack))
+        if kind == "triangle":
+            most = self.fma("f", slack, self.constant("f", 2.0), self.constant("f", 1.0))
+            other = self.compare("ole", "f", self.add("f", u, v), most)
+        else:
+            other = self.compare("ole", "f", self._larger(u, v), self.add("f", slack, self.constant("f", 1.0)))
+        return t, self.op(f"and {self.b} {inside}, {other}")
+
+    def _dot(self, a: list[str], b: list[str]) -> str:
+        value = self.mul("d", a[0], b[0])
+        for x, y in zip(a[1:], b[1:], strict=True):
+            value = self.fma("d", x, y, value)
+        return value
+
+    def _near_ball(self, kind: str) -> None:
+        """Go on to the exact test where any ray comes near the sphere, by float32 and a bound of its rounding.
+
+        The perpendicular from the centre to the ray errs by less than ``2^-20 (|f| + |c|)``, with ``f`` from the centre ``c``
+        to the origin: a few roundings of terms that large, the centre's own included.
+        """
+        own = self.op(f"sub i64 %{kind}_id, %end_disk")
+        base = self.op(f"getelementptr [4 x double], ptr %balls, i64 {own}")
+        loaded = [self.load("double", self.at(base, "double", k)) for k in range(4)]
+        c = [self.splat("f", self.op(f"fptrunc double {x} to float")) for x in loaded]
+        d = [f"%{name}" for name in _RAY[3:]]
+        f = [self.sub("f", f"%{name}", x) for name, x in zip(_RAY[:3], c, strict=False)]
+        along = self.mul("f", f[0], d[0])
+        size = self.add("f", self.call("llvm.fabs", "f", f[0]), self.call("llvm.fabs", "f", c[0]))
+        for k in (1, 2):
+            along = self.fma("f", f[k], d[k], along)
+            size = self.add("f", size, self.call("llvm.fabs", "f", f[k]))
+            size = self.add("f", size, self.call("llvm.fabs", "f", c[k]))
+        s = self.negative("f", self.mul("f", along, "%shrink32"))
+        off = [self.fma("f", s, y, x) for x, y in zip(f, d, strict=True)]
+        square = self.mul("f", off[0], off[0])
+        for k in (1, 2):
+            square = self.fma("f", off[k], off[k], square)
+        reach = self.fma("f", size, self.constant("f", 2.0**-19), self.call("llvm.fabs", "f", c[3]))
+        # Not "farther away": what overflows or is no number takes the exact test.
+        near = self.compare("ule", "f", square, self.mul("f", reach, reach))
+        near = self.op(f"and {self.b} {near}, {self.compare('ogt', 'f', f'%{kind}_t', self.constant('f', 0.0))}")
+        some = self.some(near)
+        self.lines += [f"  br i1 {some}, label %{kind}_exact, label %{kind}_last", f"{kind}_exact:"]
+
+    def _ball(self, kind: str) -> tuple[str, str | None]:
+        """See :func:`torchpt.search.tree_leaf.sphere_distance`."""
+        own = self.op(f"sub i64 %{kind}_id, %end_disk")
+        base = self.op(f"getelementptr [4 x double], ptr %balls, i64 {own}")
+        ball = [self.splat("d", self.load("double", self.at(base, "double", k))) for k in range(4)]
+        o, d = ([self.convert("fpext", "f", "d", f"%{name}") for name in names] for names in (_RAY[:3], _RAY[3:]))
+        f = [self.sub("d", x, c) for x, c in zip(o, ball, strict=False)]
+        a, b = "%square", self.negative("d", self._dot(f, d))
+        s = self.mul("d", b, "%shrink")
+        off = [self.fma("d", s, y, x) for x, y in zip(f, d, strict=True)]
+        square = self.mul("d", ball[3], ball[3])
+        rest = self.sub("d", square, self._dot(off, off))
+        root = self.call("llvm.sqrt", "d", self.mul("d", a, rest))
+        q = self.add("d", b, self.call("llvm.copysign", "d", root, b))
+        near, far = self.div("d", self.sub("d", self._dot(f, f), square), q), self.mul("d", q, "%shrink")
+        first = self.compare("olt", "d", near, far)
+        low, high = self.select("d", first, near, far), self.select("d", first, far, near)
+        t = self.select("d", self.compare("ogt", "d", low, self.constant("d", 0.0)), low, high)
+        return self.convert("fptrunc", "d", "f", t), None
+
+    def _finish(self, t: str, prim: str) -> None:
+        """Parameters of the planar hits; those in the slack beyond an edge are brought back to the edge."""
+        hit = self.op(f"icmp sge {self.i} {prim}, zeroinitializer")
+        zero, one = self.constant("f", 0.0), self.constant("f", 1.0)
+        ends = {kind: self.splat("i", self.op(f"trunc i64 %end_{kind} to i32")) for kind in KINDS[:3]}
+        planar = self.op(f"and {self.b} {hit}, {self.op(f'icmp slt {self.i} {prim}, ' + ends['disk'])}")
+        u = v = zero
+        if any(kind != "sphere" for kind in self.kinds):
+            place = self.mul("i", self.select("i", planar, prim, "zeroinitializer"), self.constant("i", _ROW))
+            p = tuple(self.fma("f", t, f"%{d}", f"%{o}") for o, d in zip(_RAY[:3], _RAY[3:], strict=True))
+            row = [self.gather("float", self.at("%rows", "float", k), place) for k in range(4, 12)]
+            u, v = self._affine(row[:4], p), self._affine(row[4:], p)
+            flat = self.op(f"icmp slt {self.i} {prim}, {ends['rectangle']}")
+            three = self.op(f"icmp slt {self.i} {prim}, {ends['triangle']}")
+            inner = self._between(u, zero, one)
+            top = self.select("f", three, self.sub("f", one, inner), one)
+            u, v = self.select("f", flat, inner, u), self.select("f", flat, self._between(v, zero, top), v)
+            u, v = (self.select("f", planar, x, zero) for x in (u, v))
+        t = self.select("f", hit, t, self.constant("f", math.inf))
+        value = "poison"
+        for k, (ty, x) in enumerate(((self.f, t), (self.i, prim), (self.f, u), (self.f, v))):
+            value = self.op(f"insertvalue {self.hit} {value}, {ty} {x}, {k}")
+        self.do(f"ret {self.hit} {value}")
+
+    def _between(self, x: str, low: str, high: str) -> str:
+        x = self._larger(x, low)
+        return self.select("f", self.compare("olt", "f", x, high), x, high)

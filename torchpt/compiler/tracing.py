@@ -1,0 +1,358 @@
+"""Running a stage once on a few lanes, and writing down what it does to each of them.
+
+Under :class:`Tracer` every tensor that depends on lanes carries a node for each of its numbers in one lane. Arithmetic on
+tables alone is run and kept as a list of steps (the *prologue*), so that other tables of the same shapes can take their
+place: what a kernel reads of a table is memory, whatever the numbers in it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torchpt.compiler.graph import DTYPES, Graph, Unsupported
+from torchpt.compiler.prologue import Guard, Source, Step, Table
+
+__all__ = [
+    "HANDLERS",
+    "LANES",
+    "Tracer",
+    "Value",
+    "handles",
+    "lanes_for",
+    "tracer_of",
+    "tracing",
+]
+
+#: Candidates for the number of lanes that a stage is traced on. An axis of a tensor that has this length is taken for the
+#: lanes', so it must divide no axis of a table.
+LANES = (97, 89, 101, 83, 103, 79, 107, 109, 113, 127)
+
+Handler = Callable[..., None]
+#: What becomes of each operator of torch, by its name without overload.
+HANDLERS: dict[str, Handler] = {}
+
+_PACKAGE = __file__.rpartition("compiler")[0]
+_active: list[Tracer] = []
+
+
+def handles(*names: str) -> Callable[[Handler], Handler]:
+    """Register ``handler(tracer, out, *args, **kwargs)``, which tells what ``out`` is made of."""
+
+    def register(handler: Handler) -> Handler:
+        for name in names:
+            HANDLERS[name] = handler
+        return handler
+
+    return register
+
+
+def lanes_for(tables: Iterable[Tensor]) -> int:
+    """A number of :data:`LANES` that is the length of no axis of the tables, nor divides one.
+
+    Raises:
+        Unsupported: where there is none.
+    """
+    sizes = {size for table in tables for size in table.shape if size}
+    for lanes in LANES:
+        if all(size % lanes for size in sizes):
+            return lanes
+    raise Unsupported("tables of so many lengths that none is left for the lanes to be traced on")
+
+
+def tracing() -> bool:
+    """Return True where a stage is being traced in this process: then tensor forms are wanted, not calls of kernels."""
+    return bool(_active)
+
+
+def tracer_of(tensor: Tensor) -> Tracer | None:
+    """Return the tracer under which a tensor depends on lanes or inputs; None where none does."""
+    return next((tracer for tracer in _active if tracer.is_traced(tensor)), None)
+
+
+@dataclass(frozen=True)
+class Value:
+    """A traced tensor: an array of nodes in which the lanes' axis has length 1."""
+
+    nodes: Any  # an array of objects, whose elements numpy's types do not tell from arrays
+    lane: int | None
+
+
+class Tracer(TorchDispatchMode):
+    """Lowers what runs under it.
+
+    Args:
+        lanes: of :data:`LANES`.
+        leaves: tables by id and their paths.
+
+    Attributes:
+        graph: of all that was done.
+        uniforms: inputs that are the same for all lanes, in order: dtype and number of elements.
+        tables: what is read, in order.
+        steps: the prologue.
+        guards: numbers that the trace relies on.
+        held: tensors that are no leaves and no results of steps.
+    """
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # else torch imports torch._dynamo at the first operator, which takes longer than most stages
+
+    def __init__(self, lanes: int, leaves: dict[int, tuple[str, Tensor]]) -> None:
+        super().__init__()
+        self.lanes = lanes
+        self.graph = Graph()
+        self.uniforms: list[tuple[str, int]] = []
+        self.tables: list[Table] = []
+        self.steps: list[Step] = []
+        self.guards: list[Guard] = []
+        self.held: list[Tensor] = []
+        self._values: dict[int, Value] = {}
+        self._sources = {key: Source("leaf", path) for key, (path, _) in leaves.items()}
+        self._tensors: dict[Table, Tensor] = {}
+        self._numbers: dict[Table, int] = {}
+        self._reads = _Reads(self)
+        self._keep: list[Any] = [leaves]  # ids stay those of the same tensors as long as these live
+
+    def __enter__(self) -> Tracer:
+        _active.append(self)
+        self._reads.__enter__()
+        return super().__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        _active.remove(self)
+        super().__exit__(*error)
+        self._reads.__exit__(*error)
+
+    # -- inputs and results
+
+    def lane(self, like: Tensor, make: Callable[[int], int]) -> Tensor:
+        """Declare ``like (..., lanes)`` an input; ``make(k)`` gives the node of its k-th number."""
+        lead = like.shape[:-1]
+        nodes = np.empty((*lead, 1), object)
+        for k, entry in enumerate(np.ndindex(*lead)):
+            nodes[(*entry, 0)] = make(k)
+        self._keep.append(like)
+        self._values[id(like)] = Value(nodes, len(lead))
+        return like
+
+    def uniform(self, like: Tensor) -> Tensor:
+        """Declare a small tensor an input that all lanes share, and that may differ from call to call."""
+        ty = DTYPES[like.dtype]
+        nodes = np.empty(tuple(like.shape), object)
+        slot = len(self.uniforms)
+        self.uniforms.append((ty, like.numel()))
+        for k, entry in enumerate(np.ndindex(*like.shape)):
+            nodes[entry] = self.graph.node("uniform", ty, extra=(slot, k))
+        self._keep.append(like)
+        self._values[id(like)] = Value(nodes, None)
+        return like
+
+    def nodes(self, tensor: Tensor) -> list[int]:
+        """The nodes of a result ``(..., lanes)``, its leading axes flattened."""
+        value = self.get(tensor)
+        if value.lane is not None and value.nodes.shape[value.lane] != 1:
+            raise Unsupported(
+                f"a result of shape {tuple(tensor.shape)} with several numbers of a lane along its lanes' axis"
+            )
+        if value.lane is None and tensor.dim() and tensor.shape[-1] == 1:  # the same number for all lanes
+            return [int(node) for node in value.nodes.reshape(-1)]
+        if value.lane != tensor.dim() - 1:
+            raise Unsupported(f"a result of shape {tuple(tensor.shape)} whose last axis is not the lanes'")
+        return [int(node) for node in value.nodes.reshape(-1)]
+
+    # -- what handlers use
+
+    def is_traced(self, tensor: Tensor) -> bool:
+        """Return True where a tensor depends on lanes or on inputs."""
+        return id(tensor) in self._values
+
+    def lane_axis(self, shape: Iterable[int]) -> int | None:
+        """Return which axis holds the lanes; None where none does."""
+        axes = [axis for axis, size in enumerate(shape) if size and size % self.lanes == 0]
+        if len(axes) > 1:
+            raise Unsupported(f"a tensor of shape {tuple(shape)} with lanes on two axes")
+        return axes[0] if axes else None
+
+    def inner(self, shape: Iterable[int], lane: int | None) -> tuple[int, ...]:
+        """The shape of the nodes of a tensor: the lanes' axis divided by the number of lanes."""
+        return tuple(size // self.lanes if axis == lane else size for axis, size in enumerate(shape))
+
+    def put(self, out: Tensor, nodes: Any, lane: int | None = None) -> None:
+        """Say what ``out`` is."""
+        nodes = np.asarray(nodes, dtype=object)
+        lane = self.lane_axis(out.shape) if lane is None else lane
+        shape = self.inner(out.shape, lane)
+        if nodes.shape != shape:
+            nodes = np.broadcast_to(nodes, shape)
+        self._keep.append(out)
+        self._values[id(out)] = Value(nodes, lane)
+
+    def alias(self, out: Tensor, tensor: Tensor) -> None:
+        """Say that ``out`` is ``tensor``."""
+        self._keep.append(out)
+        self._values[id(out)] = self.get(tensor)
+
+    def get(self, tensor: Tensor) -> Value:
+        """The nodes of a tensor; those of a small table are read element by element."""
+        value = self._values.get(id(tensor))
+        if value is not None:
+            return value
+        lane = self.lane_axis(tensor.shape)
+        if lane is not None:
+            return self._spread(tensor, lane)
+        if tensor.numel() > 4096:
+            raise Unsupported(f"a table of shape {tuple(tensor.shape)} read whole in every lane")
+        table, ty = self.table(tensor, None), DTYPES[tensor.dtype]
+        nodes = np.empty(tuple(tensor.shape), object)
+        for k, entry in enumerate(np.ndindex(*tensor.shape)):
+            nodes[entry] = self.graph.node("element", ty, extra=(table, k))
+        return Value(nodes, None)
+
+    def _spread(self, tensor: Tensor, lane: int) -> Value:
+        """A table that was expanded to lanes: the same number in each."""
+        first = torch.ops.aten.narrow.default(tensor, lane, 0, 1)
+        if not bool(((tensor == first) | ((tensor != tensor) & (first != first))).all()):
+            raise Unsupported("a table as long as the lanes that the stage is traced on")
+        self._record(torch.ops.aten.narrow.default, (tensor, lane, 0, 1), {}, first)
+        value = Value(self.get(first).nodes, lane)
+        self._values[id(tensor)] = value
+        self._keep.append(tensor)
+        return value
+
+    def source(self, tensor: Tensor) -> Source:
+        """Return where a tensor without lanes comes from."""
+        source = self._sources.get(id(tensor))
+        if source is None:
+            source = self._sources[id(tensor)] = Source("held", len(self.held))
+            self.held.append(tensor)
+        return source
+
+    def table(self, tensor: Tensor, axis: int | None) -> int:
+        """The number of a table."""
+        table = Table(self.source(tensor), axis)
+        if table not in self._numbers:
+            self._numbers[table] = len(self.tables)
+            self.tables.append(table)
+        return self._numbers[table]
+
+    # -- dispatch
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        name = func.overloadpacket.__name__
+        self.graph.origin = _files()
+        given = [x for x in _flat((args, kwargs)) if isinstance(x, Tensor)]
+        traced = any(id(x) in self._values for x in given)
+        if name == "_local_scalar_dense":
+            if traced:
+                raise Unsupported("a number of a lane asked for by Python")
+            out = func(*args, **kwargs)
+            self.guards.append(Guard(self.source(args[0]), out))
+            return out
+        out = func(*_safe(name, args) if traced else args, **kwargs)
+        if traced:
+            handler = HANDLERS.get(name) if func.namespace == "aten" else None
+            if handler is None:
+                raise Unsupported(f"the operator {name}")
+            try:
+                handler(self, out, *args, **kwargs)
+            except TypeError as error:  # arguments that the handler does not take
+                raise Unsupported(
+                    f"the operator {func} with {', '.join(map(str, kwargs)) or 'these arguments'}"
+                ) from error
+        elif not given and isinstance(out, Tensor) and self.lane_axis(out.shape) is not None:
+            self._factory(name, out)
+        else:
+            self._record(func, args, kwargs, out)
+        return out
+
+    def _factory(self, name: str, out: Tensor) -> None:
+        ty = DTYPES[out.dtype]
+        if name == "arange":
+            if out.shape[0] != self.lanes or out[0] != 0 or out[1] != 1:
+                raise Unsupported("numbers of lanes that do not count from 0 by 1")
+            self.put(out, np.array([self.graph.node("iota", ty)], object))
+        elif name in ("full", "ones", "zeros", "scalar_tensor"):
+            self.put(out, np.array(self.graph.constant(ty, out.reshape(-1)[0].item()), object))
+        else:
+            raise Unsupported(f"lanes made by {name}")
+
+    def _record(self, func: Any, args: Any, kwargs: dict[str, Any], out: Any) -> None:
+        """Keep an operator on tables for the prologue."""
+
+        def replaced(x: Any) -> Any:
+            if isinstance(x, Tensor):
+                return self.source(x)
+            return type(x)(replaced(y) for y in x) if isinstance(x, list | tuple) else x
+
+        number = len(self.steps)
+        self.steps.append(Step(func, tuple(map(replaced, args)), {k: replaced(v) for k, v in kwargs.items()}))
+        self._keep.append(out)
+        for item, tensor in enumerate(out if isinstance(out, list | tuple) else [out]):
+            source = Source("step", number, item if isinstance(out, list | tuple) else -1)
+            if isinstance(tensor, Tensor):
+                self._sources[id(tensor)] = source
+            else:  # a plain number: whether two tables are equal
+                self.guards.append(Guard(source, tensor))
+
+
+class _Reads(TorchFunctionMode):
+    """Notices lanes that leave torch for Python by ways that call no operator."""
+
+    def __init__(self, tracer: Tracer) -> None:
+        super().__init__()
+        self.tracer = tracer
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if getattr(func, "__name__", "") in ("tolist", "numpy", "__array__") and self.tracer.is_traced(args[0]):
+            raise Unsupported("numbers of lanes asked for by Python")
+        return func(*args, **(kwargs or {}))
+
+
+def _flat(values: Any) -> Iterable[Any]:
+    for value in values.values() if isinstance(values, dict) else values:
+        if isinstance(value, list | tuple | dict):
+            yield from _flat(value)
+        else:
+            yield value
+
+
+def _safe(name: str, args: Any) -> Any:
+    """Arguments with indices brought into range: the numbers of a trace mean nothing, their shapes do."""
+    if name == "index_select":
+        table, axis, index = args
+        return table, axis, index.clamp(0, max(table.shape[axis] - 1, 0))
+    if name == "take":
+        return args[0], args[1].clamp(0, max(args[0].numel() - 1, 0))
+    if name == "gather":
+        return args[0], args[1], args[2].clamp(0, max(args[0].shape[args[1]] - 1, 0)), *args[3:]
+    if name == "index":
+        table, indices = args
+        if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in indices):
+            raise Unsupported("a look-up by truth values")
+        sizes = table.shape
+        return table, [None if i is None else i.clamp(0, max(sizes[k] - 1, 0)) for k, i in enumerate(indices)]
+    return args
+
+
+def _files() -> tuple[str, ...]:
+    """The package's files on the stack, innermost first; the lane compiler's own left out."""
+    files: list[str] = []
+    frame: Any = sys._getframe(2)
+    while frame is not None:
+        name = frame.f_code.co_filename
+        if name.startswith(_PACKAGE):
+            name = name[len(_PACKAGE) :]
+            if not name.startswith("compiler") and name not in files:
+                files.append(name)
+        frame = frame.f_back
+    return tuple(files)

@@ -1,0 +1,604 @@
+"""The engine by kernels: the events of a walk on a chunk of lanes, in one thread and in memory of its own.
+
+A chunk is some thousand samples, one path a lane. Paths lie in an *arena* (:mod:`~torchpt.engines.kernels.layout`); `scatter`
+takes them from one arena to the other, without those that ended. Where the search is inside of the stages (``fused``), lanes
+come with their hits and are listed by what they met: `intersect` and `occlude` have nothing to do, and `sort` reads counters.
+Else rays are searched between stages, and the kernel ``settle`` adds the light of the last shadow rays, lists lanes and ends
+paths. A path that ends writes its radiance to the slot of its sample; :mod:`~torchpt.engines.kernels.threads` adds slots to
+the film.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.compiler.form import CAPACITY, VECTORS
+from torchpt.compiler.kernel import HEAD
+from torchpt.engines.kernels.layout import HIT, Memory, Rows, path_state, state_values
+from torchpt.engines.kernels.programs import Kernel, Kernels
+from torchpt.engines.kernels.stages import PLACE
+from torchpt.paths.integrators import LAYERS
+from torchpt.paths.integrators.base import check_output
+from torchpt.paths.state import Shadow, Splat, VertexInput, no_shadow
+from torchpt.paths.walk import Counts, Observer, walk
+from torchpt.paths.wave import Plate, Tally
+from torchpt.physics.film.splats import LARGEST, Splats
+from torchpt.physics.samplers import salts
+from torchpt.physics.shapes.geometry import Hit
+from torchpt.search import Accel
+
+__all__ = ["LANES", "Calls", "Chunk", "ChunkSearch", "Halted", "Paths", "Worker", "bounce_eagerly"]
+
+
+# ---- How one thread calls kernels: counters, and arguments that are filled in once
+
+
+_WORD = {name: k for k, name in enumerate(HEAD)}
+
+
+class Halted(Exception):
+    """The render is to end."""
+
+
+class Calls:
+    """Calls of a render's kernels by one thread.
+
+    Args:
+        kernels: of the render.
+        halt: set where the render is to end.
+
+    Attributes:
+        counters: see :class:`torchpt.engines.kernels.layout.Layout`.
+        place: which samples the chunk holds, see :data:`torchpt.engines.kernels.stages.PLACE`.
+        slots: radiance of the chunk's samples.
+    """
+
+    def __init__(self, kernels: Kernels, halt: threading.Event) -> None:
+        self.kernels, self._halt = kernels, halt
+        self.counters = np.zeros(kernels.models + 6, np.int64)
+        self.place = np.zeros(len(PLACE), np.int32)
+        self.slots = Memory(3)
+        self._prepared: dict[int, tuple[Any, Any, int, tuple[tuple[int, str], ...], range]] = {}
+        self._keep: list[Kernel] = []
+        self._salts: dict[tuple[int, int], Any] = {}
+        self._uniforms = {"place": self.place.ctypes.data}
+
+    def leave(self) -> None:
+        """Let go of the render and its kernels."""
+        del self.kernels, self._halt
+        self._prepared.clear()
+        self._keep.clear()
+
+    def serve(self, kernels: Kernels, halt: threading.Event) -> None:
+        """Go on with the kernels of another render of the same structure, whose memory looks the same."""
+        self.kernels, self._halt = kernels, halt
+
+    def clear(self) -> None:
+        """Start to count anew."""
+        self.counters[:] = 0
+
+    def counted(self) -> tuple[int, list[int]]:
+        """Return how many lanes are in the arena, and how many in each list."""
+        return int(self.counters[0]), self.counters[1 : self.kernels.models + 3].tolist()
+
+    def name_salts(self, depth: int, step: int = 0) -> None:
+        """Set the vertex, or the step on the way there, whose random dimensions kernels draw from."""
+        known = self._salts.get((depth, step))
+        if known is None:
+            known = self._salts[depth, step] = salts(depth, torch.device("cpu"), step)
+        self._uniforms["salts"] = known.data_ptr()
+
+    def run(
+        self,
+        kernel: Kernel,
+        count: int,
+        source: Memory,
+        target: Memory,
+        places: Memory | None = None,
+        lists: list[Memory] | None = None,
+        slots: Memory | None = None,
+    ) -> None:
+        """Run a kernel.
+
+        Args:
+            kernel: of the render.
+            count: how many lanes.
+            source: the arena that it reads.
+            target: the arena that it writes.
+            places: the lanes, where the kernel takes them by a list.
+            lists: what it notes lanes in.
+            slots: where it writes what belongs to samples; the radiance's own where None.
+
+        Raises:
+            Halted: where the render is to end.
+        """
+        if self._halt.is_set():
+            raise Halted
+        prepared = self._prepared.get(id(kernel))
+        if prepared is None:
+            prepared = self._prepared[id(kernel)] = self._arguments(kernel)
+        words, call, address, uniforms, first = prepared
+        words[0], words[1] = source.address, target.address
+        if places is not None:
+            words[2] = places.address
+        words[3] = self.slots.address if slots is None else slots.address
+        for place, name in uniforms:
+            words[place] = self._uniforms[name]
+        if lists is not None:
+            for place, memory in zip(first, lists, strict=False):
+                words[place] = memory.address
+        call(address, count)
+
+    def _arguments(self, kernel: Kernel) -> tuple[Any, Any, int, tuple[tuple[int, str], ...], range]:
+        """A kernel's arguments: what is always the same is filled in, and it is said where the rest goes."""
+        program = kernel.program
+        start = len(HEAD) + len(program.uniforms)
+        words = (ctypes.c_int64 * (start + program.lists))()
+        words[_WORD["stride"]] = CAPACITY
+        words[_WORD["counters"]] = self.counters.ctypes.data
+        words[_WORD["tables"]] = kernel.tables.address
+        if self.kernels.search is not None:
+            words[_WORD["search"]] = ctypes.addressof(self.kernels.search)
+        uniforms = tuple((len(HEAD) + k, name) for k, name in enumerate(program.uniforms))
+        self._keep.append(kernel)  # so that its id stays its own
+        return words, program.call, ctypes.addressof(words), uniforms, range(start, start + program.lists)
+
+
+# ---- A vertex by tensor operations, for models that no kernel can be made of, on the lanes of an arena
+
+
+def bounce_eagerly(
+    kernels: Kernels,
+    model: int,
+    roulette: float,
+    source: Memory,
+    target: Memory,
+    places: Memory,
+    count: int,
+    start: int,
+    depth: int,
+) -> int:
+    """Do what the kernel of a bounce does where the search is no part of it.
+
+    Args:
+        kernels: of the render.
+        model: its number.
+        roulette: see :func:`torchpt.paths.vertex.bounce`.
+        source: the arena of the paths.
+        target: where they go, from lane ``start`` on.
+        places: the lanes concerned.
+        count: how many.
+        start: first place in ``target``.
+        depth: of the vertex.
+
+    Returns:
+        How many shadow rays it asks for.
+    """
+    rows, lanes = kernels.state, places.words[0, :count]
+    with torch.no_grad():
+        state = path_state(rows.take(source, lanes, rows.state))
+        vertex = VertexInput(state, Hit(**rows.take(source, lanes, tuple(HIT))))
+        context = kernels.wave.context.at(salts(depth, torch.device("cpu")), roulette=roulette)
+        output = kernels.wave.bounce(context, model, vertex)
+        check_output(kernels.wave.integrator, output)
+        after, none = output.leaving, no_shadow(output.leaving)
+        shadow = none if output.shadow is None else output.shadow
+        splat = Splat(torch.full_like(after.lane, -1), none) if output.splat is None else output.splat
+    values: dict[str, Tensor | None] = {**state_values(after)}
+    values |= rows.take(source, lanes, ("weight",))
+    values |= {f"shadow_{name}": value for name, value in _named(shadow).items()}
+    values |= {f"splat_{name}": value for name, value in _named(splat.light).items()} | {"splat_pixel": splat.pixel}
+    rows.put(target, start, values)
+    return count * (int(output.shadow is not None) + int(output.splat is not None))
+
+
+def _named(light: Shadow) -> dict[str, Tensor]:
+    return {"o": light.o, "d": light.d, "t": light.t_max, "radiance": light.radiance}
+
+
+# ---- What the rays of a chunk meet, where that is asked between stages: by packets, or by the search structure
+#
+# Surfaces that are not opaque let rays pass by chance and shadow rays in part: such rays move to an arena of their own and are
+# searched again from behind the surface, until each is stopped or has met nothing.
+
+
+class ChunkSearch:
+    """The search of one thread's chunks.
+
+    Args:
+        calls: of the thread.
+    """
+
+    def __init__(self, calls: Calls) -> None:
+        self.calls, self.kernels = calls, calls.kernels
+        self.passed = [Memory(self.kernels.passed.count) for _ in range(2)] if self.kernels.passing else []
+        self.sifted = Memory(1)
+
+    def nearest(self, arena: Memory, count: int) -> None:
+        """Write the hits of the arena's rays beside them: the nearest surfaces, opaque or not."""
+        self._trace(arena, self.kernels.state, "o", "d", "t_max", count)
+
+    def transmit(self, arena: Memory, count: int, depth: int, step: int) -> int:
+        """Take a step through what lets rays pass.
+
+        Args:
+            arena: of the paths; hits of rays that are held up are written there.
+            count: how many paths there are, at the first step; then how many rays are on their way.
+            depth: of the vertex that they come to.
+            step: of the rays, from 0.
+
+        Returns:
+            How many rays are still on their way.
+        """
+        kernels, calls = self.kernels, self.calls
+        calls.name_salts(depth, step)
+        source, target = self.passed[step % 2], self.passed[1 - step % 2]
+        if step == 0:
+            calls.clear()
+            calls.run(kernels.sift(), count, arena, arena, lists=[self.sifted])
+            some = int(calls.counters[0])
+            if not some:
+                return 0
+            calls.clear()
+            calls.run(kernels.transmit(False), some, arena, target, self.sifted, slots=arena)
+        else:
+            calls.clear()
+            calls.run(kernels.transmit(True), count, source, target, slots=arena)
+        left = int(calls.counters[0])
+        if left:
+            self._trace(target, kernels.passed, "pass_o", "pass_d", "pass_t", left)
+        return left
+
+    def light(self, arena: Memory, count: int) -> None:
+        """Write how much of the light of the arena's shadow rays arrives."""
+        kernels, calls, rows = self.kernels, self.calls, self.kernels.state
+        if not kernels.packets:
+            o, d, t_max = (_row(arena.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
+            blocked = _row(arena.words, rows, "blocked", 1)[0]
+            kernels.wave.accel.blocked(o, d, t_max[0], count, blocked, kernels.non_opaque)
+        elif not kernels.has_opacity:
+            calls.run(kernels.block(), count, arena, arena)
+        if not kernels.has_opacity:
+            return
+        source, target = self.passed
+        calls.clear()
+        calls.run(kernels.begin(), count, arena, source, slots=arena)
+        while left := int(calls.counters[0]):
+            self._trace(source, kernels.passed, "pass_o", "pass_d", "pass_t", left)
+            calls.clear()
+            calls.run(kernels.through(), left, source, target, slots=arena)
+            source, target = target, source
+
+    def _trace(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: int) -> None:
+        """The nearest surface of each ray, opaque or not."""
+        if self.kernels.packets:
+            self.calls.run(self.kernels.find(rows is self.kernels.passed), count, memory, memory)
+            return
+        accel: Accel = self.kernels.wave.accel
+        floats, words = memory.floats, memory.words
+        accel.nearest(
+            _row(floats, rows, o, 3),
+            _row(floats, rows, d, 3),
+            _row(floats, rows, t_max, 1)[0],
+            count,
+            _row(floats, rows, "t", 1)[0],
+            _row(words, rows, "prim", 1)[0],
+            _row(floats, rows, "u", 1)[0],
+            _row(floats, rows, "v", 1)[0],
+        )
+
+
+def _row(memory: np.ndarray, rows: Rows, name: str, count: int) -> np.ndarray:
+    first = rows.first(name)
+    return memory[first : first + count]
+
+
+# ---- The engine by kernels: the events of a walk on a chunk of lanes, in one thread and in memory of its own
+
+
+#: Lanes of a chunk.
+LANES = CAPACITY - VECTORS.width
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Consecutive pixels of a plate (None: of the picture), and consecutive samples of each."""
+
+    first_pixel: int
+    pixels: int
+    first_sample: int
+    samples: int
+    plate: Plate | None = None
+
+
+@dataclass
+class Paths:
+    """Paths of a chunk at a vertex.
+
+    Attributes:
+        arena: what they carry, lane by lane.
+        lists: lanes by what they met: by model, at an emitter, nowhere.
+        depth: of the vertex.
+        count: how many lanes there are.
+        arrived: whether their hits are in the arena already.
+        listed: whether lanes are in the lists already.
+        shadows: whether light from the vertex before is still pending.
+        flying: how many rays are on their way through what lets them pass.
+        step: how many times they went on.
+        groups: how many lanes each model has.
+        places: how many lanes are in each list.
+    """
+
+    arena: Memory
+    lists: list[Memory]
+    depth: int = 1
+    count: int = 0
+    arrived: bool = False
+    listed: bool = False
+    shadows: bool = False
+    flying: int = 0
+    step: int = 0
+    groups: Sequence[int] = ()
+    places: Sequence[int] = ()
+
+
+class Worker:
+    """The engine of one thread: takes chunks through their paths.
+
+    Args:
+        kernels: of the render.
+        halt: set where the render is to end; None: it never is.
+
+    Attributes:
+        slots: radiance of the chunk's samples.
+        shown: layers of the chunk's samples, once they were asked for.
+        tally: rays and paths of the chunk.
+        splats: what its samples bring to other pixels.
+    """
+
+    def __init__(self, kernels: Kernels, halt: threading.Event | None = None) -> None:
+        self.kernels, self.wave = kernels, kernels.wave
+        self.calls = Calls(kernels, halt or threading.Event())
+        self.search = ChunkSearch(self.calls)
+        self.slots = self.calls.slots
+        self.shown: Memory | None = None
+        self.tally = Tally()
+        self.splats: list[Splats] = []
+        self._lost: list[np.ndarray] = []  # samples with splats that are not finite
+        self._rooms = [self._room() for _ in range(2)]
+
+    def _room(self) -> Paths:
+        """Memory for the paths of a vertex."""
+        return Paths(Memory(self.kernels.state.count), [Memory(1) for _ in range(self.kernels.models + 2)])
+
+    def room(self, depth: int) -> Paths:
+        """Return the memory of a vertex: two take turns."""
+        return self._rooms[depth % 2]
+
+    def leave(self) -> int:
+        """Let go of the render; return the bytes that are kept for another one of the same structure."""
+        held = [self.slots, *self.search.passed, self.search.sifted, *([] if self.shown is None else [self.shown])]
+        held += [memory for room in self._rooms for memory in (room.arena, *room.lists)]
+        self.calls.leave()
+        self.splats, self._lost = [], []
+        del self.kernels, self.wave, self.search.kernels
+        return sum(memory.words.nbytes for memory in held)
+
+    def serve(self, kernels: Kernels, halt: threading.Event) -> None:
+        """Go on with another render of the same structure, after `leave`: fresh memory would cost time."""
+        self.kernels, self.wave = kernels, kernels.wave
+        self.calls.serve(kernels, halt)
+        self.search.kernels = kernels
+
+    def trace(self, chunk: Chunk) -> Tally:
+        """Fill ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
+        self.tally = Tally()
+        walk(self, self.spawn(chunk), self.wave.integrator.limits)
+        self.mark_lost()
+        return self.tally
+
+    def mark_lost(self) -> None:
+        """Make samples NaN, all of whose paths ended, where a splat of theirs is not finite."""
+        for lanes in self._lost:
+            self.slots.floats[:3, lanes] = np.nan
+
+    def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
+        """Fill ``shown`` with layers of the first surfaces, channel after channel; return how many rays it took."""
+        count = chunk.pixels * chunk.samples
+        channels = sum(len(LAYERS[name].channels) for name in names)
+        if self.shown is None or len(self.shown.words) != channels:
+            self.shown = Memory(channels)
+        self.shown.words[:, :count] = 0
+        walk(self, self.spawn(chunk), self.wave.integrator.limits, _Layers(self, names))
+        return count
+
+    def start(self, chunk: Chunk) -> None:
+        """Say which samples are next."""
+        wave, plate = self.wave, chunk.plate
+        streams = wave.sampler.streams if plate is None else plate.streams
+        x, y, width, _ = wave.crop
+        point, turn = divmod(chunk.first_sample, streams.count)
+        self.calls.place[:] = np.array(
+            (
+                chunk.first_pixel, chunk.pixels, turn, (point + (1 << 31)) % (1 << 32) - (1 << 31),
+                streams.first, streams.count, x, y, width, wave.camera.resolution[0],
+            ),
+            np.int64,
+        ).astype(np.int32)  # fmt: skip
+
+    def spawn(self, chunk: Chunk) -> Paths:
+        """Start the paths of a chunk by its rays; where the search is inside of the stages with their first hits."""
+        self.start(chunk)
+        kernels, calls, given = self.kernels, self.calls, self.wave.given
+        self.splats, self._lost = [], []
+        count, places = chunk.pixels * chunk.samples, None if chunk.plate is None else chunk.plate.places
+        if given is not None:
+            places = given.number
+        paths, source = self._begin(self.room(1), 1, count), self.room(1).arena
+        calls.clear()
+        calls.name_salts(0)
+        own = slice(chunk.first_pixel, chunk.first_pixel + chunk.pixels)
+        if places is not None or given is not None:  # they lie in the arena of the next vertex until then
+            source = self.room(2).arena
+        if places is not None:
+            chosen = places[own].numpy().astype(np.int32)
+            source.words[kernels.state.first("prim"), :count] = np.tile(chosen, chunk.samples)
+        if given is not None:
+            for name, vectors in (("o", given.o), ("d", given.d)):
+                row = kernels.state.first(name)
+                source.floats[row : row + 3, :count] = np.tile(vectors[:, own].numpy(), chunk.samples)
+        lists = paths.lists if kernels.fused else None
+        kernel = kernels.generate(places is not None, given is not None)
+        calls.run(kernel, count, source, paths.arena, lists=lists)
+        if kernels.fused:
+            self.tally.rays += count
+        return paths
+
+    def _begin(self, paths: Paths, depth: int, count: int) -> Paths:
+        """Take memory for the paths of a vertex."""
+        paths.depth, paths.count, paths.shadows, paths.groups = depth, count, False, ()
+        paths.flying = paths.step = 0
+        paths.arrived = paths.listed = self.kernels.fused
+        return paths
+
+    # -- the events of a walk
+
+    def intersect(self, paths: Paths) -> bool:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        if paths.arrived:
+            return False
+        self.tally.rays += paths.count
+        self.search.nearest(paths.arena, paths.count)
+        paths.flying = paths.count if self.kernels.passing else 0
+        return self.kernels.passing
+
+    def transmit(self, paths: Paths) -> bool:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        paths.flying = self.search.transmit(paths.arena, paths.flying, paths.depth, paths.step)
+        paths.step += 1
+        return paths.flying > 0
+
+    def sort(self, paths: Paths) -> Counts:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        kernels, calls = self.kernels, self.calls
+        if not paths.listed:
+            self._settle(paths)
+        live, places = calls.counted()
+        paths.groups, paths.places = places[: kernels.models] if kernels.listed else [live], places
+        emissive = places[kernels.emissive] if kernels.has_emitters else 0
+        return Counts(paths.groups, emissive, places[kernels.missed] if kernels.has_environment else 0)
+
+    def _settle(self, paths: Paths) -> None:
+        """Add the light that was pending, list lanes by what they met, and end those that met nothing that shines."""
+        calls = self.calls
+        calls.clear()
+        calls.run(self.kernels.settle(paths.shadows), paths.count, paths.arena, paths.arena, lists=paths.lists)
+
+    def emit(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        self._on_list(self.kernels.emit(), paths, self.kernels.emissive)
+
+    def escape(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        self._on_list(self.kernels.escape(), paths, self.kernels.missed)
+
+    def _on_list(self, kernel: Kernel, paths: Paths, number: int) -> None:
+        self.calls.name_salts(paths.depth)
+        self.calls.run(kernel, paths.places[number], paths.arena, paths.arena, paths.lists[number])
+
+    def terminate(self, paths: Paths, truncated: bool) -> None:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        kernels, calls = self.kernels, self.calls
+        if not paths.groups:  # not sorted: all end where they are
+            if paths.listed:  # those that had ended before are no longer here
+                paths.count, _ = calls.counted()
+            paths.arena.words[kernels.state.first("prim"), : paths.count] = -1
+            paths.arena.floats[kernels.state.first("t_max"), : paths.count] = 0.0
+            self._settle(paths)
+            return
+        for model, count in enumerate(paths.groups):
+            if count:
+                lanes = paths.lists[model] if kernels.listed else None
+                calls.run(kernels.retire(), count, paths.arena, paths.arena, lanes)
+                self.tally.truncated += count if truncated else 0
+
+    def scatter(self, paths: Paths, roulette: float) -> Paths:
+        """See :class:`torchpt.paths.walk.Engine`."""
+        kernels, calls = self.kernels, self.calls
+        after = self._begin(self.room(paths.depth + 1), paths.depth + 1, sum(paths.groups))
+        if kernels.fused:
+            self.tally.rays += after.count
+        calls.clear()
+        calls.name_salts(paths.depth)
+        done = 0
+        for model, count in enumerate(paths.groups):
+            if not count:
+                continue
+            if not kernels.fused:
+                calls.counters[0] = done
+            lanes = paths.lists[model]
+            if model in kernels.eager:
+                self.tally.rays += bounce_eagerly(
+                    kernels, model, roulette, paths.arena, after.arena, lanes, count, done, paths.depth
+                )
+            else:
+                kernel = kernels.bounce(model, roulette)
+                lanes = lanes if kernels.listed else None
+                calls.run(kernel, count, paths.arena, after.arena, lanes, lists=after.lists)
+                self.tally.rays += count * kernel.program.shadows
+            done += count
+        return after
+
+    def occlude(self, paths: Paths) -> None:
+        """See :class:`torchpt.paths.walk.Engine`; the light itself is added where lanes are listed."""
+        rows = self.kernels.state
+        paths.shadows = "shadow_o" in rows
+        if "splat_o" in rows:
+            self._splat(paths)
+        if paths.shadows:
+            self.search.light(paths.arena, paths.count)
+
+    def _splat(self, paths: Paths) -> None:
+        """Note the light of splats that gets through; a sample with one that is not finite is lost."""
+        rows, floats, words, n = self.kernels.state, paths.arena.floats, paths.arena.words, paths.count
+        splat, shadow = (slice(rows.first(f"{name}_o"), rows.first(f"{name}_radiance")) for name in ("splat", "shadow"))
+        own = words[shadow, :n].copy()  # the search reads rays in the rows of shadow rays
+        words[shadow, :n] = words[splat, :n]
+        self.search.light(paths.arena, n)
+        words[shadow, :n] = own
+        clear = floats[rows.first("clear"), :n] if "clear" in rows else words[rows.first("blocked"), :n] == 0
+        floats[rows.first("splat_clear"), :n] = clear
+        pixel, first = words[rows.first("splat_pixel"), :n], rows.first("splat_radiance")
+        value = floats[first : first + 3, :n] * floats[rows.first("splat_clear"), :n]
+        comes, finite = (pixel >= 0) & (clear != 0), (np.abs(value) < LARGEST).all(0)
+        lane, on = words[rows.first("lane"), :n].astype(np.int64), comes & finite
+        parts = lane[on], pixel[on].astype(np.int64), value[:, on]
+        self.splats.append(Splats(*(torch.from_numpy(part) for part in parts)))
+        lost = comes & ~finite
+        if lost.any():
+            self._lost.append(lane[lost])
+
+
+class _Layers(Observer[Paths]):
+    """Reads layers off first surfaces, and ends the walk there."""
+
+    def __init__(self, worker: Worker, names: tuple[str, ...]) -> None:
+        self.worker, self.names = worker, names
+
+    def sorted(self, paths: Paths, counts: Counts) -> bool:
+        """See :class:`Observer`."""
+        worker, kernels = self.worker, self.worker.kernels
+        for model, count in enumerate(paths.groups):
+            if count:
+                lanes = paths.lists[model] if kernels.listed else None
+                kernel = kernels.layers(model, self.names)
+                worker.calls.run(kernel, count, paths.arena, paths.arena, lanes, slots=worker.shown)
+        return True

@@ -1,0 +1,338 @@
+"""Which thread takes which samples, and how they add up to a picture; renders that share the threads."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from torchpt.compiler.form import CAPACITY, VECTORS
+from torchpt.compiler.kernel import HEAD
+from torchpt.core.memory import Budget, needing, ran_out, when_short
+from torchpt.core.threads import deal
+from torchpt.engines.kernels.engine import LANES, Chunk, Halted, Worker
+from torchpt.engines.kernels.programs import Kernels
+from torchpt.paths.lost import Lost
+from torchpt.paths.wave import Plate, Tally, clamp_scale
+from torchpt.physics.film import Film
+
+__all__ = ["TASKS", "Block", "Loop", "Share", "keep", "taken"]
+
+
+# ---- Workers that no render has at the moment: the next one of the same structure takes them over, as fresh memory costs time
+
+
+#: Bytes of all that are kept; the oldest go first.
+MOST = 64 << 20
+
+_lock = threading.Lock()
+_kept: deque[tuple[Hashable, Worker, int]] = deque()
+
+
+def keep(structure: Hashable, worker: Worker) -> None:
+    """Keep a worker for renders of a structure; it lets go of the render that it was of."""
+    size = worker.leave()
+    with _lock:
+        _kept.append((structure, worker, size))
+        total = sum(one[2] for one in _kept)
+        while total > MOST:
+            total -= _kept.popleft()[2]
+
+
+def taken(structure: Hashable) -> Worker | None:
+    """Return a worker for a render of a structure, the latest; None where there is none."""
+    with _lock:
+        for number in reversed(range(len(_kept))):
+            if _kept[number][0] == structure:
+                worker = _kept[number][1]
+                del _kept[number]
+                return worker
+    return None
+
+
+def _release() -> None:
+    with _lock:
+        _kept.clear()
+
+
+def _after_fork() -> None:
+    """Another thread of the parent may have held the lock."""
+    global _lock
+    _lock = threading.Lock()
+
+
+when_short(_release)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
+
+
+# ---- Which thread takes which samples, and how they add up to a picture
+
+
+#: Tasks of a pass for each thread, so that none waits long for the last one.
+TASKS = 6
+#: Fewest lanes that repay a task.
+FEWEST = 1024
+#: Pixels of a task, unless threads would be idle: a chunk of many samples of few pixels adds them up in as many steps.
+NARROW = 128
+
+#: A plate, its first pixel and how many, the first sample and how many of each.
+Block = tuple[Plate, int, int, int, int]
+
+
+@dataclass
+class Share:
+    """Results of a task beside its samples.
+
+    Attributes:
+        tally: rays and paths.
+        samples: camera samples taken.
+        lost: samples that were not finite.
+        light: before and after the clamp.
+        rest: what memory did not suffice for.
+    """
+
+    tally: Tally
+    samples: int = 0
+    lost: Lost = field(default_factory=Lost)
+    light: tuple[float, float] = (0.0, 0.0)
+    rest: list[Block] = field(default_factory=list)
+
+
+class Loop:
+    """A render's tasks over threads. A pixel's samples are summed in their order, whichever thread takes them.
+
+    Args:
+        kernels: of the render.
+        threads: how many.
+        clamp: largest contribution of a path, or None.
+        strict: whether a task ends at a sample that is not finite; whoever is told of it ends the render.
+
+    Attributes:
+        budget: how many threads, and most lanes of a chunk.
+    """
+
+    def __init__(self, kernels: Kernels, threads: int, clamp: float | None, strict: bool) -> None:
+        self.kernels, self.clamp, self.strict = kernels, clamp, strict
+        self.budget = Budget(
+            torch.device("cpu"),
+            LANES,
+            threads,
+            what="the compiled loop on one thread",
+            instead="one thread and fewer lanes",
+            fewest=VECTORS.width,
+        )
+        self._workers: list[Worker] = []
+        self._halt = threading.Event()
+
+    def run(self, spans: Sequence[tuple[Plate, int, int]], each: Callable[[Share | None], bool]) -> bool:
+        """Take samples of every pixel of plates.
+
+        Args:
+            spans: plates, with the first sample and how many are to be taken.
+            each: called in this thread after every task, and now and then with None while tasks run (or compile);
+                returning True ends the render: tasks stop at their next kernel.
+
+        Returns:
+            Whether all were taken.
+        """
+        return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
+
+    def blocks(self, spans: Sequence[tuple[Plate, int, int]], tasks: int) -> list[Block]:
+        """Samples of plates cut into blocks of pixels: ``tasks`` for each plate, as far as they repay."""
+        return [
+            (plate, start, size, first, count)
+            for plate, first, count in spans
+            for start, size in self._cut(plate, count, tasks)
+        ]
+
+    def take(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
+        """Take blocks; ``each`` and what is returned are those of :meth:`run`."""
+        while blocks and not self._halt.is_set():
+            blocks = self._round(blocks, each)
+            if blocks:
+                blocks = self._smaller(blocks)
+        return not self._halt.is_set()
+
+    def take_rest(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
+        """Take blocks for which there was no memory, by fewer threads or lanes; else as :meth:`take`."""
+        return self.take(self._smaller(blocks), each)
+
+    def _round(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> list[Block]:
+        """Take blocks on threads; return what of them memory did not suffice for."""
+        rest: list[Block] = []
+
+        def told(share: Share | None) -> bool:
+            if share is not None:
+                rest.extend(share.rest)
+            return each(share)
+
+        deal(blocks, self.task, self.budget.threads, told, self._halt)
+        return rest
+
+    def _smaller(self, blocks: list[Block]) -> list[Block]:
+        """The blocks that are left, for fewer threads, or cut for chunks of fewer lanes.
+
+        Raises:
+            RenderError: there is no memory for one thread and a vector of lanes.
+        """
+        self._workers.clear()
+        self.budget.shrink()
+        lanes = self.budget.lanes
+        return [
+            (plate, pixel, min(lanes, start + size - pixel), first, count)
+            for plate, start, size, first, count in blocks
+            for pixel in range(start, start + size, lanes)
+        ]
+
+    def _cut(self, plate: Plate, samples: int, tasks: int) -> Iterator[tuple[int, int]]:
+        """Consecutive pixels of each task."""
+        pixels = plate.film.width * plate.film.height
+        size = pixels
+        threads = self.budget.threads
+        if tasks > 1 and threads > 1:
+            size = max(-(-pixels // tasks), -(-FEWEST // samples), min(NARROW, -(-pixels // threads)))
+        size = max(min(-(-size // VECTORS.width) * VECTORS.width, self.budget.lanes), 1)
+        for start in range(0, pixels, size):
+            yield start, min(size, pixels - start)
+
+    def dismiss(self, keeps: bool) -> None:
+        """Give up this render's workers, or keep them for the next one of its structure."""
+        while self._workers:
+            worker = self._workers.pop()
+            if keeps:
+                keep(self.kernels.structure, worker)
+
+    def halt(self) -> None:
+        """End the render: tasks stop at their next kernel."""
+        self._halt.set()
+
+    def task(self, block: Block) -> Share:
+        """Take a block, in a thread of its own."""
+        plate, start, size, first, count = block
+        share = Share(Tally())
+        sample = first
+        try:
+            worker = self._worker()
+            step = max(self.budget.lanes // size, 1)
+            while sample < first + count:
+                chunk = Chunk(start, size, sample, min(step, first + count - sample), plate)
+                self._chunk(worker, chunk, plate, share)
+                sample += chunk.samples
+                share.samples += size * chunk.samples
+                if self.strict and share.lost.count:
+                    break
+            self._workers.append(worker)
+        except Halted:
+            pass  # what was added so far counts
+        except Exception as error:
+            if not ran_out(error):
+                raise
+            share.rest = [(plate, start, size, sample, first + count - sample)]
+        return share
+
+    def _worker(self) -> Worker:
+        try:
+            return self._workers.pop()
+        except IndexError:
+            worker = taken(self.kernels.structure)
+        if worker is None:
+            return Worker(self.kernels, self._halt)
+        worker.serve(self.kernels, self._halt)
+        return worker
+
+    def _chunk(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
+        """A chunk into the films: all of it, or nothing where memory runs out."""
+        names, light = tuple(plate.layers), self.kernels.wave.integrator.light
+        rays = worker.layers(chunk, names) if names else 0
+        for film in plate.layers.values():
+            self.kernels.deposit(film.channels, False)
+        if light:
+            self.kernels.deposit(3, self.clamp is not None)
+            tally = worker.trace(chunk)
+            share.tally.truncated += tally.truncated
+            rays += tally.rays
+        # From here on a failure would leave half a chunk: what little is allocated must be there, or the render ends.
+        with needing("the sums of a film"):
+            if light:
+                self._radiance(worker, chunk, plate, share)
+                self._splats(worker, chunk, plate.film, share)
+            if names:
+                self._layers(worker, chunk, plate)
+        share.tally.rays += rays
+
+    def _radiance(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
+        values = worker.slots.floats
+        used = values[:, : chunk.pixels * chunk.samples]
+        if self.clamp is None:
+            if self._deposit(worker, values, chunk, plate.film, 3, None):
+                share.lost.add(self._lost(used, chunk))
+            return
+        finite = np.isfinite(used).all(0)
+        if not finite.all():
+            share.lost.add(self._lost(used, chunk))  # the clamp writes over them
+        before = float(np.where(finite, used, 0.0).sum(dtype=np.float64))
+        self._deposit(worker, values, chunk, plate.film, 3, self.clamp)
+        share.light = share.light[0] + before, share.light[1] + float(np.ascontiguousarray(used).sum(dtype=np.float64))
+
+    def _splats(self, worker: Worker, chunk: Chunk, film: Film, share: Share) -> None:
+        """Add what a chunk's samples bring to other pixels."""
+        before = after = 0.0
+        for splats in worker.splats:
+            assert film.splats is not None
+            value = splats.value
+            if self.clamp is not None:
+                before += float(value.sum(dtype=torch.float64))
+                value = value * clamp_scale(value, self.clamp)
+                after += float(value.sum(dtype=torch.float64))
+            stream = film.stream(chunk.first_sample + splats.lane // chunk.pixels)
+            film.splats.add(stream, splats.pixel, value)
+        share.light = share.light[0] + before, share.light[1] + after
+
+    def _layers(self, worker: Worker, chunk: Chunk, plate: Plate) -> None:
+        assert worker.shown is not None
+        first = 0
+        for film in plate.layers.values():
+            values = worker.shown.floats[first : first + film.channels]
+            self._deposit(worker, values, chunk, film, film.channels, None)
+            first += film.channels
+
+    def _deposit(
+        self, worker: Worker, values: np.ndarray, chunk: Chunk, film: Film, channels: int, clamp: float | None
+    ) -> int:
+        """Add samples to a film in their order; return how many were not finite."""
+        made = self.kernels.deposit(channels, clamp is not None)
+        kernel = made.program
+        counters = np.zeros(1, np.int64)
+        limit = np.array([clamp or 0.0], np.float32)
+        words = (ctypes.c_int64 * (len(HEAD) + len(kernel.uniforms) + 2 * (kernel.tensors + kernel.results)))()
+        words[HEAD.index("counters")] = counters.ctypes.data
+        words[HEAD.index("tables")] = made.tables.address
+        if kernel.uniforms:
+            words[len(HEAD)] = limit.ctypes.data
+        rest = len(HEAD) + len(kernel.uniforms)  # input and output tensors: addresses and lengths of rows
+        sums, n = film.sums, chunk.pixels
+        pixels = sums.shape[2]
+        for k in range(chunk.samples):
+            group = (chunk.first_sample + k) % film.randomizations
+            source = values.ctypes.data + 4 * k * n
+            total = sums.data_ptr() + 8 * (group * channels * pixels + chunk.first_pixel)
+            words[rest : rest + 6] = (source, CAPACITY, total, pixels, total, pixels)
+            if clamp is not None:
+                words[rest + 6], words[rest + 7] = source, CAPACITY
+            kernel.call(ctypes.addressof(words), n)
+        film.counted(chunk.first_pixel, n, chunk.first_sample, chunk.samples)
+        if chunk.first_sample == 0:
+            film.keep_first(values[:, :n], chunk.first_pixel)
+        return int(counters[0])
+
+    def _lost(self, used: np.ndarray, chunk: Chunk) -> Lost:
+        """Return which samples of a chunk are not finite, of the radiance ``(3, samples * pixels)`` of all."""
+        radiance = torch.from_numpy(used).view(3, chunk.samples, chunk.pixels)
+        return Lost.of(radiance, chunk.first_pixel, chunk.first_sample, self.kernels.wave.crop, chunk.plate)

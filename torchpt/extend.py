@@ -1,0 +1,130 @@
+"""All that a kind of your own needs, from one place: base classes, records, parameters, random numbers, vectors.
+
+What is here keeps its name and meaning from release to release as the functions of ``torchpt`` do; other modules may move.
+
+====================  =====================================================================================
+a material            :class:`Bsdf` with :class:`BsdfSample`
+a light               :class:`Light` with :class:`Row`, :class:`Setting`, :class:`Cone`, :class:`LightSample`
+a shape               :class:`Shape` with :class:`Surface`; :class:`Quadric` with :class:`Form`
+a camera              :class:`Camera`
+a sampler             :class:`Points`
+a filter              :class:`Filter`, :class:`Tabulated`
+a texture             :class:`Computed`
+an integrator         :class:`Path`, :class:`FirstSurfaceIntegrator`, :class:`Limits`, and the records of stages
+a layer (AOV)         :class:`SurfaceLayer`, :class:`FilmLayer`
+parameters            :class:`Scalar`, :class:`Color`, ... with :class:`Moves` and :class:`Refused`
+====================  =====================================================================================
+"""
+
+from torchpt.math.sampling import (
+    concentric_disk,
+    cosine_hemisphere,
+    power_heuristic,
+    uniform_hemisphere,
+    uniform_sphere,
+)
+from torchpt.math.vectors import Frame, dot, luminance, normalize
+from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
+from torchpt.paths.integrators.first_surface import FirstSurface, FirstSurfaceIntegrator
+from torchpt.paths.integrators.kinds.path import Path
+from torchpt.paths.layer import FilmLayer, Seen, SurfaceLayer
+from torchpt.paths.state import (
+    DirectLight,
+    Drawn,
+    Emission,
+    Field,
+    PathState,
+    Shadow,
+    Splat,
+    StageContext,
+    Transmission,
+    VertexInput,
+    VertexOutput,
+    no_shadow,
+)
+from torchpt.paths.surface import shading_normal
+from torchpt.physics.bsdfs.base import Bsdf, Parameters
+from torchpt.physics.bsdfs.records import BsdfSample
+from torchpt.physics.cameras.base import Camera
+from torchpt.physics.film.filters import Filter, Tabulated
+from torchpt.physics.lights.base import Cone, Light, Row, Setting
+from torchpt.physics.lights.records import Lights, LightSample
+from torchpt.physics.samplers import Dimension, Draws
+from torchpt.physics.samplers.base import Points
+from torchpt.physics.shapes import interact, offset_origin
+from torchpt.physics.shapes.base import Shape, Surface, placed
+from torchpt.physics.shapes.geometry import Hit, Interaction
+from torchpt.physics.shapes.quadrics import Form, Quadric
+from torchpt.physics.textures.computed import Computed
+from torchpt.physics.world import World
+from torchpt.spec import Angle, Choice, Color, Flag, Moves, Other, Refused, Scalar, Whole
+
+__all__ = [
+    "LIGHT_CHOICE",
+    "SAMPLES",
+    "STRATEGY",
+    "Angle",
+    "Bsdf",
+    "BsdfSample",
+    "Camera",
+    "Choice",
+    "Color",
+    "Computed",
+    "Cone",
+    "Dimension",
+    "DirectLight",
+    "Drawn",
+    "Draws",
+    "Emission",
+    "Field",
+    "FilmLayer",
+    "Filter",
+    "FirstSurface",
+    "FirstSurfaceIntegrator",
+    "Flag",
+    "Form",
+    "Frame",
+    "Hit",
+    "Interaction",
+    "Light",
+    "LightSample",
+    "Lights",
+    "Limits",
+    "Moves",
+    "Other",
+    "Parameters",
+    "Path",
+    "PathState",
+    "Points",
+    "Quadric",
+    "Refused",
+    "Row",
+    "Scalar",
+    "Seen",
+    "Setting",
+    "Shadow",
+    "Shape",
+    "Splat",
+    "StageContext",
+    "Surface",
+    "SurfaceLayer",
+    "Tabulated",
+    "Transmission",
+    "VertexInput",
+    "VertexOutput",
+    "Whole",
+    "World",
+    "concentric_disk",
+    "cosine_hemisphere",
+    "dot",
+    "interact",
+    "luminance",
+    "no_shadow",
+    "normalize",
+    "offset_origin",
+    "placed",
+    "power_heuristic",
+    "shading_normal",
+    "uniform_hemisphere",
+    "uniform_sphere",
+]

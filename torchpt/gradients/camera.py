@@ -1,0 +1,268 @@
+"""Gradients by the camera: what it sees stays in place, and the picture moves over it.
+
+A loss is an integral over the film, ``∫ C(p) L(p) dp``: ``C`` are the cotangents of pixels, each under its filter, ``L`` the
+radiance that is seen at ``p``. A point that is held on its surface while the camera moves is seen at ``p(θ)``, and sends as
+much light to it as before, but for what its material makes of another direction. So, by parts,
+
+    d/dθ ∫ C L dp  =  ∫ (C div u + u · ∇C) L dp  +  ∫ C dL/dθ dp  +  edges,      u = dp/dθ.
+
+The first term weighs paths by how their film area changes, and by the slopes of filters. Filters are seen together: a path
+counts in all pixels in which its place lies, as a gradient of a smooth loss has little of the slope of one filter. A box has
+jumps in place of slopes, and there paths through the borders of pixels carry light from one to the next. The second term is the
+material's part. It is the material form of Zhang et al. (*Path-Space Differentiable Rendering*, 2020) with the first point
+held too, and the borders are the boundary of its pixel.
+
+No derivative is taken of what happens behind the first point. Where that slides along its surface while later points stay,
+the geometry term of two points at distance r has a derivative of the order of 1/r: near the corners of a room its absolute
+value has no mean, and the visibility between all points changes. Here edges are only those where nearer things hide others.
+With the radiance ``L`` behind and the motions of both sides they are ``∮ C L (u_near - u_behind) · n``: nothing where the
+camera turns or its angle of view changes, which moves both alike, and nothing at creases. :mod:`torchpt.gradients.edges` takes
+that term.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.core.memory import Span
+from torchpt.engines import tensors
+from torchpt.gradients.parameters import Assembly, attached
+from torchpt.gradients.sums import Sums
+from torchpt.gradients.tape import chunk_by_chunk, counted
+from torchpt.math.vectors import dot, normalize, take
+from torchpt.paths.integrators.path import PathIntegrator
+from torchpt.paths.state import PathState
+from torchpt.paths.wave import Wave, camera_state
+from torchpt.physics.samplers import Dimension, Draws, salts
+from torchpt.physics.shapes import interact
+from torchpt.scene import Scene
+from torchpt.scene.settings import Settings
+from torchpt.spec import Moves
+
+__all__ = ["by_film", "follows", "suits"]
+
+#: Makes the seed of paths through borders another one.
+_OTHER = 0x2545F491
+
+#: How samples ``(3, ...)`` count in pixels.
+Count = Callable[[Tensor], Tensor]
+
+
+def suits(scene: Scene, settings: Settings, wanted: Iterable[str]) -> bool:
+    """Return True where gradients by the parameters ``wanted`` are taken in this form.
+
+    The camera moves, no surface does, and every ray ends at the first one: what lets some rays pass has no place to be held at.
+    """
+    moving = [name for name in wanted if scene.spec(name).moves is Moves.SURFACES]
+    of_camera = bool(moving) and all(name.startswith("camera.") for name in moving)
+    if not of_camera or any(owner.material.opacity != 1.0 for owner in (*scene.built.parts, *scene.built.copies)):
+        return False
+    return scene.description.camera.kind.projects and isinstance(settings.integrator, PathIntegrator)
+
+
+def follows(scene: Scene, wanted: Iterable[str]) -> bool:
+    """Return True where directions follow surfaces in it: those behind mirrors and glass, or where others ask for it."""
+    owners = [*scene.built.parts, *scene.built.copies]
+    bent = any(material.model.delta for owner in owners for material in owner.material.all())
+    return bent or attached(scene, [name for name in wanted if not name.startswith("camera.")])
+
+
+def by_film(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
+    """Reverse mode in this form, a chunk at a time.
+
+    Args:
+        assembly: what waves read.
+        settings: of the backward pass.
+        asked: derivatives by the pixels ``(3, H W)``.
+        sums: what is added to.
+
+    Raises:
+        RenderError: not even the tape of a single lane fits in memory.
+    """
+    still, wave, spp = assembly.wave, assembly.taped, settings.render.spp
+    count = partial(counted, settings)
+
+    def inner(span: Span) -> tuple[Tensor, Tensor]:
+        return count(interior(still, wave, span)).sum(1) / spp, asked[:, span[0] : span[0] + span[1]]
+
+    def splat(span: Span) -> tuple[Tensor, Tensor]:
+        values = splats(still, wave, span, spp, asked, count)
+        return values, torch.ones_like(values)
+
+    def border(upright: bool, each: int, span: Span) -> tuple[Tensor, Tensor]:
+        values = borders(still, wave, upright, span, each, asked, count)
+        return values, torch.ones_like(values)
+
+    _, _, width, height = still.crop
+    if not still.filter.jumps:
+        chunk_by_chunk(assembly, settings, sums, splat, cells(still), spp)
+        return
+    each = -(-spp // 4)
+    chunk_by_chunk(assembly, settings, sums, inner, width * height, spp)
+    for upright, number in borders_of(still):
+        chunk_by_chunk(assembly, settings, sums, partial(border, upright, each), number, each)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Surfaces that are seen at places of the film, held where they are."""
+
+    state: PathState  # camera rays that follow the camera to the points
+    x: Tensor  # (N,) where on the film, in pixels, differentiable
+    y: Tensor  # (N,) likewise
+    stretch: Tensor  # (N,) of value 1: film area, differentiable
+
+
+def interior(still: Wave, wave: Wave, span: Span) -> Tensor:
+    """Radiance ``(3, samples, pixels)`` whose derivative is that of pixels under a box, but for their borders.
+
+    Args:
+        still: a wave of detached parameters.
+        wave: the same under a tape.
+        span: as of :func:`torchpt.engines.tensors.radiance`.
+    """
+    with torch.no_grad():
+        state = still.rays(*span)
+    seen = _held(still, wave, state)
+    return (_brought(wave, seen.state) * seen.stretch).view(3, span[3], span[1])
+
+
+def borders(still: Wave, wave: Wave, upright: bool, span: Span, samples: int, asked: Tensor, count: Count) -> Tensor:
+    """Return what moves through borders of pixels is worth, ``(3, N)``: values are 0, derivatives are not.
+
+    Args:
+        still: a wave of detached parameters.
+        wave: the same under a tape.
+        upright: borders between neighbours in a row; else in a column.
+        span: first border, how many, first sample, how many of them.
+        samples: of each border, in all.
+        asked: derivatives by the pixels ``(3, H W)``.
+        count: how samples count in pixels.
+    """
+    x0, y0, width, _ = still.crop
+    columns = width + 1 if upright else width
+    column, row, offset, key = _cells(still, span, columns, samples, int(upright))
+    along = offset[0]
+    with torch.no_grad():
+        state = _rays(still, column + x0 + (0.0 if upright else along), row + y0 + (along if upright else 0.0), key)
+        brought = count(_brought(still, state))
+        before = _of_pixel(asked, column - (1 if upright else 0), row - (0 if upright else 1), width)
+        worth = _of_pixel(asked, column, row, width) - before
+    seen = _held(still, wave, state)
+    at = seen.x if upright else seen.y
+    return worth.to(brought.dtype) * brought * (at - at.detach()) / samples
+
+
+def borders_of(still: Wave) -> tuple[tuple[bool, int], ...]:
+    """Upright borders and others: whether they are, and how many."""
+    _, _, width, height = still.crop
+    return (True, (width + 1) * height), (False, width * (height + 1))
+
+
+def splats(still: Wave, wave: Wave, span: Span, samples: int, asked: Tensor, count: Count) -> Tensor:
+    """Return what places all over the film are worth ``(3, N)``, for filters that end without a jump.
+
+    Each path counts in all pixels that see its place: what the derivatives of neighbouring filters have in common cancels.
+
+    Args:
+        still: a wave of detached parameters.
+        wave: the same under a tape.
+        span: first cell, how many, first sample, how many of them; cells are those of :func:`cells`.
+        samples: of each cell, in all.
+        asked: derivatives by the pixels ``(3, H W)``.
+        count: how samples count in pixels.
+    """
+    x0, y0, width, _ = still.crop
+    beyond = _beyond(still)
+    column, row, offset, key = _cells(still, span, width + 2 * beyond, samples, 0)
+    column, row = column - beyond, row - beyond
+    with torch.no_grad():
+        state = _rays(still, column + x0 + offset[0], row + y0 + offset[1], key)
+    seen = _held(still, wave, state)
+    radiance = count(_brought(wave, seen.state) * seen.stretch)
+    reach = range(-beyond, beyond + 1)
+    across = [_filter(still, seen.x - (column + (x0 + k + 0.5))) for k in reach]
+    down = [_filter(still, seen.y - (row + (y0 + k + 0.5))) for k in reach]
+    worth = torch.zeros_like(radiance)
+    for i, along in zip(reach, down, strict=True):
+        for k, weight in zip(reach, across, strict=True):
+            worth = worth + _of_pixel(asked, column + k, row + i, width).to(worth.dtype) * (weight * along)
+    return radiance * worth / samples
+
+
+def cells(still: Wave) -> int:
+    """Return how many cells of a pixel's size there are that any pixel sees."""
+    _, _, width, height = still.crop
+    return (width + 2 * _beyond(still)) * (height + 2 * _beyond(still))
+
+
+def _beyond(still: Wave) -> int:
+    """Return how many pixels a filter reaches beyond its own."""
+    return math.ceil(still.filter.radius - 0.5)
+
+
+def _filter(still: Wave, away: Tensor) -> Tensor:
+    """The filter's profile ``(N,)`` at distances, of integral 1, differentiable."""
+    filter, place = still.filter, away.detach().cpu().double().numpy()
+    ends = np.linspace(-filter.radius, filter.radius, (1 << 12) + 1, dtype=np.float64)
+    middle = 0.5 * (ends[1:] + ends[:-1])
+    whole, step = filter.profile(middle).mean() * 2.0 * filter.radius, 1e-5 * filter.radius
+    slope = (filter.profile(place + step) - filter.profile(place - step)) / (2.0 * step * whole)
+    value = torch.from_numpy(filter.profile(place) / whole).to(away)
+    return value + torch.from_numpy(slope).to(away) * (away - away.detach())
+
+
+def _of_pixel(asked: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
+    """Return what is asked ``(3, N)`` of pixels; nothing beyond the picture."""
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < asked.shape[1] // width)
+    return torch.where(inside, take(asked, torch.where(inside, row * width + column, 0)), 0.0)
+
+
+def _cells(still: Wave, span: Span, columns: int, samples: int, stream: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Columns and rows ``(N,)`` of cells or borders, places within them ``(2, N)`` and keys of paths of their own."""
+    first, count, start, several = span
+    device = still.centre.device
+    cell = torch.arange(first, first + count, device=device).repeat(several)
+    sample = torch.arange(start, start + several, device=device).repeat_interleave(count)
+    sampler = replace(still.sampler, seed=still.sampler.seed ^ _OTHER, spp=samples, randomizations=1)
+    key = sampler.key(2 * cell + stream, sample)
+    offset = Draws(sampler.points, key, salts(0, device)).two(Dimension.PIXEL).to(still.context.plan.dtype)
+    return cell % columns, cell // columns, offset, key
+
+
+def _rays(still: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
+    """Camera rays through places of the film."""
+    dtype = still.context.plan.dtype
+    o, d = still.camera.rays(x.to(dtype), y.to(dtype), None)
+    return camera_state(o.expand_as(d), d, key)
+
+
+def _brought(wave: Wave, state: PathState) -> Tensor:
+    """Radiance ``(3, N)`` that camera rays bring."""
+    return tensors.trace(wave, state)
+
+
+def _held(still: Wave, wave: Wave, state: PathState) -> _Seen:
+    """Return what camera rays of detached parameters meet, as a camera under a tape sees it."""
+    world = still.context.world
+    with torch.no_grad():
+        hit = tensors.hits(still, state)
+        missed = hit.prim < 0
+        at = interact(world, state.o, state.d, replace(hit, prim=hit.prim.clamp_min(0)), True)
+        p, n = torch.where(missed, 0.0, at.p), torch.where(missed, 0.0, at.ng)
+    origin = wave.camera.origin()
+    offset = torch.where(missed, state.d, p - origin)  # what is infinitely far moves with no step of the camera
+    x, y, scale = wave.camera.project(offset)
+    area = scale * torch.where(missed, 1.0, dot(n, offset).abs())
+    value = area.detach()
+    stretch = torch.where(value > 0, area / torch.where(value > 0, value, 1.0), 1.0)
+    towards = normalize(offset)
+    o = state.o + (origin - origin.detach())
+    return _Seen(replace(state, o=o, d=state.d + (towards - towards.detach())), x, y, stretch)

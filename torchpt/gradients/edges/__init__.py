@@ -1,0 +1,15 @@
+"""Boundary terms of derivatives: what silhouettes and shadow edges that move add to a gradient.
+
+``bodies`` has what moves, ``curves`` the curves along which visibility may jump, ``primary`` those that the camera sees, and
+their samples; ``shadows`` those that may throw shadows, points on lights, and the edges of shadows; ``vertices`` what surfaces
+make of light; ``traced`` traces their rays. ``gradients`` adds it all up; ``layers`` does so for layers of first surfaces,
+their interior included.
+"""
+
+from __future__ import annotations
+
+from torchpt.gradients.edges.curves import left_out, without_gradient
+from torchpt.gradients.edges.gradients import add_gradients, concerns
+from torchpt.gradients.edges.layers import Asked, differentiable, followed
+
+__all__ = ["Asked", "add_gradients", "concerns", "differentiable", "followed", "left_out", "without_gradient"]

@@ -1,0 +1,137 @@
+"""What can be hit, the camera and the lights as float64 tensors whose derivatives edges need, and points held on them.
+
+A point of a primitive is affine in three numbers of its own: ``p0 + a0 e1 + a1 e2 + a2 e3``; of a sphere the axes are those of
+the world times its radius. So curves of primitives are written in these numbers, and a point that is held on its surface is
+its primitive and three constants. On an outline that slides over a round surface that is enough: the surface moves along the
+line of sight there, so that its points and the outline have the same motion across the outline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import affine, normalize, take
+from torchpt.math.vectors import rows as columns
+from torchpt.physics.cameras import Camera
+from torchpt.physics.shapes.geometry import Copies
+from torchpt.scene import Scene
+from torchpt.scene.settings import Film
+from torchpt.scene.world.primitives import copies_of, copy_maps, corners_of, primitives_of
+
+__all__ = ["Bodies", "Held", "bodies_of"]
+
+
+@dataclass(frozen=True)
+class Held:
+    """Points that stay on their primitives."""
+
+    prim: Tensor  # (N,) int64 as the search gives them
+    a: Tensor  # (3, N) float64
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Places of primitives, camera and lights, float64.
+
+    Attributes:
+        p0, e1, e2: ``(3, P)``.
+        e3: ``(3, Q)`` of the quadrics, which come last.
+        counts: as in :class:`~torchpt.physics.shapes.geometry.Geometry`.
+        copies: instances; None where there are none.
+        camera: in the lanes' coordinates.
+        lights: ``(3, L)`` where point and spot lights are, and where directional ones go, by their order among the sources.
+    """
+
+    p0: Tensor
+    e1: Tensor
+    e2: Tensor
+    e3: Tensor
+    counts: tuple[int, int, int, int, int]
+    copies: Copies | None
+    camera: Camera
+    lights: Tensor
+
+    @cached_property
+    def first_sphere(self) -> int:
+        """The id of the first sphere."""
+        return sum(self.counts[:3])
+
+    @cached_property
+    def first_quadric(self) -> int:
+        """The id of the first quadric."""
+        return sum(self.counts[:4])
+
+    def place(self, prim: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Origin and three axes ``(3, N)`` each of primitives ``(N,)``; the third of flat ones is zero."""
+        table = None
+        if self.copies is not None:
+            column = torch.searchsorted(self.copies.start[1:], prim, right=True)
+            table = columns(self.copies, column)
+            prim = prim - table.start + table.first
+        p0, x, y = (take(t, prim) for t in (self.p0, self.e1, self.e2))
+        z = torch.zeros_like(p0)
+        if self.counts[4]:
+            mine = prim >= self.first_quadric
+            z = torch.where(mine, take(self.e3, (prim - self.first_quadric).clamp_min(0)), z)
+        if self.counts[3]:
+            ball = (prim >= self.first_sphere) & (prim < self.first_quadric)
+            radius, one = x[0], torch.eye(3, dtype=p0.dtype, device=p0.device)
+            x, y, z = (torch.where(ball, one[:, k : k + 1] * radius, axis) for k, axis in enumerate((x, y, z)))
+        if table is not None:
+            p0, x, y = _moved(table, p0) + table.move, _moved(table, x), _moved(table, y)
+        return p0, x, y, z
+
+    def points(self, held: Held) -> Tensor:
+        """Where points are ``(3, N)``."""
+        p0, x, y, z = self.place(held.prim)
+        return affine(p0 + x * held.a[0], y, held.a[1], z, held.a[2])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All that may move, by name."""
+        found = {name: getattr(self, name) for name in ("p0", "e1", "e2", "e3", "lights")}
+        if self.copies is not None:
+            found |= {f"copies.{name}": getattr(self.copies, name) for name in ("x", "y", "z", "move")}
+        own = ((f.name, getattr(self.camera, f.name)) for f in fields(self.camera))
+        return found | {f"camera.{name}": value for name, value in own if isinstance(value, Tensor)}
+
+    def having(self, tensors: Mapping[str, Tensor]) -> Bodies:
+        """The same of other tensors, named as :meth:`tensors` names them."""
+
+        def of(stem: str) -> dict[str, Tensor]:
+            return {name.removeprefix(stem): t for name, t in tensors.items() if name.startswith(stem)}
+
+        own = {name: tensors[name] for name in ("p0", "e1", "e2", "e3", "lights")}
+        copies = None if self.copies is None else replace(self.copies, **of("copies."))
+        return replace(self, **own, copies=copies, camera=replace(self.camera, **of("camera.")))
+
+
+def _moved(table: Copies, w: Tensor) -> Tensor:
+    return affine(table.x * w[0], table.y, w[1], table.z, w[2])
+
+
+def bodies_of(scene: Scene, film: Film, params: Mapping[str, Tensor]) -> Bodies:
+    """What moves in a scene under ``params``, differentiable in them."""
+    built, space, merged = scene.built, scene.space, scene.merged(params)
+    wide = torch.float64
+    corners = [corners_of(part, merged, space, wide) for part in built.parts]
+    primitives = primitives_of(built.parts, corners, wide, scene.device)
+    copies = None
+    if built.copies:
+        copies = copies_of(copy_maps(built.parts, primitives.sizes, built.copies, merged, space), built.copies, wide)
+    e3 = torch.zeros(3, 0, dtype=wide, device=scene.device) if primitives.frame is None else primitives.frame[9:12]
+    places = []
+    for source in built.sources:
+        place = torch.zeros(3, dtype=wide, device=scene.device)
+        if source.kind in ("point", "spot"):
+            place = space.point(merged[f"{source.name}.position"])
+        elif source.kind == "directional":
+            place = normalize(merged[f"{source.name}.direction"].double()[:, None])[:, 0]
+        places.append(place)
+    lights = torch.stack(places, 1) if places else torch.zeros(3, 0, dtype=wide, device=scene.device)
+    camera = scene.camera(film, merged, wide)
+    return Bodies(primitives.p0, primitives.e1, primitives.e2, e3, primitives.counts, copies, camera, lights)

@@ -1,0 +1,443 @@
+"""Curves along which visibility may jump: edges of meshes, outlines of smooth bodies, and what is left out of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.core.tree import map_leaves
+from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.math.vectors import cross, dot, take
+from torchpt.paths.integrators.path import PathIntegrator
+from torchpt.physics.parts import Part
+from torchpt.physics.shapes.geometry import KINDS
+from torchpt.physics.shapes.quadrics import Form
+from torchpt.scene import Scene
+from torchpt.scene.prepare import kept
+from torchpt.scene.settings import Settings
+
+__all__ = [
+    "Curves",
+    "Edges",
+    "Folds",
+    "Rounds",
+    "View",
+    "edges_of",
+    "folds_of",
+    "generator",
+    "joined",
+    "known",
+    "left_out",
+    "mesh_edges",
+    "own_view",
+    "plain_of",
+    "rims",
+    "round_outline",
+    "rounds_of",
+    "straight",
+    "without_gradient",
+]
+
+
+# ---- The edges of a mesh: which two faces meet at each, once a scene
+#
+# Vertices that lie at one place are one here, whatever a file made of them: a cube has four vertices a side, and still twelve
+# edges. An edge is told by a corner of each of its faces, so that it moves as the vertices of both do.
+
+
+@dataclass(frozen=True)
+class Edges:
+    """E edges of one mesh; corners are numbered as the mesh's own faces have them.
+
+    Attributes:
+        face: ``(2, E)`` int64 the two faces; the second is that of the first where there is none.
+        first: ``(2, E)`` int64 the corner of each face at which the edge begins.
+        last: ``(2, E)`` where it ends.
+        other: ``(2, E)`` the corner off the edge.
+        border: ``(E,)`` bool: one face alone.
+        split: ``(E,)`` bool: whether the faces have vertices of their own, so that normals and texture coordinates may jump.
+    """
+
+    face: Tensor
+    first: Tensor
+    last: Tensor
+    other: Tensor
+    border: Tensor
+    split: Tensor
+
+
+def edges_of(part: Part, device: torch.device) -> Edges:
+    """The edges of a mesh, on a device."""
+    assert part.faces is not None and part.vertices is not None
+    faces, vertices = part.faces, part.vertices
+    _, welded = np.unique(vertices, axis=0, return_inverse=True)
+    corners = welded.reshape(-1)[faces]  # (F, 3)
+    count = len(faces)
+    face = np.tile(np.arange(count), 3)
+    begin, end = np.repeat(np.arange(3), count), np.repeat((1, 2, 0), count)
+    a, b = corners[face, begin], corners[face, end]
+    turned = a > b
+    begin, end = np.where(turned, end, begin), np.where(turned, begin, end)
+    key = np.minimum(a, b).astype(np.int64) * (len(vertices) + 1) + np.maximum(a, b)
+    order = np.argsort(key, kind="stable")
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    size = np.diff(starts, append=len(order))
+    # Of more than two faces at an edge each is a border of its own.
+    pairs, alone = starts[size == 2], order[np.repeat(size != 2, size)]
+    one, two = np.concatenate((order[pairs], alone)), np.concatenate((order[pairs + 1], alone))
+    split = np.zeros(len(one), bool)
+    for corner in (begin, end):
+        split |= faces[face[one], corner[one]] != faces[face[two], corner[two]]
+
+    def columns(values: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.stack((values[one], values[two])).astype(np.int64)).to(device)
+
+    border = torch.from_numpy(np.arange(len(one)) >= len(pairs)).to(device)
+    other = columns(3 - begin - end)
+    return Edges(columns(face), columns(begin), columns(end), other, border, torch.from_numpy(split).to(device))
+
+
+# ---- Curves on primitives along which visibility may jump: borders, edges of meshes, rims, and outlines of round surfaces
+#
+# A curve is written in the numbers of its primitive (:mod:`torchpt.gradients.edges.bodies`): straight, ``a + t b``, or round,
+# ``a + cos(t) b + sin(t) c``. Where it is seen from is a homogeneous place ``(e, w)``: from a point ``p`` it lies toward
+# ``e - w p``; ``w`` is 1 for a place and 0 for a direction.
+
+
+#: Numbers of a triangle's corners.
+_CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class View:
+    """Where curves are seen from: ``e (3, N)`` or ``(3, 1)``, and ``w``, 1 for places, 0 for directions."""
+
+    e: Tensor
+    w: Tensor | float
+
+    def toward(self, p: Tensor) -> Tensor:
+        """From points ``(3, N)`` to where they are seen from; of no particular length."""
+        return self.e - p * self.w
+
+
+@dataclass(frozen=True)
+class Curves:
+    """N curves, or N pieces of some."""
+
+    prim: Tensor  # (N,) int64
+    mate: Tensor  # (N,) int64 the other face at an edge; -1: there is none
+    a: Tensor  # (3, N)
+    b: Tensor  # (3, N)
+    c: Tensor  # (3, N)
+    round: Tensor  # (N,) bool
+    low: Tensor  # (N,) from where t runs
+    high: Tensor  # (N,) to where
+
+    def within(self, low: Tensor, high: Tensor) -> Curves:
+        """The same from ``low`` to ``high``."""
+        return replace(self, low=low, high=high)
+
+    def at(self, t: Tensor) -> tuple[Held, Tensor]:
+        """Points at ``t (N,)``, and how their numbers change with it ``(3, N)``."""
+        cos, sin = torch.cos(t), torch.sin(t)
+        bent, slope = self.a + cos * self.b + sin * self.c, cos * self.c - sin * self.b
+        a = torch.where(self.round, bent, self.a + t * self.b)
+        return Held(self.prim, a), torch.where(self.round, slope, self.b)
+
+    def moving(self, bodies: Bodies, t: Tensor) -> tuple[Held, Tensor, Tensor]:
+        """Points at ``t (N,)``: held, where they are ``(3, N)``, and how that changes with ``t`` ``(3, N)``."""
+        held, slope = self.at(t)
+        p0, x, y, z = bodies.place(held.prim)
+        along = x * slope[0] + y * slope[1] + z * slope[2]
+        return held, p0 + x * held.a[0] + y * held.a[1] + z * held.a[2], along
+
+
+def joined(parts: list[Curves]) -> Curves:
+    """Return curves one after another."""
+    return map_leaves(lambda *same: torch.cat(same, -1), *parts)
+
+
+def straight(prim: Tensor, begin: Tensor, end: Tensor, mate: Tensor | None = None) -> Curves:
+    """Segments between numbers ``(3, N)``, ``t`` from 0 to 1."""
+    zero, one = torch.zeros_like(begin[0]), torch.ones_like(begin[0])
+    mate = torch.full_like(prim, -1) if mate is None else mate
+    return Curves(prim, mate, begin, end - begin, torch.zeros_like(begin), zero.bool(), zero, one)
+
+
+def circles(prim: Tensor, middle: Tensor, b: Tensor, c: Tensor) -> Curves:
+    """Whole circles, ``t`` from 0 to 2 pi."""
+    zero = torch.zeros_like(middle[0])
+    return Curves(prim, torch.full_like(prim, -1), middle, b, c, zero == 0, zero, zero + 2.0 * math.pi)
+
+
+def mesh_edges(edges: Edges, index: Tensor, first: int, turned: bool) -> tuple[Curves, tuple[Held, Held]]:
+    """Some edges of a mesh, and the corners of both faces that lie off them.
+
+    Args:
+        edges: of the mesh.
+        index: which ``(N,)``.
+        first: id of the mesh's, or copy's, first triangle.
+        turned: whether its triangles have their last two corners exchanged.
+    """
+    table = torch.tensor([(*corner, 0.0) for corner in _CORNERS], dtype=torch.float64, device=index.device).T
+    table = table[:, [0, 2, 1]] if turned else table
+
+    def numbers(corner: Tensor) -> Tensor:
+        return take(table, take(corner, index))
+
+    one, two = (take(edges.face[k], index) + first for k in range(2))
+    mate = torch.where(take(edges.border, index), -1, two)
+    curves = straight(one, numbers(edges.first[0]), numbers(edges.last[0]), mate)
+    return curves, (Held(one, numbers(edges.other[0])), Held(two, numbers(edges.other[1])))
+
+
+def borders(prim: Tensor) -> Curves:
+    """The four borders of parallelograms ``prim (N,)``: ``4 N`` curves."""
+    around = torch.tensor(
+        [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)], dtype=torch.float64, device=prim.device
+    ).T
+    n = len(prim)
+    begin, end = around.repeat_interleave(n, 1), around.roll(-1, 1).repeat_interleave(n, 1)
+    return straight(prim.repeat(4), begin, end)
+
+
+def rims(prim: Tensor, height: float = 0.0, radius: float = 1.0) -> Curves:
+    """Circles about the third axis of disks and quadrics ``prim (N,)``."""
+    zero = torch.zeros(3, len(prim), dtype=torch.float64, device=prim.device)
+    middle, b, c = zero.clone(), zero.clone(), zero.clone()
+    middle[2], b[0], c[1] = height, radius, radius
+    return circles(prim, middle, b, c)
+
+
+def own_view(bodies: Bodies, prim: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    """Where primitives ``(N,)`` are seen from in their own space: ``(3, N)`` and ``(N,)``."""
+    p0, x, y, z = bodies.place(prim)
+    faces = cross(y, z), cross(z, x), cross(x, y)
+    away = view.toward(p0)
+    inverse = 1.0 / dot(x, faces[0])
+    w = torch.as_tensor(view.w, dtype=p0.dtype, device=p0.device).expand(p0.shape[1])
+    return torch.stack([dot(face, away) * inverse for face in faces]), w
+
+
+def round_outline(bodies: Bodies, prim: Tensor, view: View) -> tuple[Curves, Tensor]:
+    """Outlines of spheres and ellipsoids ``prim (N,)``, and where there is one ``(N,)``: not as seen from within.
+
+    On the unit sphere the normal is the point: ``q . c = w``, a circle.
+    """
+    c, w = own_view(bodies, prim, view)
+    far = dot(c, c)
+    some = far > w * w * (1.0 + 1e-12)
+    far = torch.where(some, far, 1.0)
+    axis = c / far.sqrt()
+    aside = torch.where(axis[0:1].abs() < 0.6, _unit(axis, 0), _unit(axis, 1))
+    b = cross(axis, aside)
+    b = b / dot(b, b).sqrt()
+    radius = (1.0 - w * w / far).clamp_min(0.0).sqrt()
+    return circles(prim, c * (w / far), b * radius, cross(axis, b) * radius), some
+
+
+def _unit(like: Tensor, k: int) -> Tensor:
+    unit = torch.zeros_like(like)
+    unit[k] = 1.0
+    return unit
+
+
+def generator(bodies: Bodies, prim: Tensor, form: Form, view: View, side: Tensor) -> tuple[Curves, Tensor]:
+    """One of the two lines of a cylinder's or cone's outline, by ``side (N,)`` of 1 or -1; and where there is one.
+
+    With ``(x, y)`` the radius times ``(cos t, sin t)`` the tangent plane holds the place where ``x c0 + y c1 = w`` on a
+    cylinder, ``w - c2`` on a cone whose tip is at 1.
+    """
+    c, w = own_view(bodies, prim, view)
+    pointed = form.bend < 0
+    wanted = w - c[2] if pointed else w
+    far = (c[0] * c[0] + c[1] * c[1]).sqrt()
+    some = far > wanted.abs() * (1.0 + 1e-12)
+    t = torch.atan2(c[1], c[0]) + side * torch.acos((wanted / torch.where(some, far, 1.0)).clamp(-1.0, 1.0))
+    zero = torch.zeros_like(t)
+    low = torch.stack((torch.cos(t), torch.sin(t), zero))
+    high = torch.stack((zero, zero, zero + 1.0)) if pointed else torch.stack((low[0], low[1], zero + 1.0))
+    return straight(prim, low, high), some
+
+
+# ---- The curves of a scene, owner by owner: those that are there anyway, and round ones, whose outlines depend on the place
+
+
+#: Faces whose unit normals differ by less make no crease.
+_FLAT = 1e-6
+
+
+@dataclass(frozen=True)
+class Folds:
+    """Edges of one mesh, or of one of its copies."""
+
+    curves: Curves
+    others: tuple[Held, Held]  # corners of the two faces off the edge
+    border: Tensor  # (N,) bool
+    crease: Tensor  # (N,) bool: where both faces are seen what is seen may jump
+    normals: tuple[Tensor, Tensor]  # (3, N) unit, of the two faces
+
+
+@dataclass(frozen=True)
+class Rounds:
+    """Round surfaces of one kind."""
+
+    prim: Tensor  # (N,)
+    form: Form | None  # of cylinders and cones; None: spheres and ellipsoids
+
+
+def known(form: Form) -> bool:
+    """Whether the outline of a quadric is known: ellipsoids, cylinders and cones."""
+    return form.around or (form.half == 0 and (form.bend == 0 or (form.bend < 0 and form.level == 0)))
+
+
+def _starts(parts: tuple[Part, ...], bodies: Bodies) -> list[int]:
+    """The id of the first primitive of each part."""
+    starts, at = [], 0
+    for part in parts:
+        starts.append(at)
+        at += len(part.faces) if part.faces is not None else 1
+    assert at == sum(bodies.counts)
+    return starts
+
+
+def _topology(scene: Scene, part: Part) -> Edges:
+    made = kept(scene).outlines
+    if part.name not in made:
+        made[part.name] = edges_of(part, scene.device)
+    return made[part.name]
+
+
+def folds_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Iterator[Folds]:
+    """The edges of each mesh, and of each copy.
+
+    Args:
+        scene: whose.
+        bodies: detached.
+        poses: the parameters.
+    """
+    parts = scene.built.parts
+    starts = dict(zip((part.name for part in parts), _starts(parts, bodies), strict=True))
+    for part in parts:
+        if part.kind != KINDS[0]:
+            continue
+        edges = _topology(scene, part)
+        turned = bool(torch.linalg.det(poses[f"{part.name}.to_world"][:3, :3].double()) < 0)
+        firsts = [starts[part.name]]
+        if bodies.copies is not None:
+            mine = [k for k, copy in enumerate(scene.built.copies, 1) if copy.of == part.name]
+            firsts += bodies.copies.start[mine].tolist()
+        every = torch.arange(len(edges.border), device=scene.device)
+        for first in firsts:
+            curves, others = mesh_edges(edges, every, first, turned)
+            normals = (_normal(bodies, others[0].prim), _normal(bodies, others[1].prim))
+            bent = dot(normals[0] - normals[1], normals[0] - normals[1]) > _FLAT**2
+            crease = edges.split & (bent | (part.uvs is not None)) if part.smooth else bent
+            yield Folds(curves, others, edges.border, crease & ~edges.border, normals)
+
+
+def _normal(bodies: Bodies, prim: Tensor) -> Tensor:
+    _, x, y, _ = bodies.place(prim)
+    n = cross(x, y)
+    return n / dot(n, n).clamp_min(torch.finfo(n.dtype).tiny).sqrt()
+
+
+def plain_of(scene: Scene, bodies: Bodies) -> Curves | None:
+    """Borders of rectangles, rims of disks, and the open ends of cylinders and cones; None where there are none.
+
+    The rim of a closed one is that of its disk.
+    """
+    found: list[Curves] = []
+    ends = torch.tensor((0, *bodies.counts)).cumsum(0).tolist()
+
+    def ids(low: int, high: int) -> Tensor:
+        return torch.arange(low, high, device=scene.device)
+
+    if bodies.counts[1]:
+        found.append(borders(ids(ends[1], ends[2])))
+    if bodies.counts[2]:
+        found.append(rims(ids(ends[2], ends[3])))
+    parts = scene.built.parts
+    for part, start in zip(parts, _starts(parts, bodies), strict=True):
+        if part.quadric is None or part.piece or part.quadric.form.around or not known(part.quadric.form):
+            continue
+        found.append(rims(ids(start, start + 1)))
+        if part.quadric.form.bend == 0:
+            found.append(rims(ids(start, start + 1), height=1.0))
+    return joined(found) if found else None
+
+
+def rounds_of(scene: Scene, bodies: Bodies) -> list[Rounds]:
+    """The surfaces that have outlines."""
+    parts, found = scene.built.parts, []
+    forms: dict[Form | None, list[int]] = {}
+    for part, start in zip(parts, _starts(parts, bodies), strict=True):
+        if part.kind == "sphere":
+            forms.setdefault(None, []).append(start)
+        elif part.quadric is not None and known(part.quadric.form):
+            forms.setdefault(None if part.quadric.form.around else part.quadric.form, []).append(start)
+    for form, prims in forms.items():
+        found.append(Rounds(torch.tensor(prims, device=scene.device), form))
+    return found
+
+
+# ---- What of a scene moves edges that no estimator knows, for the warning; what no scene tells beforehand stands in the docs
+
+
+#: Of a spot: where its light ends, and where it begins to fade.
+_RIM = ("cutoff_angle", "beam_width")
+
+
+def left_out(scene: Scene, settings: Settings) -> list[str]:
+    """Edges of the scene that are not differentiated where surfaces, lights or the camera move, each in a few words."""
+    return list(_found(scene, settings))
+
+
+def _found(scene: Scene, settings: Settings) -> Iterator[str]:
+    built, camera = scene.built, scene.description.camera.kind
+    if camera.lens:
+        yield "those that a lens blurs"
+    elif scene.camera(settings.film, scene.params, torch.float64).film_of(_point(scene.device)) is None:
+        yield f"those that a camera of kind {camera.name} sees"
+    materials = [owner.material for owner in (*built.parts, *built.copies)]
+    if any(part.model.delta for material in materials for part in material.all()):
+        yield "those seen in mirrors and clear glass, and of light that these send on"
+    if any(material.opacity != 1.0 for material in materials):
+        yield "those of surfaces that are not opaque"
+    nodes = [node for material in materials for node in material.readings()]
+    if any(getattr(node, "nearest", False) and not node.filtered for node in nodes):
+        yield "those within textures that are not interpolated"
+    if any(part.quadric is not None and not known(part.quadric.form) for part in built.parts):
+        yield "outlines of quadrics of kinds of your own"
+    if any(source.kind == "spot" and _sharp(scene, source.name) for source in built.sources):
+        yield "the rims of spots that do not fade out"
+    if not isinstance(settings.integrator, PathIntegrator):
+        yield f"edges of shadows where the integrator is {settings.integrator.name}"
+
+
+def _point(device: torch.device) -> Tensor:
+    """Any point ``(3, 1)``: whether a camera has a film for points does not depend on it."""
+    return torch.zeros(3, 1, dtype=torch.float64, device=device)
+
+
+def without_gradient(scene: Scene, wanted: Iterable[str]) -> list[str]:
+    """Those of the parameters of which pictures depend by jumps alone, so that their gradients are 0."""
+    owners = [*scene.built.parts, *scene.built.copies]
+    cut = {material.name for owner in owners for material in owner.material.all() if material.alpha_cutoff is not None}
+    rims = {f"{source.name}.{key}" for source in scene.built.sources if source.kind == "spot" for key in _RIM}
+    return [
+        name
+        for name in wanted
+        if (name in rims and _sharp(scene, name.rpartition(".")[0]))
+        or any(name.startswith(f"{own}.opacity") for own in cut)
+    ]
+
+
+def _sharp(scene: Scene, name: str) -> bool:
+    cutoff, beam = (float(scene.params[f"{name}.{key}"].detach()) for key in _RIM)
+    return beam > 0.999 * cutoff

@@ -1,0 +1,77 @@
+"""The film as edges see it: what a change of the radiance at a place of it is worth to the loss, and where points lie on it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchpt.physics.cameras import Camera
+from torchpt.physics.film import Filter
+
+__all__ = ["Worth", "film_places", "slopes"]
+
+
+class Worth:
+    """A cotangent of the picture seen through the reconstruction filter: a pixel is the integral of ``h(s - centre) L(s)``.
+
+    Args:
+        cotangent: ``(C, H, W)`` of the picture or of a layer.
+        filter: of the film.
+        crop: ``(x, y, width, height)`` of the picture on the film.
+    """
+
+    def __init__(self, cotangent: Tensor, filter: Filter, crop: tuple[int, int, int, int]) -> None:
+        self._values = cotangent.double().reshape(cotangent.shape[0], -1)
+        self._filter, self._crop = filter, crop
+        x = torch.linspace(-filter.radius, filter.radius, (1 << 14) + 1, dtype=torch.float64)
+        middle = 0.5 * (x[1:] + x[:-1])
+        self._whole = float(torch.from_numpy(filter.profile(middle.numpy())).mean()) * 2.0 * filter.radius
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Least and greatest x, then y, of what the picture sees of the film."""
+        x, y, width, height = self._crop
+        beyond = max(self._filter.radius - 0.5, 0.0)
+        return x - beyond, x + width + beyond, y - beyond, y + height + beyond
+
+    def at(self, s: Tensor) -> Tensor:
+        """``(C, N)`` at places ``s (2, N)`` of the film, in pixels."""
+        (x0, wx), (y0, wy) = (self._taps(s[k], self._crop[k], self._crop[k + 2]) for k in range(2))
+        width, height = self._crop[2:]
+        total = torch.zeros(len(self._values), s.shape[1], dtype=torch.float64, device=s.device)
+        for j, across in enumerate(wy):
+            row = (y0 + j).clamp(0, height - 1) * width
+            for i, along in enumerate(wx):
+                total += self._values.index_select(1, row + (x0 + i).clamp(0, width - 1)) * (along * across)
+        return total
+
+    def _taps(self, s: Tensor, low: int, size: int) -> tuple[Tensor, list[Tensor]]:
+        """The first pixel ``(N,)`` that sees a coordinate, and the filter there and at those that follow; 0 off the picture."""
+        radius = self._filter.radius
+        first = torch.ceil(s - 0.5 - radius).long() - low
+        weights = []
+        for k in range(math.floor(2.0 * radius) + 1):
+            pixel = first + k
+            away = (s - (pixel + low) - 0.5).cpu().numpy()
+            weight = torch.from_numpy(self._filter.profile(away)).to(s.device) / self._whole
+            # A box ends at once: a place on the border of two pixels is half in each.
+            weight = torch.where((s - (pixel + low) - 0.5).abs() == radius, 0.5 * weight, weight)
+            weights.append(torch.where((pixel >= 0) & (pixel < size), weight, 0.0))
+        return first, weights
+
+
+def film_places(camera: Camera, p: Tensor) -> Tensor:
+    """Places ``(2, N)`` of points ``(3, N)`` on the film; any for those behind the camera."""
+    seen = camera.film_of(p)
+    assert seen is not None
+    return seen[:2] / torch.where(seen[2] > 0, seen[2], 1.0)
+
+
+def slopes(camera: Camera, p: Tensor) -> tuple[Tensor, Tensor]:
+    """Places ``(2, N)`` of points on the film and how they change with them ``(2, 3, N)``, detached."""
+    with torch.enable_grad():
+        leaf = p.detach().clone().requires_grad_()
+        s = film_places(camera, leaf)
+        rows = [torch.autograd.grad(s[k].sum(), leaf, retain_graph=k == 0)[0] for k in range(2)]
+    return s.detach(), torch.stack(rows)

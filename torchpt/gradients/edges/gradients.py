@@ -1,0 +1,230 @@
+"""The gradients that moving edges add: what ``render`` asks for after the interior of the picture is differentiated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import chain
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchpt.core.threads import limited_threads
+from torchpt.gradients.edges.bodies import Bodies, bodies_of
+from torchpt.gradients.edges.draws import Numbers
+from torchpt.gradients.edges.film import Worth
+from torchpt.gradients.edges.primary import Look, pieces_of, primary_of
+from torchpt.gradients.edges.shadows import Shadows, occluders_of, sources_of
+from torchpt.gradients.edges.traced import Traced, traced_of
+from torchpt.paths.integrators.path import PathIntegrator
+from torchpt.ranks import Group, share
+from torchpt.scene import Scene
+from torchpt.scene.settings import Settings
+from torchpt.search.bounds import primitive_bounds
+from torchpt.spec import Moves
+
+__all__ = ["Boundary", "add_gradients", "boundary_of", "concerns"]
+
+#: Samples of a chunk, whose sums are added in order: the same ones whatever the memory. They take about 4 kB each, which is
+#: less in all than any render needs.
+SAMPLES = 1 << 15
+
+
+class Samples(Protocol):
+    """Samples of edges."""
+
+    def sum(self, bodies: Bodies) -> Tensor:
+        """Whose derivative is theirs."""
+        ...
+
+
+def concerns(scene: Scene, names: Iterable[str]) -> bool:
+    """Return True where any of the parameters moves edges."""
+    return any(scene.spec(name).moves in (Moves.SURFACES, Moves.SHADOWS) for name in names)
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """The edges of a backward pass.
+
+    Attributes:
+        scene: whose edges.
+        settings: of the backward pass, its seed included.
+        params: all that replace the scene's, detached.
+        leaves: those that move edges, as leaves of a tape.
+        moving: what moves, on that tape.
+        still: the same detached.
+        traced: what sees.
+        worth: of places on the film.
+        pixels: of the picture.
+        ranks: those that share the samples; None: there is but one process.
+    """
+
+    scene: Scene
+    settings: Settings
+    params: Mapping[str, Tensor]
+    leaves: Mapping[str, Tensor]
+    moving: Mapping[str, Tensor]
+    still: Bodies
+    traced: Traced
+    worth: Worth
+    pixels: int
+    ranks: Group | None = None
+
+    def gradients(self, samples: Iterable[Samples], wanted: Iterable[str]) -> list[Tensor | None]:
+        """Return what samples add to the gradients of ``wanted``; None for those that move no edges."""
+        sums = {name: torch.zeros_like(t) for name, t in self.moving.items()}
+        tensors = self.still.tensors()
+        for found in samples:
+            with torch.enable_grad():
+                own = {name: tensors[name].clone().requires_grad_() for name in sums}
+                value = found.sum(self.still.having({**tensors, **own}))
+            if not value.requires_grad:
+                continue
+            for name, grad in zip(own, torch.autograd.grad(value, list(own.values()), allow_unused=True), strict=True):
+                if grad is not None:
+                    sums[name] += grad
+        if self.ranks is not None:
+            sums = {name: self.ranks.sum(total) for name, total in sums.items()}
+        outputs, inputs = list(self.moving.values()), list(self.leaves.values())
+        grads = torch.autograd.grad(outputs, inputs, list(sums.values()), allow_unused=True)
+        by_name = dict(zip(self.leaves, grads, strict=True))
+        return [by_name.get(name) for name in wanted]
+
+    def primary(self, spp: int, look: Look, held: bool = False) -> Iterator[Samples]:
+        """Samples of the edges that the camera sees, chunk by chunk; ``look``: what rays beside them see.
+
+        ``held``: they count as they move over what is seen beside them.
+        """
+        total = spp * self.pixels
+        if self.moving.keys() <= {"lights"}:  # none of which is seen
+            return
+        with torch.no_grad():
+            pieces = pieces_of(self.scene, self.still, self.scene.merged(self.params), self.worth.bounds())
+        if pieces is None:
+            return
+        primary = primary_of(self.still, pieces, self.traced, Numbers(self.settings.render.seed, 0))
+        for first, count in self._chunks(total):
+            yield primary.samples(first, count, total, self.worth, look, held)
+
+    def shadows(self, spp: int) -> Iterator[Samples]:
+        """Samples of the edges of shadows: of lights, then of what surfaces reflect."""
+        total = spp * self.pixels
+        for shadows in self._shadows():
+            for first, count in self._chunks(total):
+                cast = shadows.samples(first, count, total, self.worth)
+                if cast is not None:
+                    yield cast
+
+    def _shadows(self) -> Iterator[Shadows]:
+        still, integrator, seed = self.still, self.traced.wave.integrator, self.settings.render.seed
+        depth = integrator.limits.max_depth
+        if not isinstance(integrator, PathIntegrator) or 0 <= depth < 2:
+            return
+        with torch.no_grad():
+            occluders = occluders_of(self.scene, still, self.scene.merged(self.params))
+            if occluders is None:
+                return
+            _, geometry = self.scene.world(torch.float32, self.params)
+            low, high = primitive_bounds(geometry)
+            reach = float((high.double().amax(1) - low.double().amin(1)).norm()) * 0.5
+            met = integrator.strategy in ("bsdf", "uniform")
+            sources = sources_of(still, self.traced.wave.context.world, reach, met)
+        if sources is None:
+            return
+        # Where nothing but the camera moves, what it does not see itself stays as it is.
+        onward = any(not name.startswith("camera.") for name in self.leaves)
+        for stream, light in enumerate((sources, None), 1):
+            if light is not None or (not 0 <= depth < 3 and self.moving.keys() - {"lights"}):
+                numbers = Numbers(seed, stream)
+                yield Shadows(still, occluders, light, self.traced, numbers, reach, depth, onward)
+
+    def _chunks(self, total: int) -> Iterator[tuple[int, int]]:
+        """First samples and how many."""
+        for _, first in share(range(0, total, SAMPLES), self.ranks):
+            yield first, min(SAMPLES, total - first)
+
+
+def boundary_of(
+    scene: Scene,
+    settings: Settings,
+    params: Mapping[str, Tensor],
+    wanted: Iterable[str],
+    dtype: torch.dtype,
+    cotangent: Tensor,
+    ranks: Group | None = None,
+) -> Boundary | None:
+    """Return what a backward pass knows of edges; None where none of the parameters moves any.
+
+    Args:
+        scene: whose.
+        settings: of the backward pass, its seed included.
+        params: all that replace the scene's.
+        wanted: names of those that are differentiated.
+        dtype: of the lanes.
+        cotangent: ``(C, H, W)`` of what is differentiated.
+        ranks: those that share the samples.
+
+    Raises:
+        SceneError: settings that this scene cannot be rendered with.
+    """
+    plain = {name: value.detach() for name, value in params.items()}
+    with torch.enable_grad():
+        leaves = {name: plain[name].clone().requires_grad_() for name in wanted if concerns(scene, (name,))}
+        bodies = bodies_of(scene, settings.film, {**plain, **leaves})
+    tensors = bodies.tensors()
+    moving = {name: t for name, t in tensors.items() if t.requires_grad}
+    still = bodies.having({name: t.detach() for name, t in tensors.items()})
+    if not moving or still.camera.film_of(still.camera.origin()) is None:
+        return None
+    with torch.no_grad():
+        traced = traced_of(scene, settings, plain, dtype)
+        worth = Worth(cotangent, traced.wave.filter, traced.wave.crop)
+    pixels = cotangent.shape[1] * cotangent.shape[2]
+    return Boundary(scene, settings, plain, leaves, moving, still, traced, worth, pixels, ranks)
+
+
+def add_gradients(
+    scene: Scene,
+    settings: Settings,
+    params: Mapping[str, Tensor],
+    wanted: tuple[str, ...],
+    dtype: torch.dtype,
+    cotangent: Tensor,
+    samples: int,
+    held: bool = False,
+    ranks: Group | None = None,
+) -> list[Tensor | None]:
+    """Return what moving edges add to the gradients of ``wanted``; None for those that move none.
+
+    Args:
+        scene: whose.
+        settings: of the backward pass, its seed included.
+        params: all that replace the scene's.
+        wanted: names of those that are differentiated.
+        dtype: of the lanes.
+        cotangent: ``(H, W, 3)`` of the picture.
+        samples: of each estimator, a pixel of the picture.
+        held: whether the interior holds in place what the camera sees (:mod:`torchpt.gradients.camera`): edges count as they
+            move over that.
+        ranks: those that share the samples, which are the same on each.
+
+    Raises:
+        SceneError: settings that this scene cannot be rendered with.
+    """
+    with limited_threads(settings.render.threads):
+        cotangent = cotangent.permute(2, 0, 1)
+        every = boundary_of(scene, settings, params, wanted, dtype, cotangent, ranks)
+        if every is None:
+            return [None] * len(wanted)
+        if not held:
+            return every.gradients(chain(every.primary(samples, every.traced.radiance), every.shadows(samples)), wanted)
+        found = every.gradients(every.primary(samples, every.traced.radiance, held=True), wanted)
+        # Shadows move with what they fall on, which is held: only lights move them.
+        lights = [name for name in wanted if not name.startswith("camera.")]
+        thrown = boundary_of(scene, settings, params, lights, dtype, cotangent, ranks)
+        if thrown is None:
+            return found
+        more = thrown.gradients(thrown.shadows(samples), wanted)
+        return [b if a is None else a if b is None else a + b for a, b in zip(found, more, strict=True)]

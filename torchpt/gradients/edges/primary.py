@@ -1,0 +1,402 @@
+"""Edges that the camera sees: samples of them, what lies on both sides, and their share of the gradient."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.curves import (
+    Curves,
+    Folds,
+    View,
+    folds_of,
+    generator,
+    joined,
+    plain_of,
+    round_outline,
+    rounds_of,
+)
+from torchpt.gradients.edges.draws import Choice, Numbers
+from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.gradients.edges.traced import Traced
+from torchpt.math.vectors import cross, dot, rows, take
+from torchpt.scene import Scene
+
+__all__ = [
+    "Along",
+    "Pieces",
+    "Primary",
+    "distance_to",
+    "is_flat",
+    "outline_of",
+    "pieces_of",
+    "share_of",
+    "step_of",
+    "steps_at",
+    "view_of",
+]
+
+
+# ---- How far beside a curve of the film rays are traced, so that they meet what lies along it and nothing beyond
+
+
+#: Of the film's longer side at a slope of 1.
+_STEP = 2.0**-16
+#: Where a face is narrow: a share of what is left of it beside its edge, but not less than this share of a whole step, which is
+#: still some roundings of a ray's direction.
+_SHARE, _LEAST = 0.25, 2.0**-6
+
+
+def step_of(bodies: Bodies) -> float:
+    """A whole step, in pixels: a few hundred roundings of a ray's direction."""
+    width = float(max(bodies.camera.resolution))
+    spread = float(bodies.camera.pixel()[4]) * width  # of the film at distance 1
+    narrow = max(1.0, 1.0 / spread) if float(bodies.camera.pixel()[3]) else 1.0
+    return _STEP * width * narrow
+
+
+def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor) -> Tensor:
+    """Steps ``(N,)`` in pixels: shorter where a ray a whole step beside an edge would pass the whole of a narrow face.
+
+    Args:
+        bodies: detached.
+        faces: the two faces of each edge ``(N,)``; -1: there is none.
+        s: places of the edges on the film ``(2, N)``.
+    """
+    whole = step_of(bodies)
+    room = torch.full_like(s[0], whole / _SHARE)
+    for prim in faces:
+        some = is_flat(bodies, prim).nonzero().squeeze(1)
+        if len(some):
+            corners = outline_of(bodies, prim[some])
+            away = torch.stack([distance_to(s[:, some], a, b) for a, b in corners])
+            # The nearest is the edge itself.
+            room[some] = torch.minimum(room[some], away.sort(0).values[1])
+    return (_SHARE * room).clamp(_LEAST * whole, whole)
+
+
+def outline_of(bodies: Bodies, prim: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """The four sides of parallelograms ``(N,)`` on the film, from ``(2, N)`` to ``(2, N)``; a triangle's last has no length."""
+    triangles, rectangles = bodies.counts[0], sum(bodies.counts[:2])
+    four = (prim >= triangles) & (prim < rectangles)
+    p0, x, y, _ = bodies.place(prim)
+    corners = [p0, p0 + x, torch.where(four, p0 + x + y, p0 + y), torch.where(four, p0 + y, p0)]
+    places = [film_places(bodies.camera, corner) for corner in corners]
+    return list(zip(places, [*places[1:], places[0]], strict=True))
+
+
+def is_flat(bodies: Bodies, prim: Tensor) -> Tensor:
+    """Which primitives ``(N,)`` are triangles or parallelograms; copies are of meshes."""
+    return (prim >= 0) & ((prim < sum(bodies.counts[:2])) | (prim >= sum(bodies.counts)))
+
+
+def distance_to(s: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """From places ``(2, N)`` to segments ``a b``."""
+    along = b - a
+    square = (along * along).sum(0)
+    share = (((s - a) * along).sum(0) / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
+    away = s - a - along * share
+    return (away * away).sum(0).sqrt()
+
+
+# ---- Edges of several surfaces that lie on one another, as where two walls of a room meet: each counts in part
+#
+# Along such a seam both sides of one edge are seen at its own distance, and what is seen beside it ends there too. The two
+# surfaces are taken to stay together; where only one of them moves the derivative is the mean of those to both sides.
+
+
+def share_of(bodies: Bodies, held: Held, mate: Tensor, s: Tensor, prim: Tensor, near: Tensor, step: Tensor) -> Tensor:
+    """Parts ``(N,)`` with which places of edges count.
+
+    Args:
+        bodies: detached.
+        held: the places.
+        mate: the other faces of the edges ``(N,)``; -1: there is none.
+        s: on the film ``(2, N)``.
+        prim: what is seen on both sides ``(2, N)``.
+        near: whether at the edge's own distance ``(2, N)``.
+        step: how far beside the edges that is ``(N,)``, in pixels.
+    """
+    own = prim == held.prim
+    other = torch.where(own[0], prim[1], prim[0])
+    both = near.all(0) & own.any(0) & ~own.all(0)
+    flat = both & (other >= 0) & (mate < 0)
+    flat = flat & is_flat(bodies, other)
+    safe = torch.where(flat, other, 0)
+    if not bool(flat.any()):
+        return torch.ones_like(s[0])
+    away = torch.stack([distance_to(s, a, b) for a, b in outline_of(bodies, safe)]).amin(0)
+    return torch.where(flat & (away < 0.5 * step), 0.5, 1.0)
+
+
+# ---- What of a scene's curves the camera may see: pieces of them on the film, with their lengths there
+
+
+#: Pieces that a round curve is cut into.
+_CUTS = 64
+#: Least weight of a crease against a silhouette of the same length: most creases jump less.
+_CREASE = 0.05
+
+Bounds = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """N pieces of curves to draw places from, evenly by what they weigh.
+
+    Attributes:
+        curves: pieces; of straight ones ``t`` runs evenly on the film, not in space.
+        near: ``(2, N)`` how ``t`` runs: ``h`` of the film at both ends, see :meth:`torchpt.cameras.Camera.film_of`.
+        weight: ``(N,)`` length on the film times importance.
+    """
+
+    curves: Curves
+    near: Tensor
+    weight: Tensor
+
+    def place(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """``t (N,)`` of places ``u`` in [0, 1) along each piece on the film, and ``du / dt``."""
+        a, b = self.near
+        span = self.curves.high - self.curves.low
+        share = u * a / (u * a + (1.0 - u) * b)
+        across = share * b + (1.0 - share) * a
+        return self.curves.low + share * span, a * b / (across * across * span)
+
+
+def view_of(bodies: Bodies) -> View:
+    """The camera as a place or a direction."""
+    pixel = bodies.camera.pixel().detach()
+    return View(pixel[:3, None], float(pixel[3]))
+
+
+def pieces_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], bounds: Bounds) -> Pieces | None:
+    """All that may be seen within ``bounds`` of the film; None where nothing may.
+
+    Args:
+        scene: whose.
+        bodies: detached.
+        poses: the parameters.
+        bounds: least and greatest x, then y.
+    """
+    view = view_of(bodies)
+    found = [_lines(bodies, *_silhouettes(bodies, folds, view), bounds) for folds in folds_of(scene, bodies, poses)]
+    fixed = plain_of(scene, bodies)
+    if fixed is not None:
+        for mine, cut in ((fixed.round, _arcs), (~fixed.round, _lines)):
+            some = rows(fixed, mine.nonzero().squeeze(1))
+            found.append(cut(bodies, some, torch.ones_like(some.low), bounds))
+    for rounds in rounds_of(scene, bodies):
+        if rounds.form is None:
+            curves, some = round_outline(bodies, rounds.prim, view)
+            found.append(_arcs(bodies, curves, some.double(), bounds))
+            continue
+        for side in (1.0, -1.0):
+            curves, some = generator(bodies, rounds.prim, rounds.form, view, torch.full_like(rounds.prim, side))
+            found.append(_lines(bodies, curves, some.double(), bounds))
+    found = [pieces for pieces in found if len(pieces.weight)]
+    if not found:
+        return None
+    near, weight = torch.cat([p.near for p in found], 1), torch.cat([p.weight for p in found])
+    return Pieces(joined([p.curves for p in found]), near, weight)
+
+
+def _silhouettes(bodies: Bodies, folds: Folds, view: View) -> tuple[Curves, Tensor]:
+    """Edges that are seen as outlines or creases, and their importance."""
+    _held, p, along = folds.curves.moving(bodies, torch.zeros_like(folds.curves.low))
+    across = cross(along, view.toward(p))
+    one, two = (dot(across, bodies.points(other) - p) for other in folds.others)
+    outline = folds.border | (one * two >= 0)
+    apart = folds.normals[0] - folds.normals[1]
+    importance = (dot(apart, apart).sqrt() * 0.5).clamp(_CREASE, 1.0)
+    importance = torch.where(outline, 1.0, torch.where(folds.crease, importance, 0.0))
+    index = (importance > 0).nonzero().squeeze(1)
+    return rows(folds.curves, index), take(importance, index)
+
+
+def _lines(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -> Pieces:
+    """Straight curves clipped to the film; on homogeneous places, since they may run behind the camera."""
+    low, high = torch.zeros_like(curves.low), torch.ones_like(curves.low)
+    ends = []
+    for t in (low, high):
+        _, p, _ = curves.moving(bodies, t)
+        seen = bodies.camera.film_of(p)
+        assert seen is not None
+        ends.append(seen)
+    begin, end = ends
+    x0, x1, y0, y1 = bounds
+
+    def inside(s: Tensor) -> list[Tensor]:
+        return [s[0] - x0 * s[2], x1 * s[2] - s[0], s[1] - y0 * s[2], y1 * s[2] - s[1], s[3]]
+
+    for a, b in zip(inside(begin), inside(end), strict=True):
+        slope = b - a
+        zero = -a / torch.where(slope == 0, 1.0, slope)
+        low = torch.where((slope > 0) & (zero > low), zero, low)
+        high = torch.where((slope < 0) & (zero < high), zero, high)
+        high = torch.where((slope == 0) & (a < 0), -1.0, high)
+    first, last = begin + (end - begin) * low, begin + (end - begin) * high
+    length = _apart(first, last)
+    index = ((high > low) & (first[2] > 0) & (last[2] > 0) & (length * importance > 0)).nonzero().squeeze(1)
+    cut = rows(curves.within(low, high), index)
+    return Pieces(cut, torch.stack((take(first[2], index), take(last[2], index))), take(length * importance, index))
+
+
+def _apart(first: Tensor, last: Tensor) -> Tensor:
+    """Distances on the film between homogeneous places of it ``(4, N)``."""
+    a, b = (s[:2] / torch.where(s[2] > 0, s[2], 1.0) for s in (first, last))
+    return ((a - b) * (a - b)).sum(0).sqrt()
+
+
+def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -> Pieces:
+    """Round curves in pieces that may lie on the film; one that comes near the camera weighs as much as the film is wide."""
+    some = (importance > 0).nonzero().squeeze(1)
+    curves, importance = rows(curves, some), take(importance, some)
+    many = torch.arange(len(some), device=some.device).repeat_interleave(_CUTS)
+    step = 2.0 * math.pi / _CUTS
+    low = torch.arange(_CUTS, dtype=torch.float64, device=some.device).repeat(len(some)) * step
+    cut = rows(curves, many).within(low, low + step)
+    ends = [bodies.camera.film_of(cut.moving(bodies, t)[1]) for t in (cut.low, cut.high)]
+    first, last = ends
+    assert first is not None and last is not None
+    x0, x1, y0, y1 = bounds
+    whole = math.hypot(x1 - x0, y1 - y0)
+    front = (torch.minimum(first[2], last[2]) > 0) & (torch.minimum(first[3], last[3]) > 0)
+    behind = (torch.maximum(first[2], last[2]) <= 0) | (torch.maximum(first[3], last[3]) <= 0)
+    length = torch.where(front, _apart(first, last), whole)
+    a, b = (film_places(bodies.camera, cut.moving(bodies, t)[1]) for t in (cut.low, cut.high))
+    near = torch.minimum(a, b) - length, torch.maximum(a, b) + length  # no arc leaves its chord by more than that
+    outside = (near[0][0] > x1) | (near[1][0] < x0) | (near[0][1] > y1) | (near[1][1] < y0)
+    weight = torch.where(behind | (front & outside), 0.0, length.clamp_max(whole)) * take(importance, many)
+    index = (weight > 0).nonzero().squeeze(1)
+    one = torch.ones(2, len(index), dtype=torch.float64, device=index.device)
+    return Pieces(rows(cut, index), one, take(weight, index))
+
+
+# ---- Edges that move across the film: silhouettes, borders and creases that the camera sees
+#
+# A picture is an integral over the film of the radiance ``L(s)``, which jumps along curves ``s(t)``. As these move, the loss
+# changes by the integral along them of ``C (L- - L+) n . ds``, with ``C(s)`` the worth of radiance at s and n the normal toward
+# + (Reynolds' transport theorem; Li, Aittala, Durand, Lehtinen, *Differentiable Monte Carlo Ray Tracing through Edge Sampling*,
+# 2018). With ``n dt = (ds_y / dt, -ds_x / dt)`` any parameter t of the curve will do. Places are drawn along the curves by
+# their length on the film; the radiance on both sides is traced by the same random numbers.
+
+
+#: A place counts as hidden where a ray beside it ends before this share of the way.
+_BEFORE = 1.0 - 2.0**-10
+#: The same where the ray meets the edge's own surface.
+_OWN = 1.0 - 2.0**-6
+
+#: Values ``(C, N)`` that rays ``o, d (3, N)`` bring, by the numbers of their samples.
+Look = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Along:
+    """Samples along curves on the film: the derivative of the loss is that of ``(weight * places(held)).sum()``.
+
+    Where what is seen is held in place, that of ``beside`` is taken away: where rays ended ``(3, M)``, or, where they met
+    nothing, infinity and their directions, and weights ``(2, M)``.
+    """
+
+    held: Held
+    weight: Tensor  # (2, N)
+    beside: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def sum(self, bodies: Bodies) -> Tensor:
+        """Differentiable in ``bodies``; of no meaning but for its derivative."""
+        total = (film_places(bodies.camera, bodies.points(self.held)) * self.weight).sum()
+        if self.beside is None:
+            return total
+        origin, away, weight = self.beside
+        # What is infinitely far moves along with the camera.
+        at = torch.where(torch.isfinite(origin), origin, bodies.camera.origin()) + away
+        return total - (film_places(bodies.camera, at) * weight).sum()
+
+
+@dataclass(frozen=True)
+class Primary:
+    """The estimator of one render.
+
+    Attributes:
+        bodies: detached.
+        pieces: what the camera may see.
+        choice: among them.
+        traced: what sees.
+        numbers: of samples.
+    """
+
+    bodies: Bodies
+    pieces: Pieces
+    choice: Choice
+    traced: Traced
+    numbers: Numbers
+
+    @torch.no_grad()
+    def samples(self, first: int, count: int, total: int, worth: Worth, look: Look, over: bool = False) -> Along:
+        """Samples ``first .. first + count`` of ``total``: those that are seen.
+
+        ``over``: they count as they move over what is seen on both sides, which is held in place.
+        """
+        number = torch.arange(first, first + count, device=self.pieces.weight.device)
+        u = (number.double() + self.numbers.of(number, 0)) / total
+        index, rest, chance = self.choice.draw(u)
+        pieces = rows(self.pieces, index)
+        t, density = pieces.place(rest)
+        held, p, along = pieces.curves.moving(self.bodies, t)
+        s, jacobian = slopes(self.bodies.camera, p)
+        slope = (jacobian * along).sum(1)
+        normal = torch.stack((slope[1], -slope[0]))
+        length = (normal * normal).sum(0).sqrt()
+        value = worth.at(s)
+        index = ((length > 0) & (value != 0).any(0)).nonzero().squeeze(1)
+        s, p, normal, length = (take(x, index) for x in (s, p, normal, length))
+        unit = normal / length
+        mate = take(pieces.curves.mate, index)
+        step = steps_at(self.bodies, (take(held.prim, index), mate), s)
+        o, d = self._beside(s, unit, step)
+        share = self._share(rows(held, index), mate, p, s, step, o, d)
+        seen = (share > 0).nonzero().squeeze(1)
+        both = torch.cat((seen, seen + len(index)))
+        o, d, index = take(o, both), take(d, both), take(index, seen)
+        values = look(o, d, take(number, index).repeat(2)) if len(index) else torch.zeros(len(value), 0).to(value)
+        jump = values[:, : len(index)] - values[:, len(index) :]
+        worthy = (take(value, index) * jump).sum(0) * take(share, seen)
+        chance, normal = take(chance * density, index) * total, take(normal, seen)
+        beside = None
+        if over:
+            each = (take(value, index).repeat(1, 2) * values).sum(0) * (take(share, seen) / chance).repeat(2)
+            each = torch.cat((each[: len(index)], -each[len(index) :]))
+            t, prim = self.traced.nearest(o, d)
+            met = prim >= 0
+            beside = torch.where(met, o, torch.inf), torch.where(met, t, 1.0) * d, normal.repeat(1, 2) * each
+        return Along(rows(held, index), normal * (worthy / chance), beside)
+
+    def _beside(self, s: Tensor, unit: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        """Rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
+        places = torch.cat((s - unit * step, s + unit * step), 1)
+        o, d = self.bodies.camera.rays(places[0], places[1], None)
+        return o.expand_as(d), d
+
+    def _share(self, held: Held, mate: Tensor, p: Tensor, s: Tensor, step: Tensor, o: Tensor, d: Tensor) -> Tensor:
+        """Return how much of each edge counts ``(N,)``: nothing where it is hidden, a part where others lie on it."""
+        n = p.shape[1]
+        t, prim = self.traced.nearest(o, d)
+        away = p - o[:, :n]
+        reach = (away * d[:, :n]).sum(0)
+        t, prim = t.view(2, n), prim.view(2, n)
+        own = (prim == held.prim) | (prim == mate)  # a round surface comes forward quickly behind its outline
+        seen = (t > reach * torch.where(own, _OWN, _BEFORE)).all(0)
+        if self.traced.wave.context.world.materials.opacity is not None:
+            seen = torch.ones_like(seen)  # what hides may let pass
+        near = (t - reach).abs() < reach * 2.0**-8
+        return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step), 0.0)
+
+
+def primary_of(bodies: Bodies, pieces: Pieces, traced: Traced, numbers: Numbers) -> Primary:
+    """The estimator over ``pieces``."""
+    return Primary(bodies, pieces, Choice(pieces.weight), traced, numbers)

@@ -1,0 +1,116 @@
+"""What surfaces make of light that edges send them: the same materials as a render's, forward only, from any to any direction.
+
+Light is followed from its source toward the camera. What a forward path weighs by the shading normal on the side of the light
+and by area on the other is weighed alike here: a factor of ``cos_s / cos_g`` at each vertex (Veach, *Robust Monte Carlo
+Methods*, 1997, section 5.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.gradients.edges.traced import Traced
+from torchpt.math.vectors import dot, rows, take
+from torchpt.paths.integrators.path import partition
+from torchpt.paths.surface import surface_at
+from torchpt.paths.vertex import shared
+from torchpt.physics.samplers import Dimension, Draws, salts
+from torchpt.physics.shapes import interact, offset_origin
+from torchpt.physics.shapes.geometry import Hit, Interaction
+
+__all__ = ["Spot", "met"]
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Points of surfaces that rays met, N lanes of the traced dtype.
+
+    Attributes:
+        traced: what sees.
+        o, d: the rays ``(3, N)``, ``d`` of unit length.
+        hit: what they met; a miss has -1.
+        p: the points ``(3, N)``.
+        n: geometric normals ``(3, N)``.
+    """
+
+    traced: Traced
+    o: Tensor
+    d: Tensor
+    hit: Hit
+    p: Tensor
+    n: Tensor
+
+    def taken(self, index: Tensor) -> Spot:
+        """Some of the lanes."""
+        return Spot(self.traced, *rows((self.o, self.d, self.hit, self.p, self.n), index))
+
+    def _each(self, found: list[Tensor], make: Callable[[int, Tensor, Interaction], list[Tensor]]) -> None:
+        """Fill in what each model makes of its lanes."""
+        _, groups = partition(self.traced.wave.context.world, self.hit)
+        for model, index in groups:
+            at = interact(
+                self.traced.wave.context.world, take(self.o, index), take(self.d, index), rows(self.hit, index)
+            )
+            for into, value in zip(found, make(model, index, at), strict=True):
+                into.index_copy_(into.dim() - 1, index, value.to(into.dtype))
+
+    def sent(self, wo: Tensor, wi: Tensor) -> Tensor:
+        """``f cos_s(wi) / cos_g(wi)`` ``(3, N)`` of light from ``wi`` that leaves along ``wo``; deltas give nothing."""
+        out = torch.zeros_like(wo)
+
+        def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
+            return [self._weighed(model, at, take(wo, index), take(wi, index))]
+
+        self._each([out], make)
+        return out
+
+    def _weighed(self, model: int, at: Interaction, wo: Tensor, wi: Tensor) -> Tensor:
+        world = self.traced.wave.context.world
+        kind = world.materials.models[model]
+        if kind.smooth:
+            return torch.zeros_like(wo)
+        surface = surface_at(world, model, -wo, at, self.traced.wave.context.pixel)
+        local = surface.frame.to_local(wi)
+        cosine = dot(wi, at.ng).abs()
+        weight, share = 1.0 / cosine.clamp_min(1e-6), shared(world, model, at, surface, wi, local)
+        weight = weight if share is None else weight * share
+        return kind.eval(surface.parameters, surface.wo, local) * weight
+
+    def scattered(self, wi: Tensor, key: Tensor, depth: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return rays by which light from ``wi`` goes on: origins, unit directions, ``f cos_s / cos_g |cos_g(wo)| / pdf``."""
+        o, d, weight = torch.zeros_like(wi), wi.clone(), torch.zeros_like(wi)
+        world, plan = self.traced.wave.context.world, self.traced.wave.context.plan
+
+        def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
+            kind, back = world.materials.models[model], take(wi, index)
+            if kind.smooth:
+                return [torch.zeros_like(at.p), back, torch.zeros_like(back)]
+            surface = surface_at(world, model, -back, at, self.traced.wave.context.pixel)
+            draws = Draws(plan.sampler, take(key, index), salts(depth, key.device))
+            lobe = draws.one(Dimension.LOBE).to(plan.dtype) if kind.lobed else None
+            sample = kind.sample(surface.parameters, surface.wo, lobe, draws.two(Dimension.BSDF).to(plan.dtype))
+            wo = surface.frame.to_world(sample.wi)
+            usable = (sample.pdf > 0) & torch.isfinite(sample.pdf)
+            factor = dot(wo, at.ng).abs() / torch.where(usable, sample.pdf, 1.0)
+            value = self._weighed(model, at, wo, back) * factor
+            return [offset_origin(world, at, wo), wo, torch.where(usable, value, 0.0)]
+
+        self._each([o, d, weight], make)
+        return o, d, weight
+
+
+def met(traced: Traced, o: Tensor, d: Tensor) -> Spot:
+    """Return where rays ``(3, N)`` meet surfaces; ``d`` of any length."""
+    world, dtype = traced.wave.context.world, traced.dtype
+    d = (d / (d * d).sum(0).sqrt()).to(dtype)
+    o = o.to(dtype)
+    t, prim, u, v = traced.wave.accel.intersect(o, d, torch.full_like(d[0], torch.inf))
+    hit = Hit(t.to(dtype), prim.long(), u.to(dtype), v.to(dtype))
+    p, n = torch.zeros_like(d), torch.zeros_like(d)
+    some = (hit.prim >= 0).nonzero().squeeze(1)
+    at = interact(world, take(o, some), take(d, some), rows(hit, some))
+    return Spot(traced, o, d, hit, p.index_copy(1, some, at.p), n.index_copy(1, some, at.ng))

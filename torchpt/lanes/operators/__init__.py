@@ -1,8 +1,0 @@
-"""What each operator of torch is as nodes of a graph.
-
-To add one: a function marked ``@handles("its aten name")`` in one of the files here.
-"""
-
-from torchpt.lanes.operators import arithmetic, choices, derivatives, gathers, reductions, views
-
-__all__ = ["arithmetic", "choices", "derivatives", "gathers", "reductions", "views"]

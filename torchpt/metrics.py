@@ -1,0 +1,16 @@
+"""Metrics of two pictures ``(H, W, 3)``, by name in :data:`METRICS`; ``error_map`` says where errors lie."""
+
+from torchpt.images.metrics import (
+    MAPS,
+    METRICS,
+    error_map,
+    flip,
+    mse,
+    psnr,
+    relmse,
+    relmse_trimmed,
+    smape,
+    ssim,
+)
+
+__all__ = ["MAPS", "METRICS", "error_map", "flip", "mse", "psnr", "relmse", "relmse_trimmed", "smape", "ssim"]

@@ -1,0 +1,15 @@
+"""Layers without light."""
+
+from __future__ import annotations
+
+from torchpt.paths.integrators.base import Integrator
+
+__all__ = ["Aov"]
+
+
+class Aov(Integrator):
+    """The layers of ``film.aovs`` without any light transport; the picture shows the first of them."""
+
+    name = "aov"
+    light = False
+    layers = ("albedo",)

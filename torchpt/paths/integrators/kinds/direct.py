@@ -1,0 +1,17 @@
+"""Direct light."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES, STRATEGY
+from torchpt.paths.integrators.path import PathIntegrator
+
+__all__ = ["Direct"]
+
+
+class Direct(PathIntegrator):
+    """Emission and direct light only: path tracing of depth 2."""
+
+    name = "direct"
+    parameters: ClassVar = {**STRATEGY, **LIGHT_CHOICE, **SAMPLES}

@@ -1,0 +1,87 @@
+"""A preview by split sum: the first surface under the environment's prefiltered maps, and other lights with their shadows.
+
+What the environment brings is not shadowed and no light is reflected twice: that is the preview's error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.core.tree import leaves
+from torchpt.math.vectors import dot
+from torchpt.paths import vertex as pure
+from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES
+from torchpt.paths.integrators.first_surface import FirstSurface, FirstSurfaceIntegrator
+from torchpt.paths.integrators.split_sum import under
+from torchpt.paths.state import StageContext, VertexInput, VertexOutput
+from torchpt.physics import lights
+from torchpt.physics.ibl import IblMaps, Sky, brdf_table, maps
+from torchpt.physics.shapes import interact
+from torchpt.physics.world import World
+
+__all__ = ["Ibl", "Preview"]
+
+
+class Ibl(FirstSurfaceIntegrator):
+    """A preview: the first surface under the environment by split sum (unshadowed), and under other lights."""
+
+    name = "ibl"
+    parameters: ClassVar = {**LIGHT_CHOICE, **SAMPLES}
+    strategy = "light"
+
+    def first(self, world: World) -> Preview:
+        """See :class:`Integrator`."""
+        return Preview.of(world)
+
+
+@dataclass(frozen=True)
+class Preview(FirstSurface):
+    """The environment ready for split-sum shading.
+
+    Attributes:
+        sky: its maps; None where there is no environment.
+        turn: ``(3, 3)`` from the world to the maps' own space; None where they are the same.
+    """
+
+    sky: Sky | None
+    turn: Tensor | None = None
+
+    @staticmethod
+    def of(world: World) -> Preview:
+        """Of a scene's environment; differentiable in it."""
+        around = lights.surroundings(world.lights)
+        if around is None:
+            return Preview(None)
+        if around.even:
+            texels = around.texels
+            return Preview(Sky.of(IblMaps(texels, (texels, texels), brdf_table().to(texels))), around.turn)
+        return Preview(Sky.of(maps(around.texels)), around.turn)
+
+    def turned(self, d: Tensor) -> Tensor:
+        """Directions ``(3, N)`` of the world in the maps' own space."""
+        return d if self.turn is None else torch.stack([dot(self.turn[k][:, None], d) for k in range(3)])
+
+    def again(self, world: World) -> Preview:
+        """See :class:`FirstSurface`."""
+        environment = None if world.lights is None else world.lights.environment
+        return Preview.of(world) if any(t.requires_grad for t in leaves(environment)) else self
+
+    def bounce(self, context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
+        """See :class:`FirstSurface`."""
+        world, state, hit = context.world, vertex.state, vertex.hit
+        local = replace(context, world=replace(world, lights=lights.without_environment(world.lights)))
+        throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
+        arriving = replace(state, throughput=throughput)
+        at = interact(world, state.o, state.d, hit, context.slide)
+        surface, direct, shadow = pure.shade(local, model, arriving, at)
+        radiance = torch.zeros_like(state.radiance)
+        if self.sky is not None:
+            n, v = self.turned(surface.frame.n), self.turned(-state.d)
+            radiance = throughput * under(self.sky, world.materials.models[model], surface.parameters, n, v)
+            if surface.shown is not None:
+                radiance = radiance * surface.shown
+        return VertexOutput(replace(state, radiance=state.radiance + radiance), None, shadow, at, surface, direct)

@@ -1,0 +1,48 @@
+"""Path tracing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
+from torchpt.paths.integrators.path import PathIntegrator
+from torchpt.spec import Refused, Scalar, Whole
+
+__all__ = ["Path"]
+
+
+class Path(PathIntegrator):
+    """Unidirectional path tracing with next event estimation."""
+
+    name = "path"
+    parameters: ClassVar = {
+        "max_depth": Whole(
+            16,
+            low=-1,
+            doc="longest path in edges: 1 emission only, 2 direct light, -1 until roulette ends it",
+        ),
+        "rr_depth": Whole(5, low=1, doc="roulette may end paths from this depth on"),
+        "rr_prob": Scalar(
+            None,
+            above=0.0,
+            high=1.0,
+            words="null or a number, 0 < rr_prob <= 1",
+            doc="chance to survive roulette; null: by throughput",
+        ),
+        **STRATEGY,
+        **LIGHT_CHOICE,
+        **SAMPLES,
+    }
+
+    @property
+    def limits(self) -> Limits:
+        """See :class:`Integrator`."""
+        return Limits(self.max_depth, self.rr_depth)
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Valued`."""
+        if values["max_depth"] == -1 and values["rr_prob"] == 1.0:
+            expected = "a survival probability below 1 where max_depth is -1 (paths would not end)"
+            raise Refused(expected, 1.0, ("rr_prob",))

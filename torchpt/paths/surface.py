@@ -1,0 +1,284 @@
+"""Points on surfaces with their materials resolved: textures, shading normals, bumps, opacity, footprints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import Frame, affine, cross, dot, normalize, take
+from torchpt.physics import bsdfs
+from torchpt.physics.shapes import surface_uv, vertex_colors
+from torchpt.physics.shapes.geometry import Interaction
+from torchpt.physics.textures import MaterialTextures, NodeMap, TextureBinding, TexturePoint
+from torchpt.physics.world import World
+
+__all__ = [
+    "Relief",
+    "Surface",
+    "TexturePoint",
+    "emission_map",
+    "mapped",
+    "opacity_map",
+    "parameters_at",
+    "shading_normal",
+    "surface_at",
+    "texture_point_at",
+]
+
+
+# ---- Normal and bump maps: the frame that they tilt, and how much light the relief that they stand for lets through
+
+
+@dataclass(frozen=True)
+class Relief:
+    """What a normal or bump map did to the shading normal."""
+
+    normal: Tensor  # (3, N) without the map, turned as the frame is
+    alpha2: Tensor  # (N,) squared roughness of a surface whose facets lean as the map does
+
+    def shadowing(self, w: Tensor) -> Tensor:
+        """How much of the light from unit directions ``w (3, N)`` the relief lets through ``(N,)``.
+
+        Smith's masking by the facets that the tilt stands for, which takes the place of the hard edge where mapped and true
+        horizon differ (Conty Estevez, Lecocq, Stein, *A Microfacet-Based Shadowing Function to Solve the Bump Terminator
+        Problem*, Ray Tracing Gems, 2019).
+        """
+        square = dot(w, self.normal).square().clamp_min(1e-12)
+        return 2.0 / (1.0 + (1.0 + self.alpha2 * (1.0 - square).clamp_min(0.0) / square).sqrt())
+
+
+def mapped(
+    textures: MaterialTextures,
+    row: Tensor,
+    local: Tensor | None,
+    slope: tuple[Tensor, Tensor] | None,
+    d: Tensor,
+    at: Interaction,
+    side: Tensor | None,
+) -> tuple[Frame, Relief]:
+    """The frame about the normal of a normal or bump map, and what the map did.
+
+    A normal map's vectors are relative to the shading normal, the tangent along u, and their cross product. A bump map's
+    heights move the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). What is seen from behind is
+    the mirror image. A normal that turns from the eye is mirrored about the surface's own (after Schuessler, Heitz,
+    Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017): all as Mitsuba's ``normalmap`` and ``bumpmap``.
+
+    Args:
+        textures: of the model.
+        row: of the materials in it.
+        local: what a normal map holds there ``(3, N)``; None where there is a bump map.
+        slope: of a bump map's heights with respect to u and v ``(N,)``; None where there is a normal map.
+        d: directions of the rays that came.
+        at: the points.
+        side: see :class:`torchpt.paths.surface.Surface`.
+    """
+    assert at.tangent is not None
+    base = Frame.along(at.ns, at.tangent)
+    if local is not None:
+        local = local * 2.0 - 1.0
+        x, y, z = local[0], local[1], local[2].clamp_min(1e-3)
+        if textures.strength is not None:
+            strength = take(textures.strength, row)
+            x, y = x * strength, y * strength
+    else:
+        assert slope is not None and at.bitangent is not None
+        du, dv = slope
+        along = torch.addcmul(at.tangent, at.ns, du - dot(at.ns, at.tangent))
+        across = torch.addcmul(at.bitangent, at.ns, dv - dot(at.ns, at.bitangent))
+        x, y, z = base.to_local(cross(along, across))
+        sign = torch.copysign(torch.ones_like(z), z.detach())
+        x, y, z = x * sign, y * sign, z * sign
+    n = at.ns if side is None else at.ns * side
+    normal = normalize(affine(base.s * x, base.t, y, n, z))
+    away = (dot(d, n) * dot(d, normal) <= 0).detach()
+    normal = torch.where(away, normalize(affine(base.s * -x, base.t, -y, n, z)), normal)
+    flat = dot(normal, normal) == 0  # no texture coordinates, so no slope
+    normal = torch.where(flat, n, normal)
+    square = dot(normal, n).square().clamp_min(1e-12)
+    alpha2 = (0.125 * (1.0 - square).clamp_min(0.0) / square).clamp_max(1.0)
+    return Frame.along(normal, at.tangent), Relief(n, alpha2)
+
+
+# ---- A surface point with its material resolved: parameters from rows and textures, the shading frame with its maps
+
+
+#: Seen more slantingly than this (as a cosine), a footprint grows no further.
+_SLANT = 1e-3
+
+
+def texture_point_at(world: World, number: int, at: Interaction, pixel: Tensor | None) -> TexturePoint | None:
+    """Where the textures of model ``number`` are read; None where it reads none.
+
+    Args:
+        world: the scene's tensors.
+        number: of the model.
+        at: the points.
+        pixel: how large a pixel is in the world, see :meth:`torchpt.cameras.Camera.pixel`; None: a point.
+    """
+    textures = world.materials.textures[number]
+    if textures is None:
+        return None
+    return TexturePoint(
+        surface_uv(world, at) if "uv" in textures.reads else None,
+        _footprint(at, pixel) if textures.filtered and pixel is not None else None,
+        vertex_colors(world, at) if "colors" in textures.reads else None,
+    )
+
+
+def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
+    """Area ``(N,)`` in texture coordinates of what a pixel covers of the surface; 0 where it has no coordinates.
+
+    Every vertex of a path counts as if the camera saw it directly (Pharr, Jakob, Humphreys, *Physically Based Rendering*,
+    4th edition, 10.1.3). Of the ellipse that a pixel is on the surface, the area: filters here are round.
+    """
+    assert at.tangent is not None and at.bitangent is not None
+    away = torch.addcmul(pixel[0:3, None], at.p, pixel[3], value=-1)
+    square = dot(away, away)
+    cosine = dot(normalize(away), at.ng).abs().clamp_min(_SLANT)
+    across = cross(at.tangent, at.bitangent)
+    stretch = dot(across, across)  # of the area, squared
+    some = stretch > 0
+    stretch = torch.where(some, torch.where(some, stretch, 1.0).sqrt(), torch.inf)
+    return square * (pixel[4] * pixel[4]) / (cosine * stretch)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface point with its material resolved."""
+
+    frame: Frame  # about the shading normal, turned to the side of wo where light does not pass through
+    side: Tensor | None  # (N,) -1 where it was turned around; None where light passes through
+    shown: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
+    parameters: bsdfs.Parameters  # lane values of the BSDF
+    wo: Tensor  # (3, N) local
+    relief: Relief | None  # None where no map bends the normals
+
+
+def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Tensor | None = None) -> Surface:
+    """Resolve the material at surface points.
+
+    Args:
+        world: the scene's tensors.
+        number: of the model that all of them have.
+        d: directions ``(3, N)`` of the rays that came.
+        at: the points.
+        pixel: see :func:`texture_point_at`.
+    """
+    model, row = world.materials.models[number], take(world.materials.row, at.slot)
+    textures = world.materials.textures[number]
+    point = texture_point_at(world, number, at, pixel)
+    ns, side, shown, relief = at.ns, None, None, None
+    if not model.transmits:
+        side = torch.copysign(torch.ones_like(ns[0]), -dot(d, ns).detach())
+        both = world.materials.two_sided[number]
+        if both is not None:
+            shown = ((side > 0) | take(both, row)).to(side.dtype)
+    if textures is not None and (textures.normal is not None or textures.bump is not None):
+        assert point is not None
+        frame, relief = _mapped(world, textures, row, point, d, at, side)
+    else:
+        ns = ns if side is None else ns * side
+        frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
+    return Surface(frame, side, shown, parameters_at(world, number, row, at, point), frame.to_local(-d), relief)
+
+
+def parameters_at(
+    world: World, number: int, row: Tensor, at: Interaction, point: TexturePoint | None
+) -> bsdfs.Parameters:
+    """Lane values of the BSDF ``number`` at rows ``(N,)``; ``point`` where textures are read."""
+    values, textures = bsdfs.gather(world.materials.parameters[number], row), world.materials.textures[number]
+    if textures is None:
+        return values
+    assert point is not None
+    return world.materials.models[number].prepare(_filled(world, values, textures.readings, row, point))
+
+
+def _filled(
+    world: World,
+    values: bsdfs.Parameters,
+    readings: dict[str, Any],
+    row: Tensor,
+    point: TexturePoint,
+) -> bsdfs.Parameters:
+    """Values with those that textures give."""
+    filled = dict(values)
+    for key, reading in readings.items():
+        if isinstance(reading, TextureBinding):
+            filled[key] = _read(world, reading, row, point)
+        else:
+            filled[key] = _filled(world, values.get(key, {}), reading, row, point)
+    return filled
+
+
+def _read(world: World, binding: TextureBinding, row: Tensor, point: TexturePoint) -> Tensor:
+    table = world.textures.tables[binding.table]
+    point = point if binding.filtered else point.bare
+    return table.look_up(take(binding.nodes, row), point, binding.channel is None)
+
+
+def _mapped_value(world: World, maps: NodeMap, at: Interaction, coloured: bool) -> Tensor:
+    """What textures by primitive give at points; any number where a surface has none."""
+    row, point = take(maps.nodes, at.slot).clamp_min(0), TexturePoint(surface_uv(world, at))
+    first, *others = (world.textures.tables[number] for number in maps.tables)
+    if maps.table is None:
+        return first.look_up(row, point, coloured)
+    which = take(maps.table, at.slot)
+    value = first.look_up(torch.where(which == 0, row, 0), point, coloured)
+    for k, table in enumerate(others, 1):
+        mine = which == k
+        value = torch.where(mine, table.look_up(torch.where(mine, row, 0), point, coloured), value)
+    return value
+
+
+def opacity_map(world: World, at: Interaction) -> Tensor:
+    """What textures make of the opacity ``(N,)`` of surfaces; 1 where they have no such texture."""
+    maps = world.textures.opacity
+    assert maps is not None
+    value = _mapped_value(world, maps, at, False)
+    value = torch.addcmul(take(maps.bias, at.slot), take(maps.factor, at.slot), value)
+    if maps.cutoff is not None:
+        cutoff = take(maps.cutoff, at.slot)
+        value = torch.where(cutoff < 0, value, (value >= cutoff).to(value.dtype))
+    return torch.where(take(maps.nodes, at.slot) < 0, 1.0, value)
+
+
+def emission_map(world: World, at: Interaction) -> Tensor:
+    """What textures make of the emission of surfaces ``(3, N)``; 1 where they have no such texture."""
+    maps = world.textures.emission
+    assert maps is not None
+    value = _mapped_value(world, maps, at, True)
+    return torch.where(take(maps.nodes, at.slot) < 0, 1.0, value)
+
+
+def shading_normal(world: World, number: int, d: Tensor, at: Interaction, point: TexturePoint | None) -> Tensor:
+    """The shading normal ``(3, N)`` on the shape's own outside, maps included."""
+    textures = world.materials.textures[number]
+    if textures is None or (textures.normal is None and textures.bump is None):
+        return at.ns
+    assert point is not None
+    row = take(world.materials.row, at.slot)
+    side = torch.copysign(torch.ones_like(d[0]), -dot(d, at.ns))
+    return _mapped(world, textures, row, point, d, at, side)[0].n * side
+
+
+def _mapped(
+    world: World,
+    textures: MaterialTextures,
+    row: Tensor,
+    point: TexturePoint,
+    d: Tensor,
+    at: Interaction,
+    side: Tensor | None,
+) -> tuple[Frame, Relief]:
+    """The frame about the normal of a normal or bump map, and what the map did."""
+    local = None if textures.normal is None else _read(world, textures.normal, row, point)
+    slope = None
+    if local is None:
+        assert textures.bump is not None
+        table = world.textures.tables[textures.bump.table]
+        point = point if textures.bump.filtered else point.bare
+        slope = table.slope(take(textures.bump.nodes, row), point)
+    return mapped(textures, row, local, slope, d, at, side)

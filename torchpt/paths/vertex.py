@@ -1,0 +1,388 @@
+"""What happens at a vertex: the stages of path tracing, and the sampling that they are made of.
+
+A stage is a pure function of lanes (:mod:`torchpt.paths.state` has what they read and return). A Python ``if`` asks only what
+the scene or the settings hold, so a stage leaves out what is not needed, and compiles to one graph whatever the number of
+lanes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchpt.math.sampling import power_heuristic, uniform_hemisphere, uniform_sphere
+from torchpt.math.vectors import dot, largest
+from torchpt.paths.roulette import chance_of, survived
+from torchpt.paths.state import (
+    FOREVER,
+    STRATEGIES,
+    DirectLight,
+    Drawn,
+    Emission,
+    PathState,
+    Plan,
+    Shadow,
+    StageContext,
+    VertexInput,
+    VertexOutput,
+)
+from torchpt.paths.surface import Surface, emission_map, opacity_map, surface_at
+from torchpt.physics import lights
+from torchpt.physics.bsdfs.records import BsdfSample
+from torchpt.physics.cameras import Camera
+from torchpt.physics.film import Filter
+from torchpt.physics.lights.records import LightSample
+from torchpt.physics.samplers import Dimension, Draws
+from torchpt.physics.shapes import interact, offset_origin, reattach
+from torchpt.physics.shapes.geometry import Hit, Interaction
+from torchpt.physics.shapes.interaction import OFFSET
+from torchpt.physics.world import World
+
+__all__ = [
+    "STRATEGIES",
+    "Onward",
+    "Plan",
+    "attach",
+    "bounce",
+    "carry_on",
+    "draw",
+    "emit",
+    "escape",
+    "generate",
+    "leaning",
+    "light_radiance",
+    "next_ray",
+    "sample_light",
+    "scatter",
+    "shade",
+    "shared",
+    "through",
+]
+
+
+# ---- Next event estimation: a point on a light for each surface point, and what it brings there
+#
+# :func:`shade` = surface -> light -> shadow ray. Whether the ray is blocked is asked later, by whoever runs the stage.
+
+
+#: Shadow rays end this fraction of their length short of the light, beside the offset off its surface.
+SHORTEN = 1e-4
+
+
+def shade(
+    context: StageContext, model: int, state: PathState, at: Interaction
+) -> tuple[Surface, DirectLight | None, Shadow | None]:
+    """Resolve the material at surface points of a BSDF model and sample a light for each.
+
+    Returns:
+        The surface; the light and the shadow rays to it (None where no light is sampled).
+    """
+    plan, world = context.plan, context.world
+    surface, kind = surface_at(world, model, state.d, at, context.pixel), world.materials.models[model]
+    if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
+        return surface, None, None
+    light = sample_light(context, model, state, at, surface)
+    wi = surface.frame.to_local(light.wi)
+    weight, pdf, heuristic = light.weight, None, None
+    if plan.strategy == "mis":
+        reflected, pdf = kind.eval_pdf(surface.parameters, surface.wo, wi)
+        heuristic = power_heuristic(light.pdf, pdf).detach()
+        weight = weight * heuristic
+    else:
+        reflected = kind.eval(surface.parameters, surface.wo, wi)
+    share = shared(world, model, at, surface, light.wi, wi)
+    weight = weight if share is None else weight * share
+    shining = light_radiance(world, light)
+    radiance = state.throughput * reflected * shining * weight
+    direct = DirectLight(light, shining, reflected, share, pdf, heuristic)
+    return surface, direct, _shadow_ray(plan, world, at, light, radiance, weight)
+
+
+def shared(world: World, model: int, at: Interaction, surface: Surface, light: Tensor, wi: Tensor) -> Tensor | None:
+    """Return the share ``(n,)`` of light that a surface lets pass before its BSDF is asked; None: all.
+
+    Args:
+        world: the scene's tensors.
+        model: number of the BSDF model.
+        at: the points.
+        surface: with its material.
+        light: ``(3, n)`` direction to the light.
+        wi: the same in the surface's frame.
+    """
+    share: Tensor | None = None
+    if leaning(world, model):
+        share = (through(at, surface, light, wi) > 0).to(wi.dtype)
+    if surface.shown is not None:
+        share = surface.shown if share is None else share * surface.shown
+    if surface.relief is not None:
+        shadowing = surface.relief.shadowing(light)
+        share = shadowing if share is None else share * shadowing
+    return share
+
+
+def sample_light(context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface) -> LightSample:
+    """Sample a point on the lights for each surface point."""
+    plan, world = context.plan, context.world
+    table = world.lights
+    assert table is not None
+    draws = Draws(plan.sampler, state.key, context.salts)
+    # The density of a light that a ray meets is asked for from where the ray left. That is where a reflected one will leave,
+    # unless paths keep the vertex itself, or nothing that can be met shines.
+    kept = lights.local(table) or table.row_of_prim is None
+    x = at.p if kept else offset_origin(world, at, -state.d)
+    n = None if world.materials.models[model].transmits else surface.frame.n
+    numbers, which = draws.two(Dimension.LIGHT), None
+    if table.choice is not None:
+        # One number chooses the light and goes on to the place on it, so that both are stratified together.
+        which = lights.fine(torch.stack((numbers[0], draws.one(Dimension.LIGHT_DIGITS))))
+    return lights.sample(table, x, which, numbers.to(plan.dtype), OFFSET, n, plan.strategy == "mis")
+
+
+def light_radiance(world: World, light: LightSample) -> Tensor:
+    """Radiance ``(3, N)`` of the points on lights, textures of emission and opacity included."""
+    if light.at is None:
+        return light.radiance
+    share = torch.ones_like(light.radiance)
+    if world.textures.emission is not None:
+        share = share * emission_map(world, light.at)
+    if world.textures.opacity is not None:
+        share = share * opacity_map(world, light.at)
+    return light.radiance * (share if light.bare is None else torch.where(light.bare, 1.0, share))
+
+
+def _shadow_ray(
+    plan: Plan, world: World, at: Interaction, light: LightSample, radiance: Tensor, weight: Tensor
+) -> Shadow:
+    """The ray to a point on a light that brings ``radiance``; of length 0 where that is none.
+
+    Under a tape it is of length 0 where the sample has no ``weight (n,)``: a colour that is 0 has a derivative.
+    """
+    o = offset_origin(world, at, light.wi)
+    d = light.target - o
+    lit = (weight.detach() if plan.tape else largest(radiance.detach().abs())) > 0
+    t_max = lit.to(plan.dtype) * (1.0 - SHORTEN)
+    if light.distant is not None:
+        d = torch.where(light.distant, light.wi, d)
+        t_max = torch.where(light.distant & lit, math.inf, t_max)
+    return Shadow(o, d, t_max, radiance)
+
+
+def leaning(world: World, model: int) -> bool:
+    """Return True where the shading normals of a model's surfaces may differ from the geometric ones."""
+    textures = world.materials.textures[model]
+    return world.geometry.normals is not None or (
+        textures is not None and (textures.normal is not None or textures.bump is not None)
+    )
+
+
+def through(at: Interaction, surface: Surface, world_wi: Tensor, wi: Tensor) -> Tensor:
+    """Positive where a direction lies on the same side of both normals: a shading normal must not let light through."""
+    same = dot(world_wi, at.ng) * wi[2]
+    return same if surface.side is None else same * surface.side
+
+
+# ---- Where a path goes behind a surface, and whether it does
+#
+# :func:`scatter` = :func:`draw` (BSDF sampling) -> :func:`attach` (only under derivatives) -> :func:`carry_on` (throughput and
+# roulette) -> :func:`next_ray`. Each hands a record to the next.
+
+
+@dataclass(frozen=True)
+class Onward:
+    """Quantities that paths carry on, after roulette."""
+
+    alive: Tensor  # (n,) bool
+    throughput: Tensor  # (3, n)
+    eta: Tensor | None  # see PathState
+    carried: Tensor  # (3, n) throughput before roulette
+    chance: Tensor | None  # (n,) to survive roulette; None where it does not play
+
+
+def scatter(
+    context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface
+) -> tuple[PathState, Hit | None, Drawn, Onward]:
+    """Draw the next direction from the BSDF and let roulette decide who goes on.
+
+    Where derivatives with respect to geometry are wanted, the next hit is found here already, since the throughput must
+    follow both ends of the ray; it is returned beside the state.
+    """
+    plan = context.plan
+    draws = Draws(plan.sampler, state.key, context.salts)
+    drawn, hit = draw(context, model, at, surface, draws), None
+    if plan.tape:
+        drawn, hit = attach(context, model, state, at, surface, drawn)
+    onward = carry_on(plan, state, surface, drawn, draws, context.roulette)
+    if hit is not None:
+        hit = replace(hit, prim=torch.where(onward.alive, hit.prim, -1))
+    return next_ray(context, model, state, at, surface, drawn, onward), hit, drawn, onward
+
+
+def draw(context: StageContext, model: int, at: Interaction, surface: Surface, draws: Draws) -> Drawn:
+    """Draw a direction from the BSDF, or from the hemisphere (strategy ``uniform``), and the ray that leaves along it."""
+    plan, world = context.plan, context.world
+    kind = world.materials.models[model]
+    u = draws.two(Dimension.BSDF).to(plan.dtype)
+    if plan.strategy == "uniform" and not kind.delta:
+        wi = uniform_sphere(u) if kind.transmits else uniform_hemisphere(u)
+        pdf = torch.full_like(wi[2], (0.25 if kind.transmits else 0.5) / math.pi)
+        sample = BsdfSample(wi, pdf, kind.eval(surface.parameters, surface.wo, wi) / pdf)
+    else:
+        lobe = draws.one(Dimension.LOBE).to(plan.dtype) if kind.lobed else None
+        sample = kind.sample(surface.parameters, surface.wo, lobe, u)
+    pdf = sample.pdf.detach()
+    sharp = torch.isinf(pdf) if kind.delta else None
+    d = surface.frame.to_world(sample.wi).detach()
+    o = offset_origin(world, at, d)
+    # Least of what must be positive for the path to go on: comparisons cost more than minima.
+    least = pdf
+    if leaning(world, model):
+        least = torch.minimum(least, through(at, surface, d, sample.wi.detach()))
+    if surface.shown is not None:
+        least = torch.minimum(least, surface.shown)
+    return Drawn(o, d, sample.wi, pdf, sample.weight, least, sharp, sample.eta)
+
+
+def attach(
+    context: StageContext, model: int, state: PathState, at: Interaction, surface: Surface, drawn: Drawn
+) -> tuple[Drawn, Hit | None]:
+    """Return what was drawn with derivatives: direction and density are constants, the integrand follows the parameters.
+
+    Where geometry is differentiated (``plan.attached``) the next hit is found, and the direction follows both of its ends.
+    """
+    plan, world = context.plan, context.world
+    kind, frame = world.materials.models[model], surface.frame
+    d, weight, pdf, sharp = drawn.d, drawn.weight, drawn.pdf, drawn.sharp
+    hit, follow, measure, alive = None, d, 1.0, drawn.least > 0
+    if plan.attached:
+        hit = context.search(replace(state, o=drawn.o, d=d, t_max=alive.to(plan.dtype) * FOREVER))
+        follow, measure = reattach(world, at.p, hit, d)
+    if not kind.smooth:
+        value = kind.eval(surface.parameters, surface.wo, frame.to_local(follow))
+        again = value * (measure / torch.where(alive & ~torch.isinf(pdf), pdf, 1.0))
+        weight = again if sharp is None else torch.where(sharp, weight, again)
+    if plan.attached:
+        # The direction of a delta follows the surface that it leaves; the next point slides along it.
+        d = follow if sharp is None else torch.where(sharp, frame.to_world(drawn.wi), follow)
+    return replace(drawn, d=d, weight=weight), hit
+
+
+def carry_on(plan: Plan, state: PathState, surface: Surface, drawn: Drawn, draws: Draws, roulette: float) -> Onward:
+    """Throughput behind the surface, and which paths go on: those that carry something, and that roulette lets live."""
+    weight = drawn.weight
+    if surface.relief is not None:
+        weight = weight * surface.relief.shadowing(drawn.d)
+    throughput = state.throughput * weight
+    brightest = largest(throughput.detach())
+    # Under a tape a path that carries nothing goes on: what it would meet is the derivative by a colour that is 0.
+    alive = (drawn.least if plan.tape else torch.minimum(drawn.least, brightest)) > 0
+    eta = state.eta
+    if eta is not None and drawn.eta is not None:
+        eta = eta * drawn.eta.detach()
+    if not roulette:
+        return Onward(alive, throughput, eta, throughput, None)
+    chance = chance_of(plan.rr_prob, roulette, brightest, eta, plan.tape)
+    alive, survivors = survived(chance, draws, alive, throughput)
+    return Onward(alive, survivors, eta, throughput, chance)
+
+
+def next_ray(
+    context: StageContext,
+    model: int,
+    state: PathState,
+    at: Interaction,
+    surface: Surface,
+    drawn: Drawn,
+    onward: Onward,
+) -> PathState:
+    """Return the paths with the rays that leave the surface; those that ended have rays of length 0."""
+    plan, world = context.plan, context.world
+    on = onward.alive.to(plan.dtype)
+    # What MIS is to know of the density, should the ray meet a light.
+    if plan.strategy == "mis" and world.lights is not None:
+        pdf = drawn.pdf
+    else:
+        alone = plan.strategy == "light" and world.lights is not None  # lights are not to be counted twice
+        pdf = torch.full_like(drawn.pdf, 0.0 if alone else math.inf)
+        if alone and drawn.sharp is not None:
+            pdf = torch.where(drawn.sharp, drawn.pdf, pdf)
+    # A path that carries what is not finite must not end unseen: no comparison holds for NaN, so it would count as dark.
+    radiance = state.radiance if plan.tape else state.radiance + onward.throughput * 0.0
+    leaving = PathState(
+        o=drawn.o,
+        d=drawn.d,
+        t_max=on * FOREVER,
+        throughput=onward.throughput * on,
+        radiance=radiance,
+        pdf=pdf,
+        lane=state.lane,
+        key=state.key,
+        eta=onward.eta,
+        extra=state.extra,
+    )
+    if state.p is None:
+        return leaving
+    n = torch.zeros_like(at.p) if world.materials.models[model].transmits else surface.frame.n
+    # Copies: no two tensors of a state share memory.
+    return replace(leaving, p=at.p.detach().clone(), n=n.detach().clone())
+
+
+# ---- The stages of the wavefront: pure functions of lanes (:mod:`torchpt.paths.state` has what they read and return)
+#
+# Python ``if`` here asks only what the scene or the settings hold (:class:`~torchpt.paths.state.Plan` is static), so a stage
+# leaves out what is not needed, and compiles to one graph whatever the number of lanes.
+
+
+def generate(plan: Plan, camera: Camera, filter: Filter, x: Tensor, y: Tensor, key: Tensor, salts: Tensor) -> PathState:
+    """Camera rays through pixels ``x, y (N,)``, at places drawn from the filter (and on the lens, where there is one)."""
+    draws = Draws(plan.sampler, key, salts)
+    offset = filter.offset(draws.two(Dimension.PIXEL)).to(plan.dtype)
+    lens = draws.two(Dimension.LENS).to(plan.dtype) if camera.lens else None
+    o, d = camera.rays(x + 0.5 + offset[0], y + 0.5 + offset[1], lens)
+    n = d.shape[1]
+    ones = torch.ones_like(d)
+    forever = torch.full((n,), math.inf, dtype=plan.dtype, device=d.device)
+    lane = torch.arange(n, device=d.device)
+    # No two tensors of a state share memory: `radiance` is added to in place.
+    return PathState(o.expand(3, n).clone(), d, forever, ones, torch.zeros_like(d), forever.clone(), lane, key)
+
+
+def emit(context: StageContext, vertex: VertexInput) -> Emission:
+    """Return what paths gather from the emitters that they hit."""
+    world, state = context.world, vertex.state
+    assert world.lights is not None
+    at = interact(world, state.o, state.d, vertex.hit, context.slide)
+    # Where lights are chosen by place the density is that at the vertex itself, which is not quite where the ray begins.
+    x = state.o if state.p is None else state.p
+    radiance, pdf = lights.emitted(world.lights, x, at, state.d, state.n)
+    if world.textures.emission is not None:
+        radiance = radiance * emission_map(world, at)
+    return _gathered(vertex, radiance, pdf)
+
+
+def escape(context: StageContext, vertex: VertexInput) -> Emission:
+    """Return what paths gather from the environment that they escape to."""
+    assert context.world.lights is not None
+    return _gathered(vertex, *lights.environment(context.world.lights, vertex.state.d))
+
+
+def _gathered(vertex: VertexInput, radiance: Tensor, light_pdf: Tensor) -> Emission:
+    state, hit = vertex.state, vertex.hit
+    # With the derivative of the chance that the rays came here.
+    throughput = state.throughput if hit.chance is None else state.throughput * hit.chance
+    # PathState.pdf is inf where emission counts whole and 0 where it does not count: the heuristic's own limits.
+    weight = power_heuristic(state.pdf, light_pdf).detach()
+    return Emission(radiance, light_pdf, weight, throughput * radiance * weight)
+
+
+def bounce(context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
+    """Return what surfaces of one BSDF model make of paths: light that is sampled, the next ray, roulette."""
+    world, state, hit = context.world, vertex.state, vertex.hit
+    at = interact(world, state.o, state.d, hit, context.slide)
+    if hit.chance is not None:
+        state = replace(state, throughput=state.throughput * hit.chance)
+    surface, direct, shadow = shade(context, model, state, at)
+    leaving, following, drawn, onward = scatter(context, model, state, at, surface)
+    return VertexOutput(leaving, following, shadow, at, surface, direct, drawn, onward.carried, onward.chance)

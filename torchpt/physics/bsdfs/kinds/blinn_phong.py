@@ -1,0 +1,80 @@
+"""Blinn's model in Phong's normalization, as published: ``f = kd / pi + ks (n + 2) / (2 pi) (h . n)^n``.
+
+Blinn, *Models of Light Reflection for Computer Synthesized Pictures*, 1977. It creates energy: at normal incidence the
+specular lobe alone reflects up to ``4 ks``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.math.sampling import cosine_hemisphere
+from torchpt.math.vectors import dot
+from torchpt.physics.bsdfs.base import Parameters
+from torchpt.physics.bsdfs.lobes import Power, above, added, cosine_power, drop_of_power, mean, share, weighed
+from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
+from torchpt.physics.bsdfs.specs import reflectance
+
+__all__ = ["BlinnPhong"]
+
+
+@dataclass(frozen=True)
+class BlinnPhong(Power):
+    """Lambert and a lobe about the half vector, as published: it reflects up to `diffuse + 4 specular`."""
+
+    name = "blinn_phong"
+    parameters: ClassVar = {
+        "specular": reflectance((0.1, 0.1, 0.1), "reflectance of the glossy one: where it is sharp, four times as much")
+    }
+    most = 4.0
+    conserves = False
+
+    def prepare(self, values: Parameters) -> Parameters:
+        """Adds how often the diffuse lobe is drawn, by what each reflects at normal incidence.
+
+        There ``(n + 2) / (2 pi) (h . n)^n`` integrates to ``4 (n + 2^(-n/2)) / (n + 4)``: from 1 at ``n = 0`` to 4.
+        """
+        n = values["exponent"]
+        peak = 4.0 * (n + torch.exp(-0.5 * math.log(2.0) * n)) / (n + 4.0)
+        return {**values, "share": share(mean(values["diffuse"]), mean(values["specular"]) * peak)}
+
+    def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Bsdf`."""
+        exponent, often = parameters["exponent"], parameters["share"]
+        seen = above(wo, wi)
+        cosine = wi[2] * seen
+        s = wo + wi  # along the half vector, 2 cos(wo, h) long
+        square = dot(s, s)
+        usable = square > 0
+        square = torch.where(usable, square, 1.0)
+        # (h . n)^n = (1 - sin^2)^(n/2)
+        peak = cosine_power((s[0] * s[0] + s[1] * s[1]) / square, 0.5 * exponent) * usable * (0.5 / math.pi)
+        value = torch.addcmul(
+            parameters["diffuse"] * (cosine * (1.0 / math.pi)), parameters["specular"], (exponent + 2.0) * peak * cosine
+        )
+        pdf = often * cosine * (1.0 / math.pi) + (1.0 - often) * (exponent + 1.0) * peak * seen / (2.0 * square.sqrt())
+        return value, pdf
+
+    def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        """One of the lobes; the half vector has density ``(n + 1) / (2 pi) (h . n)^n``. Below the surface it fails."""
+        assert lobe is not None
+        drop = drop_of_power(u[0], parameters["exponent"])
+        r = (drop * (2.0 - drop)).clamp_min(0.0).sqrt()
+        phi = (2.0 * math.pi) * u[1]
+        h = torch.stack((r * torch.cos(phi), r * torch.sin(phi), 1.0 - drop))
+        wi = torch.where(lobe < parameters["share"], cosine_hemisphere(u), h * (2.0 * dot(wo, h)) - wo)
+        return weighed(self, parameters, wo, wi)
+
+    def albedo(self, parameters: Parameters) -> Tensor:
+        """Both reflectances; where they create energy, no more than 1."""
+        return (parameters["diffuse"] + parameters["specular"]).clamp_max(1.0)
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """Facets as wide, and as bright as the lobe is at normal incidence."""
+        n = parameters["exponent"]
+        return added(parameters, 2.0 / (n + 2.0), 4.0 * (n + torch.exp(-0.34657359 * n)) / (n + 4.0))

@@ -1,0 +1,51 @@
+"""The microfacet material of the GAMES101 course: ``f = ks D F G / (4 cos_o cos_i) + (1 - F) kd / pi``.
+
+``F`` is the dielectric Fresnel reflectance at the macroscopic normal, of the angle to ``wo``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torch import Tensor
+
+from torchpt.math.microfacet import fresnel_dielectric
+from torchpt.physics.bsdfs.base import Parameters
+from torchpt.physics.bsdfs.lobes import Glossy, reflectance_at_normal
+from torchpt.physics.bsdfs.records import SplitSumMaterial
+from torchpt.physics.bsdfs.specs import GREY, WHITE, fraction, index, reflectance
+
+__all__ = ["Microfacet"]
+
+
+@dataclass(frozen=True)
+class Microfacet(Glossy):
+    """Cook and Torrance's highlight over Lambert, as in the GAMES101 course.
+
+    Not reciprocal, as Fresnel knows of ``wo`` only.
+    """
+
+    name = "microfacet"
+    parameters: ClassVar = {
+        "diffuse": reflectance(GREY, "colour of the diffuse base"),
+        "specular": reflectance(WHITE, "factor of what the facets reflect"),
+        "roughness": fraction(0.4, "of the facets: the square root of GGX's alpha"),
+        "ior": index(1.85, "index of refraction of the facets"),
+    }
+    reciprocal = False
+
+    def amounts(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Glossy`."""
+        f = fresnel_dielectric(wo[2].clamp_min(0.0), parameters["ior"]).reflectance
+        return (1.0 - f) * parameters["diffuse"], f * parameters["specular"]
+
+    def albedo(self, parameters: Parameters) -> Tensor:
+        """Both lobes at normal incidence."""
+        f0 = reflectance_at_normal(parameters["ior"])
+        return (1.0 - f0) * parameters["diffuse"] + f0 * parameters["specular"]
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """Facets over the base."""
+        specular, f0 = parameters["specular"], reflectance_at_normal(parameters["ior"])
+        return SplitSumMaterial(parameters["diffuse"], f0 * specular, specular, self.roughness(parameters), f0)

@@ -1,0 +1,42 @@
+"""Paint, wood, cloth: ``f = s f_GGX + (1 - s) base / pi``, where ``s`` is a constant reflectance such as 0.04."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torch import Tensor
+
+from torchpt.physics.bsdfs.base import Parameters
+from torchpt.physics.bsdfs.lobes import Glossy
+from torchpt.physics.bsdfs.records import SplitSumMaterial
+from torchpt.physics.bsdfs.specs import GREY, fraction, reflectance
+
+__all__ = ["Nonmetal"]
+
+
+@dataclass(frozen=True)
+class Nonmetal(Glossy):
+    """A fixed share of a GGX highlight over Lambert."""
+
+    name = "nonmetal"
+    parameters: ClassVar = {
+        "base_color": reflectance(GREY, "colour of the diffuse base"),
+        "specular": fraction(0.04, "share of the highlight"),
+        "roughness": fraction(0.5, "of its facets: the square root of GGX's alpha"),
+    }
+
+    def amounts(self, parameters: Parameters, wo: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Glossy`."""
+        s = parameters["specular"]
+        return (1.0 - s) * parameters["base_color"], s.expand_as(parameters["base_color"])
+
+    def albedo(self, parameters: Parameters) -> Tensor:
+        """Both lobes."""
+        diffuse, specular = self.amounts(parameters, parameters["base_color"])
+        return diffuse + specular
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """Reflectance alike at every angle."""
+        s = parameters["specular"]
+        return SplitSumMaterial(parameters["base_color"], s, s, self.roughness(parameters), s)

@@ -1,0 +1,56 @@
+"""No surface at all: light passes as if it were not there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
+from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
+from torchpt.spec import Refused
+
+__all__ = ["Null"]
+
+
+@dataclass(frozen=True)
+class Null(Bsdf):
+    """Nothing: light passes as if the surface were not there."""
+
+    name = "null"
+    sheer = True
+    delta = True
+    smooth = True
+    transmits = True
+
+    @classmethod
+    def check(cls, values: Values, given: frozenset[str]) -> None:
+        """Nothing can cover it, and it does not shine."""
+        super().check(values, given)
+        for key in ("opacity", "alpha_cutoff", "emission"):
+            if key in given:
+                why = "a null surface has nothing to cover or to emit (use another type with opacity)"
+                raise Refused(f"no {key}, as {why}", values[key], (key,))
+
+    def prepare(self, values: Parameters) -> Parameters:
+        """One flag that stands for the row: it has no parameters."""
+        return {"row": torch.ones(1, dtype=torch.bool)}
+
+    def eval_pdf(self, parameters: Parameters, wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+        """Nothing: a delta is not seen."""
+        return torch.zeros_like(wi), torch.zeros_like(wi[2])
+
+    def sample(self, parameters: Parameters, wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        """Straight on."""
+        return BsdfSample(-wo, torch.full_like(wo[2], math.inf), torch.ones_like(wo))
+
+    def albedo(self, parameters: Parameters) -> Tensor:
+        """White: all light goes on."""
+        return torch.ones_like(parameters["row"], dtype=torch.float32).expand(3, -1)
+
+    def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
+        """All passes."""
+        none = torch.zeros(3, len(parameters["row"]), device=parameters["row"].device)
+        return SplitSumMaterial(none, none[0], none[0], none[0], none[0], none + 1.0)

@@ -1,0 +1,53 @@
+"""The parallel projection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.physics.cameras.base import Camera
+from torchpt.spec import Moves, Scalar
+
+__all__ = ["Orthographic"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Orthographic(Camera):
+    """A camera of parallel rays, which start on the plane through its origin: what lies behind it is not seen.
+
+    Attributes:
+        width: what the film's width shows, in world units, a 0-d tensor.
+    """
+
+    name = "orthographic"
+    parameters: ClassVar = {
+        "width": Scalar(2.0, above=0.0, length=True, moves=Moves.SURFACES, doc="what the film's width shows"),
+    }
+    reaches: ClassVar[tuple[str, ...]] = ("width",)
+    sized_by: ClassVar[str] = "an orthographic camera is sized by width"
+
+    width: Tensor
+
+    def rays(self, x: Tensor, y: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
+        """See :meth:`Camera.rays`."""
+        right, up, ahead = self.axes()
+        across, along = self.place(x, y)
+        half = 0.5 * self.width
+        o = self.origin() + up * (along * half) + right * (across * half)
+        return o, ahead.expand_as(o).clone()
+
+    def film_of(self, p: Tensor) -> Tensor:
+        """See :meth:`Camera.film_of`."""
+        right, up, depth = self.covectors() @ (p - self.origin())
+        width, height = self.film[0], self.film[1]
+        x = 0.5 * width + right * (width / self.width)
+        y = 0.5 * height - up * (width / self.width)
+        return torch.stack((x, y, torch.ones_like(x), depth))
+
+    def pixel(self) -> Tensor:
+        """See :meth:`Camera.pixel`."""
+        spread = self.width / self.film[0]
+        return torch.cat((-self.axes()[2][:, 0], torch.stack((torch.zeros_like(spread), spread))))

@@ -1,0 +1,59 @@
+"""The thin lens: depth of field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.math.sampling import concentric_disk, uniform_polygon
+from torchpt.math.vectors import normalize
+from torchpt.physics.cameras.pinhole import Pinhole
+from torchpt.spec import Moves, Scalar, Whole
+
+__all__ = ["ThinLens"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThinLens(Pinhole):
+    """A perspective camera whose rays start on a lens, and meet in the plane in focus.
+
+    What lies at depth ``z`` is spread over a disk of radius ``aperture_radius |1/focus_distance - 1/z|``, as slopes of the
+    film (Potmesil and Chakravarty, *A Lens and Aperture Camera Model*, 1981).
+
+    Attributes:
+        aperture_radius: of the lens in world units, a 0-d tensor.
+        focus_distance: depth of the plane in focus, along the viewing direction, a 0-d tensor.
+        blades: corners of the aperture, the first of them up; 0 is a disk.
+    """
+
+    name = "thinlens"
+    parameters: ClassVar = {
+        "aperture_radius": Scalar(length=True, moves=Moves.SURFACES, doc="of the lens; 0 is a pinhole"),
+        "focus_distance": Scalar(
+            above=0.0, length=True, moves=Moves.SURFACES, doc="depth of the plane in focus, along the viewing direction"
+        ),
+        "blades": Whole(0, low=3, high=64, also=(0,), doc="corners of the aperture, the first of them up; 0 is a disk"),
+    }
+    lens: ClassVar[bool] = True
+    reaches: ClassVar[tuple[str, ...]] = ("aperture_radius",)
+
+    aperture_radius: Tensor
+    focus_distance: Tensor
+    blades: int
+
+    def rays(self, x: Tensor, y: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
+        """See :meth:`Camera.rays`."""
+        assert u is not None
+        left, high = concentric_disk(u) if self.blades == 0 else uniform_polygon(u, self.blades)
+        right, up, ahead = self.axes()
+        across, along = self.slopes(x, y)
+        # From the place on the lens to the point in focus, over the larger of their distances: no size overflows, and a
+        # lens without extent gives the very rays of a pinhole.
+        unit = torch.maximum(self.aperture_radius, self.focus_distance).detach()
+        near, far = self.aperture_radius / unit, self.focus_distance / unit
+        d = ahead * far + up * (along * far - high * near) + right * (across * far + left * near)
+        o = self.origin() + up * (high * self.aperture_radius) - right * (left * self.aperture_radius)
+        return o, normalize(d)

@@ -1,0 +1,41 @@
+"""Parallel light from infinitely far: where it goes in ``Lights.normal``, an irradiance in ``Lights.radiance``."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import normalize
+from torchpt.physics.lights.base import Light, Row, Setting, bright
+from torchpt.physics.lights.records import Lights, LightSample
+from torchpt.spec import Color, Direction, Moves
+
+__all__ = ["Directional"]
+
+
+class Directional(Light):
+    """Parallel light from infinitely far."""
+
+    name = "directional"
+    parameters: ClassVar = {
+        "direction": Direction(moves=Moves.SHADOWS, doc="where the light goes"),
+        "irradiance": Color((1.0, 1.0, 1.0), doc="on a surface that faces it"),
+    }
+    distant = True
+
+    @classmethod
+    def row(cls, scene: Setting) -> Row:
+        """See :class:`Light`."""
+        color = scene["irradiance"]
+        axis = normalize(scene["direction"][:, None])[:, 0]
+        return Row(color, math.pi * scene.reach**2 * bright(color), normal=axis)
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
+        """See :class:`Light`."""
+        one = torch.ones_like(u[0], dtype=at.radiance.dtype)
+        wi = (-at.normal).expand(3, u.shape[1])
+        return LightSample(wi, wi, None, at.radiance.expand_as(wi), one * torch.inf, one)

@@ -1,0 +1,331 @@
+"""An environment given by a picture of all directions, sampled by its luminance.
+
+Coordinates are Mitsuba's: in the map's own space ``u = atan2(x, -z) / 2 pi`` (wrapped) and ``v = theta / pi`` with
+``theta = acos(y)``. Texel ``(i, j)`` of H x W lies at ``u = (j + 1/2) / W``, ``v = i / (H - 1)``: the first and the last row
+are the poles. Between texels the look-up is bilinear in ``(u, v)``.
+
+**The density** is bilinear too, cell by cell, with the luminance of the same four texels; but down a cell it is linear in
+``cos(theta)``, which goes from one row to the next almost as ``theta`` does. In ``(u, cos(theta))`` equal areas are equal solid
+angles, so the density in solid angle *is* the bilinear value over a constant: no ``sin(theta)`` anywhere, finite at the poles,
+and positive wherever the look-up is. A cell's weight is the mean of its corners times its exact solid angle.
+
+**MIS compensation** (Karlík, Šik, Vévoda, Skřivan, Křivánek, *MIS Compensation: Optimizing Sampling Techniques in Multiple
+Importance Sampling*, 2019, section 5): sampled together with BSDFs, the map's own density is better made sharper, as BSDF
+sampling finds the dim rest. The mean luminance over the sphere is subtracted, and what is below it is never drawn. That is
+unbiased only while BSDF sampling covers those directions, so it holds for the strategy ``mis`` alone; ``light`` draws by
+the luminance itself. A near-constant map keeps its own density, as compensation would leave little but noise of it: one with
+less than a tenth of its light above the mean, spread over more than a tenth of the sphere (measured as
+``(int f)^2 / int f^2`` of what lies above; a small lamp before an even sky is worth the compensation however faint).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.core.threads import sum_all
+from torchpt.images.texels import TEXELS, check_source, radiance_of, read_texels, texels_of
+from torchpt.math.sampling import Cells, invert_linear
+from torchpt.math.vectors import azimuth, dot, luminance, safe_reciprocal, take
+from torchpt.physics.ibl.equirect import Cell, angles
+from torchpt.physics.lights.base import Environment, Row, Setting, Surroundings, bright
+from torchpt.physics.lights.records import Lights, LightSample
+from torchpt.spec import Moves, Other, Path, Pose, Scalar, Spec, Texels
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+__all__ = ["EVEN", "EnvironmentMap", "Envmap", "Grid", "build", "environment", "pdf", "radiance", "sample"]
+
+#: A map is near-constant with less than this share of its light above the mean, over more than this share of the sphere.
+EVEN = 0.1
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A density over a map's cells, made of ``max(luminance - floor, 0)`` at the texels.
+
+    Attributes:
+        cells: the choice of a cell, in float64.
+        floor: ``()`` what is subtracted; negative, for a black map, it makes the density uniform.
+        factor: ``()`` from the interpolated difference to the density in solid angle.
+    """
+
+    cells: Cells
+    floor: Tensor
+    factor: Tensor
+
+
+@dataclass(frozen=True)
+class EnvironmentMap:
+    """A map of H x W texels; H is at least 2.
+
+    Attributes:
+        texels: ``(3, H W)`` linear RGB.
+        height: H, static; lanes read ``size``.
+        width: W.
+        size: ``(2,)`` int64 H and W.
+        turn: ``(3, 3)`` orthogonal, from the world to the map's own space.
+        scale: ``()`` factor of the texels.
+        halves: ``(2, H)`` ``sin^2(theta / 2)`` and ``cos^2(theta / 2)`` of the rows: differences of either keep their
+            digits at its own pole.
+        steps: ``(H - 1,)`` one over the differences of the first.
+        mean: ``()`` mean luminance over the sphere, ``scale`` left out; detached.
+        plain: the density by luminance.
+        compensated: the density for MIS; None where it is ``plain``.
+    """
+
+    texels: Tensor
+    height: int
+    width: int
+    size: Tensor
+    turn: Tensor
+    scale: Tensor
+    halves: Tensor
+    steps: Tensor
+    mean: Tensor
+    plain: Grid
+    compensated: Grid | None
+
+    def grid(self, mis: bool) -> Grid:
+        """The density in use: for MIS with BSDF sampling, or alone."""
+        return self.compensated if mis and self.compensated is not None else self.plain
+
+
+def build(texels: Tensor, turn: Tensor, scale: Tensor, compensation: bool | None = None) -> EnvironmentMap:
+    """A map ready to be looked up and sampled; differentiable in all three, but for its densities.
+
+    Args:
+        texels: ``(H, W, 3)`` linear RGB in the lanes' dtype; a single row is the same at every height.
+        turn: ``(3, 3)`` orthogonal, from the world to the map's own space.
+        scale: ``()`` factor of the texels.
+        compensation: whether MIS gets a density of its own; None: where the map is uneven enough.
+    """
+    if texels.shape[0] == 1:
+        texels = texels.expand(2, -1, -1)
+    height, width, _ = texels.shape
+    planes = texels.permute(2, 0, 1).reshape(3, -1)
+    angle = torch.linspace(0.0, 0.5 * math.pi, height, dtype=torch.float64, device=texels.device)
+    sine, cosine = torch.sin(angle), torch.cos(angle)
+    # cos(pi / 2) is not quite 0 in floating point.
+    sine[0] = cosine[-1] = 0.0
+    halves = torch.stack((sine * sine, cosine * cosine))
+    top = halves[0].diff()  # near the south pole the other one keeps its digits
+    heights = torch.where(halves[0, 1:] < 0.5, top, -halves[1].diff())
+    with torch.no_grad():
+        light = luminance(planes).clamp_min(0.0).view(height, width)
+        zero = light.new_zeros(())
+        weights = _weights(light, heights)
+        mean = sum_all(weights)
+        black = not bool(mean > 0)
+        plain = _grid(_weights(torch.ones_like(light), heights), zero - 1.0) if black else _grid(weights, zero)
+        compensated = None
+        if not black and compensation is not False:
+            floor = mean.to(light.dtype)
+            weights = _weights((light - floor).clamp_min(0.0), heights)
+            if bool(sum_all(weights) > 0) and (compensation or _uneven(weights, mean, heights)):
+                compensated = _grid(weights, floor)
+    return EnvironmentMap(
+        texels=planes,
+        height=height,
+        width=width,
+        size=torch.tensor((height, width), dtype=torch.int64, device=texels.device),
+        turn=turn,
+        scale=scale,
+        halves=halves.to(texels.dtype),
+        steps=(1.0 / heights).to(texels.dtype),
+        mean=mean.to(texels.dtype),
+        plain=plain,
+        compensated=compensated,
+    )
+
+
+def _weights(values: Tensor, heights: Tensor) -> Tensor:
+    """Integrals ``(H - 1, W)`` float64 over the cells of values ``(H, W)`` at the texels; the whole sphere counts as 1."""
+    v = values.double()
+    v = v + v.roll(-1, 1)
+    return 0.25 * (v[:-1] + v[1:]) * (heights / values.shape[1])[:, None]
+
+
+def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
+    """Whether compensation repays: see :data:`EVEN`. ``weights`` are those of what lies above the mean."""
+    above = sum_all(weights)
+    spread = above * above / sum_all(weights * weights * (weights.shape[1] / heights[:, None]))
+    return bool((above > EVEN * mean) | (spread < EVEN))
+
+
+def _grid(weights: Tensor, floor: Tensor) -> Grid:
+    """From integrals over the cells; the sphere counts as 1 in them, and as 4 pi in the density."""
+    return Grid(Cells.of(weights), floor, (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype))
+
+
+def _place(map: EnvironmentMap, d: Tensor) -> Cell:
+    """The cells of unit directions ``(3, N)`` of the world."""
+    local = [dot(map.turn[k][:, None], d) for k in range(3)]
+    around, down = angles(local, torch.finfo(d.dtype).tiny)
+    tall, wide = map.size[0].to(d.dtype), map.size[1].to(d.dtype)
+    y = down * ((tall - 1.0) * (1.0 / math.pi))
+    x = around * (wide * (0.5 / math.pi)) - 0.5
+    at = Cell.of(x, y, map.size[0], map.size[1])
+    return at._replace(y=at.y.clamp_max(1.0))
+
+
+#: Colours ``(3, N)`` of a cell's texels: two of the upper row, two of the lower one.
+_Corners = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def _corners(map: EnvironmentMap, at: Cell) -> _Corners:
+    a, b, c, d = (take(map.texels, texel) for texel in at.texels(map.size[1]))
+    return a, b, c, d
+
+
+def _mix(corners: tuple[Tensor, Tensor, Tensor, Tensor], x: Tensor, y: Tensor) -> Tensor:
+    a, b, c, d = corners
+    top, bottom = a + (b - a) * x, c + (d - c) * x
+    return top + (bottom - top) * y
+
+
+def _values(grid: Grid, corners: _Corners) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What the density interpolates, ``(N,)`` a corner."""
+    a, b, c, d = ((luminance(colour.detach()).clamp_min(0.0) - grid.floor).clamp_min(0.0) for colour in corners)
+    return a, b, c, d
+
+
+def _density(map: EnvironmentMap, grid: Grid, at: Cell, corners: _Corners) -> Tensor:
+    step = math.pi / (map.size[0] - 1).to(at.y.dtype)
+    y = at.y.detach()
+    # A difference of cosines as a product, which does not cancel.
+    down = torch.sin((0.5 * step) * y) * torch.sin(step * (at.row + 0.5 * y)) * take(map.steps, at.row)
+    return _mix(_values(grid, corners), at.x.detach(), down.clamp_max(1.0)) * grid.factor
+
+
+def radiance(map: EnvironmentMap, d: Tensor) -> Tensor:
+    """Radiance ``(3, N)`` from unit directions ``d (3, N)``."""
+    at = _place(map, d)
+    return _mix(_corners(map, at), at.x, at.y) * map.scale
+
+
+def pdf(map: EnvironmentMap, d: Tensor, mis: bool) -> Tensor:
+    """Density ``(N,)`` in solid angle with which :func:`sample` draws unit directions ``d (3, N)``; detached."""
+    at = _place(map, d.detach())
+    return _density(map, map.grid(mis), at, _corners(map, at))
+
+
+def environment(map: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
+    """:func:`radiance` and :func:`pdf` in one look-up."""
+    at = _place(map, d)
+    corners = _corners(map, at)
+    return _mix(corners, at.x, at.y) * map.scale, _density(map, map.grid(mis), at, corners)
+
+
+def sample(map: EnvironmentMap, u: Tensor, mis: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Directions drawn by luminance.
+
+    Args:
+        map: the map.
+        u: ``(2, N)`` in ``[0, 1)``.
+        mis: whether BSDF sampling shares the work; without it the density leaves nothing out that shines.
+
+    Returns:
+        Unit directions ``(3, N)`` and their densities ``(N,)`` in solid angle, both detached, and the radiance ``(3, N)`` from
+        there. A density of 0 means that the draw failed.
+    """
+    grid = map.grid(mis)
+    row, column, rest = grid.cells.sample(u)
+    corners = _corners(map, Cell(row, column, rest[0], rest[1]))
+    with torch.no_grad():
+        a, b, c, d = _values(grid, corners)
+        down = invert_linear(rest[1], a + b, c + d)
+        x = invert_linear(rest[0], a + (c - a) * down, b + (d - b) * down)
+        density = _mix((a, b, c, d), x, down) * grid.factor
+        above, below = take(map.halves, row), take(map.halves, row + 1)
+        half = above + (below - above) * down
+        tall, wide = map.size[0].to(u.dtype), map.size[1].to(u.dtype)
+        phi = (x + (column + 0.5)) * (2.0 * math.pi / wide)
+        radius = 2.0 * (half[0] * half[1]).sqrt()
+        local = (radius * torch.sin(phi), half[1] - half[0], radius * -torch.cos(phi))
+        # The inverse of an orthogonal map is its transpose.
+        turn = map.turn
+        wi = torch.stack([local[0] * turn[0, k] + local[1] * turn[1, k] + local[2] * turn[2, k] for k in range(3)])
+        y = (azimuth(local[1], radius) * ((tall - 1.0) * (1.0 / math.pi)) - row).clamp(0.0, 1.0)
+    if map.turn.requires_grad:
+        return wi, density, radiance(map, wi)  # which follows the turn
+    return wi, density, _mix(corners, x, y) * map.scale
+
+
+class Envmap(Environment):
+    """An environment given by a picture of all directions."""
+
+    name = "envmap"
+    parameters: ClassVar = {
+        "path": Path(None, doc="the picture: `.exr`, `.hdr` or 8-bit; of several the first that is there"),
+        "data": Other(
+            None,
+            reader=texels_of,
+            words=TEXELS,
+            doc="in place of a file: an array, a tensor or rows of numbers, the first at the top; linear, but for uint8",
+        ),
+        "scale": Scalar(1.0, doc="factor of its radiance"),
+        "transform": Pose(
+            None,
+            angles=True,
+            moves=Moves.NOTHING,
+            doc="turns it, and may mirror it; where it is moved to, and how much it is enlarged, do not matter",
+        ),
+    }
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Light`: of one source."""
+        check_source(values)
+
+    @classmethod
+    def files(
+        cls, values: Mapping[str, Any], find: Callable[[str], FilePath]
+    ) -> dict[str, tuple[NDArray[np.float32], Spec]]:
+        """See :class:`Light`."""
+        spec = Texels(doc="radiance `(H, W, 3)`, before `scale`")
+        if values["data"] is not None:
+            return {"texels": (radiance_of(values["data"], "data", "data"), spec)}
+        file = find("path")
+        return {"texels": (radiance_of(read_texels(file), str(file), "path"), spec)}
+
+    @classmethod
+    def row(cls, scene: Setting) -> Row:
+        """See :class:`Light`; what its functions are given is an :class:`EnvironmentMap`."""
+        texels, scale = (scene.given(key).to(scene.dtype) for key in ("texels", "scale"))
+        linear = scene["to_world"][:3, :3]
+        turn = torch.linalg.inv(linear) * torch.linalg.det(linear).abs() ** (1.0 / 3.0)
+        around = build(texels, turn.to(scene.dtype), scale)
+        color = (around.mean * around.scale.detach()).expand(3)
+        return Row(color, 4.0 * math.pi**2 * scene.reach**2 * bright(color), environment=around)
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
+        """See :class:`Light`."""
+        wi, density, light = sample(at.environment, u, mis)
+        weight = torch.where(density > 0, safe_reciprocal(density), 0.0)
+        return LightSample(wi, wi, None, light, density, weight)
+
+    @classmethod
+    def arriving(cls, around: EnvironmentMap, d: Tensor, mis: bool) -> tuple[Tensor, Tensor]:
+        """See :class:`Environment`."""
+        return environment(around, d, mis)
+
+    @classmethod
+    def surroundings(cls, around: EnvironmentMap) -> Surroundings:
+        """See :class:`Environment`."""
+        texels = (around.texels * around.scale).T.reshape(around.height, around.width, 3)
+        return Surroundings(texels, around.turn)
+
+    @classmethod
+    def info(cls, around: EnvironmentMap) -> dict[str, Any]:
+        """See :class:`Environment`."""
+        return {"texels": [around.width, around.height], "mis_compensation": around.compensated is not None}

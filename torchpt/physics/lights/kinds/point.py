@@ -1,0 +1,48 @@
+"""Points that shine alike in all directions: a position in ``Lights.p0``, an intensity in ``Lights.radiance``."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt import spec
+from torchpt.math.vectors import dot, safe_reciprocal
+from torchpt.physics.lights.base import Light, Row, Setting, bright
+from torchpt.physics.lights.records import Lights, LightSample
+from torchpt.spec import Color, Moves
+
+__all__ = ["Point", "toward"]
+
+
+def toward(x: Tensor, position: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit directions ``(3, N)`` from ``x (3, N)`` to points, and one over the squared distances ``(N,)``; 0 at the point."""
+    to = position - x
+    square = dot(to, to)
+    return to / square.clamp_min(torch.finfo(square.dtype).tiny).sqrt(), safe_reciprocal(square)
+
+
+class Point(Light):
+    """A point that shines alike in all directions."""
+
+    name = "point"
+    parameters: ClassVar = {
+        "position": spec.Point(moves=Moves.SHADOWS, doc="where it is"),
+        "intensity": Color((1.0, 1.0, 1.0), doc="power per solid angle"),
+    }
+    places = ("position",)
+
+    @classmethod
+    def row(cls, scene: Setting) -> Row:
+        """See :class:`Light`."""
+        color = scene.intensity("intensity")
+        return Row(color, (4.0 * math.pi) * bright(color), scene.point("position"))
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
+        """See :class:`Light`."""
+        wi, weight = toward(x, at.p0)
+        infinite = torch.full_like(weight, torch.inf)
+        return LightSample(wi, at.p0.expand_as(wi), None, at.radiance.expand_as(wi), infinite, weight)

@@ -1,0 +1,97 @@
+"""Spots: points that shine within a cone about ``Lights.normal``; ``Lights.e1`` holds the cutoff angle and the slope.
+
+Whole up to the beam's edge, from there falling linearly in the angle to zero at the cutoff, as Mitsuba's ``spot``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import azimuth, cross, dot, luminance, normalize
+from torchpt.physics.lights.base import Cone, Light, Row, Setting, bright
+from torchpt.physics.lights.kinds import point
+from torchpt.physics.lights.records import Lights, LightSample
+from torchpt.spec import Angle, Color, Moves, Point, Refused
+
+__all__ = ["Spot", "falloff"]
+
+
+def falloff(wi: Tensor, axis: Tensor, cutoff: Tensor, slope: Tensor) -> Tensor:
+    """Share ``(N,)`` of the intensity that goes along ``-wi``.
+
+    Args:
+        wi: unit directions toward the light ``(3, N)``.
+        axis: unit ``(3, N)``.
+        cutoff: in radians ``(N,)``.
+        slope: one over the angle from the beam's edge to the cutoff ``(N,)``.
+    """
+    aside = cross(axis.expand_as(wi), wi)
+    sine = dot(aside, aside).clamp_min(torch.finfo(wi.dtype).tiny).sqrt()
+    return ((cutoff - azimuth(-dot(wi, axis), sine)) * slope).clamp(0.0, 1.0)
+
+
+def _most_of_the_cone(values: Mapping[str, Any]) -> float:
+    """The beam's width where nobody says it, as Mitsuba has it."""
+    return 0.75 * values["cutoff_angle"]
+
+
+class Spot(Light):
+    """A point that shines within a cone about the direction to ``target``."""
+
+    name = "spot"
+    parameters: ClassVar = {
+        "position": Point(moves=Moves.SHADOWS, doc="where it is"),
+        "target": Point(moves=Moves.SHADOWS, doc="a point that it aims at"),
+        "intensity": Color((1.0, 1.0, 1.0), doc="power per solid angle within the beam"),
+        "cutoff_angle": Angle(20.0, above=0.0, high=180.0, doc="from the axis; nothing shines beyond"),
+        "beam_width": Angle(
+            _most_of_the_cone,
+            above=0.0,
+            high=180.0,
+            doc="from the axis, up to which the intensity is whole; from there it falls linearly to 0 at the cutoff",
+        ),
+    }
+    places = ("position",)
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Light`."""
+        if values["position"] == values["target"]:
+            raise Refused("a point other than the position", list(values["target"]), ("target",))
+        if values["beam_width"] > values["cutoff_angle"]:
+            expected = f"an angle of at most cutoff_angle ({values['cutoff_angle']:g})"
+            raise Refused(expected, values["beam_width"], ("beam_width",))
+
+    @classmethod
+    def row(cls, scene: Setting) -> Row:
+        """See :class:`Light`."""
+        color = scene.intensity("intensity")
+        axis = normalize((scene["target"] - scene["position"])[:, None])[:, 0]
+        cutoff, beam = (scene[key] * (math.pi / 180.0) for key in ("cutoff_angle", "beam_width"))
+        # How fast it falls from the beam's edge to the cutoff; finite where the two are one.
+        slope = 1.0 / (cutoff - beam).clamp_min(1e-6)
+        # What falls linearly from a to b is on average as the mean of cosines between them, which is this product.
+        mean = torch.cos(0.5 * (cutoff + beam)) * torch.sinc((cutoff - beam) * (0.5 / math.pi))
+        share = 2.0 * math.pi * (1.0 - mean).detach()
+        numbers = torch.stack((cutoff, slope, torch.zeros_like(cutoff)))
+        return Row(color, share * bright(color), scene.point("position"), numbers, normal=axis)
+
+    @classmethod
+    def bounds(cls, at: Lights, intensity: Tensor) -> Cone:
+        """See :class:`Emitter`: whole within the beam, and beyond its edge up to the cutoff."""
+        cutoff, slope = at.e1[0], at.e1[1]
+        edge = 1.0 / slope
+        return Cone(torch.cos((cutoff - edge).clamp_min(0.0)), torch.cos(edge), luminance(at.radiance.abs()))
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor, mis: bool) -> LightSample:
+        """See :class:`Light`."""
+        drawn = point.Point.sample(at, x, u, mis)
+        share = falloff(drawn.wi, at.normal, at.e1[0], at.e1[1])
+        return replace(drawn, radiance=drawn.radiance * share)

@@ -1,0 +1,275 @@
+"""Planar lights sampled uniformly by the solid angle that they fill, seen from each reference point.
+
+Triangles: Arvo, *Stratified Sampling of Spherical Triangles*, 1995. His map is made of vectors here instead of angles: a
+subtriangle of the share ``u`` of the area ends where the reflection of a corner falls (van Oosterom and Strackee's
+``tan(E / 2)``, *The Solid Angle of a Plane Triangle*, 1983, solved for the corner), so that nothing cancels in slivers, and
+the point comes out as its own barycentric coordinates, inside the triangle whatever the rounding.
+Rectangles: Urena, Fajardo, King, *An Area-Preserving Parametrization for Spherical Rectangles*, 2013. A parallelogram that
+is no rectangle is two triangles, which share a corner and hence one continuous map.
+
+Where the angle is below :data:`LEAST` a light is sampled by area, which is then as good; above :data:`MOST` the point lies
+in the light up to rounding. The switch is part of :func:`angles`, and so the same for :func:`sample` and for the density of
+a direction that was found otherwise. Everything is float64 inside: the angle of a light near or edge-on cancels.
+
+Nothing of it is differentiable, and engines may take it over.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchpt.core.dispatch import dispatched
+from torchpt.math.sampling import uniform_triangle
+from torchpt.math.vectors import azimuth, cross, dot
+
+__all__ = [
+    "LEAST",
+    "MOST",
+    "NEAR",
+    "OPPOSITE",
+    "OTHER",
+    "RECTANGLE",
+    "SKEW",
+    "TRIANGLE",
+    "angles",
+    "inverse_pdf",
+    "sample",
+    "shapes_of",
+    "table_of",
+]
+
+#: Codes of shapes: a triangle, a rectangle, a parallelogram that is no rectangle, anything else.
+TRIANGLE, RECTANGLE, SKEW, OTHER = 0, 1, 2, 3
+#: Solid angles, in steradians, beyond which lights are sampled by area.
+LEAST, MOST = 3e-4, 2.0 * math.pi - 1e-5
+#: One plus the cosine between two corners of a triangle below which float64 loses the angle: seen from a millionth of an
+#: edge's length away, its ends lie in opposite directions. Then the triangle is sampled by area.
+OPPOSITE = 1e-12
+#: Farther than this from its centre, in units of the radius about it, a light is sampled by area.
+NEAR = 2.0
+#: Cosine of the edges below which a parallelogram is a rectangle: rounding of its corners in float32.
+SQUARE = 1e-6
+
+
+def table_of(codes: Sequence[int], p0: Tensor, e1: Tensor, e2: Tensor, near: float = NEAR) -> Tensor | None:
+    """Return what :func:`sample` reads of lights.
+
+    Args:
+        codes: of the rows' shapes: :data:`TRIANGLE`, :data:`RECTANGLE` (which may be sheared) or :data:`OTHER`.
+        p0: ``(3, K)``.
+        e1: ``(3, K)``.
+        e2: ``(3, K)``.
+        near: in place of :data:`NEAR`.
+
+    Returns:
+        ``(K, 14)`` float64: the shape's code, the squared distance from which on it is sampled by area, the centre which
+        that is from, ``p0``, ``e1``, ``e2``. None where none of them is sampled by its solid angle.
+    """
+    if set(codes) <= {OTHER}:
+        return None
+    p, a, b = (x.detach().double() for x in (p0, e1, e2))
+    code = torch.tensor(codes, device=p.device)
+    skew = dot(a, b).abs() > SQUARE * (dot(a, a) * dot(b, b)).sqrt()
+    code = torch.where(skew & (code == RECTANGLE), SKEW, code)
+    share = torch.where(code == TRIANGLE, 1.0 / 3.0, 0.5).double()
+    centre = (a + b) * share
+    corners = [torch.zeros_like(a), a, b, torch.where(code == TRIANGLE, b, a + b)]
+    square = torch.stack([dot(corner - centre, corner - centre) for corner in corners]).amax(0)
+    reach = torch.where(code == OTHER, 0.0, square * near**2)
+    return torch.cat((code.double()[None], reach[None], p + centre, p, a, b)).T.contiguous()
+
+
+def shapes_of(table: Tensor | None) -> tuple[int, ...]:
+    """Codes of the shapes in a table that are sampled here."""
+    if table is None:
+        return ()
+    return tuple(code for code in (TRIANGLE, RECTANGLE, SKEW) if bool((table[:, 0] == code).any()))
+
+
+@dispatched
+@torch.no_grad()
+def sample(
+    table: Tensor, row: Tensor | None, x: Tensor, u: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)
+) -> tuple[Tensor, Tensor]:
+    """Points on lights, seen from ``x``; nothing of it is differentiable.
+
+    Args:
+        table: from :func:`table_of`.
+        row: of each lane ``(N,)`` int64; None where the table has one row.
+        x: reference points ``(3, N)``.
+        u: ``(2, N)`` in [0, 1).
+        shapes: codes of those in the table; the others cost nothing.
+
+    Returns:
+        The primitive's own ``(u, v)`` of the points ``(2, N)``, and as :func:`angles` the solid angles ``(N,)``: where they
+        are 0 the point was drawn by area. Rows of other shapes keep ``u``.
+    """
+    shape, near, a, e, f = _seen(table, row, x)
+    w = u.double()
+    uv, angle = _of_shapes(shapes, shape, a, e, f, w)
+    angle = torch.where(near, angle, 0.0)
+    by_area = torch.where(shape == TRIANGLE, uniform_triangle(w), w) if TRIANGLE in shapes else w
+    return torch.where(angle > 0, uv, by_area).to(u.dtype), angle.to(x.dtype)
+
+
+@dispatched
+@torch.no_grad()
+def angles(table: Tensor, row: Tensor | None, x: Tensor, shapes: Sequence[int] = (TRIANGLE, RECTANGLE, SKEW)) -> Tensor:
+    """Solid angles ``(N,)`` by which :func:`sample` draws from these lights at ``x``, 0 where it draws by area.
+
+    From behind a light fills the same angle; it is the caller who knows which side emits.
+    """
+    shape, near, a, e, f = _seen(table, row, x)
+    angle = _of_shapes(shapes, shape, a, e, f, torch.zeros_like(a[:2]))[1]
+    return torch.where(near, angle, 0.0).to(x.dtype)
+
+
+def inverse_pdf(angle: Tensor, by_area: Tensor) -> Tensor:
+    """``1 / pdf`` in solid angle ``(N,)`` of points drawn by :func:`sample`, 0 behind the emitter.
+
+    Args:
+        angle: from :func:`sample` or :func:`angles`.
+        by_area: ``area cos / r^2``, 0 behind the emitter. Its derivative is that of the result: the point on the light is
+            held, and the integrand over its area is what moves.
+    """
+    if not by_area.requires_grad:
+        return torch.where(angle > 0, angle * torch.sign(by_area), by_area)
+    value = by_area.detach()
+    seen = value > 0
+    solid = angle * torch.where(seen, by_area / torch.where(seen, value, 1.0), 0.0)
+    return torch.where(angle > 0, solid, by_area)
+
+
+def _seen(table: Tensor, row: Tensor | None, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Shape, whether it is near, first corner as seen from ``x``, and edges of each lane, in float64."""
+    lanes = (table if row is None else table[row]).T.expand(14, x.shape[1])
+    away = lanes[2:5] - x.double()
+    near = (lanes[0] != OTHER) & (dot(away, away) < lanes[1])
+    return lanes[0], near, lanes[5:8] - x.double(), lanes[8:11], lanes[11:14]
+
+
+def _of_shapes(
+    shapes: Sequence[int], shape: Tensor, a: Tensor, e: Tensor, f: Tensor, u: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Points and solid angles, each lane by the form of its shape."""
+    forms = {TRIANGLE: _triangle, RECTANGLE: _rectangle, SKEW: _skew}
+    if not shapes:
+        return torch.zeros_like(a[:2]), torch.zeros_like(a[0])
+    uv, angle = forms[shapes[-1]](a, e, f, u)
+    for code in shapes[-2::-1]:
+        other, of_other = forms[code](a, e, f, u)
+        uv, angle = torch.where(shape == code, other, uv), torch.where(shape == code, of_other, angle)
+    return uv, angle
+
+
+def _reciprocal(a: Tensor) -> Tensor:
+    return a.clamp_min(1e-300).reciprocal()
+
+
+def _within(angle: Tensor) -> Tensor:
+    return torch.where((angle >= LEAST) & (angle <= MOST), angle, 0.0)
+
+
+def _unit(a: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit vectors and one over the length."""
+    inverse = _reciprocal(dot(a, a).sqrt())
+    return a * inverse, inverse
+
+
+def _excess(volume: Tensor, ab: Tensor, bc: Tensor, ca: Tensor) -> Tensor:
+    """Half the solid angle of three unit vectors; NaN where rounding is all there is of it."""
+    half = azimuth(1.0 + ab + bc + ca, volume)
+    told = 1.0 + torch.minimum(torch.minimum(ab, bc), ca) >= OPPOSITE
+    return torch.where(told, torch.where(half <= math.pi, half, 0.0), math.nan)
+
+
+def _arc(
+    half: Tensor, volume: Tensor, ab: Tensor, bc: Tensor, ca: Tensor, u: Tensor, v: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights of the unit vectors A, B, C in a direction of their triangle."""
+    c, s = torch.cos(half * u), torch.sin(half * u)
+    # C' on the arc from A to C cuts off the share u: along x A + y C, reflected.
+    x, y = volume * c - (bc + ca) * s, (1.0 + ab) * s
+    k = 2.0 * (x + y * ca) * _reciprocal(x * x + y * y + 2.0 * x * y * ca)
+    p, q = k * x - 1.0, k * y
+    # On the arc from B to C', with 1 - cos linear in v.
+    far = p * ab + q * bc
+    near = 1.0 - v * (1.0 - far)
+    t = (v * (1.0 + near) * _reciprocal(1.0 + far)).abs().sqrt()
+    return t * p, near - t * far, t * q
+
+
+def _share(weights: tuple[Tensor, Tensor, Tensor], ia: Tensor, ib: Tensor, ic: Tensor) -> tuple[Tensor, Tensor]:
+    """Barycentric shares of A and C in the plane, from weights of unit vectors and one over their lengths."""
+    a, b, c = (w.clamp_min(0.0) * i for w, i in zip(weights, (ia, ib, ic), strict=True))
+    scale = _reciprocal(a + b + c)
+    return a * scale, c * scale
+
+
+def _triangle(hub: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    (a, ia), (b, ib), (c, ic) = _unit(hub + e), _unit(hub), _unit(hub + f)
+    volume = dot(hub, cross(e, f)).abs() * (ia * ib) * ic
+    ab, bc, ca = dot(a, b), dot(b, c), dot(c, a)
+    half = _excess(volume, ab, bc, ca)
+    p, q = _share(_arc(half, volume, ab, bc, ca, u[0], u[1]), ia, ib, ic)
+    return torch.stack((p, q)), _within(2.0 * half)
+
+
+def _skew(hub: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    (o, io), (a, ia), (b, ib), (c, ic) = _unit(hub), _unit(hub + e), _unit(hub + e + f), _unit(hub + f)
+    volume = dot(hub, cross(e, f)).abs() * io
+    oa, ob, oc, ab, bc = dot(o, a), dot(o, b), dot(o, c), dot(a, b), dot(b, c)
+    first, second = volume * ia * ib, volume * ib * ic
+    one, two = _excess(first, oa, ob, ab), _excess(second, ob, oc, bc)
+    at = u[0] * (one + two)
+    left = at < one
+
+    def pick(x: Tensor, y: Tensor) -> Tensor:
+        return torch.where(left, x, y)
+
+    half = pick(one, two)
+    inner = (pick(at, at - one) * _reciprocal(half)).clamp_max(1.0)
+    weights = _arc(half, pick(first, second), pick(oa, ob), pick(ob, oc), pick(ab, bc), inner, u[1])
+    p, q = _share(weights, pick(ia, ib), io, pick(ib, ic))
+    # Of the first half A and C are the ends of e and of e + f, of the second those of e + f and of f.
+    return torch.stack((pick(p + q, p), pick(q, p + q))), _within(2.0 * (one + two))
+
+
+def _rectangle(a: Tensor, e: Tensor, f: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    wide, high = dot(e, e).sqrt(), dot(f, f).sqrt()
+    ie, jf = _reciprocal(wide), _reciprocal(high)
+    x0, y0, z = dot(a, e) * ie, dot(a, f) * jf, dot(a, cross(e, f)).abs() * ie * jf
+    x1, y1 = x0 + wide, y0 + high
+    # The unit of length: eight of them are multiplied below.
+    extent = torch.maximum(torch.maximum(x0.abs(), x1.abs()), torch.maximum(y0.abs(), y1.abs()))
+    unit = _reciprocal(torch.maximum(extent, z))
+    x0, x1, y0, y1, z = (w * unit for w in (x0, x1, y0, y1, z))
+    zz = z * z
+
+    def corner(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """A complex number that turns by the angle of the quadrant up to ``(x, y)``: tan F = x y / (z r)."""
+        return z * (x * x + y * y + zz).sqrt(), x * y
+
+    def less(p: tuple[Tensor, Tensor], q: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        return p[0] * q[0] + p[1] * q[1], p[1] * q[0] - p[0] * q[1]
+
+    begin, end = less(corner(x0, y1), corner(x0, y0)), less(corner(x1, y1), corner(x1, y0))
+    angle = azimuth(*less(end, begin))
+    h = ((y0 * y0 + zz) * (y1 * y1 + zz)).sqrt()
+    scale = _reciprocal((x0 * x0 + zz) * h)
+    # The share left of x is T = F(x, y1) - F(x, y0) = T0 + u S.
+    c, s = torch.cos(angle * u[0]), torch.sin(angle * u[0])
+    cos_t, sin_t = (c * begin[0] - s * begin[1]) * scale, (s * begin[0] + c * begin[1]) * scale
+    p = h * cos_t - y0 * y1
+    x = z * h * sin_t * _reciprocal(((p - zz) * (p + zz)).clamp_min(0.0).sqrt())
+    x = torch.minimum(torch.maximum(x, x0), x1)
+    dd = x * x + zz
+    h0, h1 = y0 * _reciprocal((dd + y0 * y0).sqrt()), y1 * _reciprocal((dd + y1 * y1).sqrt())
+    g = h0 + u[1] * (h1 - h0)
+    y = g * dd.sqrt() * _reciprocal(((1.0 - g) * (1.0 + g)).clamp_min(0.0).sqrt())
+    y = torch.minimum(torch.maximum(y, y0), y1)
+    return torch.stack(((x - x0) * _reciprocal(x1 - x0), (y - y0) * _reciprocal(y1 - y0))), _within(angle)

@@ -1,0 +1,26 @@
+"""Disks and ellipses, drawn by area."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor
+
+from torchpt.math.sampling import concentric_disk
+from torchpt.physics.lights.records import Lights
+from torchpt.physics.lights.surface import OnSurface, Surface, flat_point
+
+__all__ = ["Disk"]
+
+
+class Disk(Surface):
+    """An ellipse."""
+
+    name = "disk"
+    share = math.pi
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+        """See :class:`Surface`."""
+        place = concentric_disk(u)
+        return OnSurface(flat_point(at.p0, at.e1, at.e2, place), at.normal, place)

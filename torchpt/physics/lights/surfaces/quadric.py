@@ -1,0 +1,67 @@
+"""Emitters that are quadrics under affine maps, sampled uniformly by area in the surface's own space.
+
+Under a map M with cofactor matrix C the area element at own normal n grows by ``|C n| = |det M| / |M^T N|``, N the world's
+unit normal: what was sampled and what was hit by chance agree on the density from N alone.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import affine, dot
+from torchpt.physics.lights.records import Lights
+from torchpt.physics.lights.surface import Faces, OnSurface, Surface
+from torchpt.physics.shapes import quadrics
+
+__all__ = ["Quadric", "world_area"]
+
+
+def world_area(area: Tensor, e1: Tensor, e2: Tensor, e3: Tensor, normal: Tensor) -> Tensor:
+    """One over the density by area where the normal is ``normal (3, N)``.
+
+    Args:
+        area: area in the own space times ``|det|`` ``(N,)``.
+        e1: ``(3, N)``.
+        e2: ``(3, N)``.
+        e3: ``(3, N)``.
+        normal: unit, of the world ``(3, N)``.
+    """
+    a, b, c = dot(e1, normal), dot(e2, normal), dot(e3, normal)
+    square = a * a + b * b + c * c
+    return area / torch.where(square > 0, square, 1.0).sqrt()
+
+
+class Quadric(Surface):
+    """An ellipsoid, or the side of a cylinder or cone."""
+
+    name = "quadric"
+    convex = True
+    tabled = True
+
+    @classmethod
+    def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
+        """See :class:`Surface`: its own space's times ``|det|``; the world's by quadrature."""
+        assert faces.quadrics is not None and faces.frame is not None
+        area, whole = quadrics.areas(faces.quadrics, faces.frame)
+        return area.index_select(0, faces.column), whole.index_select(0, faces.column)
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+        """See :class:`Surface`."""
+        assert at.quadrics is not None
+        own = quadrics.sample(at.quadrics, u)
+        p = affine(at.p0 + at.e1 * own[0], at.e2, own[1], at.quadrics.e3, own[2])
+        return OnSurface(p, quadrics.outward(at.quadrics, own), own=own)
+
+    @classmethod
+    def size(cls, at: Lights, normal: Tensor) -> Tensor | None:
+        """See :class:`Surface`."""
+        assert at.quadrics is not None
+        return world_area(at.area, at.e1, at.e2, at.quadrics.e3, normal)
+
+    @classmethod
+    def bound(cls, at: Lights, normal: Tensor) -> Tensor | None:
+        """See :class:`Surface`."""
+        assert at.quadrics is not None
+        return dot(normal.detach().abs(), at.quadrics.reach)

@@ -1,0 +1,84 @@
+"""Spherical emitters: the visible cone sampled uniformly from outside, the whole sphere from within.
+
+Pharr, Jakob, Humphreys, *Physically Based Rendering*, 4th ed., section 6.2.4; the series below ``sin^2 = 6.9e-4`` keeps far
+lights exact.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchpt.math.sampling import one_minus_cos, uniform_cone, uniform_sphere
+from torchpt.math.vectors import Frame, dot, normalize, safe_reciprocal
+from torchpt.physics.lights.records import Lights
+from torchpt.physics.lights.surface import Faces, OnSurface, Surface
+
+__all__ = ["Sphere", "inverse_pdf", "sample"]
+
+
+def _cone(x: Tensor, centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Axis, distance, ``outside``, and ``1 - cos`` of the visible cone."""
+    axis = centre - x
+    square = dot(axis, axis)
+    outside = square > radius * radius * (1.0 + 2.0**-18)  # nearer, the cone is a half space up to rounding
+    safe = torch.where(outside, square, 4.0 * radius * radius)
+    return axis, safe.sqrt(), outside, one_minus_cos(radius * radius / safe)
+
+
+def sample(x: Tensor, centre: Tensor, radius: Tensor, flip: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Points ``(3, N)`` on the spheres seen from ``x (3, N)``, and the emitting side's unit normals there."""
+    axis, distance, outside, width = _cone(x, centre, radius)
+    local = uniform_cone(u, width)
+    sin2 = local[0] * local[0] + local[1] * local[1]
+    half = (radius * radius - sin2 * distance * distance).clamp_min(0.0).sqrt()
+    depth = distance * local[2] - half
+    # From the centre to the point, in the cone's frame: its z is depth cos - distance, without that cancellation.
+    seen = torch.stack((local[0] * depth, local[1] * depth, -(sin2 * distance + local[2] * half)))
+    seen = Frame.about(normalize(axis)).to_world(normalize(seen))
+    normal = torch.where(outside, seen, uniform_sphere(u))
+    return centre + normal * radius, normal * flip
+
+
+def inverse_pdf(x: Tensor, centre: Tensor, radius: Tensor, normal: Tensor, wi: Tensor, square: Tensor) -> Tensor:
+    """``1 / pdf`` in solid angle of :func:`sample`, given what was hit; 0 behind the emitting side."""
+    _, _, outside, width = _cone(x, centre, radius)
+    cosine = -dot(wi, normal)
+    whole = (4.0 * math.pi) * radius * radius * cosine * safe_reciprocal(square)
+    return torch.where(cosine > 0, torch.where(outside, (2.0 * math.pi) * width, whole), 0.0)
+
+
+class Sphere(Surface):
+    """A sphere; ``Lights.p0`` is its centre, ``Lights.e1`` begins with its radius."""
+
+    name = "sphere"
+    convex = True
+
+    @classmethod
+    def areas(cls, faces: Faces) -> tuple[Tensor, Tensor]:
+        """See :class:`Surface`."""
+        area = (4.0 * math.pi) * faces.e1[0].double() ** 2
+        return area, area.detach()
+
+    @classmethod
+    def sample(cls, at: Lights, x: Tensor, u: Tensor) -> OnSurface:
+        """See :class:`Surface`."""
+        # Detached: from a moving reference point the same spot on the light is held, as on planar lights.
+        radius = at.e1[0]
+        p, normal = sample(x.detach(), at.p0.detach(), radius.detach(), at.flip, u)
+        grown = radius / torch.where(radius == 0, 1.0, radius).detach()  # 1; rows of other kinds may have a 0 there
+        return OnSurface(at.p0 + (p - at.p0).detach() * grown, normal)
+
+    @classmethod
+    def inverse_pdf(
+        cls, at: Lights, x: Tensor, normal: Tensor, wi: Tensor, square: Tensor, by_area: Tensor
+    ) -> Tensor | None:
+        """See :class:`Surface`."""
+        found = inverse_pdf(x.detach(), at.p0.detach(), at.e1[0].detach(), normal, wi.detach(), square.detach())
+        if not by_area.requires_grad:
+            return found
+        # In area measure the derivative of a sphere's share is that of the planar form.
+        value = by_area.detach()
+        return found * torch.where(value > 0, by_area / torch.where(value > 0, value, 1.0), 1.0)

@@ -1,0 +1,40 @@
+"""Hammersley points ``(i / n, van der Corput(i))``, padded: each set of dimensions is shuffled and scrambled for itself.
+
+The second coordinate is Owen-scrambled rather than rotated (Cranley-Patterson): a rotation moves points across the
+elementary intervals that hold one each, and leaves the same grid in every pixel; scrambling keeps every interval and lets the
+variance of smooth integrands fall faster than ``n^-2``. For the same end the first is jittered within its ``n``-th. The order
+is a permutation of any length, so that sets of dimensions are independent and ``n`` need not be a power of two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.math.hashing import mix, to_unit
+from torchpt.physics.samplers.base import Points
+from torchpt.physics.samplers.bits import X, Y, jittered, place, reverse_bits, scramble, shuffle
+
+__all__ = ["Hammersley"]
+
+
+@dataclass(frozen=True)
+class Hammersley(Points):
+    """``(i/n, van der Corput)``, the first jittered, the second Owen-scrambled: a net whatever the count, which is fixed."""
+
+    name = "hammersley"
+    needs_count = True
+    rows = 3
+
+    def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """See :class:`Points`."""
+        return jittered(key, salt)
+
+    def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """See :class:`Points`."""
+        seed = mix(key[0] ^ salt)
+        index = shuffle(key[1], key[2], seed)
+        x = place(index.double(), to_unit(mix(mix(seed ^ X) ^ index)).double(), key[2].double())
+        return torch.stack((x, to_unit(reverse_bits(scramble(index, mix(seed ^ Y))))))

@@ -1,0 +1,38 @@
+"""Independent uniform numbers by counter-based hashing: no state, no order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.math.hashing import as_int32, mix, to_unit
+from torchpt.physics.samplers.base import ADAPTIVE, Points
+
+__all__ = ["Independent"]
+
+_SECOND = as_int32(0x9E3779B9)
+
+
+def _word(key: Tensor, salt: Tensor | int) -> Tensor:
+    # Two rounds: the first spreads the sample index under this dimension's salt, the second brings in the pixel, so
+    # that two lanes share a number only if both rounds collide, and then in this one dimension alone.
+    return mix(mix(key[1] ^ salt) + key[0])
+
+
+@dataclass(frozen=True)
+class Independent(Points):
+    """Random numbers, for comparisons and for tests that need independent samples."""
+
+    name = "independent"
+    parameters = ADAPTIVE
+
+    def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """See :class:`Points`."""
+        return to_unit(_word(key, salt))
+
+    def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """See :class:`Points`."""
+        word = _word(key, salt)
+        return torch.stack((to_unit(word), to_unit(mix(word ^ _SECOND))))

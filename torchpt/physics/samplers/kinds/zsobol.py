@@ -1,0 +1,86 @@
+"""One Sobol' sequence for the whole film, dealt out along a Z curve, so that errors of neighbours differ (blue noise).
+
+Ahmed and Wonka, *Screen-Space Blue-Noise Diffusion of Monte Carlo Sampling Error via Hierarchical Ordering of Pixels*, ACM
+TOG 39(6), 2020; as in pbrt-4's ``ZSobolSampler``. Each square of 2x2, 4x4, ... pixels holds a run of the sequence, so the
+errors in it cancel. The digits (base 4) of a place on the curve are permuted by a hash of the digits above them, anew for
+each dimension.
+
+A permutation of four things is an affine map of two bits, ``A d + b`` with an invertible ``A``: there are 6 * 4 = 24 of both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.math.hashing import logical_shift, mix, to_unit
+from torchpt.physics.samplers.base import Numbers, Points
+from torchpt.physics.samplers.bits import X, Y, reverse_bits, scramble, second_dimension
+
+__all__ = ["ZSobol"]
+
+#: Of a place on the curve. Places that share all digits above are one block, 2^24 samples with a sequence of their own.
+DIGITS = 12
+
+
+def _spread(x: Tensor) -> Tensor:
+    """A zero between any two of the low 16 bits of int64 lanes."""
+    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        x = (x | (x << shift)) & mask
+    return x
+
+
+def _index(word: Tensor, state: Tensor) -> Tensor:
+    """The point of the Sobol' sequence that a place on the curve is given under the hash ``state`` of a dimension."""
+    index = torch.zeros_like(word)
+    for shift in range(2 * DIGITS - 1, 0, -2):
+        digit = (word >> shift) & 3
+        # Columns of A: one of the three vectors, and one of the two others.
+        one = 1 + ((logical_shift(state, 16) * 3) >> 16)
+        other = 1 + one - 3 * ((one + 1) >> 2)
+        other = other ^ (one & -((state >> 4) & 1))
+        moved = (one & -(digit & 1)) ^ (other & -(digit >> 1)) ^ ((state >> 2) & 3)
+        index = index | (moved << shift)
+        state = mix(state + digit + 1)
+    odd = logical_shift(word, 31)
+    return (index | (((word ^ state) & 1) & odd)) >> (1 - odd)
+
+
+@dataclass(frozen=True)
+class ZSobol(Points):
+    """One Sobol' sequence for the film along a Z curve: of a few samples a pixel the error is blue noise."""
+
+    name = "zsobol"
+    needs_count = True
+    of_film = True
+
+    def key(self, numbers: Numbers, pixel: Tensor, group: Tensor, point: Tensor) -> Tensor:
+        """``(2, N)`` int32: the seed of the block, and the place of the point on the curve within it.
+
+        The place has ``DIGITS`` digits of two bits above one single bit. Where ``numbers.bits`` is odd, the single bit is the
+        last of the point's index and the sign bit is set; else it is none of the place.
+        """
+        seed = torch.index_select(numbers.seeds, 0, group)
+        bits, width = numbers.bits, numbers.width
+        odd = bits & 1
+        code = _spread(pixel % width) | (_spread(pixel // width) << 1)
+        curve = (code << bits) | point
+        size = odd + 2 * DIGITS
+        place = (curve & ((torch.ones_like(size) << size) - 1)) << (1 - odd)
+        block = mix(mix((curve >> size).to(torch.int32)) + ((curve >> (size + 32)).to(torch.int32) << 16))
+        return torch.stack((mix(block ^ seed), (place | -(odd << 31)).to(torch.int32)))
+
+    def draw_1d(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """See :class:`Points`."""
+        seed = mix(key[0] ^ salt)
+        return to_unit(reverse_bits(scramble(_index(key[1], seed), mix(seed ^ X))))
+
+    def draw_2d(self, key: Tensor, salt: Tensor | int) -> Tensor:
+        """See :class:`Points`."""
+        seed = mix(key[0] ^ salt)
+        index = _index(key[1], seed)
+        x = scramble(index, mix(seed ^ X))
+        y = scramble(second_dimension(index), mix(seed ^ Y))
+        return torch.stack((to_unit(reverse_bits(x)), to_unit(reverse_bits(y))))

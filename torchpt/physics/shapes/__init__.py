@@ -1,0 +1,18 @@
+"""Shapes: what they declare, and from what the search found to a surface point, its normals, and points sampled on it.
+
+One kind a file in ``kinds/``. Planar primitives (triangle, rectangle, disk) share one affine form; spheres are their own.
+"""
+
+from __future__ import annotations
+
+from torchpt.physics.shapes.base import Shape
+from torchpt.physics.shapes.interaction import interact, offset_origin, reattach
+from torchpt.physics.shapes.uv import surface_uv, vertex_colors
+from torchpt.spec import Kinds
+
+#: The kinds of shapes.
+KINDS: Kinds[Shape] = Kinds(
+    "torchpt.physics.shapes.kinds", ("mesh", "sphere", "rectangle", "disk", "cube", "cylinder", "cone", "instance")
+)
+
+__all__ = ["KINDS", "Shape", "interact", "offset_origin", "reattach", "surface_uv", "vertex_colors"]

@@ -1,0 +1,1 @@
+"""One kind of shape a file, see :mod:`torchpt.physics.shapes`."""

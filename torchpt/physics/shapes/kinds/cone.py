@@ -1,0 +1,95 @@
+"""Cones: a side, and a disk that closes it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.physics.shapes.base import BOTTOM, UPRIGHT, Matrix, Place, Shape, Size, Surface, placed
+from torchpt.physics.shapes.quadrics import Form, Quadric, ring
+from torchpt.spec import Flag, Refused
+
+__all__ = ["Cone"]
+
+
+class Cone(Shape, Quadric):
+    """An analytic cone with its axis along y."""
+
+    # Its side in its own space: x^2 + y^2 = (1 - z)^2, 0 <= z <= 1; it is sqrt(2) long.
+    name = "cone"
+    form = Form(bend=-1.0, level=0.0, shift=1.0)
+    area = math.sqrt(2.0) * math.pi
+    parameters: ClassVar = {
+        "apex": Place((0.0, 0.0, 0.0), doc="its tip, before the transform"),
+        "height": Size(
+            -1.0,
+            low=None,
+            length=True,
+            words="a finite number other than 0",
+            doc="from the tip to the base along y: the base lies below the tip where it is negative",
+        ),
+        "slope": Size(
+            1.0, above=0.0, doc="radius over distance from the tip, along the axis: the base's radius is slope |height|"
+        ),
+        "capped": Flag(True, doc="closed by a disk that faces outward"),
+    }
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Shape`."""
+        if values["height"] == 0:
+            raise Refused("a finite number other than 0", values["height"], ("height",))
+
+    @classmethod
+    def own(cls, values: Mapping[str, Any]) -> Any:
+        """See :class:`Shape`."""
+        height, slope = values["height"], values["slope"]
+        turn = UPRIGHT if height < 0 else UPRIGHT * [[1.0], [-1.0], [-1.0]]
+        (x, y, z), length = values["apex"], abs(height)
+        return placed((x, y + height, z), (slope * length, slope * length, length), turn)
+
+    @classmethod
+    def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
+        """See :class:`Shape`."""
+        if not values["capped"]:
+            return [Surface("quadric", quadric=cls)]
+        return [Surface("quadric", "side", quadric=cls), Surface("disk", "bottom", BOTTOM)]
+
+    @classmethod
+    def place(cls, u: Tensor, v: Tensor) -> Tensor:
+        """See :class:`Quadric`."""
+        around, height = ring(u), v.clamp(0.0, 1.0)
+        radius = 1.0 - height
+        return torch.stack((around[0] * radius, around[1] * radius, height))
+
+    @classmethod
+    def normal(cls, q: Tensor) -> Tensor:
+        """See :class:`Quadric`: ``sqrt(2)`` long; at the apex along the axis."""
+        radius = (1.0 - q[2]).detach()
+        below = radius > 0
+        share = 1.0 / torch.where(below, radius, 1.0)
+        return torch.stack((q[0] * share, q[1] * share, torch.where(below, 1.0 - q[2], 1.0) * share))
+
+    @classmethod
+    def climb(cls, q: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Quadric`."""
+        one = torch.ones_like(radius)
+        return -one, one
+
+    @classmethod
+    def sample(cls, u: Tensor) -> Tensor:
+        """See :class:`Quadric`."""
+        phi = (2.0 * math.pi) * u[0]
+        # The area between the apex and a distance from it grows with the square of that distance.
+        radius = u[1].sqrt()
+        return torch.stack((radius * torch.cos(phi), radius * torch.sin(phi), 1.0 - radius))
+
+    @classmethod
+    def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Quadric`: the hull of an ellipse and the apex."""
+        reach = (e1.square() + e2.square()).sqrt()
+        return torch.minimum(-reach, e3), torch.maximum(reach, e3)

@@ -1,0 +1,42 @@
+"""Cubes: triangles, four vertices a side, so that their normals are flat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from torchpt.physics.shapes.base import Shape, Triangles
+
+__all__ = ["Cube"]
+
+# outward normal, then the directions of +u and of +v on that side; sides in Mitsuba's order
+_SIDES = (
+    ((0, -1, 0), (0, 0, 1), (1, 0, 0)),
+    ((0, 1, 0), (-1, 0, 0), (0, 0, -1)),
+    ((1, 0, 0), (0, 1, 0), (0, 0, -1)),
+    ((0, 0, 1), (0, 1, 0), (1, 0, 0)),
+    ((-1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    ((0, 0, -1), (0, -1, 0), (1, 0, 0)),
+)
+_UVS = ((0, 1), (1, 1), (1, 0), (0, 0))
+
+
+class Cube(Shape):
+    """The cube ``[-1, 1]^3`` with outward face normals, then transformed."""
+
+    name = "cube"
+    meshed = True
+
+    @classmethod
+    def triangles(cls, values: Mapping[str, Any]) -> Triangles:
+        """See :class:`Shape`: 24 vertices, 12 triangles, outward normals and the uv of Mitsuba's ``cube``."""
+        vertices, normals, faces = [], [], []
+        for side, frame in enumerate(_SIDES):
+            normal, along_u, along_v = np.array(frame, dtype=np.float64)
+            vertices += [normal + (2 * u - 1) * along_u + (2 * v - 1) * along_v for u, v in _UVS]
+            normals += [normal] * 4
+            faces += [[4 * side, 4 * side + 1, 4 * side + 2], [4 * side + 3, 4 * side, 4 * side + 2]]
+        uvs = np.tile(np.array(_UVS, dtype=np.float64), (6, 1))
+        return Triangles(None, np.array(vertices), np.array(faces, dtype=np.int64), np.array(normals), uvs, flat=True)

@@ -1,0 +1,69 @@
+"""Cylinders: a side, and two disks that close it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.physics.shapes.base import BOTTOM, TOP, UPRIGHT, Matrix, Place, Shape, Size, Surface, placed
+from torchpt.physics.shapes.quadrics import Form, Quadric, ring
+from torchpt.spec import Flag
+
+__all__ = ["Cylinder"]
+
+
+class Cylinder(Shape, Quadric):
+    """An analytic cylinder about an axis along y."""
+
+    # Its side in its own space: x^2 + y^2 = 1, 0 <= z <= 1.
+    name = "cylinder"
+    form = Form(bend=0.0, level=1.0)
+    area = 2.0 * math.pi
+    parameters: ClassVar = {
+        "center": Place((0.0, 0.0, 0.0), doc="its middle, half-way up, before the transform"),
+        "radius": Size(1.0, above=0.0, length=True, doc="before the transform"),
+        "height": Size(1.0, above=0.0, length=True, doc="along y, before the transform"),
+        "capped": Flag(True, doc="closed by two disks that face outward"),
+    }
+
+    @classmethod
+    def own(cls, values: Mapping[str, Any]) -> Any:
+        """See :class:`Shape`."""
+        radius, height = values["radius"], values["height"]
+        x, y, z = values["center"]
+        return placed((x, y - 0.5 * height, z), (radius, radius, height), UPRIGHT)
+
+    @classmethod
+    def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
+        """See :class:`Shape`."""
+        if not values["capped"]:
+            return [Surface("quadric", quadric=cls)]
+        side = Surface("quadric", "side", quadric=cls)
+        return [side, Surface("disk", "bottom", BOTTOM), Surface("disk", "top", TOP)]
+
+    @classmethod
+    def place(cls, u: Tensor, v: Tensor) -> Tensor:
+        """See :class:`Quadric`."""
+        around = ring(u)
+        return torch.stack((around[0], around[1], v.clamp(0.0, 1.0)))
+
+    @classmethod
+    def normal(cls, q: Tensor) -> Tensor:
+        """See :class:`Quadric`."""
+        return torch.stack((q[0], q[1], torch.zeros_like(q[2])))
+
+    @classmethod
+    def sample(cls, u: Tensor) -> Tensor:
+        """See :class:`Quadric`."""
+        phi = (2.0 * math.pi) * u[0]
+        return torch.stack((torch.cos(phi), torch.sin(phi), u[1]))
+
+    @classmethod
+    def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Quadric`: the hull of two ellipses."""
+        reach = (e1.square() + e2.square()).sqrt()
+        return torch.minimum(-reach, e3 - reach), torch.maximum(reach, e3 + reach)

@@ -1,0 +1,21 @@
+"""Disks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torchpt.physics.shapes.base import Matrix, Shape, Surface
+
+__all__ = ["Disk"]
+
+
+class Disk(Shape):
+    """The unit disk in the xy plane with normal +z, then transformed."""
+
+    name = "disk"
+
+    @classmethod
+    def surfaces(cls, values: Mapping[str, Any], pose: Matrix) -> list[Surface]:
+        """See :class:`Shape`."""
+        return [Surface("disk")]

@@ -1,0 +1,104 @@
+"""Meshes: triangles of a file, or written out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from torchpt.physics.shapes.base import Shape, Triangles
+from torchpt.spec import REQUIRED, Block, Flag, Map, Other, Path, Refused, Scalar, Vertices, Whole, reading
+
+__all__ = ["Displacement", "Mesh"]
+
+
+class Displacement:
+    """How far vertices move along their normals, after cutting triangles in four."""
+
+    parameters: ClassVar = {
+        "texture": Map(REQUIRED, doc="a number texture, or the name of one: how far, in units of scale"),
+        "scale": Scalar(1.0, low=None, length=True, doc="factor of the texture"),
+        "subdivisions": Whole(0, high=12, doc="how often each triangle is cut in four before"),
+    }
+
+
+def _object(value: Any) -> Any:
+    """An object of trimesh; or parts, which Python code read itself. Whoever builds the scene takes it apart."""
+    if isinstance(value, tuple | list) and value and all(hasattr(part, "faces") for part in value):
+        return tuple(value)
+    if all(kind.__module__.partition(".")[0] != "trimesh" for kind in type(value).__mro__):
+        raise Refused("a trimesh.Trimesh or trimesh.Scene (an object of Python; files have a path)")
+    return value
+
+
+class Mesh(Shape):
+    """Triangles from a file, from inline ``vertices`` and ``faces``, or from an object of trimesh."""
+
+    name = "mesh"
+    parameters: ClassVar = {
+        "path": Path(None, doc="the file: OBJ, PLY, STL, glTF, or one that trimesh reads"),
+        "mesh": Other(
+            None,
+            reader=_object,
+            words="a trimesh.Trimesh or trimesh.Scene",
+            doc="an object of Python, read when the scene is loaded",
+        ),
+        "vertices": Vertices(None, doc="points in its own space"),
+        "faces": Other(
+            None,
+            reader=reading.faces,
+            words="a list of faces, each three or more vertex indices (whole numbers >= 0)",
+            doc="corners, counted from 0; polygons are split into fans",
+        ),
+        "normals": Other(
+            None,
+            reader=lambda value: reading.rows(value, 3, "[x, y, z]"),
+            words="a list of [x, y, z], finite numbers each",
+            doc="one a vertex; none: computed, smooth",
+        ),
+        "uvs": Other(
+            None,
+            reader=lambda value: reading.rows(value, 2, "[u, v]"),
+            words="a list of [u, v], finite numbers each",
+            doc="texture coordinates, one a vertex",
+        ),
+        "face_normals": Flag(False, doc="shade flat, whatever normals there are"),
+        "displacement": Block(None, kind=Displacement, doc="moves the vertices when the scene is loaded"),
+    }
+    meshed = True
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Shape`."""
+        inline = {name: values[name] for name in ("vertices", "faces", "normals", "uvs")}
+        vertices, faces = values["vertices"], values["faces"]
+        if values["path"] is not None and values["mesh"] is not None:
+            raise Refused("either path or mesh, not both", "an object", ("mesh",))
+        for whole in ("path", "mesh"):
+            if values[whole] is not None:
+                for name, value in inline.items():
+                    if value is not None:
+                        raise Refused(f"either {whole} or an inline mesh, not both", value.tolist(), (name,))
+                return
+        if vertices is None or faces is None:
+            missing = "faces" if vertices is not None else "vertices" if faces is not None else "path"
+            raise Refused("a path, or vertices and faces", None, (missing,))
+        bad = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
+        if len(bad):
+            expected = f"vertex indices in 0..{len(vertices) - 1}"
+            raise Refused(expected, faces[bad[0]].tolist(), ("faces", int(bad[0])))
+        for name in ("normals", "uvs"):
+            value = inline[name]
+            if value is not None and len(value) != len(vertices):
+                raise Refused(f"one row for each of the {len(vertices)} vertices", len(value), (name,))
+        if values["face_normals"] and values["normals"] is not None:
+            raise Refused("no normals where face_normals is true", len(values["normals"]), ("normals",))
+
+    @classmethod
+    def triangles(cls, values: Mapping[str, Any]) -> Triangles:
+        """See :class:`Shape`."""
+        arrays = (values[name] for name in ("path", "vertices", "faces", "normals", "uvs"))
+        return Triangles(
+            *arrays, flat=values["face_normals"], displacement=values["displacement"], object=values["mesh"]
+        )

@@ -1,0 +1,1 @@
+"""One kind of primitive a file, see :mod:`torchpt.physics.shapes.primitive`."""

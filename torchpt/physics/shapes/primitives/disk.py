@@ -1,0 +1,60 @@
+"""Disks, which transforms make ellipses of; texture coordinates are the distance from the centre and the azimuth (Mitsuba)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import take
+from torchpt.physics.shapes.geometry import Interaction
+from torchpt.physics.shapes.primitive import Corners, Place, Primitive
+from torchpt.physics.shapes.primitives._affine import axes_of
+from torchpt.physics.shapes.quadrics import polar
+from torchpt.physics.world import World
+
+if TYPE_CHECKING:
+    from torchpt.physics.parts import Part
+
+__all__ = ["Disk"]
+
+
+class Disk(Primitive):
+    """An ellipse about its centre ``p0``."""
+
+    name = "disk"
+    charted = True
+
+    @classmethod
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
+        """See :class:`Primitive`."""
+        move, x, y, mirrored = axes_of(pose)
+        p1, p2 = move + x, move + y
+        return Corners(move.to(dtype), p1.to(dtype), p2.to(dtype), mirrored=mirrored)
+
+    @classmethod
+    def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
+        """See :class:`Primitive`: outward, and around."""
+        u, v, e1, e2 = at.u, at.v, place.e1, place.e2
+        away = torch.addcmul(e1 * u, e2, v)
+        square = torch.where(mine, u * u + v * v, 1.0)
+        some = square > 0
+        tangent = torch.where(some, away / torch.where(some, square, 1.0).sqrt(), e1)
+        if at.bitangent is None:
+            return tangent, None
+        around = torch.addcmul(e2 * u, e1, v, value=-1) * (2.0 * math.pi)
+        if world.geometry.mirrored is not None:
+            around = torch.where(take(world.geometry.mirrored, at.prim), -around, around)
+        return tangent, around
+
+    @classmethod
+    def uv(cls, world: World, at: Interaction) -> Tensor | None:
+        """See :class:`Primitive`."""
+        x, y = at.u, at.v
+        if world.geometry.mirrored is not None:
+            turned = take(world.geometry.mirrored, at.prim)
+            x, y = torch.where(turned, y, x), torch.where(turned, x, y)
+        return torch.stack(polar(x, y))

@@ -1,0 +1,80 @@
+"""Quadrics under affine maps, such as ellipsoids and the sides of cylinders: see :mod:`torchpt.physics.shapes.quadrics`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import affine, dot
+from torchpt.physics.shapes import quadrics
+from torchpt.physics.shapes.geometry import Interaction, Quadrics
+from torchpt.physics.shapes.primitive import Corners, Held, Met, Place, Primitive, Rays
+from torchpt.physics.world import World
+
+if TYPE_CHECKING:
+    from torchpt.physics.parts import Part
+
+__all__ = ["Quadric"]
+
+
+class Quadric(Primitive):
+    """A quadric; ``p0``, ``e1`` and ``e2`` of its map lie where those of flat primitives do."""
+
+    name = "quadric"
+    flat = False
+    charted = True
+
+    @classmethod
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
+        """See :class:`Primitive`."""
+        linear, move = pose.split((3, 1), 1)
+        x, y = linear[:, 0:1], linear[:, 1:2]
+        frame = torch.cat((move, x, y, linear[:, 2:3]))
+        return Corners(move.to(dtype), x.to(dtype), y.to(dtype), frame=frame)
+
+    @classmethod
+    def meet(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Met:
+        """See :class:`Primitive`."""
+        table = quadrics.rows(world, place.prim)
+        own = _told(table, rays, mine)
+        if rays.slide:
+            moved = quadrics.slide(table, place.p0, place.e1, rays.o, rays.d, rays.hit.t, own)
+            own = torch.where(mine, moved, own)
+        ng = quadrics.outward(table, own)
+        # At the point itself: a needle is far thinner than it is long.
+        return Met(_point(table, place, own), ng, dot(ng.detach().abs(), table.reach), own)
+
+    @classmethod
+    def hold(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Held:
+        """See :class:`Primitive`: at its place in its own space."""
+        table = quadrics.rows(world, place.prim)
+        own = _told(table, rays, mine)
+        return Held(_point(table, place, own), quadrics.direction(table, quadrics.normal(table, own)))
+
+    @classmethod
+    def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
+        """See :class:`Primitive`."""
+        assert at.own is not None
+        tangent = quadrics.tangent(place.e1, place.e2, at.own)
+        if at.bitangent is None:
+            return tangent, None
+        return tangent, quadrics.bitangent(quadrics.rows(world, at.prim), place.e1, place.e2, at.own)
+
+    @classmethod
+    def uv(cls, world: World, at: Interaction) -> Tensor | None:
+        """See :class:`Primitive`."""
+        if at.own is None:  # a point on lights of other kinds
+            return None
+        return quadrics.surface_uv(quadrics.rows(world, at.prim), at.own)
+
+
+def _told(table: Quadrics, rays: Rays, mine: Tensor) -> Tensor:
+    """Points ``(3, N)`` in their own space as the search tells them."""
+    return quadrics.place(table, torch.where(mine, rays.hit.u, 0.0), torch.where(mine, rays.hit.v, 0.0))
+
+
+def _point(table: Quadrics, place: Place, own: Tensor) -> Tensor:
+    return affine(place.p0 + place.e1 * own[0], place.e2, own[1], table.e3, own[2])

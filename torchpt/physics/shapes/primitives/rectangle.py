@@ -1,0 +1,47 @@
+"""Rectangles, which transforms make parallelograms of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchpt.physics.shapes.primitive import Corners, Primitive, Triple
+from torchpt.physics.shapes.primitives._affine import axes_of_all, corner_moves, unit_uvs
+
+if TYPE_CHECKING:
+    from torchpt.physics.parts import Part
+
+__all__ = ["Rectangle"]
+
+
+class Rectangle(Primitive):
+    """A parallelogram; texture coordinates run over [0, 1]^2."""
+
+    name = "rectangle"
+
+    @classmethod
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
+        """See :class:`Primitive`: Mitsuba's unit shape [-1, 1]^2 from its lower corner."""
+        return cls.corners_of_many(pose[None], dtype)[0]
+
+    @classmethod
+    def corners_of_many(cls, poses: Tensor, dtype: torch.dtype) -> list[Corners]:
+        """See :class:`Primitive`."""
+        move, x, y, mirrored = axes_of_all(poses)
+        x, y = 2.0 * x, 2.0 * y
+        p0 = move - 0.5 * (x + y)
+        places = (place.to(dtype).split(1, 1) for place in (p0, p0 + x, p0 + y))
+        return [Corners(*own, mirrored=flag) for *own, flag in zip(*places, mirrored, strict=True)]
+
+    @classmethod
+    def uvs(cls, part: Part, corners: Corners) -> Triple:
+        """See :class:`Primitive`."""
+        return unit_uvs(corners)
+
+    @classmethod
+    def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Primitive`."""
+        return corner_moves(corners, uvs)

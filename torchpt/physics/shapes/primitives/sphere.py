@@ -1,0 +1,103 @@
+"""Spheres: ``p0`` is the centre, ``e1`` begins with the radius. Texture coordinates as in Mitsuba: azimuth, angle from z."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import azimuth, cross, dot, normalize, take
+from torchpt.physics.shapes.geometry import Interaction
+from torchpt.physics.shapes.primitive import Corners, Held, Met, Place, Primitive, Rays, Triple
+from torchpt.physics.shapes.quadrics import polar
+from torchpt.physics.world import World
+
+if TYPE_CHECKING:
+    from torchpt.physics.parts import Part
+
+__all__ = ["Sphere", "axes"]
+
+
+class Sphere(Primitive):
+    """A sphere."""
+
+    name = "sphere"
+    charted = True
+    flat = False
+    angles = True
+
+    @classmethod
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
+        """See :class:`Primitive`."""
+        linear, move = pose.split((3, 1), 1)
+        radius = torch.linalg.det(linear).abs() ** (1.0 / 3.0)
+        zero = torch.zeros_like(radius)
+        p1 = torch.stack((radius, zero, zero))[:, None]
+        return Corners(move.to(dtype), p1.to(dtype), torch.zeros_like(move).to(dtype))
+
+    @classmethod
+    def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Primitive`: the vector whose cross product with the normal the tangent is, and ``(pi r, 0, 0)``."""
+        linear = linear.to(corners.p0)
+        radius, zero = corners.p1[0].abs(), torch.zeros_like(corners.p1[0])
+        turned = -1.0 if part.flip else 1.0  # the normal is
+        handed = torch.sign(torch.linalg.det(linear.detach().double())).to(corners.p0) * turned
+        around = normalize(linear[:, 2:3]) * (2.0 * math.pi * radius * handed)
+        return around, torch.stack((math.pi * radius * handed, zero, zero))
+
+    @classmethod
+    def meet(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Met:
+        """See :class:`Primitive`."""
+        assert world.geometry.flip is not None
+        o, d, p0 = rays.o, rays.d, place.p0
+        radius = torch.where(mine, place.e1[0], 1.0)
+        t = _distance(o, d, p0, radius, rays.hit.t) if rays.slide else rays.hit.t
+        t = torch.where(mine, t, 0.0)
+        away = o + d * t - p0
+        outward = normalize(torch.where(mine, away, torch.ones_like(away)))
+        return Met(p0 + outward * radius, outward * take(world.geometry.flip, place.prim))
+
+    @classmethod
+    def hold(cls, world: World, place: Place, rays: Rays, mine: Tensor) -> Held:
+        """See :class:`Primitive`: at its normal."""
+        radius = torch.where(mine, place.e1[0], 1.0)
+        outward = normalize((rays.o + rays.d * rays.hit.t - place.p0).detach())
+        return Held(place.p0 + outward * radius, outward * (radius * radius))
+
+    @classmethod
+    def tangents(cls, world: World, place: Place, at: Interaction, mine: Tensor) -> tuple[Tensor, Tensor | None]:
+        """See :class:`Primitive`: around, and down."""
+        assert at.tangent is not None
+        around = cross(at.tangent, at.ng)
+        down = None if at.bitangent is None else cross(normalize(around), at.ng) * at.bitangent[0]
+        return around, down
+
+    @classmethod
+    def uv(cls, world: World, at: Interaction) -> Tensor | None:
+        """See :class:`Primitive`."""
+        assert world.geometry.axes is not None
+        first, end = world.geometry.ends[2], world.geometry.ends[3]
+        row = torch.minimum((at.prim - first).clamp_min(0), end - first - 1)
+        away = at.p - take(world.geometry.p0, at.prim)
+        x, y, z = (dot(take(axis, row), away) for axis in world.geometry.axes)
+        across, turn = polar(x, y)
+        return torch.stack((turn, azimuth(z, across) * (1.0 / math.pi)))
+
+
+def axes(poses: list[Tensor], dtype: torch.dtype) -> Triple:
+    """Unit x, y, z ``(3, S)`` of spheres with these poses ``(4, 4)``."""
+    linear = [pose[:3, :3] for pose in poses]
+    x, y, z = (normalize(torch.stack([m[:, k] for m in linear], 1).to(dtype)) for k in range(3))
+    return x, y, z
+
+
+def _distance(o: Tensor, d: Tensor, centre: Tensor, radius: Tensor, near: Tensor) -> Tensor:
+    """The root next to the search's ``near``, with the derivative of the sphere's implicit equation at it."""
+    t = near.detach()
+    f = o + d * t - centre
+    # One Newton step on |f|^2 = r^2; the slope is a constant of it, so the value is polished and the derivative right.
+    slope = (2.0 * dot(f, d)).detach()
+    return t - (dot(f, f) - radius * radius) / torch.where(slope == 0, 1.0, slope)

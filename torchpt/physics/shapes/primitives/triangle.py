@@ -1,0 +1,65 @@
+"""Triangles: of meshes, with normals and texture coordinates at their corners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import cross, dot, normalize
+from torchpt.physics.shapes.normals import smooth_normals
+from torchpt.physics.shapes.primitive import Corners, Primitive, Triple
+from torchpt.physics.shapes.primitives._affine import corner_moves, unit_uvs
+
+if TYPE_CHECKING:
+    from torchpt.physics.parts import Part
+
+__all__ = ["Triangle"]
+
+
+class Triangle(Primitive):
+    """A triangle of a mesh."""
+
+    name = "triangle"
+
+    @classmethod
+    def corners(cls, part: Part, pose: Tensor, dtype: torch.dtype, own: Mapping[str, Tensor]) -> Corners:
+        """See :class:`Primitive`."""
+        linear, move = pose.split((3, 1), 1)
+        assert part.faces is not None
+        points = linear @ own["vertices"].T.double() + move
+        faces = torch.from_numpy(part.faces).to(points.device)
+        if bool(torch.linalg.det(linear.detach()) < 0):
+            faces = faces[:, [0, 2, 1]]  # a mirrored mesh keeps its outside
+        points = points.to(dtype)
+        p0, p1, p2 = (points.index_select(1, faces[:, k]) for k in range(3))
+        if not part.smooth:
+            return Corners(p0, p1, p2, None, faces, uvs=own.get("uvs"))
+        if part.normals is None:
+            normals = smooth_normals(points, faces)
+        else:
+            given = own.get("normals", torch.from_numpy(part.normals)).to(linear)
+            normals = normalize(torch.linalg.inv(linear).T @ given.T).to(dtype)
+        n0, n1, n2 = (normals.index_select(1, faces[:, k]) for k in range(3))
+        if not bool((dot(normals, normals) > 0).all()):  # a corner without a normal takes its face's
+            flat = normalize(cross(p1 - p0, p2 - p0))
+            n0, n1, n2 = (torch.where(dot(n, n) > 0, n, flat) for n in (n0, n1, n2))
+        return Corners(p0, p1, p2, (n0, n1, n2), faces, uvs=own.get("uvs"))
+
+    @classmethod
+    def uvs(cls, part: Part, corners: Corners) -> Triple:
+        """See :class:`Primitive`: those of the file, else the triangle's own."""
+        if part.uvs is None:
+            return unit_uvs(corners)
+        assert corners.faces is not None
+        given = torch.from_numpy(part.uvs) if corners.uvs is None else corners.uvs
+        uv = given.to(corners.p0).T
+        first, second, third = (uv.index_select(1, corners.faces[:, k]) for k in range(3))
+        return first, second, third
+
+    @classmethod
+    def moves(cls, part: Part, corners: Corners, uvs: Triple, linear: Tensor) -> tuple[Tensor, Tensor]:
+        """See :class:`Primitive`."""
+        return super().moves(part, corners, uvs, linear) if part.uvs is None else corner_moves(corners, uvs)

@@ -1,0 +1,273 @@
+"""Quadrics under affine maps: points, normals, tangents, uv, area and sampling, in the surface's own space.
+
+What a surface is in its own space is said by its class (:class:`Quadric`), in the file of the shape that has it. A primitive
+maps it by ``p = p0 + x e1 + y e2 + z e3``; normals follow by the cofactor matrix, which needs no inverse and keeps the outside
+outside when the map mirrors. The functions below take lanes of any of the surfaces that a scene has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import affine, azimuth, cross, dot, normalize
+from torchpt.math.vectors import rows as columns
+from torchpt.physics.shapes.geometry import Quadrics, QuadricTable
+from torchpt.physics.world import World
+
+__all__ = [
+    "Form", "Quadric", "areas", "bitangent", "direction", "normal", "octahedral", "outward", "place", "polar", "quadrics_of",
+    "ring", "rows", "sample", "slide", "surface_uv", "table_of", "tangent",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Form:
+    """``x^2 + y^2 + bend w^2 + 2 half w = level`` with ``w = z - shift``, where ``low <= z <= high``.
+
+    Attributes:
+        bend: of the square of w.
+        level: on the other side.
+        shift: of z.
+        low: least z.
+        high: greatest z.
+        around: whether the search tells a point by its direction from the origin (two octahedral coordinates), as it must
+            where the surface closes smoothly at an end; else by its place on the ring and its height.
+        half: half of what w counts.
+    """
+
+    bend: float
+    level: float
+    shift: float = 0.0
+    low: float = 0.0
+    high: float = 1.0
+    around: bool = False
+    half: float = 0.0
+
+
+class Quadric:
+    """A surface in its own space: round about z, within ``[-1, 1]^3``.
+
+    Attributes:
+        name: of the surface.
+        form: its equation.
+        area: of it.
+    """
+
+    name: ClassVar[str] = ""
+    form: ClassVar[Form]
+    area: ClassVar[float]
+
+    @classmethod
+    def place(cls, u: Tensor, v: Tensor) -> Tensor:
+        """Points ``(3, N)`` from the ``u, v (N,)`` of a search (:func:`torchpt.search.leaf.quadric`), none of it derived."""
+        raise NotImplementedError
+
+    @classmethod
+    def normal(cls, q: Tensor) -> Tensor:
+        """Outward normals ``(3, N)`` at its points, of any length; where there is none, along the axis."""
+        raise NotImplementedError
+
+    @classmethod
+    def climb(cls, q: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+        """How the distance from the axis, which is ``radius (N,)``, and z change with the texture coordinate ``v``."""
+        return torch.zeros_like(radius), torch.ones_like(radius)
+
+    @classmethod
+    def v(cls, q: Tensor, radius: Tensor) -> Tensor:
+        """The texture coordinate ``v (N,)`` at points whose distance from the axis is ``radius (N,)``."""
+        return q[2]
+
+    @classmethod
+    def sample(cls, u: Tensor) -> Tensor:
+        """Points ``(3, N)`` uniform by area, from ``u (2, N)`` in [0, 1)."""
+        raise NotImplementedError
+
+    @classmethod
+    def box(cls, e1: Tensor, e2: Tensor, e3: Tensor) -> tuple[Tensor, Tensor]:
+        """Its box ``(3, Q)`` under the map by ``e1, e2, e3 (3, Q)``, from ``p0``."""
+        raise NotImplementedError
+
+
+def ring(u: Tensor) -> Tensor:
+    """Points ``(3, N)`` of the unit circle in the xy plane, by the way along the square ``|x| + |y| = 1`` in [-2, 2]."""
+    across, sign = u.abs(), torch.copysign(torch.ones_like(u), u)
+    return normalize(torch.stack((1.0 - across, sign * torch.minimum(across, 2.0 - across), torch.zeros_like(u))))
+
+
+def octahedral(u: Tensor, v: Tensor) -> Tensor:
+    """Unit directions ``(3, N)`` by their octahedral coordinates."""
+    z = 1.0 - u.abs() - v.abs()
+    x = torch.where(z < 0, torch.copysign(1.0 - v.abs(), u), u)
+    y = torch.where(z < 0, torch.copysign(1.0 - u.abs(), v), v)
+    return normalize(torch.stack((x, y, z)))
+
+
+def polar(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance from the axis ``(N,)`` and azimuth in turns ``(N,)``, with derivatives that are finite on the axis."""
+    square = torch.addcmul(x * x, y, y)
+    some = square > 0
+    across = torch.where(some, torch.where(some, square, 1.0).sqrt(), 0.0)
+    return across, azimuth(x, y) * (0.5 / math.pi)
+
+
+# -- when a scene is assembled
+
+
+def quadrics_of(kinds: Sequence[type[Quadric]], turned: Sequence[bool], frames: Tensor, dtype: torch.dtype) -> Quadrics:
+    """What lanes need of quadrics; in float64 until it is their normals' directions.
+
+    Args:
+        kinds: of each.
+        turned: whether the normals of each are turned around.
+        frames: ``(12, Q)`` float64, ``p0 e1 e2 e3``.
+        dtype: of the lanes.
+    """
+    p0, e1, e2, e3 = frames[0:3], frames[3:6], frames[6:9], frames[9:12]
+    faces = [cross(e2, e3), cross(e3, e1), cross(e1, e2)]
+    front = torch.tensor([-1.0 if turn else 1.0 for turn in turned], dtype=p0.dtype, device=p0.device)
+    front = front * torch.sign(dot(e1, faces[0]).detach())
+    scale = torch.stack(faces).detach().abs().amax((0, 1))
+    n1, n2, n3 = ((n * (front / scale)).to(dtype) for n in faces)
+    reach = (p0.abs() + e1.abs() + e2.abs() + e3.abs()).detach().to(dtype)
+    present = tuple(sorted(set(kinds), key=lambda kind: kind.name))
+    code = None
+    if len(present) > 1:
+        code = torch.tensor([present.index(kind) for kind in kinds], dtype=torch.int64, device=p0.device)
+    return Quadrics(present, code, e3.to(dtype), n1, n2, n3, reach)
+
+
+def table_of(table: Quadrics, frames: Tensor) -> QuadricTable:
+    """The quadrics as the search sees them, from frames ``(12, Q)``."""
+    frames = frames.detach()
+    forms = torch.tensor([astuple(kind.form) for kind in table.kinds], dtype=torch.float64, device=frames.device).T
+    p0, e1, e2, e3 = frames[0:3], frames[3:6], frames[6:9], frames[9:12]
+    low, high = zip(*(kind.box(e1, e2, e3) for kind in table.kinds), strict=True)
+    form = forms.expand(-1, frames.shape[1]) if table.code is None else forms[:, table.code]
+    return QuadricTable(frames, form, _each(table, low) + p0, _each(table, high) + p0)
+
+
+def areas(table: Quadrics, frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Areas ``(Q,)`` float64 of quadrics: their own space's times ``|det|``, and (by quadrature, detached) the world's."""
+    e1, e2, e3 = frames[3:6], frames[6:9], frames[9:12]
+    own = torch.tensor([kind.area for kind in table.kinds], dtype=torch.float64, device=e1.device)
+    own = own.expand(e1.shape[1]) if table.code is None else own[table.code]
+    det = dot(e1, cross(e2, e3)).abs()
+    faces = [n.detach() for n in (cross(e2, e3), cross(e3, e1), cross(e1, e2))]
+    grid = (torch.arange(16, dtype=torch.float64, device=e1.device) + 0.5) / 16
+    spots = torch.cartesian_prod(grid, grid)
+    total = torch.zeros_like(own)
+    for spot in spots:
+        n = normal(table, sample(table, spot[:, None].expand(2, len(own))))
+        grown = affine(faces[0] * n[0], faces[1], n[1], faces[2], n[2])
+        total += (dot(grown, grown) / dot(n, n)).sqrt()
+    return own * det, own * total / len(spots)
+
+
+# -- on lanes
+
+
+def rows(world: World, prim: Tensor) -> Quadrics:
+    """The columns ``(., N)`` of primitives ``prim (N,)``; any where one is no quadric."""
+    assert world.geometry.quadrics is not None
+    index = (prim - world.geometry.ends[3]).clamp_min(0)
+    return columns(world.geometry.quadrics, index)
+
+
+def _each(table: Quadrics, values: Iterable[Tensor]) -> Tensor:
+    """What each surface makes of lanes, where the lanes are its own; ``values`` in the order of ``table.kinds``."""
+    first, *others = values
+    for number, value in enumerate(others, 1):
+        assert table.code is not None
+        first = torch.where(table.code == number, value, first)
+    return first
+
+
+def place(table: Quadrics, u: Tensor, v: Tensor) -> Tensor:
+    """Points ``(3, N)`` in their own space from the ``u, v (N,)`` of a search."""
+    return _each(table, (kind.place(u, v) for kind in table.kinds))
+
+
+def normal(table: Quadrics, q: Tensor) -> Tensor:
+    """Outward normals ``(3, N)`` at points of their own space, as long as :meth:`Quadric.normal` makes them."""
+    return _each(table, (kind.normal(q) for kind in table.kinds))
+
+
+def direction(table: Quadrics, n: Tensor) -> Tensor:
+    """Own normals ``(3, N)`` as front-facing directions of the world, not of unit length."""
+    return affine(table.n1 * n[0], table.n2, n[1], table.n3, n[2])
+
+
+def outward(table: Quadrics, q: Tensor) -> Tensor:
+    """Unit normals ``(3, N)`` of the world, on the front."""
+    return normalize(direction(table, normal(table, q)))
+
+
+def tangent(e1: Tensor, e2: Tensor, q: Tensor) -> Tensor:
+    """Derivatives ``(3, N)`` of the world's point with respect to ``u``, the azimuth in turns."""
+    return (e2 * q[0] - e1 * q[1]) * (2.0 * math.pi)
+
+
+def bitangent(table: Quadrics, e1: Tensor, e2: Tensor, q: Tensor) -> Tensor:
+    """Derivatives ``(3, N)`` of the world's point with respect to ``v``."""
+    across = (q[0] * q[0] + q[1] * q[1]).detach()
+    radius = torch.where(across > 0, across, 1.0).sqrt()
+    x, y = q[0] / radius, q[1] / radius
+    inward, upward = (_each(table, part) for part in zip(*(kind.climb(q, radius) for kind in table.kinds), strict=True))
+    return affine(e1 * (inward * x), e2, inward * y, table.e3, upward)
+
+
+def surface_uv(table: Quadrics, q: Tensor) -> Tensor:
+    """Texture coordinates ``(2, N)``: the azimuth about z over 2 pi, and :meth:`Quadric.v`."""
+    across, turn = polar(q[0], q[1])
+    return torch.stack((turn, _each(table, (kind.v(q, across) for kind in table.kinds))))
+
+
+def slide(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t: Tensor, q: Tensor) -> Tensor:
+    """The points ``q (3, N)`` with the derivative of where the ray ``o + t d`` meets the surface, in all arguments but ``t``.
+
+    One Newton step on the surface's equation, whose slope is a constant of it. In float64 it is the value too, finer than the
+    search's float32; else the value stays ``q``, which knows nothing of how far away the ray began.
+    """
+    det = dot(e1, table.n1)
+    inverse = 1.0 / torch.where(det == 0, 1.0, det)
+
+    def own(x: Tensor) -> Tensor:
+        return torch.stack((dot(table.n1, x), dot(table.n2, x), dot(table.n3, x))) * inverse
+
+    f, e = own(o - p0), own(d)
+    at = f + e * t.detach()
+    value = _each(table, (_excess(kind.form, at) for kind in table.kinds))
+    slope = _each(table, (_slope(kind.form, at, e) for kind in table.kinds)).detach()
+    moved = at - e.detach() * (value / torch.where(slope == 0, 1.0, slope))
+    return moved if q.dtype == torch.float64 else q + (moved - moved.detach())
+
+
+def _excess(form: Form, q: Tensor) -> Tensor:
+    """By how much points ``(3, N)`` are off the equation of a surface: ``(N,)``."""
+    value = q[0] * q[0] + q[1] * q[1]
+    if form.bend or form.half:
+        w = q[2] - form.shift if form.shift else q[2]
+        value = value + form.bend * w * w if form.bend else value
+        value = value + (2.0 * form.half) * w if form.half else value
+    return value - form.level
+
+
+def _slope(form: Form, q: Tensor, e: Tensor) -> Tensor:
+    """How :func:`_excess` grows along ``e (3, N)``: ``(N,)``."""
+    half = q[0] * e[0] + q[1] * e[1]
+    if form.bend or form.half:
+        w = q[2] - form.shift if form.shift else q[2]
+        half = half + form.bend * w * e[2] if form.bend else half
+        half = half + form.half * e[2] if form.half else half
+    return 2.0 * half
+
+
+def sample(table: Quadrics, u: Tensor) -> Tensor:
+    """Points ``(3, N)`` uniform by area in their own space, from ``u (2, N)`` in [0, 1)."""
+    return _each(table, (kind.sample(u) for kind in table.kinds))

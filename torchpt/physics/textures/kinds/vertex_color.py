@@ -1,0 +1,58 @@
+"""The colours of a mesh's vertices, between them as points lie between the corners."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchpt.math.vectors import luminance
+from torchpt.physics.textures.base import CHANNELS, Node, Opening, Table, Texture, TexturePoint
+
+__all__ = ["VertexColor"]
+
+
+@dataclass(frozen=True)
+class _Node(Node):
+    channel: int | None
+    filtered: bool = False
+    reads: ClassVar[str] = "colors"
+
+    @property
+    def variant(self) -> Hashable:
+        return VertexColor, self.channel
+
+    def table(
+        self, nodes: Sequence[Any], parameters: Mapping[str, Tensor], dtype: torch.dtype, device: torch.device
+    ) -> Table:
+        return _Table(self.channel)
+
+
+@dataclass(frozen=True)
+class _Table(Table):
+    channel: int | None
+
+    @property
+    def count(self) -> int:
+        return 0  # nothing of its own
+
+    def look_up(self, nodes: Tensor, point: TexturePoint, coloured: bool) -> Tensor:
+        assert point.colors is not None
+        if self.channel is None:
+            return point.colors
+        return point.colors[self.channel] if self.channel >= 0 else luminance(point.colors)
+
+
+class VertexColor(Texture):
+    """The colours of a mesh's vertices, taken as linear; white on surfaces that have none."""
+
+    name = "vertex_color"
+    reads = "colors"
+
+    @classmethod
+    def open(cls, values: Mapping[str, Any], opening: Opening) -> Node:
+        """See :class:`Texture`."""
+        return _Node(opening.number(CHANNELS[:4], "vertices have no alpha"))

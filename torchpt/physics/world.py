@@ -1,0 +1,24 @@
+"""The world: all tensors of a scene that stages read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torchpt.physics.bsdfs.records import LaneMaterials
+    from torchpt.physics.lights.records import Lights
+    from torchpt.physics.shapes.geometry import LaneGeometry
+    from torchpt.physics.textures.records import LaneTextures
+
+__all__ = ["World"]
+
+
+@dataclass(frozen=True)
+class World:
+    """A scene as the lanes gather from it: everything on one device, floats in one dtype. Absent things are ``None``."""
+
+    geometry: LaneGeometry
+    materials: LaneMaterials
+    textures: LaneTextures
+    lights: Lights | None  # None where nothing emits

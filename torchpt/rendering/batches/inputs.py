@@ -1,0 +1,177 @@
+"""What a batch is given, read and checked: cameras, parameters, seeds; and how errors name the scene that they are about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchpt.core.errors import AssetError, NotBuiltError, RenderError, SceneError
+from torchpt.scene import Scene
+from torchpt.scene.entry import as_scene
+
+__all__ = ["Cameras", "Seeds", "cameras_of", "named", "params_of", "scenes_of", "seeds_of"]
+
+#: Blocks of scene files, poses ``(4, 4)`` (lists of numbers too), or a tensor of poses ``(C, 4, 4)``.
+Cameras = Tensor | Sequence[Mapping[str, Any] | Tensor] | None
+#: One for all, one for each scene, or one for each scene and camera.
+Seeds = int | Sequence[int] | Sequence[Sequence[int]] | None
+
+#: Keys of a camera's block, one of which at least says where it stands.
+_PLACES = frozenset({"origin", "target", "to_world", "R", "t"})
+
+
+def scenes_of(scenes: Any) -> Scene | Iterable[Scene]:
+    """The scenes of a batch, as they are given; what an iterator gives is not looked at yet.
+
+    Raises:
+        SceneError: something else.
+    """
+    if isinstance(scenes, Scene):
+        return scenes
+    if isinstance(scenes, str | bytes | Mapping | Tensor) or not isinstance(scenes, Iterable):
+        raise SceneError("scenes", scenes, "a scene from torchpt.load, or a sequence or an iterator of such scenes")
+    if isinstance(scenes, Sequence):
+        for s, scene in enumerate(scenes):
+            as_scene(scene, f"scenes[{s}]")
+    return scenes
+
+
+def cameras_of(cameras: Cameras) -> Sequence[Mapping[str, Any] | Tensor | None]:
+    """The cameras of a batch one by one; None stands for each scene's own.
+
+    Raises:
+        SceneError: something else.
+    """
+    if cameras is None:
+        return [None]
+    expected = "a sequence of camera blocks or poses (4, 4), or a dense tensor (C, 4, 4)"
+    if isinstance(cameras, Tensor | np.ndarray):
+        poses = _pose("cameras", cameras, expected)
+        if poses.dim() != 3 or not len(poses):
+            raise SceneError("cameras", tuple(poses.shape), expected)
+        return list(poses.unbind())
+    if not isinstance(cameras, Sequence) or isinstance(cameras, str) or not cameras:
+        raise SceneError("cameras", cameras, expected)
+    found: list[Mapping[str, Any] | Tensor] = []
+    for c, camera in enumerate(cameras):
+        if not isinstance(camera, Mapping | Tensor | np.ndarray | list | tuple):
+            raise SceneError(f"cameras[{c}]", camera, expected)
+        if isinstance(camera, Mapping) and not _PLACES & camera.keys():
+            whole = (
+                "a whole camera block, with origin and target, to_world, or R and t; hand single numbers over as params"
+            )
+            raise SceneError(f"cameras[{c}]", dict(camera), f"{whole}, such as camera.fov")
+        found.append(camera if isinstance(camera, Mapping) else _pose(f"cameras[{c}]", camera, "a pose (4, 4), dense"))
+    return found
+
+
+def _pose(key: str, value: Any, expected: str) -> Tensor:
+    """A tensor as it is, an array as one; lists of numbers in float64. Shapes are not looked at."""
+    if isinstance(value, Tensor):
+        if value.layout is not torch.strided:
+            raise SceneError(key, f"a {value.layout} tensor", expected)
+        return value
+    try:
+        return torch.as_tensor(value, dtype=None if isinstance(value, np.ndarray) else torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise SceneError(key, value, expected) from None
+
+
+def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Mapping[str, Tensor]] | None:
+    """The parameters of each scene of a batch; None where there are none.
+
+    Raises:
+        SceneError: tensors without a leading dimension, or of different ones; neither a mapping nor a sequence of mappings.
+    """
+    if params is None:
+        return None
+    if isinstance(params, Mapping):
+        size: int | None = None
+        for name, value in params.items():
+            if not isinstance(value, Tensor) or value.dim() < 1 or not len(value):
+                found = tuple(value.shape) if isinstance(value, Tensor) else value
+                raise SceneError(f"params.{name}", found, "a tensor whose first dimension is the number of scenes")
+            own = scenes.params.get(name) if isinstance(scenes, Scene) else None
+            if own is not None and value.dim() <= own.dim():
+                expected = f"a first dimension that is the number of scenes, before those of {tuple(own.shape)}"
+                raise SceneError(f"params.{name}", tuple(value.shape), expected)
+            if value.layout is not torch.strided:
+                raise SceneError(f"params.{name}", f"a {value.layout} tensor", "a dense tensor")
+            size = size or len(value)
+            if len(value) != size:
+                raise SceneError(
+                    f"params.{name}", tuple(value.shape), f"a first dimension of {size}, as the first parameter's"
+                )
+        if size and isinstance(scenes, Sequence) and size != len(scenes):
+            expected = f"as many as there are scenes, {len(scenes)}, along the first dimension of each tensor"
+            raise SceneError("params", size, expected)
+        parts = {name: value.unbind() for name, value in params.items()}
+        return [{name: part[s] for name, part in parts.items()} for s in range(size)] if size else None
+    if isinstance(params, Sequence) and not isinstance(params, str) and params:
+        for s, own in enumerate(params):
+            if not isinstance(own, Mapping):
+                raise SceneError(f"params[{s}]", own, "a mapping from names to tensors")
+        if isinstance(scenes, Sequence) and len(params) != len(scenes):
+            raise SceneError("params", len(params), f"as many as there are scenes, {len(scenes)}")
+        return params
+    raise SceneError("params", params, "a mapping to tensors with a leading dimension, or a sequence of mappings")
+
+
+def seeds_of(seed: Seeds, scenes: int | None, cameras: int) -> Callable[[int, int], Any]:
+    """The seed of scene ``s`` and camera ``c`` (None: the scene's own).
+
+    Args:
+        seed: as it was given.
+        scenes: how many there are; None: that is not known.
+        cameras: how many there are.
+
+    Raises:
+        SceneError: too few or too many.
+    """
+    if seed is None or isinstance(seed, int):
+        return lambda s, c: seed
+    whole = seed.tolist() if isinstance(seed, Tensor | np.ndarray) else seed
+    expected = f"a whole number, a sequence of {scenes or 'as many as there are scenes'}, or of sequences of {cameras}"
+    if not isinstance(whole, Sequence) or isinstance(whole, str) or (scenes is not None and len(whole) != scenes):
+        raise SceneError("seed", whole, expected)
+    for row in whole:
+        if isinstance(row, Sequence) and (isinstance(row, str) or len(row) != cameras):
+            raise SceneError("seed", whole, expected)
+
+    def of(s: int, c: int) -> Any:
+        if s >= len(whole):
+            raise SceneError("seed", len(whole), "as many as there are scenes")
+        row = whole[s]
+        return row[c] if isinstance(row, Sequence) else row
+
+    return of
+
+
+@contextmanager
+def named(scene: str, camera: int | None) -> Iterator[None]:
+    """Errors within say which scene of a batch they are about, and those of a camera's block which camera.
+
+    Args:
+        scene: such as ``scenes[3]``; "" where there is but one.
+        camera: its number; None where scenes have their own.
+    """
+    try:
+        yield
+    except SceneError as error:
+        key = error.key
+        if camera is not None and key.startswith(("camera", "params.camera.to_world")):
+            key = f"cameras[{camera}]{key.removeprefix('params.camera.to_world').removeprefix('camera')}"
+        elif scene and not key.startswith(("scenes[", "params[", "cameras[", "seed")):
+            key = f"{scene}.{key}"
+        made = NotBuiltError if isinstance(error, NotBuiltError) else SceneError
+        raise made(key, error.value, error.expected, error.file) from None
+    except AssetError as error:
+        raise AssetError(error.file, f"{error.problem} ({scene})" if scene else error.problem) from None
+    except RenderError as error:
+        known = not scene or str(error).startswith(scene)
+        raise RenderError(str(error) if known else f"{scene}: {error}") from None

@@ -1,0 +1,71 @@
+"""What a render says of its samples that are not finite: how many by cause, and where the first one is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from torchpt.engines.tensors import brought
+from torchpt.paths.lost import Lost, Place
+from torchpt.paths.state import PathState
+from torchpt.paths.wave import Wave
+from torchpt.scene.names import Names
+from torchpt.scene.scene import Scene
+
+if TYPE_CHECKING:  # what traces samples again is imported once there are such
+    from torchpt.paths.explain import Fault
+
+__all__ = ["causes_of", "told"]
+
+
+def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str]:
+    """Samples by cause, most first, and a sentence about the first one; nothing where none was lost.
+
+    Only the first :data:`~torchpt.paths.lost.KEPT` are traced again. The others are counted as ``nan, not traced`` and
+    ``infinite, not traced``, so that all add up to ``lost.count``.
+
+    Args:
+        scene: what was rendered.
+        wave: of the render.
+        lost: its samples that were not finite.
+    """
+    if not lost.count:
+        return {}, ""
+    from torchpt.paths.explain import faults_of
+
+    faults = faults_of(_trace, wave, lost.places)
+    causes = Counter(fault.name for fault in faults)
+    nans = sum(place.nan for place in lost.places)
+    causes["nan, not traced"] = lost.nan - nans
+    causes["infinite, not traced"] = lost.infinite - (len(lost.places) - nans)
+    first = f"{_named(wave, lost.places[0])}: {_said(scene, wave, faults[0])}"
+    return {name: count for name, count in causes.most_common() if count}, first
+
+
+def told(scene: Scene, wave: Wave, place: Place) -> str:
+    """Return a sentence about one sample that is not finite."""
+    from torchpt.paths.explain import faults_of
+
+    return f"{_named(wave, place)} is not finite: {_said(scene, wave, faults_of(_trace, wave, [place])[0])}"
+
+
+def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
+    return brought(wave, state, observer=observer)
+
+
+def _named(wave: Wave, place: Place) -> str:
+    """A sample by number and pixel, or ray; pilots take some of their own."""
+    if wave.given is not None:
+        return f"sample {place.sample} of ray {place.y * wave.crop[2] + place.x}"
+    return str(place) + (" (its second value)" if place.first else "")
+
+
+def _said(scene: Scene, wave: Wave, fault: Fault) -> str:
+    if fault.cause == "not repeated":
+        return "traced again by tensor operations it is finite"
+    depth = f" at depth {fault.depth}" if fault.depth else ""
+    if fault.slot < 0:
+        return fault.name + depth
+    return f"{fault.name}{depth} ({Names(scene.built, wave.context.world).owner(fault.slot)})"

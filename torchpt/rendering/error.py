@@ -1,0 +1,214 @@
+"""The second values of a render's pilots, and the rounds of adaptive sampling that they decide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.paths.wave import Plate, Wave
+from torchpt.physics.film import Film, KnownError, Pilots, pilots_of
+from torchpt.physics.film.error import (
+    BLOCK,
+    STREAMS,
+    Again,
+    again_counts,
+    error_by_pilots,
+    foreseen,
+    known_error,
+    pilots_alone,
+    shared_out,
+    to_look_at,
+)
+from torchpt.physics.samplers import Streams
+from torchpt.scene.settings import Settings
+
+__all__ = ["FIRST_ROUND", "Shares", "Twice", "second_values"]
+
+
+# ---- The second values of a render's pilots: pixels that are sampled again by other random numbers
+
+
+@dataclass
+class Twice:
+    """Pilots and their second values.
+
+    Adaptive sampling decides by them where samples go. For no pixel to depend on it they are left out of the picture then, and
+    are made of two streams, whose difference tells their own variance.
+
+    Attributes:
+        pilots: where they are.
+        plate: sums of their second values.
+        counted: whether these are part of the picture.
+        third: what was looked at again, and how many of those pixels are suspects.
+        looked: samples a pixel that the picture had then; None: nothing was looked at yet.
+    """
+
+    pilots: Pilots
+    plate: Plate
+    counted: bool
+    third: tuple[Plate, int] | None = None
+    looked: float | None = None
+
+    def picture(self, film: Film) -> Tensor:
+        """The picture ``(H, W, 3)`` in float64."""
+        if not self.counted or not len(self.pilots):
+            return film.mean()
+        places, second = self.plate.places, self.plate.film
+        values, first = film.values(), film.counts[places].double()
+        again = second.counts.double()
+        share = (again / (first + again).clamp_min(1.0))[:, None]
+        values[places] += share * (second.values() - values[places])
+        return values.reshape(film.height, film.width, -1)
+
+    def counts(self, film: Film) -> Tensor:
+        """Samples that each pixel of the picture holds ``(pixels,)`` int64."""
+        counts = film.counts
+        if self.counted and len(self.pilots):
+            counts[self.plate.places] += self.plate.film.counts
+        return counts
+
+    def known(self, film: Film, picture: Tensor) -> KnownError | None:
+        """What the picture, :meth:`picture` of the film, knows of its error."""
+        if not len(self.pilots) or int(self.plate.film.counts.min()) == 0:
+            return None
+        again = None
+        if self.third is not None:
+            plate, suspects = self.third
+            values = torch.stack(plate.film.streams()).cpu()
+            assert plate.places is not None
+            again = Again(plate.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
+        first = self._first(film)
+        return known_error(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
+
+    def looks(self, pixels: int) -> float:
+        """Return what looking again takes, as a share of the samples of a picture of so many pixels."""
+        return STREAMS * sum(again_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
+
+    def look_again(self, film: Film, agreed: Callable[[Tensor], Tensor] | None = None) -> list[tuple[Plate, int, int]]:
+        """What is to be sampled for the picture to know its error better, once it is finished or may be.
+
+        ``agreed`` makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
+        """
+        if not len(self.pilots):
+            return []
+        picture, first = self.picture(film).cpu(), self._first(film)
+        suspects, doubtful = to_look_at(picture, self.pilots, first, self._second())
+        if agreed is not None:
+            suspects, doubtful = agreed(suspects), agreed(doubtful)
+        places = torch.cat((suspects, doubtful)).to(film.sums.device)
+        streams = Streams(self.plate.streams.first + self.plate.streams.count, STREAMS)
+        plate = Plate(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
+        self.third = plate, len(suspects)
+        self.looked = float(film.counts.double().mean())
+        samples = round(self.looked)
+        return [(plate, 0, STREAMS * samples)]
+
+    def alone(self, film: Film) -> KnownError | None:
+        """RelMSE as the pilots alone tell it."""
+        if not len(self.pilots):
+            return None
+        return pilots_alone(self.pilots, self._first(film), self._second(), self._spare(), self.counted)
+
+    def _first(self, film: Film) -> Tensor:
+        assert self.plate.places is not None
+        return film.taken(self.plate.places).values().cpu()
+
+    def _second(self) -> Tensor:
+        return self.plate.film.values().cpu()
+
+    def _spare(self) -> Tensor | None:
+        """The variance of second values where it is not that of the first ones."""
+        if self.counted:
+            return None
+        one, other = self.plate.film.streams()
+        return ((one - other).square() / 4).cpu()
+
+
+def second_values(wave: Wave, settings: Settings, device: torch.device) -> Twice:
+    """Pilots of a render, nothing sampled yet."""
+    film = settings.film
+    pilots = pilots_of(settings.render.seed, (film.width, film.height), wave.crop)
+    streams = Streams(wave.sampler.randomizations, 2 if settings.adaptive else 1)
+    sums = Film(len(pilots), 1, streams.count, device)
+    return Twice(pilots, Plate(sums, {}, streams, pilots.places.to(device)), not settings.adaptive)
+
+
+# ---- Adaptive sampling: rounds of samples where pilots say that the error is
+
+
+#: Samples that every pixel takes before any is asked.
+FIRST_ROUND = 16
+
+
+class Shares:
+    """Samples of the blocks of a picture.
+
+    Args:
+        pilots: of the picture.
+        film: of the picture.
+        agreed: makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
+    """
+
+    def __init__(self, pilots: Pilots, film: Film, agreed: Callable[[Tensor], Tensor] | None = None) -> None:
+        self.pilots, self._agreed = pilots, agreed
+        x, y = torch.arange(film.width) + pilots.corner[0], torch.arange(film.height) + pilots.corner[1]
+        rows, columns = pilots.blocks
+        #: Block of each pixel.
+        self.block = ((y // BLOCK)[:, None] * columns + (x // BLOCK)[None]).reshape(-1)
+        self.pixels = torch.bincount(self.block, minlength=rows * columns)
+        self._parts: list[tuple[Film, Tensor, Film]] = []
+
+    def spans(self, picture: Plate, twice: Twice, mean: float, last: bool) -> list[tuple[Plate, int, int]]:
+        """What is to be sampled for the picture to have ``mean`` samples a pixel: plates of pixels with as many samples.
+
+        ``last``: whether no round follows, see :func:`torchpt.physics.film.error.shared_out`.
+        """
+        device = picture.film.sums.device
+        counts = self._of_blocks(picture.film.counts.cpu())
+        aims = shared_out(self._errors(twice), counts, self.pixels, mean, last)
+        spans: list[tuple[Plate, int, int]] = []
+        if self._agreed is not None:
+            aims = self._agreed(aims)
+        most = int(aims.max()) + 1
+        kinds = (counts * most + aims)[aims > counts].unique().tolist()
+        pilot_blocks = self.block[self.pilots.places]
+        for have, aim in (divmod(kind, most) for kind in kinds):
+            chosen = (counts == have) & (aims == aim)
+            places = chosen[self.block].nonzero()[:, 0].to(device)
+            spans.append((self._part(picture, places, places), have, aim - have))
+            seconds = chosen[pilot_blocks].nonzero()[:, 0]
+            if len(seconds):
+                part = self._part(twice.plate, seconds.to(device), self.pilots.places[seconds].to(device))
+                spans.append((part, have, aim - have))
+        return spans
+
+    def put_back(self) -> None:
+        """Add what was sampled to the films that it is of."""
+        for whole, places, part in self._parts:
+            whole.put(places, part)
+        self._parts.clear()
+
+    def _part(self, plate: Plate, places: Tensor, pixels: Tensor) -> Plate:
+        """Some pixels of a plate as a plate of their own."""
+        films = {}
+        for name, film in (("", plate.film), *plate.layers.items()):
+            films[name] = film.taken(places)
+            self._parts.append((film, places, films[name]))
+        return Plate(films.pop(""), films, plate.streams, pixels)
+
+    def _of_blocks(self, counts: Tensor) -> Tensor:
+        """Samples of the pixels of each block, which are the same."""
+        found = torch.zeros(len(self.pixels), dtype=torch.int64)
+        found[self.block] = counts
+        return found
+
+    def _errors(self, twice: Twice) -> Tensor:
+        """Relative variance of the pixels of each block, up to a factor: second values alone are asked."""
+        a, b = (x.cpu() for x in twice.plate.film.streams())
+        errors, known = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
+        at = tuple(self.pilots.block)
+        errors[at], known[at] = error_by_pilots(self.pilots, a, b), True
+        return foreseen(errors, known).reshape(-1)

@@ -1,0 +1,243 @@
+"""``render`` in graphs of ``torch.compile``: one opaque operator forward and one backward, with fake kernels.
+
+A graph holds tensors, numbers and text. So a scene is named by its number, wishes are written as text, and parameters are the
+operators' tensors; the seed is a number of its own, so that another one needs no other graph. What a graph cannot hold is
+rendered outside of it, which breaks it: ``full=True`` (a :class:`torchpt.Rendering`), scenes with models of the caller's own,
+arguments that are no plain values.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from contextvars import ContextVar
+from functools import partial, wraps
+from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from torchpt.core.errors import RenderError
+from torchpt.rendering import Rendering
+from torchpt.scene import Scene
+from torchpt.scene.editions import AFTER, check_unchanged
+from torchpt.scene.formats.description import settings
+from torchpt.scene.scene import numbered
+from torchpt.scene.settings import BLOCKS
+
+__all__ = ["known", "opaque", "outside"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+#: What arguments that are written down in a graph may be. (Older torch traces no unions of types, but tuples of them.)
+_LISTS, _PLAIN = (list, tuple), (bool, int, str)
+#: While an operator is at work: what its forward pass made, which its backward pass is not to make again.
+_known: ContextVar[list[Rendering] | None] = ContextVar("known", default=None)
+
+
+def known(make: Callable[[], Rendering]) -> Rendering:
+    """What the forward pass of an operator made, where this is its backward pass; else what is made now."""
+    made = _known.get()
+    if made:
+        return made[0]
+    rendering = make()
+    if made is not None:
+        made.append(rendering)
+    return rendering
+
+
+def opaque(render: Callable[P, R]) -> Callable[P, R]:
+    """``render`` for eager code and for graphs, whose operators are registered here."""
+    _register(render)
+
+    @wraps(render)
+    def call(*args: Any, **wishes: Any) -> Any:
+        return in_graph(*args, **wishes) if torch.compiler.is_compiling() else render(*args, **wishes)
+
+    in_graph = partial(_in_graph, render)
+    return call
+
+
+def outside(call: Callable[P, R]) -> Callable[P, R]:
+    """``call`` for eager code and for graphs, which break there."""
+
+    @wraps(call)
+    def either(*args: P.args, **wishes: P.kwargs) -> R:
+        made: Any = torch.compiler.disable(call) if torch.compiler.is_compiling() else call
+        return made(*args, **wishes)
+
+    return either
+
+
+def _in_graph(
+    render: Callable[..., Any],
+    scene: Scene,
+    params: Mapping[str, Tensor] | None = None,
+    full: bool = False,
+    seed: int | None = None,
+    dtype: torch.dtype = torch.float32,
+    **wishes: Any,
+) -> Any:
+    """The render as an operator of the graph that is being traced, or outside of it. It is torch that reads this function."""
+    if full or len(scene.own_models) > 0 or not _fits(params, seed, dtype, wishes):
+        outside: Any = torch.compiler.disable(render)
+        return outside(scene, params=params, full=full, seed=seed, dtype=dtype, **wishes)
+    given = dict(params) if params is not None else {}
+    if torch.is_grad_enabled():
+        for name, value in scene.params.items():
+            if value.requires_grad and name not in given:
+                given[name] = value
+    wanted = [name for name in given if given[name].requires_grad]
+    text = _text([wishes, list(given), wanted, dtype is torch.float64])
+    return torch.ops.torchpt.render(scene.number, text, -1 if seed is None else seed, list(given.values()))[0]
+
+
+def _fits(params: Any, seed: Any, dtype: Any, wishes: Mapping[str, Any]) -> bool:
+    """Whether arguments can be written down in a graph; others, what is not accepted among them, are seen to outside of it."""
+    known = dtype is torch.float32 or dtype is torch.float64
+    number = isinstance(seed, int) and not isinstance(seed, bool)
+    if params is not None and not (
+        isinstance(params, Mapping) and all([isinstance(value, Tensor) for value in params.values()])
+    ):
+        return False
+    return known and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(wishes)
+
+
+def _plain(value: Any) -> bool:
+    """Whether a nest of values is one of numbers, words and None."""
+    if isinstance(value, Mapping):
+        return all([isinstance(key, str) and _plain(value[key]) for key in value])
+    if isinstance(value, _LISTS):
+        return all([_plain(item) for item in value])
+    if isinstance(value, float):
+        return -math.inf < value < math.inf
+    return value is None or isinstance(value, _PLAIN)
+
+
+def _text(value: Any) -> str:
+    """A nest of plain values as Python writes it."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join([repr(key) + ": " + _text(value[key]) for key in value]) + "}"
+    if isinstance(value, _LISTS):
+        return "[" + ", ".join([_text(item) for item in value]) + "]"
+    return repr(value)
+
+
+class _Order(NamedTuple):
+    """A render as an operator is asked for it.
+
+    Attributes:
+        scene: what.
+        wishes: arguments of ``render``.
+        names: of the parameters that are handed over.
+        wanted: which of them are differentiated.
+    """
+
+    scene: Scene
+    wishes: dict[str, Any]
+    names: list[str]
+    wanted: list[str]
+
+    @classmethod
+    def read(cls, number: int, text: str, seed: int) -> _Order:
+        """Raises RenderError where the scene is gone."""
+        scene = numbered(int(number))
+        if scene is None:
+            raise RenderError("the scene that this compiled graph renders is gone: keep a reference to it")
+        wishes, names, wanted, double = ast.literal_eval(text)
+        wishes |= {"dtype": torch.float64 if double else torch.float32, "seed": None if seed < 0 else int(seed)}
+        return cls(scene, wishes, names, wanted)
+
+    def editions(self) -> dict[str, int]:
+        """Of the scene's own parameters, but for those that are handed over."""
+        return {name: edition for name, edition in self.scene.editions().items() if name not in self.names}
+
+    def like(self) -> Tensor:
+        """A picture of the right size, unfilled."""
+        blocks = {name: self.wishes.get(name) for name in BLOCKS if name != "render"}
+        film = settings(self.scene.description, blocks).film
+        _, _, width, height = film.crop or (0, 0, film.width, film.height)
+        return torch.empty(height, width, 3, dtype=self.wishes["dtype"], device=self.scene.device)
+
+
+def _apart(work: Callable[[], R], made: list[Rendering], device: torch.device) -> R:
+    """Work of an operator, in a thread of its own: in that of the operator torch would not note what depends on what."""
+    stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
+    found: list[R] = []
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        _known.set(made)
+        try:
+            with torch.cuda.stream(stream):
+                found.append(work())
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run, name="torchpt.render")
+    thread.start()
+    thread.join()
+    if failed:
+        raise failed[0]
+    return found[0]
+
+
+def _register(render: Callable[..., Any]) -> None:
+    """Make the operators ``torchpt::render`` and ``torchpt::render_gradients``."""
+
+    def picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        order, made = _Order.read(number, text, seed), []
+
+        def work() -> Tensor:
+            given = {name: value.detach() for name, value in zip(order.names, tensors, strict=True)}
+            with torch.no_grad():
+                return render(order.scene, params=given, **order.wishes).contiguous()
+
+        editions = order.editions().values()
+        return _apart(work, made, order.scene.device), torch.tensor([made[0].spp, *editions])
+
+    def like_picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        order = _Order.read(number, text, 0)
+        return order.like(), torch.empty(1 + len(order.editions()), dtype=torch.int64)
+
+    def gradients(
+        number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor
+    ) -> list[Tensor]:
+        order = _Order.read(number, text, seed)
+        spp, *editions = facts.tolist()
+        now = order.editions()
+        check_unchanged(dict(zip(now, editions, strict=True)), now, AFTER)
+        made = [Rendering(order.like(), spp=spp)]
+
+        def work() -> list[Tensor]:
+            given = {name: value.detach() for name, value in zip(order.names, tensors, strict=True)}
+            leaves = {name: given[name].requires_grad_() for name in order.wanted}
+            image = render(order.scene, params=given, **order.wishes)
+            grads = dict(zip(leaves, torch.autograd.grad(image, list(leaves.values()), cotangent), strict=True))
+            every = (grads.get(name, torch.zeros_like(value)) for name, value in given.items())
+            return [value.detach().contiguous() for value in every]
+
+        return _apart(work, made, order.scene.device)
+
+    def like_gradients(
+        number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor
+    ) -> list[Tensor]:
+        return [torch.empty_like(value, memory_format=torch.contiguous_format) for value in tensors]
+
+    def keep(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        *ctx.named, tensors = inputs
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(output[1], *tensors)
+
+    def go_back(ctx: Any, cotangent: Tensor, _: Any) -> tuple[Any, ...]:
+        facts, *tensors = ctx.saved_tensors
+        return None, None, None, back(*ctx.named, tensors, facts, cotangent)
+
+    forth = torch.library.custom_op("torchpt::render", picture, mutates_args=())
+    forth.register_fake(like_picture)
+    forth.register_autograd(go_back, setup_context=keep)
+    back = torch.library.custom_op("torchpt::render_gradients", gradients, mutates_args=())
+    back.register_fake(like_gradients)

@@ -1,0 +1,134 @@
+"""Several renders at once: their samples are one work list, and what is next is made ready while threads trace."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from functools import partial
+
+import torch
+
+from torchpt.compiler.graph import Unsupported
+from torchpt.core.threads import Crew, one_thread, undisturbed
+from torchpt.engines.kernels.threads import Block, Share
+from torchpt.rendering.result import Rendering
+from torchpt.rendering.run import Run
+
+__all__ = ["Entry", "render_many"]
+
+#: Renders a thread that are made ready in advance.
+AHEAD = 2
+
+
+@dataclass
+class Entry:
+    """A render of several.
+
+    Attributes:
+        device: where it is rendered.
+        make: makes it ready for a number of threads; called when it is soon to begin.
+        done: told of the rendering.
+        failed: told of an error instead, which it may raise as another one.
+        run: once it is ready.
+        left: tasks of it that are not done.
+        rest: blocks that memory did not suffice for.
+    """
+
+    device: torch.device
+    make: Callable[[int], Run]
+    done: Callable[[Rendering], None]
+    failed: Callable[[BaseException], None]
+    run: Run = field(init=False)
+    left: int = field(init=False, default=0)
+    rest: list[Block] = field(init=False, default_factory=list)
+
+
+def render_many(entries: Iterable[Entry], tasks: int) -> None:
+    """Render them, each to the very bits that it has alone.
+
+    Renders that the compiled loop takes, and that nothing but their number of samples ends, share threads and a work list.
+    Others are rendered one after another: by tensor operations (as on CUDA), to a time or an error, in bounded memory.
+
+    Args:
+        entries: what is to be rendered; taken one by one.
+        tasks: into how many parts the work of a render is cut, as far as that repays.
+
+    Raises:
+        Exception: what an entry's ``failed`` raises; the others are given up then.
+    """
+    crew = Crew[Entry, Share](torch.get_num_threads())
+    waiting, begun = iter(entries), dict[int, Entry]()
+    try:
+        while True:
+            with _beside(crew):
+                entry = next(waiting, None)
+            if entry is None:
+                break
+            with undisturbed(entry.device), _blamed(entry), _beside(crew):
+                entry.run = entry.make(crew.threads)
+                spans = entry.run.at_once()
+            if spans is None:
+                _drain(crew, begun, 0)
+                with undisturbed(entry.device), _blamed(entry):
+                    entry.done(entry.run.go(None))
+                del entry.run
+                continue
+            with _blamed(entry):
+                loop = entry.run.loop
+                assert loop is not None
+                begun[id(entry)] = entry
+                blocks = loop.blocks(spans, tasks)
+                entry.left = len(blocks)
+                for block in blocks:
+                    crew.add(entry, partial(loop.task, block))
+            _drain(crew, begun, AHEAD * crew.threads * tasks)
+        _drain(crew, begun, 0)
+    finally:
+        for entry in begun.values():  # those that are not done stop at their next kernel
+            if entry.run.loop is not None:
+                entry.run.loop.halt()
+        crew.close()
+
+
+@contextmanager
+def _beside(crew: Crew[Entry, Share]) -> Iterator[None]:
+    """While all cores trace, tensor operations of this thread are its own: a team would wait for a core, and spin meanwhile."""
+    with one_thread() if crew.pending else nullcontext():
+        yield
+
+
+@contextmanager
+def _blamed(entry: Entry) -> Iterator[None]:
+    """Tell an entry of the errors within."""
+    try:
+        yield
+    except Exception as error:
+        entry.failed(error)
+        raise
+
+
+def _drain(crew: Crew[Entry, Share], begun: dict[int, Entry], most: int) -> None:
+    """Take in what threads have done, until no more than ``most`` blocks are pending."""
+    while True:
+        found = crew.next(wait=crew.pending > most)
+        if found is None:
+            if crew.pending <= most:
+                return
+            continue
+        entry, share = found
+        entry.left -= 1
+        with undisturbed(entry.device), _blamed(entry), _beside(crew):
+            if isinstance(share, Unsupported):
+                entry.run.unsupported = share
+                assert entry.run.loop is not None
+                entry.run.loop.halt()
+            elif isinstance(share, BaseException):
+                raise share
+            else:
+                entry.rest += share.rest
+                entry.run.took(share)
+            if entry.left == 0:
+                del begun[id(entry)]
+                entry.done(entry.run.completed(entry.rest))
+                del entry.run

@@ -1,0 +1,329 @@
+"""One path of a render, vertex by vertex: the very path that the picture's sample is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchpt.core.errors import SceneError
+from torchpt.core.threads import limited_threads
+from torchpt.engines import tensors
+from torchpt.paths.explain import Bounced, Explainer, Left, Met, Shone
+from torchpt.paths.integrators import KINDS as INTEGRATORS
+from torchpt.paths.integrators.path import PathIntegrator
+from torchpt.paths.state import DirectLight, VertexOutput
+from torchpt.paths.wave import clamp_scale
+from torchpt.physics.shapes import interact
+from torchpt.scene import Scene
+from torchpt.scene.names import Names
+from torchpt.scene.prepare import make_wave
+from torchpt.scene.settings import Settings
+
+__all__ = ["Chosen", "Emission", "Path", "Scattered", "Vertex", "one_path"]
+
+#: Three numbers: a colour, a point or a direction.
+Triple = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Emission:
+    """Light that the path met by chance.
+
+    Attributes:
+        light: its name.
+        radiance: of it.
+        pdf: density in solid angle with which it would have been sampled.
+        mis_weight: of having met it.
+        contribution: to the sample.
+    """
+
+    light: str
+    radiance: Triple
+    pdf: float
+    mis_weight: float
+    contribution: Triple
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Light that was sampled.
+
+    Attributes:
+        light: its name.
+        wi: direction to it.
+        pdf: in solid angle, with the choice of the light; infinite of a light without extent.
+        arriving: its radiance over that density.
+        bsdf: what the material reflects of it, with the cosine and the shadowing of bent normals.
+        mis_weight: of having sampled it.
+        visible: how much of it gets here: 0, 1, or between behind what is not opaque; None where it would bring nothing anyway.
+        contribution: to the sample.
+    """
+
+    light: str
+    wi: Triple
+    pdf: float
+    arriving: Triple
+    bsdf: Triple
+    mis_weight: float
+    visible: float | None
+    contribution: Triple
+
+
+@dataclass(frozen=True)
+class Scattered:
+    """The direction in which the path goes on, as the material drew it.
+
+    Attributes:
+        wi: the direction.
+        pdf: in solid angle; infinite of a mirror's.
+        weight: BSDF and cosine over the density, with the shadowing of bent normals.
+        eta: index of refraction of the side of ``wi`` over that of ``wo``; None where nothing refracts.
+        survival: chance to survive roulette; None where it does not play.
+        throughput: what the path carries on; before roulette where that ends it.
+    """
+
+    wi: Triple
+    pdf: float
+    weight: Triple
+    eta: float | None
+    survival: float | None
+    throughput: Triple
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vertex:
+    """A place where a ray of the path ended; places are the scene's, directions unit, all of the world.
+
+    Attributes:
+        depth: from 1.
+        position: None where the ray escaped, as the rest then.
+        shape: name.
+        kind: of the primitive.
+        primitive: its number within its part of the shape.
+        material: name.
+        model: the material's ``type``.
+        normal: for shading, on the side of ``wo`` where the material is opaque.
+        geometric_normal: on the shape's outside.
+        wo: direction to the vertex before.
+        emission: None where nothing shines here.
+        light: None where none was sampled.
+        scattered: None where the path is as long as it may be.
+        radiance: of the sample up to here.
+    """
+
+    depth: int
+    position: Triple | None = None
+    shape: str | None = None
+    kind: str | None = None
+    primitive: int | None = None
+    material: str | None = None
+    model: str | None = None
+    normal: Triple | None = None
+    geometric_normal: Triple | None = None
+    wo: Triple
+    emission: Emission | None = None
+    light: Chosen | None = None
+    scattered: Scattered | None = None
+    radiance: Triple
+
+
+@dataclass(frozen=True)
+class Path:
+    """One path.
+
+    Attributes:
+        scene: its name.
+        pixel: ``(x, y)`` on the whole film.
+        sample: its number in the pixel.
+        seed: of the render.
+        origin: of the camera ray.
+        direction: of it.
+        vertices: in order.
+        ended: how it did: escaped, max_depth, absorbed, roulette or not finite.
+        radiance: of the whole path.
+        value: what enters the picture: weighted by the filter, black where it is not finite, clamped.
+    """
+
+    scene: str
+    pixel: tuple[int, int]
+    sample: int
+    seed: int
+    origin: Triple
+    direction: Triple
+    vertices: tuple[Vertex, ...]
+    ended: str
+    radiance: Triple
+    value: Triple
+
+
+def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: int) -> Path:
+    """Trace one sample by tensor operations, and tell what happened.
+
+    Args:
+        scene: what.
+        settings: of the render whose sample it is.
+        pixel: ``(x, y)`` on the whole film.
+        sample: its number in the pixel.
+
+    Raises:
+        SceneError: a pixel or sample that the render has not, or an integrator that follows no paths.
+    """
+    film, spp = settings.film, settings.render.spp
+    if not (0 <= pixel[0] < film.width and 0 <= pixel[1] < film.height):
+        expected = f"a pixel [x,y] of the film of {film.width} x {film.height} pixels, counted from 0"
+        raise SceneError("debug.pixel", list(pixel), expected)
+    if not 0 <= sample < spp:
+        raise SceneError("debug.sample", sample, f"a whole number from 0 to {spp - 1}, as render.spp is {spp}")
+    if not isinstance(settings.integrator, PathIntegrator):
+        names = ", ".join(name for name in INTEGRATORS if issubclass(INTEGRATORS[name], PathIntegrator))
+        expected = f"one that follows paths ({names}) beside debug.pixel"
+        raise SceneError("integrator.type", settings.integrator.name, expected)
+    with torch.no_grad(), limited_threads(settings.render.threads):
+        wave = make_wave(scene, settings, None, torch.float32)
+        explainer = Explainer(wave.context.world)
+        x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
+        state = wave.rays_of(x, y, number)
+        explainer.began(state)
+        brought = tensors.brought(wave, state, observer=explainer)
+        return _Story(scene, explainer).told(settings, pixel, sample, brought)
+
+
+class _Story:
+    """Turns what happened in one lane into a :class:`Path`."""
+
+    def __init__(self, scene: Scene, explainer: Explainer) -> None:
+        self.scene, self.events, self.world = scene, explainer.events, explainer.world
+        self.names = Names(scene.built, self.world)
+        self.centre, self.unit = scene.space.centre, scene.space.unit
+
+    def told(self, settings: Settings, pixel: tuple[int, int], sample: int, brought: Tensor) -> Path:
+        left = self.events[0]
+        assert isinstance(left, Left)
+        vertices = tuple(self._vertices())
+        value = torch.where(torch.isfinite(brought).all(0), brought, 0.0)
+        clamp = settings.integrator.clamp
+        if clamp is not None:
+            value = value * clamp_scale(value, clamp)
+        return Path(
+            scene=self.scene.name,
+            pixel=pixel,
+            sample=sample,
+            seed=settings.render.seed,
+            origin=self._place(left.state.o),
+            direction=_three(left.state.d),
+            vertices=vertices,
+            ended=self._ended(),
+            radiance=vertices[-1].radiance,
+            value=_three(value),
+        )
+
+    def _place(self, p: Tensor) -> Triple:
+        """A point in the scene's own coordinates."""
+        return tuple((p[:, 0].double() * self.unit + self.centre).tolist())
+
+    def _vertices(self) -> Iterator[Vertex]:
+        """One for each time that a ray of the path met something, or nothing."""
+        for k, met in enumerate(self.events):
+            if not isinstance(met, Met) or float(met.state.t_max) == 0.0:  # a path that ended has rays without length
+                continue
+            here = [event for event in self.events[k:] if not isinstance(event, Left) and event.depth == met.depth]
+            shone = next((event for event in here if isinstance(event, Shone)), None)
+            yield self._vertex(met, shone, next((event for event in here if isinstance(event, Bounced)), None))
+
+    def _vertex(self, met: Met, shone: Shone | None, bounced: Bounced | None) -> Vertex:
+        radiance = met.state.radiance if shone is None else met.state.radiance + shone.light.brought
+        light, output = None, None if bounced is None else bounced.output
+        if bounced is not None and bounced.clear is not None:
+            output = bounced.output
+            assert output.direct is not None and output.shadow is not None
+            light = self._chosen(output.direct, output.shadow.radiance, bounced.clear)
+            radiance = torch.addcmul(output.leaving.radiance, output.shadow.radiance, bounced.clear)
+        wo, escaped = _three(-met.state.d), int(met.hit.prim) < 0
+        emission = None if shone is None else self._emission(shone)
+        if escaped:
+            return Vertex(depth=met.depth, wo=wo, emission=emission, radiance=_three(radiance))
+        at = interact(self.world, met.state.o, met.state.d, met.hit)
+        found = self.names.surface(int(at.slot), int(at.prim))
+        normal = at.ns if output is None or output.surface is None else output.surface.frame.n
+        return Vertex(
+            depth=met.depth,
+            position=self._place(at.p),
+            shape=found.shape,
+            kind=found.kind,
+            primitive=found.primitive,
+            material=found.material,
+            model=found.model,
+            normal=_three(normal),
+            geometric_normal=_three(at.ng),
+            wo=wo,
+            emission=emission,
+            light=light,
+            scattered=None if output is None else _scattered(output),
+            radiance=_three(radiance),
+        )
+
+    def _emission(self, shone: Shone) -> Emission:
+        lights = self.world.lights
+        assert lights is not None
+        row = len(lights.area) - 1  # the environment
+        if shone.slot is not None:
+            assert lights.row_of_prim is not None
+            row = int(lights.row_of_prim[shone.slot])
+        light = shone.light
+        return Emission(
+            self.names.light(row),
+            _three(light.radiance),
+            float(light.pdf),
+            float(light.weight),
+            _three(light.brought),
+        )
+
+    def _chosen(self, direct: DirectLight, brought: Tensor, clear: Tensor) -> Chosen:
+        sample, reflected = direct.sample, direct.reflected
+        return Chosen(
+            light=self.names.light(0 if sample.row is None else int(sample.row)),
+            wi=_three(sample.wi),
+            pdf=float(sample.pdf),
+            arriving=_three(direct.radiance * sample.weight),
+            bsdf=_three(reflected if direct.share is None else reflected * direct.share),
+            mis_weight=1.0 if direct.weight is None else float(direct.weight),
+            visible=float(clear) if bool((brought != 0).any()) else None,
+            contribution=_three(brought * clear),
+        )
+
+    def _ended(self) -> str:
+        """Return how the path did."""
+        last = next(event for event in reversed(self.events) if not isinstance(event, Shone))
+        if isinstance(last, Met) and float(last.state.t_max) > 0.0:
+            return "escaped" if int(last.hit.prim) < 0 else "max_depth"
+        output = next(event.output for event in reversed(self.events) if isinstance(event, Bounced))
+        assert output.drawn is not None and output.carried is not None
+        if not bool(torch.isfinite(output.carried).all()):
+            return "not finite"
+        if float(output.drawn.least) > 0.0 and bool((output.carried > 0).any()):
+            return "roulette"
+        return "absorbed"
+
+
+def _scattered(output: VertexOutput) -> Scattered:
+    drawn, carried, chance, after = output.drawn, output.carried, output.chance, output.leaving
+    assert drawn is not None and carried is not None and output.surface is not None
+    goes_on, weight, relief = float(after.t_max) > 0.0, drawn.weight, output.surface.relief
+    if relief is not None:
+        weight = weight * relief.shadowing(drawn.d)
+    return Scattered(
+        wi=_three(drawn.d),
+        pdf=float(drawn.pdf),
+        weight=_three(weight),
+        eta=None if drawn.eta is None else float(drawn.eta),
+        survival=None if chance is None else float(chance),
+        throughput=_three(after.throughput if goes_on else carried),
+    )
+
+
+def _three(value: Tensor) -> Triple:
+    """The numbers of one lane."""
+    return tuple(value.detach().reshape(3, -1)[:, 0].tolist())

@@ -1,0 +1,118 @@
+"""What a render comes to: the picture so far, its layers, and what is known of both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchpt.core.memory import Meter, mb, retried
+from torchpt.images.denoiser import GUIDES
+from torchpt.paths.integrators import LAYERS
+from torchpt.physics.film import KnownError
+from torchpt.rendering.causes import causes_of
+from torchpt.rendering.result import Rendering
+
+if TYPE_CHECKING:
+    from torchpt.rendering.run import Run
+
+__all__ = ["final", "known_of", "rendering_of"]
+
+
+def final(run: Run) -> Rendering:
+    """The picture at the end, and why samples of it are not finite."""
+    size = mb(run.need.picture)
+    return retried(lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}", lambda: _told(run))
+
+
+def _told(run: Run) -> Rendering:
+    rendering = rendering_of(run)
+    rendering.nonfinite_causes, rendering.nonfinite_first = causes_of(run.scene, run.wave, run.lost)
+    return rendering
+
+
+def rendering_of(run: Run) -> Rendering:
+    """The picture so far; where ranks share a render, what their films hold was joined before."""
+    radiant, film = run.integrator.light, run.picture.film
+    layers = _layers(run)
+    known, unknown = None, ""
+    if radiant:
+        values = film.mean() if run.twice is None else run.twice.picture(film)
+        image, (known, unknown) = values.to(run.dtype), known_of(run, values)
+    else:
+        shown = layers[next(iter(run.seen))]
+        blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
+        image = shown.expand(-1, -1, 3).contiguous() if shown.shape[2] == 1 else torch.cat((shown, blank), -1)
+    clamped = None
+    if radiant and run.integrator.clamp is not None:
+        before, after = run.light.tolist()
+        clamped = 1.0 - after / before if before > 0 else 0.0
+    counts = (film if radiant else next(iter(run.picture.layers.values()))).counts
+    names = run.settings.film.aovs or run.integrator.layers
+    meter = Meter(run.device)
+    return Rendering(
+        image=image,
+        layers={name: layers[name] for name in names},
+        guides={name: layers[name] for name in GUIDES} if run.settings.film.denoise else {},
+        spp=round(float(counts.double().mean())) if run.settings.adaptive else int(counts.sum()) // len(counts),
+        load_seconds=run.load_seconds,
+        build_seconds=run.build_seconds,
+        compile_seconds=run.compile_seconds(),
+        render_seconds=run.seconds_of_sampling(),
+        write_seconds=run.write_seconds(),
+        paths=run.done,
+        rays=run.tally.rays,
+        nonfinite_samples=run.lost.count,
+        truncated_paths=run.tally.truncated,
+        clamped=clamped,
+        relmse=None if known is None or unknown else known.relmse,
+        relmse_interval=None if known is None or unknown else known.interval,
+        relmse_unknown=unknown,
+        heavy_tailed=known is not None and known.heavy_tailed,
+        stopped_by=run.stop.reason,
+        complete=bool(run.stop.reason) and not run.ended,
+        peak_memory=max(meter.peak() - meter.base(), 0),
+        lanes=run.waves.lanes if run.waves is not None and run.waves.short else None,
+        eager=tuple(run.eager),
+        scene=run.name,
+        settings=run.settings,
+    )
+
+
+def known_of(run: Run, picture: Tensor) -> tuple[KnownError | None, str]:
+    """Return what the samples tell of the picture's own error, None where nobody asked, and why that is not known, or ""."""
+    film = run.picture.film
+    if run.twice is not None:
+        known = run.twice.known(film, picture)
+    else:
+        relmse = film.relmse()
+        known = None if relmse is None else KnownError(relmse, None, False)
+    if known is None or not run.done:
+        return known, ""
+    from torchpt.rendering.unlit import unlit
+
+    lacks = unlit(run.scene, run.wave, run.geometry, picture, known.relmse)
+    if lacks.reason:
+        return known, lacks.reason
+    if known.interval is not None:
+        low, high = known.interval
+        known = replace(known, interval=(low, high + lacks.dark))
+    return known, ""
+
+
+def _layers(run: Run) -> dict[str, Tensor]:
+    """The layers so far: those of first surfaces, and those that the film makes."""
+    layers = {}
+    film = run.picture.film
+    for name, layer in run.seen.items():
+        seen = run.picture.layers[name]
+        values = seen.mean() * (run.unit if layer.length else 1.0) if layer.averaged else seen.first()
+        layers[name] = values.to(run.dtype)
+    for name in run.settings.film.aovs:
+        if name not in run.seen:
+            made: Any = LAYERS[name]  # a FilmLayer
+            counts = film.counts if run.twice is None else run.twice.counts(film)
+            layers[name] = made.of(film, counts).to(run.dtype)
+    return layers

@@ -1,0 +1,158 @@
+"""A render's passes by several ranks: each samples some pixels of every plate, and the films are put together again.
+
+A rank's pixels are a plate of their own, as those are that adaptive sampling asks for. Their sums go on from what the film
+holds, sample by sample, so a film has the bits that it has in one process, whoever took which pixel.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchpt.compiler.graph import Unsupported
+from torchpt.core import tree
+from torchpt.core.version import __version__
+from torchpt.paths.lost import Lost
+from torchpt.paths.wave import Plate, Tally
+from torchpt.physics.film import Film
+from torchpt.ranks import Group, dealt
+from torchpt.rendering.checkpoint import State
+from torchpt.scene import Scene
+from torchpt.scene.fingerprint import fingerprints
+from torchpt.scene.settings import Settings, having
+from torchpt.spec import Role
+
+if TYPE_CHECKING:
+    from torchpt.rendering.run import Run
+
+__all__ = ["Span", "Split", "stamp"]
+
+#: A plate, its first sample and how many.
+Span = tuple[Plate, int, int]
+
+
+class Split:
+    """This rank's part in a render.
+
+    Args:
+        group: the ranks.
+    """
+
+    def __init__(self, group: Group) -> None:
+        self.group = group
+        self._parts: list[tuple[Plate, Plate]] = []
+
+    def begin(self) -> None:
+        """Nothing is sampled yet."""
+        self._parts.clear()
+
+    def take(self, run: Run, spans: list[Span]) -> bool:
+        """Take the samples of this rank, and count those of all; returns whether all were taken.
+
+        Raises:
+            Unsupported: of any rank.
+        """
+        done, rays, truncated = run.done, run.tally.rays, run.tally.truncated
+        lost, light = run.lost, run.light
+        run.lost, run.light, run.shared = Lost(), torch.zeros_like(light), (done, self.group.size)
+        reason = ""
+        try:
+            run.take_alone([(self._part(plate), first, count) for plate, first, count in spans])
+        except Unsupported as error:
+            reason = str(error) or "unsupported"
+        own = run.done - done, run.tally.rays - rays, run.tally.truncated - truncated, run.lost.count
+        every = self.group.agree("a pass", *own, run.ended, bool(reason))
+        if any(failed for *_, failed in every):
+            raise Unsupported(reason or "what another rank met")
+        run.done, run.shared = done + sum(int(n) for n, *_ in every), (0, 1)
+        run.tally = Tally(rays + sum(int(said[1]) for said in every), truncated + sum(int(said[2]) for said in every))
+        if any(said[3] for said in every):
+            lost.add(self._of_all(run.lost))
+        run.lost = lost
+        for part in self.group.gather(run.light) if run.integrator.clamp is not None else ():
+            light = light + part
+        run.light = light
+        run.ended = any(said[4] for said in every) and run.done < run.asked()
+        return not any(said[4] for said in every)
+
+    def join(self) -> None:
+        """Make films whole on every rank."""
+        for whole, part in self._parts:
+            for film, own in zip(_films(whole), _films(part), strict=True):
+                self._join(film, own)
+        self._parts.clear()
+
+    def decide(self, seconds: float, error: float | None) -> tuple[float, float | None]:
+        """Seconds and an error as the first rank has them."""
+        seconds, known, error_there = self.group.decide("seconds", seconds, error is not None, error or 0.0)
+        return seconds, error_there if known else None
+
+    def due(self, due: bool) -> bool:
+        """Return True where the first rank is to write a checkpoint."""
+        return bool(self.group.decide("a checkpoint", due)[0])
+
+    def places(self, own: Tensor) -> Tensor:
+        """Whole numbers that the first rank computed; those of another kind of processor may round otherwise."""
+        return self.group.first(own)
+
+    def state(self, own: State | None, like: State) -> State | None:
+        """Return what the first rank read from a checkpoint, which is ``like`` a state of this render; None: nothing."""
+        text = "" if own is None else json.dumps(own.facts)
+        sent = bytes(self.group.first(torch.tensor(list(text.encode()), dtype=torch.uint8)).tolist())
+        if not sent:
+            return None
+        arrays = {}
+        for name, value in like.arrays.items():
+            values = value if own is None else own.arrays[name]
+            arrays[name] = self.group.first(values.reshape(-1)).view(value.shape)
+        return State(json.loads(sent), arrays)
+
+    def _part(self, plate: Plate) -> Plate:
+        """The pixels of a plate that are this rank's."""
+        for whole, part in self._parts:
+            if whole is plate:
+                return part
+        device = plate.film.sums.device
+        places = dealt(plate.film.width * plate.film.height, self.group.rank, self.group.size).to(device)
+        layers = {name: film.taken(places) for name, film in plate.layers.items()}
+        pixels = places if plate.places is None else plate.places[places]
+        part = Plate(plate.film.taken(places), layers, plate.streams, pixels)
+        self._parts.append((plate, part))
+        return part
+
+    def _join(self, whole: Film, own: Film) -> None:
+        """The pixels of all ranks into a film."""
+        sent = torch.cat([value.reshape(-1).view(torch.int64) for value in own.state().values()])
+        for rank, values in enumerate(self.group.gather(sent)):
+            places = dealt(whole.width * whole.height, rank, self.group.size).to(sent.device)
+            part = whole.part(len(places))
+            state, first = {}, 0
+            for name, value in part.state().items():
+                state[name] = values[first : first + value.numel()].view(value.dtype).view(value.shape)
+                first += value.numel()
+            part.restore(state)
+            whole.put(places, part)
+
+    def _of_all(self, own: Lost) -> Lost:
+        """Samples that are not finite, of all ranks."""
+        text = json.dumps(own.plain()).encode()
+        every = Lost()
+        for values in self.group.gather(torch.tensor(list(text), dtype=torch.uint8)):
+            every.add(Lost.read(json.loads(bytes(values.tolist()))))
+        return every
+
+
+def _films(plate: Plate) -> list[Film]:
+    return [plate.film, *plate.layers.values()]
+
+
+def stamp(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype) -> bytes:
+    """Return a hash of what ranks must have in common to render one picture."""
+    free = having(Role.FREE, but=Role.FILES)  # upon files ranks must agree all the same
+    free["render"] = (*free["render"], "device")
+    own = settings.integrator if settings.integrator.foreign else None
+    return tree.fingerprint((__version__, settings.plain(free), own, fingerprints(scene, params), dtype))

@@ -1,0 +1,549 @@
+"""Timed runs of a study that resume: where they are kept, the reference pictures, the measuring."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchpt.core.errors import AssetError, OutputError, SceneError
+from torchpt.core.tree import fingerprint
+from torchpt.core.version import __version__
+from torchpt.images import colour, read_image, read_layers, write_image
+from torchpt.images.denoiser import check_denoiser, denoiser_version
+from torchpt.images.metrics import relative
+from torchpt.images.write import temporary_beside
+from torchpt.rendering.api import Progress, Rendering, render_scene
+from torchpt.rendering.result import denoise_rendering
+from torchpt.reports.study import Study, Variant
+from torchpt.scene.devices import device_of
+from torchpt.scene.fingerprint import fingerprint as fingerprint_of
+from torchpt.scene.formats.description import Description, overridden, read_description
+from torchpt.scene.prepare import Kept, kept
+from torchpt.scene.scene import Scene
+from torchpt.scene.settings import Settings, having
+from torchpt.spec import Role
+
+__all__ = [
+    "Curve",
+    "Job",
+    "Measured",
+    "Run",
+    "Stopped",
+    "Store",
+    "Truth",
+    "film_size",
+    "from_file",
+    "from_runs",
+    "machine",
+    "measure",
+    "name_of",
+    "prepare",
+    "seed_of",
+    "write_whole",
+]
+
+
+# ---- Finished runs on disk: a picture and its facts each, so that a study which was stopped resumes
+#
+# A run's name is a hash of all that it depends on: the scene and its files, every setting, seed and samples, the renderer's
+# own source and the machine. So a study that changed takes up what still holds of it and never a wrong run. The facts are
+# written after the picture and say that the run is whole.
+
+
+#: Rooms that no picture depends on.
+_ABOVE = ("reports", "commands", "cli/main.py", "__main__.py", "share")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        file: its picture, ``.exr``.
+        facts: ``spp seed seconds set_up nonfinite_samples rays``, and what it was a run of.
+    """
+
+    file: Path
+    facts: dict[str, Any]
+
+    @property
+    def seconds(self) -> float:
+        """Of sampling alone."""
+        return self.facts["seconds"]
+
+    def image(self) -> Tensor:
+        """The picture ``(H, W, 3)`` float64."""
+        return read_image(self.file)[..., :3].double()
+
+
+class Store:
+    """The folder of a study's runs.
+
+    Args:
+        folder: made where it is not there; others may share it.
+
+    Raises:
+        OutputError: it cannot be made or written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            probe = temporary_beside(folder / "probe.json")
+            probe.touch()
+            probe.unlink()
+        except OSError as error:
+            raise OutputError(folder, f"cannot be used for runs ({error.strerror or error})") from None
+
+    def get(self, name: str) -> Run | None:
+        """The run of this name, where it is there and whole."""
+        try:
+            facts = json.loads((self.folder / f"{name}.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        picture = self.folder / f"{name}.exr"
+        whole = isinstance(facts, dict) and {"seconds", "spp", "seed", "nonfinite_samples"} <= facts.keys()
+        return Run(picture, facts) if whole and picture.is_file() else None
+
+    def put(self, name: str, image: Tensor, facts: Mapping[str, Any]) -> Run:
+        """Keep a run."""
+        picture = self.folder / f"{name}.exr"
+        write_image(picture, image)
+        write_whole(self.folder / f"{name}.json", json.dumps(facts, indent=1).encode())
+        return Run(picture, dict(facts))
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file beside its place and move it there.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    temporary = temporary_beside(path)
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError(path, f"cannot be written ({error.strerror or error})") from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def name_of(facts: Mapping[str, Any]) -> str:
+    """The name of a run that depends on these facts, on this renderer and on this machine."""
+    whole = {"facts": facts, "torchpt": __version__, "source": _source(), "torch": torch.__version__, **machine()}
+    return fingerprint(json.dumps(whole, sort_keys=True)).hex()
+
+
+@lru_cache(maxsize=1)
+def machine() -> dict[str, Any]:
+    """What times depend on: processor, cores, threads, GPU."""
+    processor = platform.processor() or platform.machine()
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        processor = next((line.partition(": ")[2] for line in lines if line.startswith("model name")), processor)
+    facts: dict[str, Any] = {"processor": processor, "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+    if torch.cuda.is_available():
+        facts["gpu"] = torch.cuda.get_device_name()
+    return facts
+
+
+@lru_cache(maxsize=1)
+def _source() -> str:
+    """A hash of the package, but for what stands above rendering."""
+    root = Path(__file__).parents[1]
+    hashed = hashlib.blake2b(digest_size=12)
+    for path in sorted(root.rglob("*.py")):
+        name = path.relative_to(root)
+        if name.parts[0] not in _ABOVE:
+            hashed.update(str(name).encode() + path.read_bytes())
+    return hashed.hexdigest()
+
+
+# ---- The reference: a file, or the mean of independent runs, whose variance is known and taken off squared errors
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What pictures are compared with.
+
+    Attributes:
+        image: ``(H, W, 3)`` float64.
+        variance: of ``image`` by value, the same shape; 0 where nobody knows it.
+        runs: the independent pictures ``(H, W, 3)`` that it is the mean of; empty for a file.
+        told: where it comes from, for the report.
+    """
+
+    image: Tensor
+    variance: Tensor
+    runs: tuple[Tensor, ...]
+    told: dict[str, Any]
+
+    @cached_property
+    def weight(self) -> Tensor:
+        """Of a squared error that becomes relative: ``1 / (ref² + 0.01)``."""
+        return relative(1.0, self.image)
+
+    def shown(self, film: Any) -> Tensor:
+        """As a screen shows it; the latest is kept."""
+        key = (film.exposure, film.tonemap, film.gamma)
+        if key not in self._shown:
+            self._shown.clear()
+            self._shown[key] = colour.display(self.image, *key)
+        return self._shown[key]
+
+    @cached_property
+    def _shown(self) -> dict[tuple[Any, ...], Tensor]:
+        return {}
+
+    @property
+    def noise(self) -> float:
+        """Its own relMSE, as far as it is known."""
+        return float((self.variance * self.weight).mean())
+
+
+def from_runs(runs: Sequence[Run]) -> Truth:
+    """The mean of independent runs; the variance of that mean is their spread over their number."""
+    images = tuple(run.image() for run in runs)
+    stack = torch.stack(images)
+    told = {
+        "made": True,
+        "spp": runs[0].facts["spp"],
+        "seeds": len(runs),
+        "seconds": sum(run.seconds for run in runs),
+        "settings": runs[0].facts["settings"],
+    }
+    return Truth(stack.mean(0), stack.var(0) / len(runs), images, told)
+
+
+def from_file(path: str, size: tuple[int, int]) -> Truth:
+    """A picture from a file; its layer ``variance`` (of the mean, as ``film.aovs=[variance]`` writes it) counts.
+
+    Args:
+        path: linear, such as ``.exr``.
+        size: width and height that it must have.
+
+    Raises:
+        AssetError: a file that cannot be read, of another size, or with values that are not finite.
+    """
+    layers = read_layers(path)
+    image = layers["image"] if "image" in layers else next(iter(layers.values()))
+    image = image.expand(-1, -1, 3) if image.shape[2] == 1 else image[..., :3]
+    if image.shape[2] != 3:
+        raise AssetError(path, f"expected a picture of 1, 3 or 4 channels, got {image.shape[2]}")
+    high, wide = image.shape[:2]
+    if (wide, high) != size:
+        raise AssetError(
+            path, f"expected a picture of {size[0]} x {size[1]} pixels as the film is, got {wide} x {high}"
+        )
+    if not torch.isfinite(image).all():
+        raise AssetError(path, "expected finite values in a reference")
+    variance = layers.get("variance")
+    usable = variance is not None and variance.shape == image.shape and bool(torch.isfinite(variance).all())
+    spread = variance.double().clamp_min(0.0) if variance is not None and usable else torch.zeros_like(image).double()
+    return Truth(image.double(), spread, (), {"made": False, "file": path, "variance": usable})
+
+
+# ---- The runs of a study: which there are, and how each is timed
+#
+# Every step of a curve has independent runs with seeds of their own. Settings take turns, one seed after the other, so that a
+# machine that slows down slows all of them. Whenever they change, a run that is thrown away comes first: what it compiles and
+# builds is no run's time.
+#
+# For the denoised pictures of a curve its runs are rendered once more, by the same seeds and with the layers that the denoiser
+# looks at: the picture under the noise is the same to the bit, and the curve's own times are without those layers.
+
+
+#: Settings that no run depends on, or that each has its own of.
+_FREE = {
+    "film": (*having(Role.FREE)["film"], "aovs"),
+    "render": (*having(Role.FILES)["render"], "seed", "spp"),
+}
+
+
+class Stopped(Exception):
+    """A wish to stop was met.
+
+    Attributes:
+        done: runs that are kept.
+        total: runs of the study.
+    """
+
+    def __init__(self, done: int, total: int) -> None:
+        self.done, self.total = done, total
+        super().__init__(done, total)
+
+
+@dataclass
+class Job:
+    """Settings of which runs are wanted.
+
+    Attributes:
+        scene: loaded.
+        wishes: complete; spp and seed are set for each run.
+        facts: what runs depend on, beside spp and seed.
+        purpose: ``run`` or ``reference``: their seeds never meet.
+        left: what its runs left for the next one: its kernels, while those of another setting are in the scene's hands.
+    """
+
+    scene: Scene
+    wishes: Settings
+    facts: dict[str, Any]
+    purpose: str
+    left: Kept | None = None
+
+    @property
+    def pixels(self) -> int:
+        """Of the picture."""
+        wide, high = film_size(self.wishes)
+        return wide * high
+
+
+@dataclass
+class Curve:
+    """A variant on a scene.
+
+    Attributes:
+        variant: its settings.
+        job: how it is run.
+        steps: spp to its runs.
+        denoised: how the runs are rendered that are denoised; None where none are wanted.
+        denoised_steps: spp to those runs, whose pictures are the denoised ones.
+        reference: how its reference is made; None where that is a file.
+        truths: the runs of the reference.
+    """
+
+    variant: Variant
+    job: Job
+    steps: dict[int, list[Run]] = field(default_factory=dict)
+    denoised: Job | None = None
+    denoised_steps: dict[int, list[Run]] = field(default_factory=dict)
+    reference: Job | None = None
+    truths: list[Run] = field(default_factory=list)
+
+
+@dataclass
+class Measured:
+    """A scene of a study with its curves.
+
+    Attributes:
+        name: as it was asked for.
+        curves: in the order of the grid.
+    """
+
+    name: str
+    curves: list[Curve]
+
+
+def film_size(wishes: Settings) -> tuple[int, int]:
+    """Width and height of the picture."""
+    film = wishes.film
+    return (film.width, film.height) if film.crop is None else film.crop[2:]
+
+
+def seed_of(study_seed: int, purpose: str, spp: int, number: int) -> int:
+    """The seed of a run: another one for each purpose, step and number."""
+    words = f"{study_seed}/{purpose}/{spp}/{number}"
+    return int.from_bytes(hashlib.blake2b(words.encode(), digest_size=6).digest(), "big")
+
+
+def prepare(study: Study) -> list[Measured]:
+    """Load the scenes and check every setting, before anything is rendered.
+
+    Raises:
+        TorchptError: a scene or setting that cannot be used; a denoiser that is wanted and not there.
+    """
+    if study.asked["denoise"]:
+        check_denoiser()
+    found = []
+    for name in study.scenes:
+        description = read_description(name)
+        loaded: dict[str, tuple[Scene, str]] = {}
+        curves = []
+        for variant in study.variants:
+            curve = Curve(variant, _job(description, study.overrides(variant), loaded, "run"))
+            if study.asked["denoise"]:
+                curve.denoised = _denoised(curve.job)
+            if not study.reference.files:
+                curve.reference = _job(description, study.truth(variant), loaded, "reference")
+            curves.append(curve)
+        found.append(Measured(name, curves))
+    return found
+
+
+def _job(
+    description: Description,
+    overrides: Mapping[str, Mapping[str, Any]],
+    loaded: dict[str, tuple[Scene, str]],
+    purpose: str,
+) -> Job:
+    description, wishes = overridden(description, overrides)
+    # Such wishes of a scene are about files.
+    film, render = wishes.film.but(denoise=False, aovs=()), wishes.render.without(Role.FILES)
+    wishes = replace(wishes, film=film, render=render)
+    if not wishes.integrator.light:
+        raise SceneError("integrator.type", wishes.integrator.name, "an integrator that carries light")
+    device = str(device_of(wishes.render.device))
+    if device not in loaded:
+        scene = Scene(description, device_of(device))
+        loaded[device] = scene, fingerprint_of(scene)
+    scene, named = loaded[device]
+    return Job(scene, wishes, {"scene": named, "device": device, "settings": wishes.plain(_FREE)}, purpose)
+
+
+def _denoised(job: Job) -> Job:
+    """The same runs with the layers that the denoiser looks at."""
+    wishes = replace(job.wishes, film=job.wishes.film.but(denoise=True))
+    facts = {**job.facts, "settings": wishes.plain(_FREE), "denoiser": denoiser_version()}
+    return Job(job.scene, wishes, facts, job.purpose)
+
+
+def measure(
+    study: Study,
+    prepared: list[Measured],
+    store: Store,
+    on_progress: Callable[[int, int, int, float], bool | None] | None = None,
+) -> None:
+    """Render what is missing and fill in the runs.
+
+    Args:
+        study: what is asked.
+        prepared: from `prepare`.
+        store: where runs are kept.
+        on_progress: called with samples done and to do, rays and seconds; returning True stops.
+
+    Raises:
+        Stopped: ``on_progress`` said so; finished runs are kept.
+    """
+    wanted = _wanted(study, prepared)
+    names = [_name(job, spp, seed) for job, spp, seed, _ in wanted]
+    missing = {name: job.pixels * spp for name, (job, spp, _, _) in zip(names, wanted, strict=True)}
+    missing = {name: samples for name, samples in missing.items() if store.get(name) is None}
+    clock = _Clock(sum(missing.values()), on_progress)
+    latest: Job | None = None
+    for name, (job, spp, seed, place) in zip(names, wanted, strict=True):
+        run = store.get(name)
+        if run is None:
+            if job is not latest:  # what it leaves is there for the runs that follow
+                _turn(latest, job)
+                thrown = _render(job, min(study.asked["spp"][0], spp), seed, clock, counts=False)
+                if not clock.stop:
+                    _denoise(job, thrown)  # its first time takes longer too
+                latest = job
+            rendering = None if clock.stop else _render(job, spp, seed, clock)
+            if rendering is None or not rendering.complete:
+                raise Stopped(sum(store.get(other) is not None for other in set(names)), len(set(names)))
+            denoising = _denoise(job, rendering)
+            picture = rendering.image if rendering.denoised is None else rendering.denoised
+            run = store.put(name, picture, _told(job, spp, seed, rendering, denoising))
+        place.append(run)
+
+
+def _turn(latest: Job | None, job: Job) -> None:
+    """Another setting's turn: a scene keeps the kernels of its latest render only, and making them anew takes seconds."""
+    if latest is not None:
+        latest.left = replace(kept(latest.scene))
+    if job.left is not None:
+        keeper = kept(job.scene)
+        keeper.kernels, keeper.first, keeper.dark = job.left.kernels, job.left.first, job.left.dark
+
+
+Wanted = tuple[Job, int, int, list[Run]]
+
+
+def _wanted(study: Study, prepared: list[Measured]) -> list[Wanted]:
+    """All runs in order, each with the list that it goes to."""
+    found: list[Wanted] = []
+    for measured in prepared:
+        for number in range(study.asked["seeds"]):
+            for curve in measured.curves:
+                pairs = [(curve.job, curve.steps)]
+                if curve.denoised is not None:
+                    pairs.append((curve.denoised, curve.denoised_steps))
+                for job, steps in pairs:
+                    for spp in study.asked["spp"]:
+                        seed = seed_of(study.asked["seed"], "run", spp, number)
+                        found.append((job, spp, seed, steps.setdefault(spp, [])))
+        shared: dict[str, Job] = {}
+        for curve in measured.curves:
+            if curve.reference is None:
+                continue
+            job = shared.setdefault(_name(curve.reference, 0, 0), curve.reference)
+            for number in range(study.reference.seeds):
+                seed = seed_of(study.asked["seed"], "reference", study.reference.spp, number)
+                found.append((job, study.reference.spp, seed, curve.truths))
+    return found
+
+
+def _name(job: Job, spp: int, seed: int) -> str:
+    return name_of({**job.facts, "purpose": job.purpose, "spp": spp, "seed": seed})
+
+
+def _render(job: Job, spp: int, seed: int, clock: _Clock, counts: bool = True) -> Rendering:
+    wishes = replace(job.wishes, render=job.wishes.render.but(spp=spp, seed=seed))
+    rendering = render_scene(job.scene, wishes, on_progress=clock.watch if counts else clock.glance)
+    if counts:
+        clock.passed(rendering)
+    return rendering
+
+
+def _denoise(job: Job, rendering: Rendering) -> float | None:
+    """Denoise where that is wanted; returns the seconds that it took."""
+    return denoise_rendering(rendering, job.wishes) if job.wishes.film.denoise else None
+
+
+def _told(job: Job, spp: int, seed: int, rendering: Rendering, denoising: float | None) -> dict[str, Any]:
+    set_up = rendering.build_seconds + rendering.compile_seconds
+    seconds = getattr(rendering, "render_seconds", None) or max(rendering.seconds - set_up, 1e-9)
+    return {
+        "spp": spp,
+        "seed": seed,
+        "seconds": seconds + (denoising or 0.0),
+        "denoise_seconds": denoising,
+        "set_up": set_up,
+        "rays": rendering.rays,
+        "nonfinite_samples": rendering.nonfinite_samples,
+        "truncated_paths": rendering.truncated_paths,
+        "clamped": rendering.clamped,
+        "purpose": job.purpose,
+        **job.facts,
+    }
+
+
+class _Clock:
+    """How far all of the study is."""
+
+    def __init__(self, total: int, tell: Callable[[int, int, int, float], bool | None] | None) -> None:
+        self.total, self.tell = total, tell
+        self.done, self.rays, self.seconds, self.stop = 0, 0, 0.0, False
+
+    def watch(self, state: Progress) -> bool:
+        """Tell of a run on its way."""
+        if self.tell is not None:
+            done = self.done + state.done
+            self.stop |= bool(self.tell(done, self.total, self.rays + state.rays, self.seconds + state.seconds))
+        return self.stop
+
+    def glance(self, state: Progress) -> bool:
+        """Ask only whether to stop."""
+        if self.tell is not None:
+            self.stop |= bool(self.tell(self.done, self.total, self.rays, self.seconds))
+        return self.stop
+
+    def passed(self, rendering: Rendering) -> None:
+        """Count a finished run."""
+        self.done, self.rays = self.done + rendering.paths, self.rays + rendering.rays
+        self.seconds += rendering.seconds

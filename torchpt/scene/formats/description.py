@@ -1,0 +1,277 @@
+"""A scene file as it was written, checked: names, files and numbers, nothing built yet."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import IO, Any, TypeVar
+
+from torchpt.core.errors import AssetError, SceneError
+from torchpt.core.files import MAX_BYTES, check_regular, configs, is_regular
+from torchpt.physics.bsdfs import Bsdf
+from torchpt.physics.lights import KINDS as LIGHTS
+from torchpt.physics.shapes import KINDS as SHAPES
+from torchpt.physics.textures import KINDS as TEXTURES
+from torchpt.scene import settings as run_settings
+from torchpt.scene.formats.cameras import read_camera
+from torchpt.scene.formats.materials import Kind, check_material, material_types, read_material
+from torchpt.scene.formats.textures import check_texture, texture_of
+from torchpt.scene.formats.yaml import parse_yaml, plain, read_open, read_yaml
+from torchpt.scene.settings import BLOCKS, Settings, having
+from torchpt.spec import Role
+from torchpt.spec.schema import Described, check_keys, described
+
+__all__ = [
+    "ASSETS",
+    "MAX_ENTRIES",
+    "Description",
+    "Source",
+    "overridden",
+    "read_description",
+    "scene_names",
+    "settings",
+]
+
+ASSETS = "$TORCHPT_ASSETS"
+#: Textures, materials, shapes (instances are some) and lights that a scene may name, of each.
+MAX_ENTRIES = 100_000
+_KEYS = ("version", "camera", *BLOCKS, "textures", "materials", "shapes", "lights")
+
+T = TypeVar("T")
+#: What a scene is read from.
+Source = str | os.PathLike[str] | IO[str] | IO[bytes] | Mapping[str, Any]
+SOURCES = "a scene's name, a path ending in .yaml, YAML text, an open file, or a mapping"
+
+
+@dataclass(frozen=True)
+class Description:
+    """A checked scene description.
+
+    Attributes:
+        file: the scene file, or None for a scene given as a dict.
+        base: the folder that relative paths start from.
+        camera: the camera.
+        version: 1 where the file states it, else None.
+        film: the film settings that the file really sets, as written.
+        integrator: the same for the integrator.
+        sampler: the same for the sampler.
+        render: the same for the run.
+        textures: by name.
+        materials: by name.
+        shapes: by name, in file order.
+        lights: by name.
+    """
+
+    file: str | None
+    base: Path
+    camera: Described
+    version: int | None = None
+    film: dict[str, Any] = field(default_factory=dict)
+    integrator: dict[str, Any] = field(default_factory=dict)
+    sampler: dict[str, Any] = field(default_factory=dict)
+    render: dict[str, Any] = field(default_factory=dict)
+    textures: dict[str, Described] = field(default_factory=dict)
+    materials: dict[str, Described] = field(default_factory=dict)
+    shapes: dict[str, Described] = field(default_factory=dict)
+    lights: dict[str, Described] = field(default_factory=dict)
+
+    def resolve(self, path: str | tuple[str, ...], key: str) -> Path:
+        """The file that a scene names, or the first existing one of several.
+
+        A relative path starts at the scene file's folder; a leading ``$TORCHPT_ASSETS`` is expanded, no other variable.
+
+        Args:
+            path: as written in the scene.
+            key: dotted key for the error.
+
+        Raises:
+            SceneError: ``$TORCHPT_ASSETS`` is used and not set.
+            AssetError: no such file.
+        """
+        candidates = (path,) if isinstance(path, str) else path
+        problems: list[SceneError | AssetError] = []
+        for candidate in candidates:
+            try:
+                return self._existing(candidate, key)
+            except (SceneError, AssetError) as error:
+                problems.append(error)
+        raise problems[-1]
+
+    def _existing(self, path: str, key: str) -> Path:
+        head, _, rest = path.partition("/")
+        if head == ASSETS:
+            folder = os.environ.get(ASSETS[1:], "")
+            if not folder:
+                expected = f"a file that can be found (the environment variable {ASSETS[1:]} is not set)"
+                raise SceneError(key, path, expected, self.file)
+            found = Path(folder) / rest
+        else:
+            found = self.base / path
+        try:
+            check_regular(found, MAX_BYTES)
+        except OSError as error:
+            problem = (
+                "no such file" if isinstance(error, FileNotFoundError | NotADirectoryError) else str(error.strerror)
+            )
+            hint = f"; only {ASSETS} is expanded" if path.startswith(("$", "~")) and head != ASSETS else ""
+            where = f"{key} of {self.file}" if self.file else key
+            raise AssetError(found, f"{problem}, named by {where}{hint}") from None
+        return found
+
+
+def scene_names() -> list[str]:
+    """The scenes that ship, by name."""
+    return sorted(path.stem for path in (configs() / "scene").glob("*.yaml"))
+
+
+def read_description(
+    source: Source,
+    bsdfs: Mapping[str, Bsdf] | None = None,
+    change: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+) -> Description:
+    """A checked scene description.
+
+    Args:
+        source: the name of a scene in ``configs/scene/``, a path ending in ``.yaml``, an open file, YAML text of more than
+            one line, or a mapping of the same schema. Relative paths start at the file's folder; where there is no file, at
+            the current one.
+        bsdfs: material types of the caller's own: type name to model instance.
+        change: of what was written, before it is checked.
+
+    Raises:
+        SceneError: what is wrong first, with file, dotted key, value and what is accepted.
+        NotBuiltError: something that the format knows and this version does not build.
+
+    Warns:
+        EnergyWarning: a material may reflect more light than it receives.
+    """
+    types, change = material_types(bsdfs), change or (lambda raw: raw)
+    if isinstance(source, Mapping):
+        return _describe(change(plain(source)), types, None, Path.cwd())
+    if not isinstance(source, str | os.PathLike) and hasattr(source, "read"):
+        named = getattr(source, "name", None)
+        file = named if isinstance(named, str) and is_regular(named) else None
+        base = Path.cwd() if file is None else Path(file).resolve().parent
+        return _describe(change(plain(read_open(source, file), file)), types, file, base)
+    if not isinstance(source, str | os.PathLike):
+        raise SceneError("scene", source, SOURCES)
+    file = os.fspath(source)
+    if isinstance(source, str) and "\n" in source:
+        return _describe(change(plain(parse_yaml(source))), types, None, Path.cwd())
+    if file.endswith((".yaml", ".yml")):
+        path = Path(file)
+    elif file in scene_names():
+        path = configs() / "scene" / f"{file}.yaml"
+        file = str(path)
+    else:
+        raise SceneError("scene", file, f"one of {', '.join(scene_names())}, or a path ending in .yaml")
+    return _describe(change(plain(read_yaml(path, file), file)), types, file, path.resolve().parent)
+
+
+def settings(description: Description, overrides: Mapping[str, Any] | None = None) -> Settings:
+    """The complete run settings: built-in default < scene file < override.
+
+    Args:
+        description: whose blocks film, integrator, sampler and render count as the scene's wishes.
+        overrides: by block, e.g. ``{"render": {"spp": 16}}``; None means unset.
+
+    Raises:
+        SceneError: key such as ``render.spp``.
+    """
+    blocks = {name: getattr(description, name) for name in BLOCKS}
+    return run_settings.merge(blocks, overrides or {}, description.file)
+
+
+def overridden(description: Description, overrides: Mapping[str, Mapping[str, Any]]) -> tuple[Description, Settings]:
+    """The description and the complete settings where a null among the overrides unsets the scene's own wish.
+
+    Args:
+        description: of the scene.
+        overrides: by block, as `settings` takes them.
+
+    Returns:
+        The description without the wishes that were unset, and the settings.
+
+    Raises:
+        SceneError: key such as ``render.spp``.
+    """
+    for block, given in overrides.items():
+        own = {key: value for key, value in getattr(description, block).items() if given.get(key, key) is not None}
+        description = replace(description, **{block: own})
+    return description, settings(description, overrides)
+
+
+def _describe(raw: dict[str, Any], types: Mapping[str, Kind], file: str | None, base: Path) -> Description:
+    check_keys(raw, _KEYS, "", "a scene", file)
+    version = raw.get("version")
+    if version is not None and (isinstance(version, bool) or version != 1):
+        raise SceneError("version", version, "1", file)
+    if raw.get("camera") is None:
+        raise SceneError("camera", None, "a camera (every scene needs one)", file)
+    blocks = {name: _settings_block(raw, name, file) for name in BLOCKS}
+    camera = read_camera(raw["camera"], blocks["film"], file)
+    run_settings.merge(blocks, {}, file)
+    textures = _named(raw, "textures", file, lambda item, key: described("texture", TEXTURES, item, key, file))
+    materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
+    for name, material in materials.items():
+        check_material(material, f"materials.{name}", materials, textures, file)
+    shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, textures, types, file))
+    lights = _named(raw, "lights", file, lambda item, key: described("light", LIGHTS, item, key, file))
+    return Description(
+        file, base, camera, version, **blocks, textures=textures, materials=materials, shapes=shapes, lights=lights
+    )
+
+
+def _settings_block(raw: Mapping[str, Any], name: str, file: str | None) -> dict[str, Any]:
+    block = raw.get(name)
+    if block is None:
+        return {}
+    if not isinstance(block, dict):
+        raise SceneError(name, block, "a mapping of settings", file)
+    for key in having(Role.FILES).get(name, ()):
+        if block.get(key) not in (None, False):
+            expected = "null: which files are written is said on the command line or in Python, never by a scene"
+            raise SceneError(f"{name}.{key}", block[key], expected, file)
+    return {key: value for key, value in block.items() if value is not None}
+
+
+def _named(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[[Any, str], T]) -> dict[str, T]:
+    items = raw.get(block)
+    if items is None:
+        return {}
+    if not isinstance(items, dict):
+        raise SceneError(block, items, f"a mapping from names to {block}", file)
+    if len(items) > MAX_ENTRIES:
+        raise SceneError(block, len(items), f"at most {MAX_ENTRIES} of them (what is larger is a mesh)", file)
+    return {name: read(item, f"{block}.{name}") for name, item in items.items()}
+
+
+def _shape(
+    item: Any,
+    key: str,
+    materials: Mapping[str, Described],
+    textures: Mapping[str, Described],
+    types: Mapping[str, Kind],
+    file: str | None,
+) -> Described:
+    if isinstance(item, dict) and isinstance(item.get("material"), dict):
+        inline = read_material(item["material"], f"{key}.material", types, file)
+        check_material(inline, f"{key}.material", materials, textures, file)
+        item = {**item, "material": inline}
+    shape = described("shape", SHAPES, item, key, file, texture=texture_of)
+    displacement = shape.values.get("displacement")
+    if displacement is not None:
+        where = f"{key}.displacement.texture"
+        check_texture(displacement["texture"], where, textures, file, coordinates=True, points=True)
+    material, emission, where = shape["material"], shape["emission"], f"{key}.material"
+    if isinstance(material, str):
+        if material not in materials:
+            known = ", ".join(materials) or "none is defined"
+            raise SceneError(where, material, f"the name of a material ({known}) or a material", file)
+        material, where = materials[material], f"materials.{material}"
+    if emission is not None and material is not None and material["emission"] is not None:
+        expected = f"no emission where the material emits as well ({where}.emission)"
+        raise SceneError(f"{key}.emission", emission, expected, file)
+    return shape

@@ -1,0 +1,244 @@
+"""The materials of a scene file, and what can be said of them only once all are known: names, and blends of blends."""
+
+from __future__ import annotations
+
+from collections import ChainMap
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from torchpt.core.errors import EnergyWarning, NotBuiltError, SceneError, warn_caller
+from torchpt.physics.bsdfs import KINDS, Bsdf
+from torchpt.physics.bsdfs.base import made
+from torchpt.physics.bsdfs.specs import Inner
+from torchpt.scene.formats.textures import TextureInput, check_texture, texture_of
+from torchpt.spec import REQUIRED, Refused, Spec, parameters_of, spec_of
+from torchpt.spec.schema import Described, described, values_of
+
+__all__ = [
+    "MAX_BLENDS", "POINTS", "Kind", "check_material", "inner_of", "material_types", "model_of", "plain_material",
+    "read_material",
+]  # fmt: skip
+
+#: A type of material: a class of :data:`torchpt.physics.bsdfs.KINDS`, or the one instance that a caller handed over.
+Kind = type[Bsdf] | Bsdf
+
+#: How deep blends may be nested: every level can double the models that a lane evaluates.
+MAX_BLENDS = 8
+
+#: Slots that the colours of vertices cannot give.
+_IMAGED = ("opacity", "emission", "normal_map", "bump_map")
+#: What is read at points, without regard to how large a pixel is: light and cut-outs are the same for every ray.
+POINTS = ("opacity", "emission")
+
+
+def material_types(models: Mapping[str, Bsdf] | None) -> Mapping[str, Kind]:
+    """The table of types: those of the package and a caller's own.
+
+    Args:
+        models: type name to model instance.
+
+    Raises:
+        SceneError: key ``bsdfs.NAME``: no model, the name of a type that exists, or parameters that cannot be read.
+    """
+    if models is not None and not isinstance(models, Mapping):
+        raise SceneError("bsdfs", models, "a mapping from type names to instances of torchpt.Bsdf")
+    for name, model in (models or {}).items():
+        key = f"bsdfs.{name}"
+        if not isinstance(name, str) or not name.isidentifier():
+            raise SceneError("bsdfs", name, "names made of letters, digits and underscores")
+        if name in KINDS:
+            raise SceneError(key, model, f"a name of its own ({name} is a type that exists)")
+        if not isinstance(model, Bsdf):
+            raise SceneError(key, model, "an instance of a subclass of torchpt.Bsdf")
+        _check_own(model, key)
+    own: Mapping[str, Kind] = models or {}
+    return ChainMap(own, KINDS)  # type: ignore[arg-type]
+
+
+def _check_own(model: Bsdf, key: str) -> None:
+    """Refuse parameters that cannot be read."""
+    if not isinstance(model.parameters, Mapping):
+        raise SceneError(f"{key}.parameters", model.parameters, "a mapping from names to defaults")
+    own = {} if model.parameters is Bsdf.parameters else model.parameters
+    for parameter, value in own.items():
+        at = f"{key}.parameters.{parameter}"
+        if not isinstance(parameter, str) or not parameter.isidentifier() or parameter.startswith("_"):
+            raise SceneError(f"{key}.parameters", parameter, "names made of letters, digits and underscores")
+        if parameter == "type" or parameter in Bsdf.parameters:
+            raise SceneError(at, value, f"another name ({parameter} is taken)")
+        try:
+            spec = spec_of(value)
+            if spec.default not in (REQUIRED, None) and not callable(spec.default):
+                spec.read(spec.default)
+        except Refused as error:
+            raise SceneError(at, value.default if isinstance(value, Spec) else value, error.expected) from None
+
+
+def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | None, depth: int = 0) -> Described:
+    """The material of a mapping, with those in place inside it.
+
+    Args:
+        raw: the mapping as written.
+        key: its dotted key.
+        types: the table, of :func:`material_types`.
+        file: scene file for errors.
+        depth: how many blends it lies in.
+
+    Raises:
+        SceneError: what is wrong with it.
+        NotBuiltError: a key that the format knows and this version does not build.
+    """
+    if isinstance(raw, Mapping) and "type" in raw and raw["type"] is None:
+        raw = {**raw, "type": "null"}  # YAML reads the bare word as nothing
+    name = raw.get("type") if isinstance(raw, Mapping) else None
+    sides = _inner_keys(types[name]) if isinstance(name, str) and name in types else ()
+    if sides:
+        if depth == MAX_BLENDS:
+            raise SceneError(key, name, f"blends nested at most {MAX_BLENDS} deep", file)
+        inline = {side: raw[side] for side in sides if isinstance(raw.get(side), Mapping)}
+        inner = {side: read_material(item, f"{key}.{side}", types, file, depth + 1) for side, item in inline.items()}
+        raw = {**raw, **inner}
+    return described("material", types, raw, key, file, texture=texture_of)
+
+
+def plain_material() -> Described:
+    """That of shapes which are given none: grey, diffuse."""
+    return values_of(KINDS["diffuse"], {}, "", None, texture=texture_of)
+
+
+def _inner_keys(kind: Kind) -> tuple[str, ...]:
+    return tuple(key for key, spec in parameters_of(kind).items() if isinstance(spec, Inner))
+
+
+def inner_of(material: Described) -> dict[str, str | Described]:
+    """The materials that a blend is made of, by key: names, or materials in place. Of others none."""
+    return {key: material[key] for key in _inner_keys(material.kind)}
+
+
+def model_of(material: Described, materials: Mapping[str, Described]) -> tuple[Bsdf, dict[str, Any]]:
+    """A material's model, in the variant that it needs, and what that is given.
+
+    Args:
+        material: the material.
+        materials: all materials by name, for blends.
+    """
+    models = {
+        key: model_of(materials[item] if isinstance(item, str) else item, materials)[0]
+        for key, item in inner_of(material).items()
+    }
+    return made(material.kind, {**material.values, **models})
+
+
+def check_material(
+    material: Described,
+    key: str,
+    materials: Mapping[str, Described],
+    textures: Mapping[str, Described],
+    file: str | None,
+) -> None:
+    """What can be said of a material only once all are known.
+
+    Args:
+        material: the material.
+        key: its dotted key.
+        materials: all materials by name.
+        textures: all textures by name.
+        file: scene file for errors.
+
+    Raises:
+        SceneError: a texture that does not exist; a blend of what does not exist, of itself or of what cannot be
+            blended; ``two_sided`` where light passes through.
+        NotBuiltError: a texture where none is built yet.
+
+    Warns:
+        EnergyWarning: it may reflect more light than it receives.
+    """
+    inner = inner_of(material)
+    if inner:
+        name = key.removeprefix("materials.")
+        _check_blend(material, key, materials, file, (name,) if materials.get(name) is material else (), 1)
+        for side, item in inner.items():
+            if isinstance(item, Described):
+                check_material(item, f"{key}.{side}", materials, textures, file)
+    slots = {slot: value for slot, value in material.values.items() if isinstance(value, TextureInput)}
+    for slot, value in slots.items():
+        sheer = slot == "weight" and any(item.kind.sheer for item in _sides(material, materials))
+        check_texture(
+            value, f"{key}.{slot}", textures, file, coordinates=slot in _IMAGED or sheer, points=slot in POINTS or sheer
+        )
+    model, _ = model_of(material, materials)
+    for slot in slots:
+        if slot in model.tabulated:
+            expected = f"a number, as {material.name} tabulates what depends on it"
+            raise NotBuiltError(f"{key}.{slot}", "a texture", expected, file)
+    if "two_sided" in material.given and model.transmits:
+        expected = "no two_sided, as light passes through this material (it is for opaque ones only)"
+        raise SceneError(f"{key}.two_sided", material["two_sided"], expected, file)
+    if problem := material.kind.energy(material.values):
+        where = f"{file}: {key}" if file else key
+        warn_caller(f"{where}: {problem}", EnergyWarning)
+
+
+def _check_blend(
+    blend: Described, key: str, materials: Mapping[str, Described], file: str | None, trail: tuple[str, ...], depth: int
+) -> None:
+    if depth > MAX_BLENDS:
+        raise SceneError(key, blend.name, f"blends nested at most {MAX_BLENDS} deep", file)
+    for side, item in inner_of(blend).items():
+        at, beyond = f"{key}.{side}", trail
+        if isinstance(item, str):
+            if item not in materials:
+                known = ", ".join(materials) or "none is defined"
+                raise SceneError(at, item, f"the name of a material ({known}) or a material", file)
+            if item in trail:
+                circle = " -> ".join((*trail[trail.index(item) :], item))
+                raise SceneError(at, item, f"a blend that does not contain itself ({circle})", file)
+            beyond = (*trail, item)
+        inner = materials[item] if isinstance(item, str) else item
+        if inner["emission"] is not None:
+            where, value = (at, item) if isinstance(item, str) else (f"{at}.emission", inner["emission"])
+            raise SceneError(where, value, "a material without emission (give it to the blend itself)", file)
+        _check_maps(blend, inner, item, at, materials, file)
+        if not inner["two_sided"]:
+            where, value = (at, item) if isinstance(item, str) else (f"{at}.two_sided", False)
+            raise SceneError(where, value, "a two-sided material (say two_sided on the blend itself)", file)
+        if inner_of(inner):
+            _check_blend(inner, at, materials, file, beyond, depth + 1)
+
+
+def _check_maps(
+    blend: Described,
+    inner: Described,
+    item: str | Described,
+    at: str,
+    materials: Mapping[str, Described],
+    file: str | None,
+) -> None:
+    """Refuse textures that would have to be known before a blend can be: of normals and of how much is there at all."""
+    for key, advice in (("normal_map", "give it to the blend itself"), ("bump_map", "give it to the blend itself")):
+        if inner[key] is not None:
+            where = at if isinstance(item, str) else f"{at}.{key}"
+            raise SceneError(where, item if isinstance(item, str) else "a texture", f"no {key} ({advice})", file)
+    if isinstance(inner["opacity"], TextureInput):
+        where = at if isinstance(item, str) else f"{at}.opacity"
+        raise NotBuiltError(where, "an opacity texture inside a blend", "an opacity texture of the blend itself", file)
+    if isinstance(blend.values.get("weight"), TextureInput) and _sheer(inner, materials):
+        if not inner.kind.sheer or isinstance(blend["opacity"], TextureInput):
+            expected = "an opacity texture instead, or numbers"
+            raise NotBuiltError(at, "a blend by a texture with what light passes by chance", expected, file)
+
+
+def _sides(material: Described, materials: Mapping[str, Described]) -> Iterator[Described]:
+    """The materials that a blend is made of, those that exist."""
+    for item in inner_of(material).values():
+        if not isinstance(item, str):
+            yield item
+        elif item in materials:
+            yield materials[item]
+
+
+def _sheer(material: Described, materials: Mapping[str, Described]) -> bool:
+    """Whether rays may pass a material as if it were not there."""
+    if material.kind.sheer or material["opacity"] != 1.0:
+        return True
+    return any(_sheer(side, materials) for side in _sides(material, materials))

@@ -1,0 +1,183 @@
+"""glTF 2.0, `.glb` and `.gltf`: triangles and lights of every node, moved by the node's world matrix, with their materials.
+
+Khronos glTF 2.0 specification. What is left out is named; a file that requires an extension which is not read is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.core.errors import AssetError
+from torchpt.scene.meshes.gltf_document import Document
+from torchpt.scene.meshes.gltf_lights import PUNCTUAL, camera_at, light_at
+from torchpt.scene.meshes.gltf_material import MATERIAL_EXTENSIONS, Materials
+from torchpt.scene.meshes.mesh import MOST_PARTS, FileMaterial, MeshPart, too_many, transformed
+
+__all__ = ["load_gltf"]
+
+_READ = {*MATERIAL_EXTENSIONS, "KHR_texture_transform", "KHR_mesh_quantization", PUNCTUAL}
+_ATTRIBUTES = ("POSITION", "NORMAL", "TEXCOORD_0", "COLOR_0")
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+#: Vertices or faces, whichever are more, that the nodes of a file may come to (a larger file may hold as many as bytes).
+MOST_PLACED = 20_000_000
+
+
+def load_gltf(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
+    """The primitives of a glTF file, one part each, in world space.
+
+    Raises:
+        AssetError: truncated or malformed, a missing buffer or picture, or an extension that is required and not read.
+    """
+    return _Scene(Document(path, data), len(data)).parts(materials)
+
+
+class _Scene:
+    """The nodes of one document."""
+
+    def __init__(self, document: Document, size: int) -> None:
+        self.document, self.json, self.path = document, document.json, document.path
+        # Nodes may place one mesh many times: a small file must not ask for any amount of memory.
+        self.most = max(MOST_PLACED, size)
+        self.materials = Materials(document)
+
+    def parts(self, materials: bool) -> list[MeshPart]:
+        required = [name for name in self.json.get("extensionsRequired", []) if name not in _READ]
+        if required:
+            raise AssetError(self.path, f"requires the extension {str(required[0])[:80]}, which is not read")
+        nodes = list(self.nodes())
+        cameras = [camera_at(self.document, node, matrix) for node, matrix in nodes if "camera" in node]
+        cameras = tuple(camera for camera in cameras if camera is not None)
+        left_out = [name for name in ("animations", "skins") if self.json.get(name)]
+        left_out += ["cameras"] * (bool(self.json.get("cameras")) and not cameras)
+        # Extensions of materials and textures are named where they are met.
+        elsewhere = ("KHR_materials_", "KHR_texture_", "EXT_texture_")
+        used = [str(name) for name in (*self.json.get("extensionsUsed", []), *self.json.get("extensions", {}))]
+        left_out += [name for name in used if name not in _READ and not name.startswith(elsewhere)]
+        lights = tuple(
+            light_at(self.document, node, matrix, left_out)
+            for node, matrix in nodes
+            if PUNCTUAL in node.get("extensions", {})
+        )
+        placed = [(node, matrix) for node, matrix in nodes if "mesh" in node]
+        total = count = 0
+        for node, _ in placed:
+            total += sum(map(self.size, self.document.item("meshes", node["mesh"])["primitives"]))
+            if total > self.most:
+                raise AssetError(self.path, f"more than {self.most} vertices or faces once nodes are placed")
+            count += len(self.document.item("meshes", node["mesh"])["primitives"])
+            if count > MOST_PARTS:
+                raise too_many(self.path)
+        parts = []
+        for node, matrix in placed:
+            mesh = self.document.item("meshes", node["mesh"])
+            for number, primitive in enumerate(mesh["primitives"]):
+                part = self.primitive(mesh, node, number, primitive, materials, left_out)
+                if part is not None:
+                    parts.append(transformed(part, matrix))
+        # With a part that is kept: those without a face are not.
+        holder = next((number for number, part in enumerate(parts) if len(part.faces)), None)
+        if holder is not None:
+            parts[holder] = replace(parts[holder], lights=lights, cameras=cameras)
+        return parts
+
+    def size(self, primitive: dict[str, Any]) -> int:
+        """Vertices or faces of a primitive, whichever are more, as declared; what is alone too much its accessor refuses."""
+        named = [primitive["attributes"]["POSITION"]] + [primitive[key] for key in ("indices",) if key in primitive]
+        counts = [self.document.item("accessors", number).get("count") for number in named]
+        counts = [count if type(count) is int and 0 < count <= self.most else 0 for count in counts]
+        return max(counts[0], counts[-1] // (3 if primitive.get("mode", _TRIANGLES) == _TRIANGLES else 1))
+
+    def nodes(self) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+        """Every node of the scene with its world matrix."""
+        nodes = self.json.get("nodes", [])
+        if "scenes" in self.json:
+            roots = self.document.item("scenes", self.json.get("scene", 0)).get("nodes", [])
+        else:
+            every = range(len(nodes))
+            children = {child for index in every for child in self.document.item("nodes", index).get("children", [])}
+            roots = [index for index in every if index not in children]
+        stack = [(index, np.eye(4)) for index in reversed(roots)]
+        seen: set[int] = set()
+        while stack:
+            index, parent = stack.pop()
+            node = self.document.item("nodes", index)
+            if index in seen:
+                raise AssetError(self.path, f"node {index} has two parents (nodes form a tree)")
+            seen.add(index)
+            matrix = parent @ self.local(node, index)
+            yield node, matrix
+            stack += [(child, matrix) for child in reversed(node.get("children", []))]
+
+    def local(self, node: dict[str, Any], index: int) -> NDArray[np.float64]:
+        if "matrix" in node:
+            matrix = np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T  # stored by columns
+        else:
+            x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), dtype=np.float64)
+            norm = x * x + y * y + z * z + w * w
+            double = 2.0 / norm if norm > 0 else 0.0
+            rotation = np.eye(3) + double * np.array(
+                [
+                    [-(y * y + z * z), x * y - z * w, x * z + y * w],
+                    [x * y + z * w, -(x * x + z * z), y * z - x * w],
+                    [x * z - y * w, y * z + x * w, -(x * x + y * y)],
+                ]
+            )
+            matrix = np.eye(4)
+            matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
+            matrix[:3, 3] = node.get("translation", (0, 0, 0))
+        if not (np.abs(matrix) < 1e30).all():
+            raise AssetError(self.path, f"node {index} has a transform that is not finite")
+        return matrix
+
+    def primitive(
+        self, mesh: dict[str, Any], node: dict[str, Any], number: int, primitive: dict[str, Any],
+        materials: bool, left_out: list[str],
+    ) -> MeshPart | None:  # fmt: skip
+        """One primitive as a part in its mesh's space; None for points and lines."""
+        mode = primitive.get("mode", _TRIANGLES)
+        if mode not in (_TRIANGLES, _STRIP, _FAN):
+            left_out.append("points and lines")
+            return None
+        attributes = primitive["attributes"]
+        read = self.document.accessor
+        vertices = read(attributes["POSITION"], "VEC3")
+        normals = read(attributes["NORMAL"], "VEC3") if "NORMAL" in attributes else None
+        uvs = read(attributes["TEXCOORD_0"], "VEC2") if "TEXCOORD_0" in attributes else None
+        colors = read(attributes["COLOR_0"], "VEC3", "VEC4")[:, :3] if "COLOR_0" in attributes else None
+        for name, value in (("NORMAL", normals), ("TEXCOORD_0", uvs), ("COLOR_0", colors)):
+            if value is not None and len(value) != len(vertices):
+                raise AssetError(self.path, f"{name} has {len(value)} rows for {len(vertices)} vertices")
+        if "indices" in primitive:
+            index = read(primitive["indices"], "SCALAR").astype(np.int64).reshape(-1)
+        else:
+            index = np.arange(len(vertices))
+        label = str(mesh.get("name") or node.get("name") or "")[:80]
+        label = label if len(mesh["primitives"]) == 1 else f"{label}{number}"
+        ignored = list(left_out)
+        ignored += [str(name) for name in attributes if name not in (*_ATTRIBUTES, "TANGENT", "JOINTS_0", "WEIGHTS_0")]
+        ignored += [str(name) for name in primitive.get("extensions", {})]
+        ignored += ["morph targets"] * bool(primitive.get("targets")) + ["skin"] * ("skin" in node)
+        material: FileMaterial | None = None
+        if materials:
+            material, colors = self.materials.of(primitive.get("material"), colors)
+        faces = _triangles(index, mode, self.path)
+        return MeshPart(label, vertices, faces, normals, uvs, colors, material, tuple(dict.fromkeys(ignored)))
+
+
+def _triangles(index: NDArray[np.int64], mode: int, path: Path) -> NDArray[np.int64]:
+    """Index triples of a triangle list, strip or fan (glTF 2.0, 3.7.2.1)."""
+    if mode == _TRIANGLES:
+        if len(index) % 3:
+            raise AssetError(path, f"{len(index)} indices are no whole number of triangles")
+        return index.reshape(-1, 3)
+    first = np.arange(max(len(index) - 2, 0))
+    if mode == _FAN:
+        return np.stack([index[first + 1], index[first + 2], np.broadcast_to(index[:1], first.shape)], axis=1)
+    odd = first % 2
+    return np.stack([index[first], index[first + 1 + odd], index[first + 2 - odd]], axis=1)

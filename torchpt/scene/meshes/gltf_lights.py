@@ -1,0 +1,113 @@
+"""Lights and cameras of a glTF file's nodes: the rules, which ``docs/assets.md`` tells users.
+
+Khronos glTF 2.0 extension ``KHR_lights_punctual`` and specification 3.10 (cameras). Both look along their node's -z.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.core.errors import AssetError
+from torchpt.physics.lights import KINDS as LIGHTS
+from torchpt.scene.meshes.gltf_document import Document, Rules
+from torchpt.scene.meshes.mesh import FileCamera, FileLight
+from torchpt.spec import parameters_of
+
+__all__ = ["PUNCTUAL", "camera_at", "light_at"]
+
+PUNCTUAL = "KHR_lights_punctual"
+_KEYS = ("name", "type", "color", "intensity", "spot", "extras")
+#: The extension's kinds of lights, which are called as ours.
+_TYPES = ("point", "spot", "directional")
+#: Amounts and lengths beyond it are taken for mistakes.
+_MOST = 1e30
+#: Degrees that a beam has at least: light that is whole on the axis alone.
+_NARROWEST = 1e-3
+
+
+def light_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float64], left_out: list[str]) -> FileLight:
+    """The light of a node that has the extension.
+
+    Args:
+        document: the file.
+        node: of the document.
+        matrix: ``(4, 4)`` from the node to the file's space.
+        left_out: where the names of what is not used go.
+
+    Raises:
+        AssetError: a light that does not exist, or numbers that none can have.
+    """
+    index = node["extensions"][PUNCTUAL].get("light")
+    lights = document.json.get("extensions", {}).get(PUNCTUAL, {}).get("lights", [])
+    if type(index) is not int or not isinstance(lights, list) or not 0 <= index < len(lights):
+        count = len(lights) if isinstance(lights, list) else 0
+        raise AssetError(document.path, f"{PUNCTUAL}: light {str(index)[:40]} does not exist ({count} are declared)")
+    rules = _Rules(document, index, lights[index])
+    left_out += [f"{PUNCTUAL}.{str(key)[:40]}" for key in lights[index] if key not in _KEYS]
+    name = str(lights[index].get("name") or node.get("name") or f"light{index}")[:80]
+    position, direction = matrix[:3, 3], -matrix[:3, 2]
+    if not (np.abs(position) <= _MOST).all():
+        raise rules.wrong("its node places it nowhere (a position that is not finite)")
+    length = np.abs(direction).max()
+    if not 0 < length < np.inf:
+        raise rules.wrong("its node leaves it no direction (scaled to nothing, or not finite)")
+    direction = direction / length
+    return FileLight(name, rules.kind, position, direction / np.linalg.norm(direction), rules.values())
+
+
+class _Rules(Rules):
+    """One light."""
+
+    def __init__(self, document: Document, index: int, block: dict[str, Any]) -> None:
+        super().__init__(document, f"{PUNCTUAL}: light {index}")
+        self.block = block
+        self.kind = str(block.get("type"))
+        if self.kind not in _TYPES:
+            raise self.wrong(f"type {self.kind[:40]!r}, expected point, spot or directional")
+        self.parameters = parameters_of(LIGHTS[self.kind])
+
+    def values(self) -> dict[str, float | tuple[float, ...]]:
+        """Return what a scene file's light of its type has beside its place."""
+        color = self.numbers(self.block, "color", (1.0, 1.0, 1.0), _MOST)
+        intensity = self.number(self.block, "intensity", 1.0, _MOST)
+        amount = tuple(value * intensity for value in color)
+        if max(amount) > _MOST:
+            raise self.wrong(f"color times intensity is above {_MOST:g}")
+        key = "intensity" if "intensity" in self.parameters else "irradiance"
+        return {key: amount, **(self.cone() if "cutoff_angle" in self.parameters else {})}
+
+    def cone(self) -> dict[str, float]:
+        cone = self.block.get("spot", {})
+        inner = self.number(cone, "innerConeAngle", 0.0, _MOST)
+        outer = self.number(cone, "outerConeAngle", math.pi / 4.0, _MOST)
+        if not 0.0 < outer <= 0.5 * math.pi + 1e-6:  # a right angle in float32 is a little more than one
+            raise self.wrong(f"outerConeAngle {outer:g} is not above 0 and at most pi / 2")
+        if inner >= outer:
+            raise self.wrong(f"innerConeAngle {inner:g} is not below outerConeAngle {outer:g}")
+        cutoff = math.degrees(outer)
+        beam = min(max(math.degrees(inner), _NARROWEST), cutoff)
+        return {"cutoff_angle": cutoff, "beam_width": beam}
+
+
+def camera_at(document: Document, node: dict[str, Any], matrix: NDArray[np.float64]) -> FileCamera | None:
+    """The camera of a node that has one; None where its numbers make no picture (no picture is made with it here)."""
+    index, cameras = node["camera"], document.json.get("cameras")
+    if type(index) is not int or not isinstance(cameras, list) or not 0 <= index < len(cameras):
+        return None
+    block = cameras[index]
+    if not isinstance(block, dict):
+        return None
+    kind = block.get("type")
+    lens = block.get(kind) if kind in ("perspective", "orthographic") else None
+    size = lens.get("yfov" if kind == "perspective" else "xmag") if isinstance(lens, dict) else None
+    if isinstance(size, bool) or not isinstance(size, int | float):
+        return None
+    if not 0.0 < size < (math.pi if kind == "perspective" else _MOST) or not (np.abs(matrix) <= _MOST).all():
+        return None
+    name = str(block.get("name") or node.get("name") or f"camera{index}")[:80]
+    film = f"fov: {math.degrees(size):.6g}, fov_axis: y" if kind == "perspective" else f"width: {2.0 * size:.6g}"
+    return FileCamera(name, str(kind), matrix, film)

@@ -1,0 +1,306 @@
+"""A part of a mesh file: vertices, faces, smooth normals, displacement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchpt.core.errors import AssetError
+from torchpt.physics.shapes import normals
+
+__all__ = [
+    "MOST_PARTS",
+    "FileCamera",
+    "FileLight",
+    "FileMaterial",
+    "MeshPart",
+    "checked",
+    "corners_of_polygons",
+    "displaced",
+    "smooth_normals",
+    "subdivided",
+    "too_many",
+    "transformed",
+]
+
+
+# ---- Smooth vertex normals of meshes that have none
+
+
+def smooth_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return unit vertex normals ``(V, 3)``, as :func:`torchpt.physics.shapes.normals.smooth_normals` has them.
+
+    A vertex without a face of positive area gets (0, 0, 1), so nothing is NaN; so does one whose faces face each other.
+
+    Args:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+    """
+    columns = torch.from_numpy(np.ascontiguousarray(np.asarray(vertices, np.float64).T))
+    found = normals.smooth_normals(columns, torch.from_numpy(np.asarray(faces, np.int64)), 1e-12).T.contiguous().numpy()
+    found[~found.any(1)] = (0.0, 0.0, 1.0)
+    return found
+
+
+# ---- What a mesh loader hands over, and the checks that every format shares
+
+
+#: Parts that one file may come to: groups of an OBJ file, placed primitives of a glTF file.
+MOST_PARTS = 100_000
+
+_LARGEST = float(np.finfo(np.float32).max)
+
+Rgb = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class FileMaterial:
+    """A mesh file's own material.
+
+    Attributes:
+        name: as in the file.
+        material: what a scene file would have: ``type``, parameters, textures inline with absolute paths or
+            `EncodedImage`.
+        ignored: what the file says about the look and torchpt does not read, by the file's names.
+    """
+
+    name: str
+    material: dict[str, Any] = field(default_factory=lambda: {"type": "diffuse"})
+    ignored: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class FileLight:
+    """A light of a mesh file that is no surface.
+
+    Attributes:
+        name: as in the file.
+        kind: ``type`` of a scene file's light: ``point``, ``spot`` or ``directional``.
+        position: ``(3,)`` float64 in the file's space.
+        direction: ``(3,)`` of unit length, where it shines.
+        numbers: what a scene file's light of that type has beside its place.
+    """
+
+    name: str
+    kind: str
+    position: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    numbers: dict[str, float | tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class FileCamera:
+    """A camera of a mesh file, for users to copy: a scene has its own.
+
+    Attributes:
+        name: as in the file.
+        kind: ``type`` of a scene file's camera.
+        matrix: ``(4, 4)`` from its own space, where it looks along -z with +y up, to the file's.
+        film: what it sees, as keys of a scene file's camera.
+    """
+
+    name: str
+    kind: str
+    matrix: NDArray[np.float64]
+    film: str
+
+
+@dataclass(frozen=True)
+class MeshPart:
+    """Triangles that share a material.
+
+    Attributes:
+        name: the group's name in the file, may be empty.
+        vertices: ``(V, 3)`` float64.
+        faces: ``(F, 3)`` int64, front side counter-clockwise.
+        normals: ``(V, 3)`` float64 of unit length where the file has them, else None.
+        uvs: ``(V, 2)`` float64, row 0 of an image at v = 0, or None.
+        colors: ``(V, 3)`` float64, linear RGB >= 0, or None.
+        material: the file's own, or None.
+        ignored: what else of the file was left out, by name.
+        lights: of the whole file; one of its parts has them.
+        cameras: the same.
+    """
+
+    name: str
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    normals: NDArray[np.float64] | None = None
+    uvs: NDArray[np.float64] | None = None
+    colors: NDArray[np.float64] | None = None
+    material: FileMaterial | None = None
+    ignored: tuple[str, ...] = ()
+    lights: tuple[FileLight, ...] = ()
+    cameras: tuple[FileCamera, ...] = ()
+
+
+def checked(parts: list[MeshPart], path: Path) -> list[MeshPart]:
+    """The parts, with indices and numbers checked, normals made unit and odd ones replaced.
+
+    A zero normal becomes the smooth one of its vertex; a texture coordinate that is not finite becomes 0.
+
+    Raises:
+        AssetError: no triangle at all, more than :data:`MOST_PARTS` parts, a vertex, normal or colour that is not finite, an
+            index out of range.
+    """
+    if len(parts) > MOST_PARTS:
+        raise too_many(path)
+    if not parts or all(len(part.faces) == 0 for part in parts):
+        raise AssetError(path, "the mesh is empty (no face)")
+    return [_checked(part, path) for part in parts if len(part.faces)]
+
+
+def too_many(path: Path) -> AssetError:
+    """What is said of a file of more than :data:`MOST_PARTS`."""
+    return AssetError(path, f"has more than {MOST_PARTS} parts; at most so many are read")
+
+
+def _checked(part: MeshPart, path: Path) -> MeshPart:
+    label = f" of part {part.name}" if part.name else ""
+    bad = np.flatnonzero(~(np.abs(part.vertices) <= _LARGEST).all(axis=1))  # NaN compares false
+    if len(bad):
+        raise AssetError(path, f"vertex {bad[0]}{label} is not finite: {part.vertices[bad[0]].tolist()}")
+    count = len(part.vertices)
+    bad = np.flatnonzero(((part.faces < 0) | (part.faces >= count)).any(axis=1))
+    if len(bad):
+        indices = part.faces[bad[0]].tolist()
+        raise AssetError(path, f"face {bad[0]}{label} has an index outside 0..{count - 1}: {indices}")
+    normals, uvs = part.normals, part.uvs
+    if normals is not None:
+        bad = np.flatnonzero(~np.isfinite(normals).all(axis=1))
+        if len(bad):
+            raise AssetError(path, f"normal {bad[0]}{label} is not finite: {normals[bad[0]].tolist()}")
+        largest = np.abs(normals).max(axis=1, keepdims=True)
+        zero = largest[:, 0] == 0
+        scaled = normals / np.where(largest > 0, largest, 1.0)
+        normals = scaled / np.where(zero, 1.0, np.linalg.norm(scaled, axis=1))[:, None]
+        if zero.any():
+            normals[zero] = smooth_normals(part.vertices, part.faces)[zero]
+    if part.colors is not None:
+        bad = np.flatnonzero(~((part.colors >= 0) & (part.colors <= _LARGEST)).all(axis=1))
+        if len(bad):
+            raise AssetError(path, f"colour {bad[0]}{label} is not finite and >= 0: {part.colors[bad[0]].tolist()}")
+    if uvs is not None and not np.isfinite(uvs).all():
+        uvs = np.where(np.isfinite(uvs), uvs, 0.0)
+    return replace(part, normals=normals, uvs=uvs)
+
+
+def corners_of_polygons(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Fans over polygons: ``(F, 3)`` positions into a flat list of corners, in polygon order.
+
+    Args:
+        starts: position of each polygon's first corner.
+        counts: corners of each polygon, at least 3 (right for convex ones, as in most loaders).
+    """
+    fans = counts - 2
+    owner = np.repeat(np.arange(len(counts)), fans)
+    step = np.arange(len(owner)) - np.repeat(np.cumsum(fans) - fans, fans)
+    first = starts[owner]
+    return np.stack([first, first + step + 1, first + step + 2], axis=1)
+
+
+def transformed(part: MeshPart, matrix: NDArray[np.float64]) -> MeshPart:
+    """A part moved by an affine ``(4, 4)`` matrix; a mirroring one flips the winding, the front stays outside."""
+    linear = matrix[:3, :3]
+    normals, faces = part.normals, part.faces
+    if normals is not None:
+        cofactors = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
+        normals = normals @ cofactors.T
+    if np.linalg.det(linear) < 0:
+        faces = faces[:, ::-1]
+        normals = None if normals is None else -normals  # cofactors carry the sign of the determinant
+    return replace(
+        part, vertices=part.vertices @ linear.T + matrix[:3, 3], faces=np.ascontiguousarray(faces), normals=normals
+    )
+
+
+# ---- Displacement maps: a mesh is subdivided when the scene is built, and its vertices move along their normals
+#
+# Vertices that lie at one place (on both sides of a seam of the texture, say) move together, so that no crack opens.
+
+
+Rows = NDArray[np.float64]
+
+
+def displaced(piece: MeshPart, heights: Callable[[Rows], Rows], subdivisions: int) -> MeshPart:
+    """A mesh with its vertices moved along their normals.
+
+    Args:
+        piece: the mesh, with texture coordinates.
+        heights: from texture coordinates ``(V, 2)`` to how far each vertex goes ``(V,)``, in the mesh's own space.
+        subdivisions: how often every triangle is first cut into four.
+
+    Returns:
+        The mesh; its normals are those of its new shape, to be computed.
+    """
+    assert piece.uvs is not None
+    normals = piece.normals if piece.normals is not None else smooth_normals(piece.vertices, piece.faces)
+    mesh = replace(piece, normals=normals)
+    for _ in range(subdivisions):
+        mesh = subdivided(mesh)
+    assert mesh.normals is not None and mesh.uvs is not None
+    place, group = _places(mesh.vertices)
+    direction = _averaged(_unit(mesh.normals), group, len(place))
+    height = _averaged(heights(mesh.uvs)[:, None], group, len(place))
+    vertices = place + _unit(direction) * height
+    # One vertex a place, so that the new normals are smooth across seams; texture coordinates stay with their own.
+    joined = replace(mesh, vertices=vertices, faces=group[mesh.faces], normals=None, uvs=None, colors=None)
+    smooth = smooth_normals(joined.vertices, joined.faces)
+    return replace(mesh, vertices=vertices[group], normals=smooth[group])
+
+
+def subdivided(mesh: MeshPart) -> MeshPart:
+    """A mesh with every triangle cut into four at the middles of its edges; whatever the vertices have is interpolated."""
+    a, b, c = mesh.faces.T
+    ends = np.sort(np.concatenate([np.stack([a, b], 1), np.stack([b, c], 1), np.stack([c, a], 1)]), axis=1)
+    # As one number each, which sorts many times faster than pairs.
+    keys, which = np.unique(ends[:, 0] * len(mesh.vertices) + ends[:, 1], return_inverse=True)
+    edges = np.stack(np.divmod(keys, len(mesh.vertices)), 1)
+    ab, bc, ca = which.reshape(3, -1) + len(mesh.vertices)
+    faces = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+
+    def extended(rows: Rows | None) -> Rows | None:
+        return None if rows is None else np.concatenate([rows, 0.5 * (rows[edges[:, 0]] + rows[edges[:, 1]])])
+
+    normals = extended(mesh.normals)
+    vertices = extended(mesh.vertices)
+    assert vertices is not None
+    return replace(
+        mesh,
+        vertices=vertices,
+        faces=faces,
+        normals=None if normals is None else _unit(normals),
+        uvs=extended(mesh.uvs),
+        colors=extended(mesh.colors),
+    )
+
+
+def _places(vertices: Rows) -> tuple[Rows, NDArray[np.int64]]:
+    """Distinct positions, and which of them each vertex has."""
+    bits = (np.ascontiguousarray(vertices) + 0.0).view(np.uint64)  # + 0 makes -0 and 0 one
+    mixed = bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+    mixed ^= mixed >> np.uint64(29)
+    # Any vertex of a place will do for it: asked for the first ones, `unique` would have to sort stably, which is far slower.
+    keys, group = np.unique(mixed.sum(1) * np.uint64(0xBF58476D1CE4E5B9), return_inverse=True)
+    place, group = np.empty((len(keys), 3)), group.reshape(-1)
+    place[group] = vertices
+    if not np.array_equal(place[group], vertices):  # two places of one hash: once in 2^64 / V^2 meshes
+        place, group = np.unique(vertices, axis=0, return_inverse=True)
+    return place, group.reshape(-1)
+
+
+def _averaged(rows: Rows, group: NDArray[np.int64], count: int) -> Rows:
+    """Means ``(count, C)`` over groups."""
+    total = np.stack([np.bincount(group, column, minlength=count) for column in rows.T], 1)
+    return total / np.bincount(group, minlength=count)[:, None]
+
+
+def _unit(rows: Rows) -> Rows:
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.where(length > 0, length, 1.0)

@@ -1,0 +1,203 @@
+"""MTL material files: their statements, checked. What these come to as materials is in :mod:`mtl_material`."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchpt.core.errors import AssetError
+from torchpt.core.files import is_regular, read_regular
+from torchpt.scene.meshes.mesh import FileMaterial, Rgb
+from torchpt.scene.meshes.mtl_material import COLORS, MAPS, NUMBERS, Map, Statements, material_of
+
+__all__ = ["beside", "decoded_lines", "read_mtl"]
+
+# options of a map statement -> how many words follow, at most; numbers only where the option takes one to three
+_OPTIONS = {
+    **{"-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-texres": 1, "-bm": 1, "-boost": 1, "-imfchan": 1},
+    **{"-type": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-colorspace": 1},
+}
+_VECTORS = ("-o", "-s", "-t")
+
+
+def decoded_lines(data: bytes) -> list[str]:
+    """The lines of a text file, with continuations (a backslash at the end of a line) joined by blanks of equal count.
+
+    A continued line keeps the line numbers right: what was joined leaves empty lines behind.
+    """
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    if "\\" not in text:
+        return lines
+    number = 0
+    while number < len(lines):
+        end = number
+        while lines[end].endswith("\\") and end + 1 < len(lines):
+            lines[end] = lines[end][:-1]
+            end += 1
+        if end > number:
+            lines[number] = " ".join(lines[number : end + 1])
+            lines[number + 1 : end + 1] = [""] * (end - number)
+        number = end + 1
+    return lines
+
+
+def beside(path: Path, name: str) -> Path | None:
+    """The file that a statement of ``path`` names, or None: with backslashes too, and by its last part alone."""
+    forward = name.replace("\\", "/")
+    for form in dict.fromkeys((name, forward, forward.rpartition("/")[2])):
+        candidate = path.parent / form
+        if form and is_regular(candidate):
+            return candidate
+    return None
+
+
+def read_mtl(path: Path, wanted: set[str]) -> dict[str, FileMaterial]:
+    """The materials of an MTL file by name.
+
+    Args:
+        path: the file.
+        wanted: names of those that are used; the others' pictures need not exist.
+
+    Raises:
+        AssetError: a file that cannot be read, a statement that is malformed, a picture that is missing.
+    """
+    try:
+        lines = decoded_lines(read_regular(path))
+    except OSError as error:
+        raise AssetError(path, f"cannot be read ({error.strerror})") from None
+    found: dict[str, Statements] = {}
+    current: Statements | None = None
+    for number, line in enumerate(lines, 1):
+        key, *rest = line.strip().split(None, 1)[:2] or ("",)
+        if not key or key.startswith("#"):
+            continue
+        text = rest[0].strip() if rest else ""
+        if key.lower() == "newmtl":
+            if not text:
+                raise AssetError(path, f"line {number}: newmtl without a name")
+            current = found[text] = Statements()
+        elif current is not None:
+            _add(current, key, text, _Line(path, number))
+    return {name: _finished(name, statements, path) for name, statements in found.items() if name in wanted}
+
+
+@dataclass(frozen=True)
+class _Line:
+    path: Path
+    number: int
+
+    def wrong(self, expected: str, found: str) -> AssetError:
+        return AssetError(self.path, f"line {self.number}: expected {expected}, got {found[:60]!r}")
+
+
+def _add(statements: Statements, key: str, text: str, line: _Line) -> None:
+    """Files one statement under its kind."""
+    lower = key.lower()
+    kind = lower.replace("map_bump", "bump").replace("map_norm", "norm").replace("map_opacity", "map_d")
+    if lower in COLORS:
+        if text.split()[:1] in (["spectral"], ["xyz"]):
+            statements.ignored.append(f"{key} {text.split()[0]}")
+        else:
+            statements.colors[lower] = _color(text, key, line)
+    elif lower in NUMBERS:
+        words = text.partition("#")[0].split()
+        if words[:1] == ["-halo"]:
+            statements.ignored.append(f"{key} -halo")
+            words = words[1:]
+        try:
+            (value,) = map(float, words)
+        except (ValueError, OverflowError):
+            value = float("nan")
+        if not abs(value) <= 3e38:
+            raise line.wrong(f"{key} and one finite number", text)
+        statements.numbers[lower] = value
+    elif kind in MAPS:
+        statements.maps[kind] = _map(key, text, line)
+    elif lower not in ("ka", "map_ka", "sharpness", "map_aat"):  # ambient light is computed, not given
+        statements.ignored.append(key)
+
+
+def _color(text: str, key: str, line: _Line) -> Rgb:
+    try:
+        values = [float(word) for word in text.partition("#")[0].split()]
+    except ValueError:
+        values = []
+    if len(values) == 1:
+        values *= 3
+    if len(values) != 3 or not all(0 <= value <= 3e38 for value in values):
+        raise line.wrong(f"{key} r g b, finite and >= 0", text)
+    return values[0], values[1], values[2]
+
+
+def _map(key: str, text: str, line: _Line) -> Map:
+    """A map statement: options, then a file name that may hold blanks."""
+    found = list(re.finditer(r"\S+", text))
+    words, starts, at = [word[0] for word in found], [word.start() for word in found], 0
+    options: dict[str, list[str]] = {}
+    while at < len(words) - 1 and words[at].lower() in _OPTIONS:
+        option = words[at].lower()
+        end = at + 1
+        while end < len(words) and end - at <= _OPTIONS[option] and (option not in _VECTORS or _is_number(words[end])):
+            end += 1
+        if option in _VECTORS and end == len(words):
+            end -= 1  # a file may be called 1
+        options[option] = words[at + 1 : end]
+        at = end
+    rest = text[starts[at] :] if at < len(starts) else ""
+    if not rest:
+        raise line.wrong(f"{key} and the name of a file", text)
+
+    def numbers(option: str, default: tuple[float, ...]) -> tuple[float, ...]:
+        try:
+            given = tuple(map(float, options.get(option, ())))
+        except ValueError:
+            given = (float("nan"),)
+        if not all(abs(value) <= 1e6 for value in given):
+            raise line.wrong(f"{option} and numbers", text)
+        return (given + default[len(given) :])[: len(default)]
+
+    ignored = [f"{key} {option}" for option in options if option not in ("-bm", "-s", "-o", "-clamp", "-imfchan")]
+    ignored = [name for name in ignored if name.split()[-1] not in ("-blendu", "-blendv", "-cc", "-texres")]
+    channel = (options.get("-imfchan") or [""])[0].lower()
+    channels = {"": None, "r": "r", "g": "g", "b": "b", "m": "a", "l": "luminance"}
+    if channel not in channels:
+        ignored.append(f"{key} -imfchan {channel}")
+    offset, scale = numbers("-o", (0.0, 0.0)), numbers("-s", (1.0, 1.0))
+    if "-s" in options and len(options["-s"]) == 1:
+        scale = (scale[0], scale[0])
+    return Map(
+        key=key,
+        name=rest,
+        line=line.number,
+        bump=numbers("-bm", (1.0,))[0],
+        offset=(offset[0], offset[1]),
+        scale=(scale[0], scale[1]),
+        clamp=(options.get("-clamp") or ["off"])[0].lower() == "on",
+        channel=channels.get(channel),
+        ignored=tuple(ignored),
+    )
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _finished(name: str, statements: Statements, path: Path) -> FileMaterial:
+    """The material of its statements; every picture has been found."""
+    files: dict[str, str] = {}
+    for kind, found in statements.maps.items():
+        file = beside(path, found.name) or beside(path, found.name.partition("#")[0].strip())
+        if file is None:
+            raise AssetError(path, f"line {found.line}: the image file {found.name[:80]!r} is missing")
+        files[kind] = str(file.resolve())
+    material, ignored = material_of(statements, files)
+    return FileMaterial(name, material, tuple(dict.fromkeys([*statements.ignored, *ignored])))

@@ -1,0 +1,280 @@
+"""What the statements of an MTL file come to: the rules, which ``docs/assets.md`` tells users.
+
+The format was made for Phong's model (Alias Wavefront, *Object Files*, appendix B: MTL 3.0); ``Pr Pm Ps Pc Pcr aniso
+anisor norm`` are the extension of Clara.io's and Blender's exporters, whose meaning is Burley's principled model.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import Any
+
+from torchpt.scene.meshes.file_texture import image_texture, plain_scale
+
+__all__ = ["COLORS", "MAPS", "NUMBERS", "Map", "Statements", "coat_gloss", "material_of"]
+
+Rgb = tuple[float, float, float]
+
+COLORS = ("kd", "ks", "ke", "tf")
+NUMBERS = ("ns", "ni", "d", "tr", "illum", "pr", "pm", "ps", "pc", "pcr", "aniso", "anisor")
+MAPS = ("map_kd", "map_ks", "map_ke", "map_pr", "map_pm", "map_ps", "map_d", "bump", "norm")
+
+_PBR = {"pr", "pm", "ps", "pc", "pcr", "aniso", "map_pr", "map_pm", "map_ps"}
+_NAMES = {"pr": "Pr", "pm": "Pm", "ps": "Ps", "pc": "Pc", "pcr": "Pcr", "ks": "Ks", "kd": "Kd"}
+_GREY = (0.5, 0.5, 0.5)
+_WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Map:
+    """A map statement.
+
+    Attributes:
+        key: as written.
+        name: the file's, as written.
+        line: where it stands.
+        bump: ``-bm``.
+        offset: ``-o``.
+        scale: ``-s``.
+        clamp: ``-clamp on``.
+        channel: of ``-imfchan``, or None.
+        ignored: options that are not read.
+    """
+
+    key: str
+    name: str
+    line: int
+    bump: float = 1.0
+    offset: tuple[float, float] = (0.0, 0.0)
+    scale: tuple[float, float] = (1.0, 1.0)
+    clamp: bool = False
+    channel: str | None = None
+    ignored: tuple[str, ...] = ()
+
+
+@dataclass
+class Statements:
+    """What a file says of one material, by lower-case key; the last statement of a key holds."""
+
+    colors: dict[str, Rgb] = field(default_factory=dict)
+    numbers: dict[str, float] = field(default_factory=dict)
+    maps: dict[str, Map] = field(default_factory=dict)
+    ignored: list[str] = field(default_factory=list)
+
+
+def coat_gloss(roughness: float) -> float:
+    """The ``clearcoat_gloss`` whose alpha is ``roughness^2``: alpha runs from 0.1 at gloss 0 to 0.001 at gloss 1."""
+    return min(max((0.1 - roughness * roughness) / 0.099, 0.0), 1.0)
+
+
+def material_of(statements: Statements, files: dict[str, str]) -> tuple[dict[str, Any], list[str]]:
+    """A material as a scene file would have it, and what of the statements it does not say.
+
+    Args:
+        statements: those of one material.
+        files: absolute path of each map.
+    """
+    rules = _Rules(statements, files)
+    material = rules.surface()
+    rules.cover(material)
+    rules.relief(material)
+    rules.glow(material)
+    return material, rules.ignored
+
+
+class _Rules:
+    """One material's statements, and the names of those that were left out."""
+
+    def __init__(self, statements: Statements, files: dict[str, str]) -> None:
+        self.colors, self.numbers, self.maps = statements.colors, statements.numbers, statements.maps
+        self.files = files
+        self.ignored = [name for found in self.maps.values() for name in found.ignored]
+        self.illum = int(self.numbers.get("illum", 2.0)) if abs(self.numbers.get("illum", 2.0)) < 100 else 2
+        self.opacity = self._opacity()
+
+    def surface(self) -> dict[str, Any]:
+        """The model and its own parameters."""
+        if self._is_glass():
+            return self._glass()
+        if _PBR & (self.numbers.keys() | self.maps.keys()):
+            return self._principled()
+        ks = self.colors.get("ks", (0.0, 0.0, 0.0))
+        shiny = max(ks) > 0 or "map_ks" in self.maps
+        if self.illum in (3, 5, 8) and shiny and "map_kd" not in self.maps and max(self.colors.get("kd", _GREY)) == 0:
+            return {"type": "conductor", "reflectance": self._color("ks", _WHITE, "map_ks")}
+        if not shiny or self.illum in (0, 1):
+            self.ignored += ["Ks"] * (max(ks) > 0) + ["map_Ks"] * ("map_ks" in self.maps)
+            return {"type": "diffuse", "reflectance": self._color("kd", _GREY, "map_kd")}
+        return {
+            "type": "principled",
+            "base_color": self._color("kd", _GREY, "map_kd"),
+            "specular": self._specular(ks),
+            "roughness": self._phong_roughness(),
+        }
+
+    def _opacity(self) -> float:
+        """`d`, else 1 - `Tr`; but a `Tr` of 1 is taken for the `d` that some exporters write under that name."""
+        if "d" in self.numbers:
+            return self._bounded(self.numbers["d"], "d")
+        through = self._bounded(self.numbers.get("tr", 0.0), "Tr")
+        if through == 1.0:
+            self.ignored.append("Tr 1 (taken for d 1)")
+            return 1.0
+        return 1.0 - through
+
+    def _is_glass(self) -> bool:
+        index = self.numbers.get("ni", 1.0)
+        whole = self.opacity == 1.0 and "map_d" not in self.maps
+        return index != 1.0 and (self.illum in (4, 7) or (self.illum in (6, 9) and (whole or "tf" in self.colors)))
+
+    def _glass(self) -> dict[str, Any]:
+        index = self.numbers["ni"]
+        material: dict[str, Any] = {"type": "dielectric", "int_ior": min(max(index, 1e-3), 1e3), "ext_ior": 1.0}
+        self.ignored += ["Ni out of range"] * (material["int_ior"] != index)
+        roughness = self._bounded(self.numbers.get("pr", 0.0), "Pr")
+        if roughness > 0:
+            material |= {"type": "roughdielectric", "roughness": roughness}
+        tint = self._unit("tf", _WHITE)
+        if tint != _WHITE:
+            material["specular_transmittance"] = list(tint)
+        self.ignored += [
+            found.key for kind, found in self.maps.items() if kind in ("map_kd", "map_ks", "map_pr", "map_pm")
+        ]
+        self.opacity = 1.0  # it says how much light passes, which the glass knows
+        return material
+
+    def _principled(self) -> dict[str, Any]:
+        given = self.numbers
+        rough = self._bounded(given["pr"], "Pr") if "pr" in given else 1.0 if "map_pr" in self.maps else None
+        if rough is None:
+            rough = self._phong_roughness() if "ns" in given else 0.5
+        material: dict[str, Any] = {
+            "type": "principled",
+            "base_color": self._color("kd", _GREY, "map_kd"),
+            "roughness": self._number(rough, "map_pr"),
+        }
+        features = {
+            "metallic": self._number(self._amount("pm", "map_pm"), "map_pm"),
+            "sheen": self._number(self._amount("ps", "map_ps"), "map_ps"),
+            "clearcoat": self._bounded(given.get("pc", 0.0), "Pc"),
+            "anisotropic": self._bounded(abs(given.get("aniso", 0.0)), "aniso"),
+        }
+        material |= {name: value for name, value in features.items() if value != 0.0}
+        if "clearcoat" in material:
+            material["clearcoat_gloss"] = coat_gloss(self._bounded(given.get("pcr", 0.0), "Pcr"))
+        index = given.get("ni", 1.0)
+        if 1.0 < index <= 1e3:
+            material["eta"] = index
+        self.ignored += ["Ks"] * (max(self.colors.get("ks", (0.0,))) > 0) + ["map_Ks"] * ("map_ks" in self.maps)
+        self.ignored += ["anisor"] * (given.get("anisor", 0.0) != 0.0)
+        return material
+
+    def _amount(self, key: str, kind: str) -> float:
+        """A feature's number: where a map is given, 0 counts as absent."""
+        value = self._bounded(self.numbers.get(key, 0.0), _NAMES[key])
+        return 1.0 if kind in self.maps and value == 0.0 else value
+
+    def _specular(self, ks: Rgb) -> Any:
+        """How strong a dielectric highlight is: the mean of `Ks`."""
+        if max(ks) == 0:
+            ks = _WHITE  # beside its map
+        if min(ks) != max(ks):
+            self.ignored.append("Ks (its hue)")
+        return self._number(self._bounded(sum(ks) / 3.0, "Ks"), "map_ks")
+
+    def _phong_roughness(self) -> float:
+        """Of the microfacets whose highlight is about as wide as that of the exponent `Ns`.
+
+        alpha = sqrt(2 / (Ns + 2)) (Walter et al., *Microfacet Models for Refraction through Rough Surfaces*, 2007,
+        section 5.2, for Beckmann's), and roughness = sqrt(alpha).
+        """
+        if "ns" not in self.numbers:
+            return 0.5
+        return math.sqrt(math.sqrt(2.0 / (max(self.numbers["ns"], 0.0) + 2.0)))
+
+    def cover(self, material: dict[str, Any]) -> None:
+        """How much of the surface is there at all: `d`, `Tr`, `map_d`."""
+        found = self.maps.get("map_d")
+        if found is not None:
+            channel = found.channel
+            if channel is None and self.files["map_d"] == self.files.get("map_kd"):
+                channel = "a" if PurePath(self.files["map_d"]).suffix.lower() not in (".jpg", ".jpeg") else None
+            opacity = self.opacity if self.opacity > 0 else 1.0
+            material["opacity"] = self._image("map_d", opacity, channel or "luminance")
+        elif self.opacity != 1.0:
+            material["opacity"] = self.opacity
+        glass = material["type"] in ("dielectric", "roughdielectric")
+        if not glass and self._unit("tf", _WHITE) != _WHITE and self.illum not in (0, 1, 2):
+            self.ignored.append("Tf")
+
+    def relief(self, material: dict[str, Any]) -> None:
+        """`norm`, `bump`: where the latter's file is called a normal map, it is one."""
+        kind = "norm" if "norm" in self.maps else "bump"
+        if kind not in self.maps:
+            return
+        if kind == "norm" and "bump" in self.maps:
+            self.ignored.append(self.maps["bump"].key)
+        found = self.maps[kind]
+        stem = PurePath(self.files[kind]).stem.lower()
+        if kind == "norm" or "normal" in stem or stem.endswith(("_n", "_nrm", "_nor", "_norm")):
+            material["normal_map"] = self._image(kind, 1.0, None)
+            if found.bump < 0.0:
+                self.ignored.append(f"{found.key} -bm")
+            elif found.bump != 1.0:
+                material["normal_strength"] = found.bump
+        else:
+            material["bump_map"] = self._image(kind, found.bump, found.channel or "luminance")
+
+    def glow(self, material: dict[str, Any]) -> None:
+        """`Ke` times `map_Ke`."""
+        light = self.colors.get("ke", (0.0, 0.0, 0.0))
+        if "map_ke" in self.maps:
+            material["emission"] = self._image("map_ke", plain_scale(light if max(light) > 0 else _WHITE), None)
+        elif max(light) > 0:
+            material["emission"] = list(light)
+
+    def _color(self, key: str, default: Rgb, kind: str) -> Any:
+        """A colour of at most 1, times its map; beside one, black counts as white, as exporters write it for absent."""
+        color = self._unit(key, _WHITE if kind in self.maps else default)
+        if kind not in self.maps:
+            return list(color)
+        return self._image(kind, plain_scale(color if max(color) > 0 else _WHITE), None)
+
+    def _number(self, value: float, kind: str) -> Any:
+        """A number times its map."""
+        if kind not in self.maps:
+            return value
+        return self._image(kind, value, self.maps[kind].channel or "luminance")
+
+    def _image(self, kind: str, scale: float | list[float], channel: str | None) -> dict[str, Any]:
+        found = self.maps[kind]
+        transform: dict[str, Any] = {}
+        if found.scale != (1.0, 1.0):
+            transform["scale"] = list(found.scale)
+        # The format counts v from the bottom: with v = 1 - v', s v + o becomes s v' + (1 - s - o).
+        move = (found.offset[0], 1.0 - found.scale[1] - found.offset[1])
+        if move != (0.0, 0.0):
+            transform["translate"] = list(move)
+        return image_texture(
+            self.files[kind],
+            scale=scale,
+            channel=channel,
+            wrap="clamp" if found.clamp else "repeat",
+            uv_transform=transform,
+        )
+
+    def _unit(self, key: str, default: Rgb) -> Rgb:
+        color = self.colors.get(key, default)
+        if max(color) > 1:
+            self.ignored.append(f"{key.capitalize()} above 1")
+            return min(color[0], 1.0), min(color[1], 1.0), min(color[2], 1.0)
+        return color
+
+    def _bounded(self, value: float, name: str) -> float:
+        """A number in 0..1."""
+        inside = min(max(value, 0.0), 1.0)
+        if inside != value and f"{name} outside 0..1" not in self.ignored:
+            self.ignored.append(f"{name} outside 0..1")
+        return inside

@@ -1,0 +1,211 @@
+"""Wavefront OBJ: polygons with their own indices for position, texture and normal, in groups of one material each.
+
+Corners ``v/vt/vn`` become vertices, one for each different combination, as in Mitsuba. Polygons are split into fans
+(right for convex ones). Texture v is flipped: the format counts it from the bottom row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.core.errors import AssetError
+from torchpt.scene.meshes.mesh import MOST_PARTS, FileMaterial, MeshPart, corners_of_polygons, smooth_normals, too_many
+from torchpt.scene.meshes.mtl import beside, decoded_lines, read_mtl
+
+__all__ = ["load_obj"]
+
+_CURVES = ("curv", "curv2", "surf", "l", "p")
+
+
+@dataclass
+class _Text:
+    """The file's statements as written, sorted by kind, with the line numbers for errors."""
+
+    v: list[str] = field(default_factory=list)
+    vt: list[str] = field(default_factory=list)
+    vn: list[str] = field(default_factory=list)
+    f: list[str] = field(default_factory=list)
+    lines: dict[str, list[int]] = field(default_factory=lambda: {key: [] for key in ("v", "vt", "vn", "f")})
+    face_groups: list[int] = field(default_factory=list)
+    groups: dict[str, int] = field(default_factory=dict)
+    libraries: list[str] = field(default_factory=list)
+    ignored: list[str] = field(default_factory=list)
+
+
+def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
+    """The parts of an OBJ file, one per `usemtl` name.
+
+    Raises:
+        AssetError: a malformed line, an index out of range, a malformed MTL file.
+    """
+    text = _split(decoded_lines(data), path)
+    known = _libraries(text, path) if materials else {}
+    positions = _numbers(text, "v", 3, path)
+    uvs = _numbers(text, "vt", 2, path)
+    normals = _numbers(text, "vn", 3, path)
+    if not text.f:
+        return []
+    combos, index, counts = _corners(text, path, (len(positions), len(uvs), len(normals)))
+    triangles = corners_of_polygons(np.cumsum(counts) - counts, counts)  # (F, 3) into the flat corners
+    owner = np.repeat(np.array(text.face_groups), counts - 2)
+    uvs[:, 1] = 1.0 - uvs[:, 1]
+    all_positions, all_faces = positions[combos[:, 0]], index[triangles]
+    all_uvs, all_normals = _looked_up(combos[:, 1], uvs), _looked_up(combos[:, 2], normals)
+    if all_normals is None and len(text.groups) > 1 and np.isfinite(positions).all():
+        all_normals = smooth_normals(all_positions, all_faces)  # over the whole file: groups meet without a crease
+    if len(text.groups) > MOST_PARTS:
+        raise too_many(path)
+    parts = []
+    order = np.argsort(owner, kind="stable")  # faces of a group stay in the order of the file
+    ends = np.searchsorted(owner[order], np.arange(1, len(text.groups) + 1))
+    for (name, _), rows in zip(text.groups.items(), np.split(order, ends[:-1]), strict=True):
+        faces = all_faces[rows]
+        used, local = np.unique(faces, return_inverse=True)
+        material = known.get(name)
+        if material is None and name and materials:
+            material = FileMaterial(name, ignored=("not defined in an MTL file",))
+        part_normals = None if all_normals is None else all_normals[used]
+        part_uvs = None if all_uvs is None else all_uvs[used]
+        left_out = tuple(dict.fromkeys(text.ignored))
+        faces = local.reshape(-1, 3)
+        parts.append(MeshPart(name, all_positions[used], faces, part_normals, part_uvs, None, material, left_out))
+    return parts
+
+
+def _split(lines: list[str], path: Path) -> _Text:
+    text = _Text()
+    tables = {"v": text.v, "vt": text.vt, "vn": text.vn}
+    group = -1
+    for number, line in enumerate(lines, 1):
+        key = line[:2].rstrip()
+        if key not in ("v", "vt", "vn", "f"):
+            key = (line.split(None, 1) or ("",))[0]
+        if key in tables:
+            tables[key].append(line)
+            text.lines[key].append(number)
+        elif key == "f":
+            if group < 0:
+                group = text.groups.setdefault("", len(text.groups))
+            if "#" in line or "-" in line:
+                words = line.partition("#")[0].split()
+                line = " ".join(_absolute(words, (len(text.v), len(text.vt), len(text.vn)), path, number))
+            text.f.append(line)
+            text.lines["f"].append(number)
+            text.face_groups.append(group)
+        elif key == "usemtl":
+            name = line.strip()[6:].strip()
+            group = text.groups.setdefault(name, len(text.groups))
+        elif key == "mtllib":
+            text.libraries.append(line.strip()[6:].strip())
+        elif key in _CURVES:
+            text.ignored.append(key)
+    return text
+
+
+def _absolute(words: list[str], counts: tuple[int, int, int], path: Path, number: int) -> list[str]:
+    """A face with its negative indices (counted back from the statement) made positive."""
+    result = [words[0]]
+    for word in words[1:]:
+        indices = word.split("/")
+        for slot, index in enumerate(indices[:3]):
+            if index.startswith("-"):
+                try:
+                    absolute = counts[slot] + 1 + int(index)
+                except ValueError:
+                    raise AssetError(path, f"line {number}: {word!r} is no corner v/vt/vn") from None
+                if absolute < 1:
+                    raise AssetError(path, f"line {number}: corner {word!r} counts back beyond the first element")
+                indices[slot] = str(absolute)
+        result.append("/".join(indices))
+    return result
+
+
+def _libraries(text: _Text, path: Path) -> dict[str, FileMaterial]:
+    known: dict[str, FileMaterial] = {}
+    for name in text.libraries:
+        whole = beside(path, name)  # a name may hold blanks; else blanks separate several names
+        files = [whole] if whole is not None else [beside(path, word) for word in name.split()]
+        if not files or None in files:  # often so with files that were sent around; the shape is there all the same
+            text.ignored.append(f"mtllib {name} (no such file)")
+        for file in files:
+            if file is not None:
+                known.update(read_mtl(file, set(text.groups)))
+    return known
+
+
+def _numbers(text: _Text, key: str, columns: int, path: Path) -> NDArray[np.float64]:
+    """``(n, columns)``: the first numbers of each statement; a one-number `vt` gets v = 0."""
+    rows: list[str] = getattr(text, key)
+    words = " ".join(rows).split()
+    width = columns + 1
+    if len(words) == width * len(rows) and words[::width] == [key] * len(rows):  # the usual form, in bulk
+        del words[::width]
+        try:
+            return np.array(list(map(float, words)), dtype=np.float64).reshape(-1, columns)
+        except ValueError:
+            pass  # the loop below finds the line
+    result = np.zeros((len(rows), columns))
+    for index, (number, row) in enumerate(zip(text.lines[key], rows, strict=True)):
+        found = row.partition("#")[0].split()
+        if key == "v" and len(found) >= 7:
+            text.ignored.append("v x y z r g b (colours)")
+        try:
+            values = [float(word) for word in found[1:width]]
+        except ValueError:
+            values = []
+        if len(values) != columns and not (key == "vt" and len(values) == 1):
+            raise AssetError(path, f"line {number}: expected {key} and {columns} numbers, got {row.strip()[:60]!r}")
+        result[index, : len(values)] = values
+    return result
+
+
+def _corners(
+    text: _Text, path: Path, sizes: tuple[int, int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Corners of all faces.
+
+    Returns:
+        the different corners ``(V, 3)`` as zero-based v, vt, vn (-1: absent); which of them each corner is ``(C,)``;
+        how many corners each face has.
+    """
+    words = " ".join(text.f).split()
+    heads = np.array([at for at, word in enumerate(words) if word == "f"])
+    counts = np.diff(heads, append=len(words)) - 1
+    if len(heads) != len(text.f) or (counts < 3).any():
+        face = int(np.argmax(counts < 3)) if len(heads) == len(text.f) else 0
+        line = text.f[face].strip()[:60]
+        raise AssetError(path, f"line {text.lines['f'][face]}: a face needs three or more corners: {line!r}")
+    corners = [word for word in words if word != "f"]
+    numbers = {word: row for row, word in enumerate(dict.fromkeys(corners))}
+    index = np.array(list(map(numbers.__getitem__, corners)), dtype=np.int64)
+
+    def line_of(word: str) -> int:
+        return text.lines["f"][int(np.searchsorted(np.cumsum(counts), corners.index(word), side="right"))]
+
+    table = np.full((len(numbers), 3), -1, dtype=np.int64)
+    for row, word in enumerate(numbers):
+        try:
+            for slot, part in enumerate(word.split("/")):
+                if part:
+                    table[row, slot] = int(part) - 1 if int(part) else -2
+        except (ValueError, IndexError, OverflowError):
+            raise AssetError(path, f"line {line_of(word)}: {word[:40]!r} is no corner v/vt/vn") from None
+    bad = np.flatnonzero((table < -1).any(axis=1) | (table >= np.array(sizes)).any(axis=1) | (table[:, 0] < 0))
+    if len(bad):
+        word = list(numbers)[bad[0]]
+        found = f"{sizes[0]} v, {sizes[1]} vt, {sizes[2]} vn"
+        raise AssetError(
+            path, f"line {line_of(word)}: corner {word!r} has an index out of range (the file has {found})"
+        )
+    return table, index, counts
+
+
+def _looked_up(indices: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Rows of ``values``, zeros where the index is -1; None where all are."""
+    if not len(values) or (indices < 0).all():
+        return None
+    return np.where((indices >= 0)[:, None], values[np.maximum(indices, 0)], 0.0)

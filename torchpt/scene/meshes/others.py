@@ -1,0 +1,115 @@
+"""The long tail of mesh formats, through trimesh: OFF, 3MF, COLLADA, XAML, 3DXML. What is read of them is what it gives.
+
+Nothing is run and nothing fetched: archives are refused above a size, document types in COLLADA as well, and pictures lie
+beside the file or below.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+import zipfile
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from torchpt.core.errors import AssetError
+from torchpt.core.files import MAX_BYTES, check_regular
+from torchpt.scene.meshes import PARSERS
+from torchpt.scene.meshes.gltf import MOST_PLACED
+from torchpt.scene.meshes.mesh import MeshPart
+from torchpt.scene.meshes.trimesh_objects import Notes, mesh_parts_of
+
+__all__ = ["load_others"]
+
+_BEGINS = re.compile(rb"(?:\xef\xbb\xbf|\xff\xfe|\xfe\xff)?\s*<")
+_ENCODING = re.compile(rb"<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)")
+_ENCODINGS = (
+    b"utf-8",
+    b"utf8",
+    b"utf-16",
+    b"us-ascii",
+    b"ascii",
+    b"iso-8859-1",
+    b"latin-1",
+    b"latin1",
+    b"windows-1252",
+)
+
+#: Bytes that an archive may unfold to.
+MOST_UNFOLDED = 2**30
+
+
+def load_others(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
+    """The meshes of a file as trimesh reads it, moved by its nodes.
+
+    Raises:
+        AssetError: a package that is not installed, a malformed file, a picture that is missing.
+    """
+    kind = path.suffix.lower()
+    missing = [name for name in PARSERS[kind] if find_spec(name) is None]
+    if missing:
+        needs = "the package " if len(missing) == 1 else "the packages "
+        how = "pip install 'torchpt-renderer[formats]'"
+        raise AssetError(path, f"reading {kind} needs {needs}{' and '.join(missing)}: {how}")
+    try:
+        _screen(path, data)
+        with Notes() as notes, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of NumPy and of readers about themselves
+            scene, lost = _read(path, data)
+    except (AssetError, MemoryError):
+        raise
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [""])[0][:120]
+        raise AssetError(path, f"malformed {kind} ({type(error).__name__}: {reason})") from None
+    if lost and materials:
+        raise AssetError(path, f"the file {lost[0][:80]!r} is missing")
+    parts = mesh_parts_of(scene, str(path), materials=materials, most=max(MOST_PLACED, len(data)))
+    ignored = tuple(dict.fromkeys((*parts[0].ignored, *notes.texts)))
+    return [replace(parts[0], ignored=ignored), *parts[1:]]
+
+
+def _read(path: Path, data: bytes) -> tuple[Any, list[str]]:
+    """The scene, and names of files that it asks for and that are not there."""
+    import trimesh
+    from trimesh.resolvers import FilePathResolver
+
+    lost: list[str] = []
+
+    class Beside(FilePathResolver):
+        def absolute(self, name: str) -> Path:
+            path = super().absolute(name)
+            if path.exists():
+                check_regular(path, MAX_BYTES)
+            return path
+
+        def get(self, name: str) -> bytes:
+            try:
+                return super().get(name)
+            except Exception:
+                lost.append(name)
+                raise
+
+    kind = path.suffix.lower().removeprefix(".")
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=Beside(str(path)), process=False)
+    return scene, lost
+
+
+def _screen(path: Path, data: bytes) -> None:
+    """Refuse archives that unfold to too much, and XML that declares entities."""
+    texts = [data] if path.suffix.lower() == ".dae" else []
+    if data.startswith(b"PK"):
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(info.file_size for info in archive.infolist())
+            if size > MOST_UNFOLDED:
+                raise AssetError(path, f"unfolds to {size} bytes, more than {MOST_UNFOLDED} are not read")
+            texts += [archive.read(info) for info in archive.infolist() if info.filename.lower().endswith(".dae")]
+    for text in texts:
+        plain = text.replace(b"\0", b"")  # of UTF-16
+        declared = _ENCODING.search(plain[:200])
+        if not _BEGINS.match(plain) or (declared and declared[1].lower() not in _ENCODINGS):
+            raise AssetError(path, "is no XML in UTF-8, UTF-16, ASCII or Latin-1")  # in which what follows would hide
+        if b"<!DOCTYPE" in plain or b"<!ENTITY" in plain:
+            raise AssetError(path, "declares a document type, which is not read")

@@ -1,0 +1,318 @@
+"""PLY, ASCII and binary: the elements `vertex` and `face`; anything else in the file is stepped over.
+
+Declared sizes are held against the file's before anything is allocated.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.core.errors import AssetError
+from torchpt.scene.meshes.mesh import FileMaterial, MeshPart, corners_of_polygons
+from torchpt.scene.meshes.ply_rows import misfit
+
+__all__ = ["load_ply"]
+
+_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4"},
+    **{"double": "f8", "float64": "f8"},
+}
+_INDICES = ("vertex_indices", "vertex_index")
+_COLORS = ("red", "green", "blue")
+_COLORED = {"type": "diffuse", "reflectance": {"type": "vertex_color"}}
+#: Bytes of the longest header.
+_MOST_HEADER = 2**20
+_END = re.compile(rb"(?:^|\r)end_header[ \t]*(?:\r\n|\n|\r(?!\n))", re.MULTILINE)
+_UVS = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))
+
+
+@dataclass
+class _Property:
+    name: str
+    kind: str  # numpy type of the value or of the list's items
+    count: str = ""  # numpy type of a list's length; empty for a scalar
+
+
+@dataclass
+class _Element:
+    name: str
+    size: int
+    properties: list[_Property] = field(default_factory=list)
+
+
+Columns = dict[str, Any]  # scalar property: (n,); list property: (lengths (n,), flat items)
+
+
+def load_ply(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
+    """The faces of a PLY file as one part; the format has no materials, but vertices may have colours.
+
+    Raises:
+        AssetError: truncated, malformed, or without vertices and faces.
+    """
+    layout, elements, start = _header(path, data)
+    reader = _Ascii(path, data, start, elements) if layout == "ascii" else _Binary(path, data, start, layout)
+    found: dict[str, Columns] = {}
+    for element in elements:
+        columns = reader.read(element)
+        if element.name in ("vertex", "face"):
+            found[element.name] = columns
+        if element.name in ("tristrips", "tristrip"):
+            raise AssetError(path, "triangle strips (element tristrips) are not read; expected element face")
+        if {"vertex", "face"} <= found.keys():
+            break
+    if "vertex" not in found:
+        raise AssetError(path, "no element vertex")
+    if isinstance(reader, _Ascii):
+        reader.end()
+    return [_part(path, found["vertex"], found.get("face", {}), elements, materials)]
+
+
+def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], materials: bool) -> MeshPart:
+    missing = [name for name in "xyz" if not isinstance(vertex.get(name), np.ndarray)]
+    if missing:
+        problem = f"has a list as its property {missing[0]}, expected a number"
+        problem = problem if missing[0] in vertex else f"has no property {missing[0]}"
+        raise AssetError(path, f"element vertex {problem}")
+
+    def stack(names: tuple[str, ...]) -> NDArray[np.float64] | None:
+        if not all(isinstance(vertex.get(name), np.ndarray) for name in names):
+            return None
+        return np.stack([np.asarray(vertex[name], dtype=np.float64) for name in names], axis=1)
+
+    vertices = stack(("x", "y", "z"))
+    assert vertices is not None
+    uvs = next((pair for pair in map(stack, _UVS) if pair is not None), None)
+    ignored = [name for name in face if name in ("texcoord", "texnumber")]
+    ignored += [name for name in ("alpha",) if name in vertex]
+    key = next((name for name in _INDICES if isinstance(face.get(name), tuple)), None)
+    if key is None:
+        if any(element.name == "face" and element.size for element in elements):
+            raise AssetError(path, "element face has no list vertex_indices")
+        return MeshPart("", vertices, np.zeros((0, 3), dtype=np.int64))
+    counts, items = face[key]
+    bad = np.flatnonzero(counts < 3)
+    if len(bad):
+        raise AssetError(path, f"face {bad[0]} has {counts[bad[0]]} corners, expected three or more")
+    if items.dtype.kind == "f":
+        raise AssetError(path, "the vertex indices of element face are no integers")
+    colors = _colors(vertex, elements)
+    own = FileMaterial("vertex colors", _COLORED) if materials and colors is not None else None
+    starts = np.cumsum(counts) - counts
+    faces = items.astype(np.int64)[corners_of_polygons(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
+    return MeshPart("", vertices, faces, stack(("nx", "ny", "nz")), uvs, colors, own, tuple(ignored))
+
+
+def _colors(vertex: Columns, elements: list[_Element]) -> NDArray[np.float64] | None:
+    """Linear RGB: floats as stored, integers over the largest of their declared type."""
+    kinds = {p.name: p.kind for element in elements if element.name == "vertex" for p in element.properties}
+    if not all(isinstance(vertex.get(name), np.ndarray) for name in _COLORS):
+        return None
+    white = [1.0 if kinds[name][0] == "f" else np.iinfo(kinds[name]).max for name in _COLORS]
+    return np.stack([np.asarray(vertex[c], dtype=np.float64) / w for c, w in zip(_COLORS, white, strict=True)], axis=1)
+
+
+def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
+    if not data.startswith(b"ply"):
+        raise AssetError(path, "no PLY file (it does not start with ply)")
+    found = _END.search(data, 0, _MOST_HEADER)
+    if found is None:
+        long = len(data) > _MOST_HEADER
+        raise AssetError(
+            path, f"no end_header in its first {_MOST_HEADER} bytes" if long else "truncated: no end_header"
+        )
+    layout, elements = "", []
+    for line in data[: found.start()].decode("latin-1").replace("\r", "\n").split("\n"):
+        words = line.split()
+        problem = AssetError(path, f"header: {line.strip()[:60]!r} is not understood")
+        if not words or words[0] in ("ply", "comment", "obj_info"):
+            continue
+        if words[0] == "format" and len(words) == 3:
+            layout = words[1]
+        elif words[0] == "element" and len(words) == 3:
+            if not words[2].isdecimal() or not words[2].isascii() or len(words[2]) > 15:
+                raise problem
+            elements.append(_Element(words[1][:80], int(words[2])))
+        elif words[0] == "property" and elements:
+            elements[-1].properties.append(_property(words, problem))
+        else:
+            raise problem
+    if layout not in ("ascii", "binary_little_endian", "binary_big_endian"):
+        raise AssetError(path, f"header: unknown format {layout!r}")
+    return layout, elements, found.end()
+
+
+def _property(words: list[str], problem: AssetError) -> _Property:
+    if len(words) == 5 and words[1] == "list" and words[2] in _TYPES and words[3] in _TYPES:
+        if _TYPES[words[2]][0] == "f":
+            raise problem
+        return _Property(words[4], _TYPES[words[3]], _TYPES[words[2]])
+    if len(words) == 3 and words[1] in _TYPES:
+        return _Property(words[2], _TYPES[words[1]])
+    raise problem
+
+
+def _truncated(path: Path, element: _Element, row: int | None = None) -> AssetError:
+    where = "" if row is None else f" (at {element.name} {row})"
+    return AssetError(
+        path, f"truncated: {element.size} of element {element.name} declared, the file is too short{where}"
+    )
+
+
+class _Binary:
+    """Reads element after element from the bytes behind the header."""
+
+    def __init__(self, path: Path, data: bytes, start: int, layout: str) -> None:
+        self.path, self.data, self.at = path, data, start
+        self.order = "<" if layout == "binary_little_endian" else ">"
+
+    def read(self, element: _Element) -> Columns:
+        properties = element.properties
+        smallest = sum(np.dtype(p.count or p.kind).itemsize for p in properties)
+        if element.size * smallest > len(self.data) - self.at:
+            raise _truncated(self.path, element)
+        if not properties or not element.size:
+            return {
+                p.name: (np.zeros(0, np.int64), np.zeros(0, p.kind)) if p.count else np.zeros(0) for p in properties
+            }
+        uniform = self.uniform(element)
+        return self.ragged(element) if uniform is None else uniform
+
+    def uniform(self, element: _Element) -> Columns | None:
+        """All records at once where every list has the length it has in the first record."""
+        lengths, at = [], self.at
+        for p in element.properties:
+            length = 1
+            if p.count:
+                length = self.integer(p.count, at, element, 0)
+                at += np.dtype(p.count).itemsize
+            at += length * np.dtype(p.kind).itemsize
+            lengths.append(length)
+        fields: list[Any] = []
+        for slot, (p, length) in enumerate(zip(element.properties, lengths, strict=True)):
+            if p.count:
+                fields += [(f"n{slot}", self.order + p.count), (f"p{slot}", self.order + p.kind, (length,))]
+            else:
+                fields.append((f"p{slot}", self.order + p.kind))
+        if at - self.at > len(self.data) or (at - self.at) * element.size > len(self.data) - self.at:
+            return None
+        records = np.frombuffer(self.data, np.dtype(fields), element.size, self.at)
+        columns: Columns = {}
+        for slot, (p, length) in enumerate(zip(element.properties, lengths, strict=True)):
+            values = records[f"p{slot}"].astype(p.kind)
+            if p.count:
+                if (records[f"n{slot}"] != length).any():
+                    return None
+                columns[p.name] = (np.full(element.size, length, dtype=np.int64), values.reshape(-1))
+            else:
+                columns[p.name] = values
+        self.at += records.nbytes
+        return columns
+
+    def ragged(self, element: _Element) -> Columns:
+        """Record by record, for lists of different lengths."""
+        chunks: list[list[Any]] = [[] for _ in element.properties]
+        counts: list[list[int]] = [[] for _ in element.properties]
+        at = self.at
+        for row in range(element.size):
+            for slot, p in enumerate(element.properties):
+                length = 1
+                if p.count:
+                    length = self.integer(p.count, at, element, row)
+                    at += np.dtype(p.count).itemsize
+                size = length * np.dtype(p.kind).itemsize
+                if length < 0 or at + size > len(self.data):
+                    raise _truncated(self.path, element, row)
+                chunks[slot].append(self.data[at : at + size])
+                counts[slot].append(length)
+                at += size
+        self.at = at
+        columns: Columns = {}
+        for slot, p in enumerate(element.properties):
+            values = np.frombuffer(b"".join(chunks[slot]), self.order + p.kind).astype(p.kind)
+            columns[p.name] = (np.array(counts[slot], dtype=np.int64), values) if p.count else values
+        return columns
+
+    def integer(self, kind: str, at: int, element: _Element, row: int) -> int:
+        raw = self.data[at : at + np.dtype(kind).itemsize]
+        if len(raw) < np.dtype(kind).itemsize:
+            raise _truncated(self.path, element, row)
+        value = int.from_bytes(raw, "little" if self.order == "<" else "big", signed=kind[0] == "i")
+        if value < 0:
+            raise AssetError(self.path, f"{element.name} {row} has a list of negative length")
+        return value
+
+
+class _Ascii:
+    """The same from words of text."""
+
+    def __init__(self, path: Path, data: bytes, start: int, elements: list[_Element]) -> None:
+        self.path, self.data, self.start, self.elements = path, data, start, elements
+        self.words, self.at = data[start:].split(), 0
+
+    def read(self, element: _Element) -> Columns:
+        properties = element.properties
+        if element.size * len(properties) > len(self.words) - self.at:
+            raise self.wrong(_truncated(self.path, element).problem)
+        if not any(p.count for p in properties):
+            flat = self.take(element.size * len(properties), element, float)
+            table = flat.reshape(-1, max(len(properties), 1))
+            return {p.name: table[:, slot] for slot, p in enumerate(properties)}
+        chunks: list[list[bytes]] = [[] for _ in properties]
+        counts: list[list[int]] = [[] for _ in properties]
+        for row in range(element.size):
+            for slot, p in enumerate(properties):
+                length = 1
+                if p.count:
+                    length = int(self.take(1, element, int)[0])
+                if length < 0 or self.at + length > len(self.words):
+                    raise self.wrong(_truncated(self.path, element, row).problem)
+                chunks[slot] += self.words[self.at : self.at + length]
+                counts[slot].append(length)
+                self.at += length
+        columns: Columns = {}
+        for slot, p in enumerate(properties):
+            values = self.convert(chunks[slot], element, float if p.kind[0] == "f" else int)
+            columns[p.name] = (np.array(counts[slot], dtype=np.int64), values) if p.count else values
+        return columns
+
+    def take(self, size: int, element: _Element, kind: type) -> NDArray[Any]:
+        if self.at + size > len(self.words):
+            raise self.wrong(_truncated(self.path, element).problem)
+        self.at += size
+        return self.convert(self.words[self.at - size : self.at], element, kind)
+
+    def convert(self, words: list[bytes], element: _Element, kind: type) -> NDArray[Any]:
+        try:
+            return np.array(list(map(kind, words)), dtype=np.float64 if kind is float else np.int64)
+        except (ValueError, OverflowError):
+            expected = "a number" if kind is float else "a whole number of at most 64 bits"
+            word = next(word for word in words if not _fits(word, kind))
+            found = repr(word[:40].decode("latin-1"))
+            raise self.wrong(f"element {element.name} holds {found}, expected {expected}") from None
+
+    def wrong(self, problem: str) -> AssetError:
+        """The first row that is another than the header says; where all are as it says, the problem that was met."""
+        return AssetError(self.path, misfit(self.data, self.start, self.elements) or problem)
+
+    def end(self) -> None:
+        """Refuse rows that came out even by chance: what is left over is not what the header says."""
+        read = [element for element in self.elements if element.size and element.properties]
+        last = next((number for number, element in enumerate(read) if element.name == "face"), len(read))
+        if last >= len(read) - 1 and self.at < len(self.words):
+            found = misfit(self.data, self.start, self.elements)
+            if found is not None:
+                raise AssetError(self.path, found)
+
+
+def _fits(word: bytes, kind: type) -> bool:
+    try:
+        return bool(np.array([kind(word)], dtype=np.float64 if kind is float else np.int64).size)
+    except (ValueError, OverflowError):
+        return False

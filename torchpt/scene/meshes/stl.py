@@ -1,0 +1,54 @@
+"""STL, binary and ASCII: loose triangles, welded where corners are equal so that smooth normals can be computed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchpt.core.errors import AssetError
+from torchpt.scene.meshes.mesh import MeshPart
+
+__all__ = ["load_stl"]
+
+_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_HEADER = 84
+
+
+def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
+    """The triangles of an STL file as one part; its facet normals are not used.
+
+    Raises:
+        AssetError: truncated or malformed.
+    """
+    del materials  # the format has none
+    declared = int.from_bytes(data[80:84], "little") if len(data) >= _HEADER else -1
+    if data.lstrip()[:5].lower() == b"solid" and len(data) != _HEADER + 50 * declared:
+        corners = _ascii(path, data)
+    elif declared < 0:
+        raise AssetError(path, f"truncated: {len(data)} bytes, an STL file has at least {_HEADER}")
+    elif len(data) < _HEADER + 50 * declared:
+        raise AssetError(path, f"truncated: {declared} triangles need {_HEADER + 50 * declared} bytes, got {len(data)}")
+    else:
+        records = np.frombuffer(data, _RECORD, declared, _HEADER)
+        corners = records["corners"].astype(np.float64).reshape(-1, 3)
+    if not len(corners):
+        return []
+    vertices, index = np.unique(corners + 0.0, axis=0, return_inverse=True)  # + 0.0: -0 and 0 are one corner
+    return [MeshPart("", vertices, index.reshape(-1, 3).astype(np.int64))]
+
+
+def _ascii(path: Path, data: bytes) -> NDArray[np.float64]:
+    words = data.split()
+    if b"endsolid" not in words and b"ENDSOLID" not in words:
+        raise AssetError(path, "truncated: no endsolid")
+    lowered = np.array([word.lower() == b"vertex" for word in words])
+    at = np.flatnonzero(lowered)
+    if len(at) % 3 or (len(at) and at[-1] + 3 >= len(words)):
+        raise AssetError(path, f"truncated: {len(at)} corners are no whole number of triangles")
+    try:
+        flat = [float(words[start + offset]) for start in at.tolist() for offset in (1, 2, 3)]
+    except ValueError:
+        raise AssetError(path, "a vertex statement without three numbers") from None
+    return np.array(flat, dtype=np.float64).reshape(-1, 3)

@@ -1,0 +1,303 @@
+"""From a scene to what an engine runs: what all waves of a render share, and what a scene keeps for the next one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from torchpt.core.errors import SceneError, say_once
+from torchpt.engines.kernels.programs import Kernels
+from torchpt.engines.kernels.threads import Loop
+from torchpt.images.denoiser import GUIDES
+from torchpt.math.vectors import dot, normalize
+from torchpt.paths.integrators import LAYERS
+from torchpt.paths.integrators.base import Integrator
+from torchpt.paths.state import Plan, StageContext
+from torchpt.paths.wave import Rays, Wave
+from torchpt.physics.cameras import Camera
+from torchpt.physics.film import Filter
+from torchpt.physics.samplers import ADAPTIVE, Points, Sampler
+from torchpt.physics.world import World
+from torchpt.scene import Scene
+from torchpt.scene.settings import Settings
+from torchpt.spec import Moves
+from torchpt.spec.schema import Described
+
+if TYPE_CHECKING:
+    from torchpt.paths.integrators.first_surface import FirstSurface
+    from torchpt.paths.layer import SurfaceLayer
+
+__all__ = ["Kept", "kept", "kernels_of", "loop_facts", "loop_of", "looped", "make_wave", "rebound", "surface_layers"]
+
+
+# ---- What renders of a scene leave for the next one
+
+
+@dataclass
+class Kept:
+    """Of one scene.
+
+    Attributes:
+        kernels: of its latest render by the compiled loop.
+        first: the integrator and the world that this was made of, and what happens at first surfaces.
+        dark: a world, and the same without lights.
+        camera: the latest one on a film, with what it was made of.
+        outlines: the edges of its meshes, as :mod:`torchpt.gradients.edges.curves` finds them.
+    """
+
+    kernels: Kernels | None = None
+    first: tuple[Integrator, World, FirstSurface] | None = None
+    dark: tuple[World, World] | None = None
+    camera: tuple[Any, Camera] | None = None
+    outlines: dict[str, Any] = field(default_factory=dict)
+
+
+_scenes: WeakKeyDictionary[Scene, Kept] = WeakKeyDictionary()
+
+
+def kept(scene: Scene) -> Kept:
+    """Return what is kept for a scene, as long as the scene is; views of it share it."""
+    return _scenes.setdefault(scene.origin, Kept())
+
+
+# ---- What all waves of a render share, and how they run: as tensor operations, or as the compiled loop
+
+
+def make_wave(
+    scene: Scene,
+    settings: Settings,
+    params: Mapping[str, Tensor] | None,
+    dtype: torch.dtype,
+    tape: bool = False,
+    attached: bool = False,
+    like: Wave | None = None,
+    rays: tuple[Tensor, Tensor] | None = None,
+) -> Wave:
+    """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``.
+
+    ``like``: a wave of the same scene, settings and parameters, but for those of the camera: what it reads is read again.
+    ``rays``: origins and directions ``(..., 3)`` in the scene's coordinates, in place of the camera's.
+
+    Raises:
+        SceneError: a direction that is zero, or a ray that is not finite.
+    """
+    film, spp = settings.film, settings.render.spp
+    integrator = settings.integrator.counted_in(scene.space.unit)
+    params = params or {}
+    shaping = {name: value for name, value in params.items() if not name.startswith("camera.")}
+    own = not shaping  # the world is the scene's own, and what is made of it may be kept
+    if like is None:
+        uv = any(layer.uv for layer in surface_layers(settings).values())
+        world, geometry = scene.world(dtype, shaping, uv, settings.light_choice)
+        threads = None if settings.render.threads == "auto" else int(settings.render.threads)
+        moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in shaping)
+        accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
+        if not integrator.lit:
+            world = _dark(scene, world, own)
+    else:
+        world, accel = like.context.world, like.accel
+    points = points_of(settings.sampler)
+    plan = integrator.plan(points, dtype, tape, attached)
+    camera = _camera(scene, settings, params, dtype)
+    crop = film.crop or (0, 0, film.width, film.height)
+    context = _context(plan, world, camera, crop, integrator)
+    wave = Wave(
+        context=context if rays is None else replace(context, pixel=None),  # rays have no width
+        integrator=integrator,
+        accel=accel,
+        camera=camera,
+        filter=_filter(film.filter.kind, tuple(film.filter.values.items()), scene.device),
+        sampler=Sampler(points, settings.render.seed, settings.streams, spp, film.width),
+        crop=crop,
+        centre=scene.space.shift,
+        first=_first(scene, integrator, world, own) if like is None else like.first,
+    )
+    return wave if rays is None else wave.along(_given(scene, *rays, dtype))
+
+
+def _given(scene: Scene, o: Tensor, d: Tensor, dtype: torch.dtype) -> Rays:
+    """Return rays ``(..., 3)`` of the scene's coordinates as lanes have them, differentiable."""
+    o, d = (x.reshape(-1, 3).T.double() for x in (o, d))
+    origin = ((o - scene.space.centre[:, None]) / scene.space.unit).to(dtype).contiguous()
+    _refuse("o", o, torch.isfinite(origin).all(0), f"an origin that is finite in {str(dtype).removeprefix('torch.')}")
+    _refuse("d", d, torch.isfinite(d).all(0) & (d != 0).any(0), "a direction that is finite and not zero")
+    unit = normalize(d)
+    # What is of unit length up to rounding keeps its bits.
+    near = (dot(d, d) - 1.0).abs() < 8.0 * torch.finfo(dtype).eps
+    unit = unit + torch.where(near, d - unit, 0.0).detach()
+    return Rays(origin, unit.to(dtype).contiguous())
+
+
+def _refuse(key: str, given: Tensor, good: Tensor, expected: str) -> None:
+    """Refuse the first of some vectors ``(3, N)`` that is not ``good (N,)``.
+
+    Raises:
+        SceneError: names it.
+    """
+    bad = (~good).nonzero()
+    if len(bad):
+        raise SceneError(f"{key}, ray {int(bad[0])}", given[:, int(bad[0])].tolist(), expected)
+
+
+def _camera(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:
+    """The camera on the film; the latest one where it was made of the same."""
+    merged, film = scene.merged(params), settings.film
+    if torch.is_grad_enabled():
+        return scene.camera(film, merged, dtype)
+    given = [value for name, value in merged.items() if name.startswith("camera.")]
+    if any(value.is_inference() for value in given):
+        return scene.camera(film, merged, dtype)
+    # By identity: what the ids are of is held beside them, so that they stay their own.
+    held = (scene.description.camera, *given)
+    made_of = ([id(value) for value in held], [value._version for value in given], film.width, film.height, dtype)
+    keeper = kept(scene)
+    if keeper.camera is None or keeper.camera[0][0] != made_of:
+        keeper.camera = (made_of, held), scene.camera(film, merged, dtype)
+    return keeper.camera[1]
+
+
+@lru_cache(maxsize=64)
+def _filter(kind: type[Filter], values: tuple[tuple[str, Any], ...], device: torch.device) -> Filter:
+    """A filter; renders of the same read the same tensors."""
+    return kind(dict(values), device)
+
+
+def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Wave:
+    """An eager wave whose world and camera follow ``params`` under a tape, of one of the same parameters detached.
+
+    The search structure stays.
+    """
+    uv = any(layer.uv for layer in surface_layers(settings).values())
+    world, _ = scene.world(wave.context.plan.dtype, params, uv, settings.light_choice)
+    if not wave.integrator.lit:
+        world = replace(world, lights=None)
+    camera = scene.camera(settings.film, scene.merged(params), wave.context.plan.dtype)
+    context = _context(wave.context.plan, world, camera, wave.crop, wave.integrator)
+    return replace(wave, context=context, camera=camera, first=None if wave.first is None else wave.first.again(world))
+
+
+def points_of(sampler: Described) -> Points:
+    """Return where the points lie, of the settings of a sampler."""
+    return sampler.kind(**{key: value for key, value in sampler.values.items() if key not in ADAPTIVE})
+
+
+def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:
+    """The layers of first surfaces that are wanted, by name; those for the denoiser alone come last."""
+    names = (*(settings.film.aovs or settings.integrator.layers), *(GUIDES if settings.film.denoise else ()))
+    if not names:
+        return {}
+    from torchpt.paths.layer import SurfaceLayer
+
+    layers = {name: LAYERS[name] for name in names}
+    return {name: layer for name, layer in layers.items() if issubclass(layer, SurfaceLayer)}
+
+
+def _first(scene: Scene, integrator: Integrator, world: World, own: bool) -> FirstSurface | None:
+    """Return what happens at first surfaces; kept with the scene, unless the world is not the scene's ``own``."""
+    if not own or torch.is_grad_enabled():
+        return integrator.first(world)
+    keeper = kept(scene)
+    if keeper.first is not None and keeper.first[0] == integrator and keeper.first[1] is world:
+        return keeper.first[2]
+    first = integrator.first(world)
+    if first is not None:
+        keeper.first = integrator, world, first
+    return first
+
+
+def _dark(scene: Scene, world: World, own: bool) -> World:
+    """The world without lights; one of the scene's ``own`` is kept with it."""
+    if not own:
+        return replace(world, lights=None)
+    keeper = kept(scene)
+    if keeper.dark is None or keeper.dark[0] is not world:
+        keeper.dark = world, replace(world, lights=None)
+    return keeper.dark[1]
+
+
+def _context(
+    plan: Plan, world: World, camera: Camera, crop: tuple[int, int, int, int], integrator: Integrator
+) -> StageContext:
+    """Return what the stages of a render read beside their lanes."""
+    context = StageContext(plan, world, _pixel_of(world, camera))
+    return replace(context, camera=camera, crop=crop) if integrator.splats else context
+
+
+def _pixel_of(world: World, camera: Camera) -> Tensor | None:
+    """Return what textures filtered by the pixel's footprint need of the camera; None where there are none."""
+    return camera.pixel() if world.textures.filtered else None
+
+
+def looped(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool:
+    """Return True where a render runs as kernels, False where it runs as tensor operations.
+
+    Raises:
+        SceneError: ``render.compile`` is ``on`` where there are no kernels.
+    """
+    if settings.render.compile == "off":
+        return False
+    missing = ""
+    if device.type != "cpu":
+        missing = f"kernels run on a CPU; this scene is on {device}"
+    elif dtype != torch.float32:
+        missing = f"kernels compute in float32; this render is in {str(dtype).removeprefix('torch.')}"
+    if missing and settings.render.compile == "on":
+        raise SceneError("render.compile", "on", f"auto or off ({missing})")
+    return not missing
+
+
+def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
+    """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
+    packets = wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
+    opaque = wave.context.world.materials.opacity is None and not wave.integrator.own_transmit
+    fused = packets and opaque and wave.first is None and not wave.integrator.splats
+    kernels = Kernels(wave, packets, fused, before, fixed=not scene.own_models)
+    own = [
+        k
+        for k, model in enumerate(wave.context.world.materials.models)
+        if any(model is mine for mine in scene.own_models)
+    ]
+    eager = kernels.probe(own) if wave.integrator.light else {}
+    if eager and kernels.fused:  # what runs as tensor operations hands its rays to the search structure
+        kernels = Kernels(wave, packets, False)
+    kernels.eager = eager
+    return kernels
+
+
+def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
+    """Tell how a render of the scene would run: as the compiled loop, and how that searches, or as tensor operations."""
+    with torch.no_grad():
+        if not looped(settings, scene.device, torch.float32):
+            return {"stages": "eager, by tensor operations"}
+        wave = make_wave(scene, settings, None, torch.float32)
+        kernels = kernels_of(scene, wave)
+    search = "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else wave.accel.name
+    names = [str(model) for model in wave.context.world.materials.models]
+    eager = {names[number]: reason for number, reason in kernels.eager.items()}
+    return {
+        "stages": "compiled to loops over lanes",
+        "search": search,
+        "rows_a_path": kernels.state.count,
+        **({"eager": eager} if eager else {}),
+    }
+
+
+def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Loop:
+    """The compiled loop of a render on ``threads`` (None: as many as torch's), whose kernels are kept with the scene.
+
+    Materials without kernels join ``eager``.
+    """
+    keeper = kept(scene)
+    kernels = keeper.kernels = kernels_of(scene, wave, keeper.kernels)
+    for number, reason in kernels.eager.items():
+        name = str(wave.context.world.materials.models[number])
+        eager.append(f"{name}: {reason}")
+        say_once(f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}")
+    integrator = wave.integrator
+    return Loop(kernels, threads or torch.get_num_threads(), integrator.clamp, integrator.strict)

@@ -1,0 +1,619 @@
+"""The run settings (film, integrator, sampler, render): built-in default < scene file < explicit override."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, TypedDict
+
+import torch
+from torch import Tensor
+
+from torchpt.core.errors import SceneError
+from torchpt.paths.integrators import KINDS as INTEGRATORS
+from torchpt.paths.integrators import LAYERS
+from torchpt.paths.integrators.base import Integrator
+from torchpt.physics.film import FILTERS
+from torchpt.physics.samplers import KINDS as SAMPLERS
+from torchpt.ranks import Group
+from torchpt.spec import Choice, Flag, Other, Refused, Role, Scalar, Valued, Whole, parameters_of, reading
+from torchpt.spec.arguments import Argument, declared
+from torchpt.spec.schema import Described, Memo, check_keys, described, dotted, refuse_foreign, refused, values_of
+
+__all__ = [
+    "BLOCKS",
+    "FILTERS",
+    "INTEGRATORS",
+    "RECORDS",
+    "SAMPLERS",
+    "TYPED",
+    "Call",
+    "Common",
+    "Every",
+    "Film",
+    "Render",
+    "Settings",
+    "Traced",
+    "Wishes",
+    "blocks_of",
+    "having",
+    "merge",
+]
+
+BLOCKS = ("film", "integrator", "sampler", "render")
+MAX_SIDE = 65_536
+MAX_PIXELS = 2**28
+#: From this many samples a pixel on they are shared by four streams, below by two, where every pixel is to know its variance.
+#: Each takes something from Sobol' points (Cornell box, 64 spp: relMSE 0.38, 0.50, 0.58 of independent sampling for one, two,
+#: four); four make the variance of a single pixel less of a guess.
+MANY_SAMPLES = 256
+#: The largest `render.seed`.
+MOST_SEED = 2**63 - 1
+
+
+#: What has a type: the kinds it may be of, and the one it is of where nothing is said.
+TYPED: dict[str, tuple[Mapping[str, Any], str]] = {
+    "integrator": (INTEGRATORS, "path"),
+    "sampler": (SAMPLERS, "sobol"),
+    "filter": (FILTERS, "gaussian"),
+}
+
+
+def _crop(value: Any) -> tuple[int, int, int, int]:
+    if not isinstance(value, list | tuple) or len(value) != 4 or not all(type(x) is int for x in value):
+        raise Refused("[x, y, width, height], whole numbers of pixels")
+    x, y, width, height = value
+    if x < 0 or y < 0 or width < 1 or height < 1:
+        raise Refused("[x, y, width, height] with x, y >= 0 and width, height >= 1")
+    return x, y, width, height
+
+
+def _aovs(value: Any) -> tuple[str, ...]:
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list | tuple):
+        raise Refused(f"a list of {', '.join(LAYERS)}")
+    for index, name in enumerate(names):
+        if not isinstance(name, str) or name not in LAYERS or name in names[:index]:
+            raise Refused(f"a list of different ones of {', '.join(LAYERS)}", name, (index,))
+    return tuple(names)
+
+
+def _gamma(value: Any) -> float | str:
+    if value == "srgb":
+        return "srgb"
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 100:
+        raise Refused("srgb or an exponent > 0 such as 0.4545")
+    return float(value)
+
+
+class Film(Valued):
+    """The picture: its size in pixels, its reconstruction filter, and how 8-bit files show it."""
+
+    parameters: ClassVar = {
+        "width": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
+        "height": Whole(512, low=1, high=MAX_SIDE, doc="in pixels"),
+        "filter": Other(
+            lambda _: _typed("filter", {}, "film.filter"),
+            words=f"{', '.join(FILTERS)}, or a mapping",
+            doc="how samples become pixels",
+        ),
+        "crop": Other(
+            None,
+            reader=_crop,
+            words="[x, y, width, height]",
+            doc="the part that is rendered, in pixels",
+        ),
+        "aovs": Other(
+            (),
+            reader=_aovs,
+            words=f"a list of {', '.join(LAYERS)}",
+            doc="layers, kept by .exr",
+        ),
+        "denoise": Flag(False, doc="a second picture beside the first, without its noise"),
+        "exposure": Scalar(
+            0.0, low=-64, high=64, words="a number of stops in -64..64", doc="of 8-bit files", role=Role.FREE
+        ),
+        "tonemap": Choice("none", names=("none", "filmic", "aces", "reinhard"), doc="of 8-bit files", role=Role.FREE),
+        "gamma": Other(
+            "srgb",
+            reader=_gamma,
+            words="srgb or an exponent > 0",
+            doc="of 8-bit files: out = in^gamma",
+            role=Role.FREE,
+        ),
+    }
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Valued`."""
+        wide, high, crop = values["width"], values["height"], values["crop"]
+        if wide * high > MAX_PIXELS:
+            raise Refused(f"a film of at most {MAX_PIXELS} pixels", [wide, high], ("width",))
+        if crop is not None and (crop[0] + crop[2] > wide or crop[1] + crop[3] > high):
+            raise Refused(f"a crop inside the film of {wide} x {high} pixels", list(crop), ("crop",))
+
+
+_DEVICE = re.compile(r"(auto|cpu|cuda|cuda:[0-9]{1,3})\Z")
+
+
+def _device(value: Any) -> str:
+    if not isinstance(value, str) or not _DEVICE.match(value):
+        raise Refused("auto, cpu, cuda or cuda:N")
+    return value
+
+
+def _pilots(value: Any) -> bool | str:
+    if isinstance(value, bool) or value == "auto":
+        return value
+    raise Refused("auto, true or false")
+
+
+def _file(value: Any) -> str:
+    if isinstance(value, str) and value.strip() and value.isprintable():
+        return value
+    raise Refused("null or a file path")
+
+
+#: How gradients are taken, the default first.
+ADJOINTS = ("replay", "autograd")
+_TYPE = "a type, or a mapping with `type` and its settings"
+_FILE = "null or a file path"
+
+
+def _whole(low: int, doc: str) -> Argument:
+    words = f"a whole number >= {low}"
+    return Argument(None, fits=lambda value: type(value) is int and value >= low, words=words, doc=doc)
+
+
+def _truth(default: bool, doc: str) -> Argument:
+    return Argument(default, fits=lambda value: type(value) is bool, words="True or False", doc=doc)
+
+
+# The arguments of `render`, and with them the block `render`: each is declared here and nowhere else. Signatures, `help`,
+# checks, keys of the command line, files of configs/ and tables of the docs are made of this (`scripts/make_configs.py`,
+# `scripts/make_tables.py`).
+
+
+class _Samples(TypedDict, total=False):
+    """What lists begin with."""
+
+    spp: Annotated[int | None, Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take")]
+
+
+class Traced(TypedDict, total=False):
+    """Arguments of whatever traces paths."""
+
+    integrator: Annotated[
+        str | Mapping[str, Any] | Integrator | None,
+        Other(TYPED["integrator"][1], words=_TYPE, doc="what is estimated"),
+    ]
+    sampler: Annotated[
+        str | Mapping[str, Any] | None,
+        Other(TYPED["sampler"][1], words=_TYPE, doc="where sample points come from"),
+    ]
+    device: Annotated[
+        str | torch.device | None,
+        Other(
+            "auto",
+            reader=_device,
+            words="auto, cpu, cuda or cuda:N",
+            doc="auto: CUDA where there is one; in Python the scene's own, where it was loaded",
+        ),
+    ]
+    accel: Annotated[
+        str | None,
+        Choice("auto", names=("auto", "torch", "numba", "brute"), doc="the search structure"),
+    ]
+    compile: Annotated[
+        str | bool | None,
+        Choice(
+            "auto",
+            names=("auto", "on", "off"),
+            booleans={True: "on", False: "off"},
+            doc="whether stages run as kernels; auto: in float32 on a CPU, else as tensor operations",
+        ),
+    ]
+    threads: Annotated[
+        int | str | None,
+        Whole("auto", low=1, high=1024, also=("auto",), doc="auto: as many as torch uses", role=Role.FREE),
+    ]
+    max_memory: Annotated[
+        int | str | None,
+        Other(
+            None,
+            reader=reading.memory_size,
+            words="null, bytes, or a size such as 4GB",
+            doc="of all that the process holds above what import took; see docs/stability.md",
+            role=Role.FREE,
+        ),
+    ]
+    dtype: Annotated[
+        torch.dtype,
+        Argument(
+            torch.float32,
+            fits=lambda value: value in (torch.float32, torch.float64),
+            words="torch.float32 or torch.float64",
+            doc="of the lanes; float64 is for checking derivatives, and the search stays float32",
+        ),
+    ]
+    adjoint: Annotated[
+        str | None,
+        Argument(
+            ADJOINTS[0],
+            fits=lambda value: value in ADJOINTS,
+            words=" or ".join(ADJOINTS),
+            doc="how gradients are taken: `replay` traces paths again and goes back along them, in memory that grows with"
+            " neither depth nor samples; `autograd` runs each chunk of pixels again under a plain tape",
+        ),
+    ]
+    seed_grad: Annotated[
+        int | None,
+        _whole(
+            0, "of the backward pass; none: one of its own, as shared samples would bias the gradient of a squared loss"
+        ),
+    ]
+    spp_grad: Annotated[
+        int | None, _whole(1, "samples a pixel of the backward pass; none: as many as the forward pass took")
+    ]
+
+
+class Common(_Samples, Traced, total=False):
+    """Arguments of :func:`torchpt.render` that are the same for all pictures of a batch."""
+
+    film: Annotated[
+        Mapping[str, Any] | None,
+        Other(None, words=f"a mapping of {', '.join(Film.parameters)}", doc="the picture: its size, its layers"),
+    ]
+    pilots: Annotated[
+        bool | str | None,
+        Other(
+            "auto",
+            reader=_pilots,
+            words="auto, true or false",
+            doc="whether one pixel of 16 is sampled twice, by which the picture knows its error; auto: not in Python",
+        ),
+    ]
+    time_limit: Annotated[
+        float | None,
+        Scalar(
+            None,
+            above=0.0,
+            words="null or seconds > 0",
+            doc="seconds of sampling; loading, building, compiling apart",
+            role=Role.ENDS | Role.FREE,
+        ),
+    ]
+    target_error: Annotated[
+        float | None,
+        Scalar(
+            None,
+            above=0.0,
+            words="null or a relMSE > 0",
+            doc="the relMSE, by its pilots, at which the picture is done",
+            role=Role.ENDS,
+        ),
+    ]
+    checkpoint: Annotated[
+        str | None,
+        Other(
+            None,
+            reader=_file,
+            words=_FILE,
+            doc="where the state is written every few seconds and at the end, to go on from",
+            role=Role.FILES | Role.FREE,
+        ),
+    ]
+    resume: Annotated[
+        bool | None,
+        Flag(False, doc="whether to go on from the checkpoint, where there is one", role=Role.FILES | Role.FREE),
+    ]
+    edges: Annotated[
+        bool, _truth(True, "whether silhouettes and shadow edges that move are differentiated; False warns")
+    ]
+    edge_spp: Annotated[
+        int | None,
+        _whole(1, "samples a pixel of each estimator of edges; none: as many as the backward pass takes"),
+    ]
+    ranks: Annotated[
+        Group | None,
+        Argument(
+            None,
+            fits=lambda value: isinstance(value, Group),
+            words="a torchpt.ranks.Group",
+            doc="processes that share the work; each gets all of the picture",
+        ),
+    ]
+
+
+class Wishes(Common, total=False):
+    """Arguments of :func:`torchpt.render` beside the scene and ``full``."""
+
+    seed: Annotated[int | None, Whole(0, high=MOST_SEED, doc="the same seed gives the same picture")]
+    params: Annotated[
+        Mapping[str, Tensor] | None,
+        Argument(
+            None,
+            fits=lambda value: isinstance(value, Mapping),
+            words="a mapping from names of scene.params to tensors",
+            doc="tensors in place of the scene's, where a material has a number or colour also texels (H, W, C); where one"
+            " requires gradients, so does the picture",
+        ),
+    ]
+
+
+class Every(Wishes, total=False):
+    """All keyword arguments of :func:`torchpt.render`."""
+
+    full: Annotated[
+        bool,
+        _truth(False, "True: a torchpt.Rendering: picture, layers, error, counts and seconds as one object"),
+    ]
+
+
+_ARGUMENTS = {name: argument.spec for name, argument in declared(Every).items()}
+
+
+class Render(Valued):
+    """Settings of how the work is done; none of them but ``spp`` and ``seed`` changes what the picture converges to."""
+
+    parameters: ClassVar = {
+        **{name: _ARGUMENTS[name] for name in ("spp", "seed")},  # which lists begin with
+        **{name: s for name, s in _ARGUMENTS.items() if name not in BLOCKS and not isinstance(s, Argument)},
+        "preview": Other(
+            None,
+            reader=_file,
+            words=_FILE,
+            doc="albedo and normal beside it first, then the picture so far after each pass",
+            role=Role.FILES | Role.FREE,
+        ),
+    }
+
+    @property
+    def stops(self) -> dict[str, Any]:
+        """The stop rules that are set besides ``spp``, by name."""
+        every = {name: getattr(self, name) for name in having(Role.ENDS)["render"]}
+        return {name: value for name, value in every.items() if value is not None}
+
+    def without(self, role: Role) -> Render:
+        """Return the same with the settings of a role left out."""
+        return Render(**{name: value for name, value in self.values.items() if name not in having(role)["render"]})
+
+    @classmethod
+    def check(cls, values: Mapping[str, Any], given: frozenset[str]) -> None:
+        """See :class:`Valued`."""
+        if values["resume"] and values["checkpoint"] is None:
+            raise Refused("false without render.checkpoint, the file to go on from", True, ("resume",))
+
+
+class Call(Valued):
+    """What a call of :func:`torchpt.render` says beside settings of the scene file."""
+
+    parameters: ClassVar = {name: s for name, s in _ARGUMENTS.items() if isinstance(s, Argument)}
+
+    @classmethod
+    def of(cls, wishes: Mapping[str, Any]) -> Call:
+        """Return what arguments say, checked.
+
+        Raises:
+            SceneError: one that is not accepted.
+        """
+        values: dict[str, Any] = {}
+        for name in [name for name in cls.parameters if name in wishes]:
+            try:
+                values[name] = declared(Every)[name].read(wishes[name])
+            except Refused as error:
+                raise refused(error, name, wishes[name], None) from None
+        return cls(**values)
+
+
+def blocks_of(wishes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings among the arguments of a call by block; the device is none of them: it is the scene's."""
+    own = {name: wishes.get(name) for name in Render.parameters if name in _ARGUMENTS and name != "device"}
+    return {**{name: wishes.get(name) for name in BLOCKS}, "render": own}
+
+
+#: The blocks without types.
+RECORDS: Mapping[str, type[Valued]] = {"film": Film, "render": Render}
+
+
+def having(role: Role, but: Role = Role.NONE) -> dict[str, tuple[str, ...]]:
+    """Return the settings of a role by block, without those that have the role ``but`` too."""
+    return {
+        block: tuple(name for name, s in parameters_of(record).items() if s.role & role and not s.role & but)
+        for block, record in RECORDS.items()
+    }
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All run settings, complete.
+
+    Attributes:
+        film: the picture.
+        integrator: what it estimates.
+        sampler: where sample points come from.
+        render: how the work is done.
+    """
+
+    film: Film
+    integrator: Integrator
+    sampler: Described
+    render: Render
+
+    @property
+    def adaptive(self) -> bool:
+        """Return True where samples go where the error is."""
+        return bool(self.sampler.values.get("adaptive", False))
+
+    @property
+    def pilots(self) -> bool:
+        """Return True where one pixel of a block is sampled twice; ``auto``: where something asks for it."""
+        if not self.integrator.light or self.integrator.splats or "variance" in self.film.aovs:
+            return False
+        asked = self.adaptive or self.render.target_error is not None
+        return asked if self.render.pilots == "auto" else bool(self.render.pilots)
+
+    @property
+    def streams(self) -> int:
+        """Return how many streams share the samples of a pixel: one, unless each pixel is to know its variance."""
+        spp = self.render.spp
+        return min(spp, 4 if spp >= MANY_SAMPLES else 2) if "variance" in self.film.aovs else 1
+
+    @property
+    def light_choice(self) -> str:
+        """Return how a light is chosen; where no light is sampled it does not matter."""
+        return self.integrator.light_choice
+
+    def plain(self, without: Mapping[str, Collection[str]] = MappingProxyType({})) -> dict[str, Any]:
+        """Return them as a scene file would state them, but for the keys ``without``, by block."""
+        told = {name: _plain(getattr(self, name)) for name in BLOCKS}
+        return {
+            block: {k: v for k, v in keys.items() if k not in without.get(block, ())} for block, keys in told.items()
+        }
+
+
+def _plain(value: Any) -> Any:
+    if not isinstance(value, Valued | Described):
+        return value
+    kind = {"type": value.name} if hasattr(value, "name") else {}
+    return kind | {key: _plain(item) for key, item in value.values.items()}
+
+
+def _set(raw: Any, key: str, file: str | None) -> dict[str, Any]:
+    """The keys of a block that are really set (null means unset); a filter's or block's bare name is its type."""
+    if raw is None:
+        return {}
+    if isinstance(raw, str) and key.rpartition(".")[2] in TYPED:
+        return {"type": raw}
+    if not isinstance(raw, Mapping):
+        raise SceneError(key, raw, "a mapping of settings", file)
+    return {str(name): value for name, value in raw.items() if value is not None}
+
+
+def _overlay(what: str, below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """``above`` over ``below``; keys of ``below`` that another type was meant to read do not follow."""
+    table, default = TYPED[what]
+    before, after = below.get("type", default), above.get("type", below.get("type", default))
+    if before != after and isinstance(after, str) and after in table:
+        own = parameters_of(table[after])
+        below = {name: value for name, value in below.items() if name in own}
+    return {**below, **above}
+
+
+def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None) -> Settings:
+    """Complete settings from the blocks of a scene file and explicit overrides, both by block name.
+
+    Raises:
+        SceneError: an unknown block or key, a key that does nothing for the chosen type, a bad value.
+        NotBuiltError: a setting that this version does not build.
+    """
+    own = overrides.get("integrator")
+    if isinstance(own, Integrator):  # one of the caller's own kinds, or of ours, made already
+        return _merge({**scene, "integrator": None}, {**overrides, "integrator": None}, file, own)
+    given = {name: _plain_mappings(blocks) for name, blocks in (("scene", scene), ("overrides", overrides))}
+    return _merged.get(file, given, lambda: _merge(scene, overrides, file))
+
+
+#: Settings by what was said of them: a loop of renders says the same again and again.
+_merged: Memo[Settings] = Memo(256)
+
+
+def _plain_mappings(blocks: Mapping[str, Any]) -> Any:
+    return {name: dict(value) if isinstance(value, Mapping) else value for name, value in blocks.items()}
+
+
+def _merge(
+    scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None, own: Integrator | None = None
+) -> Settings:
+    check_keys(overrides, BLOCKS, "", "the settings", None)
+    blocks: dict[str, Any] = {}
+    for block in BLOCKS:
+        below, above = _set(scene.get(block), block, file), _set(overrides.get(block), block, None)
+        raw = _overlay(block, below, above) if block in TYPED else {**below, **above}
+        if "filter" in raw:
+            inner = [_set(part.get("filter"), "film.filter", name) for part, name in ((below, file), (above, None))]
+            raw["filter"] = _overlay("filter", *inner)
+        try:
+            if block == "render":
+                _open_end(raw, blocks["sampler"])
+            blocks[block] = own if own is not None and block == "integrator" else _block(block, raw)
+        except SceneError as error:
+            blame = None if _given(overrides, error.key) else file
+            raise type(error)(error.key, error.value, error.expected, blame) from None
+    settings = Settings(**blocks)
+    _check_pilots(settings, file)
+    if not settings.integrator.light:
+        if settings.film.denoise:
+            expected = f"false where integrator is {settings.integrator.name} (it carries no light)"
+            raise SceneError("film.denoise", True, expected, None if _given(overrides, "film.denoise") else file)
+        for name in settings.film.aovs:
+            if LAYERS[name].light:
+                expected = f"no {name} where integrator is {settings.integrator.name} (it carries no light)"
+                raise SceneError("film.aovs", list(settings.film.aovs), expected, file)
+    return settings
+
+
+def _check_pilots(settings: Settings, file: str | None) -> None:
+    """Raise where what is asked for takes pilots and there can be none, or where every pixel is sampled twice anyway."""
+    film, render = settings.film, settings.render
+    adaptive, variance = settings.adaptive, "variance" in film.aovs
+    for key, wanted in (("sampler.adaptive", adaptive), ("render.target_error", render.target_error is not None)):
+        if not wanted:
+            continue
+        value = render.target_error if key.startswith("render") else adaptive
+        if render.pilots is False:
+            raise SceneError("render.pilots", False, f"auto or true beside {key}", file)
+        if not settings.integrator.light:
+            expected = f"an integrator that carries light, not {settings.integrator.name}"
+            raise SceneError(key, value, expected, file)
+        if settings.integrator.splats:
+            expected = f"an integrator whose samples light their own pixels alone, not {settings.integrator.name}"
+            raise SceneError(key, value, expected, file)
+        if variance:
+            raise SceneError("film.aovs", list(film.aovs), f"no variance beside {key}", file)
+    if settings.integrator.splats and render.pilots is True:
+        expected = "auto or false where samples light other pixels than their own; film.aovs=[variance] tells the error"
+        raise SceneError("render.pilots", True, expected, file)
+    if variance and render.pilots is True:
+        expected = "auto or false where film.aovs asks for variance: every pixel is sampled by two streams then"
+        raise SceneError("render.pilots", True, expected, file)
+
+
+def _open_end(raw: Mapping[str, Any], sampler: Described) -> None:
+    """Raise where something else than ``spp`` is to end a render whose points depend on their number."""
+    for name in having(Role.ENDS)["render"]:
+        if sampler.kind.needs_count and raw.get(name) is not None:
+            free = ", ".join(kind for kind in SAMPLERS if not SAMPLERS[kind].needs_count)
+            expected = (
+                f"null where sampler is {sampler.name}, whose points depend on how many there are (free of it: {free})"
+            )
+            raise SceneError(dotted("render", name), raw[name], expected)
+
+
+def _given(overrides: Mapping[str, Any], key: str) -> bool:
+    """Return True where the override names the key that is wrong."""
+    value: Any = overrides
+    for part in key.split(".")[:3]:
+        if not isinstance(value, Mapping) or value.get(part) is None:
+            return isinstance(value, str)
+        value = value[part]
+    return True
+
+
+def _block(block: str, raw: dict[str, Any]) -> Any:
+    if block in TYPED:
+        refuse_foreign(block, TYPED[block][0], raw, TYPED[block][1], None)
+        made = _typed(block, raw, block)
+        return made.kind(**made.values) if block == "integrator" else made
+    if block == "film":
+        if "filter" in raw:
+            raw["filter"] = _typed("filter", raw["filter"], "film.filter")
+        return Film(**values_of(Film, raw, block, None, "the film").values)
+    return Render(**values_of(Render, raw, block, None, "the render settings").values)
+
+
+def _typed(what: str, raw: dict[str, Any], key: str) -> Described:
+    """A thing whose type picks its kind."""
+    return described(what, TYPED[what][0], raw, key, None, TYPED[what][1])

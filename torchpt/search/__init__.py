@@ -1,0 +1,83 @@
+"""Search structures: which primitive does a ray hit first, and does it hit anything.
+
+One contract (:class:`~torchpt.search.base.Accel`: start there), three backends:
+
+- ``brute`` (CPU): every ray against every primitive in packets, by kernels of the lane compiler; for a few dozen primitives.
+- ``numba`` (CPU): a wide tree built by the surface area heuristic (``tree_build.py``, ``tree_layout.py``, ``tree_leaf.py``);
+  packets and single rays go through it (``tree_packet.py``, ``tree_single.py``, ``tree.py``).
+- ``torch`` (any device, the reference): a linear BVH built and traversed by tensor operations (``lbvh.py``).
+
+Instances of meshes are a second level above the last two (``instances.py``). Nothing here imports numba until a numba backend
+is built.
+
+May import: ``compiler`` and what lies below it; of physics the geometry.
+"""
+
+from __future__ import annotations
+
+from torchpt.core.errors import SceneError
+from torchpt.physics.shapes.geometry import Geometry
+from torchpt.search.base import Accel, Hits
+
+__all__ = ["BRUTE_LIMIT", "KINDS", "Accel", "Hits", "build"]
+
+#: What ``kind`` accepts.
+KINDS = ("auto", "torch", "numba", "brute")
+#: Up to this many primitives ``auto`` takes the packet search on a CPU (measured crossover, scripts/bench_accel.py).
+BRUTE_LIMIT = 128
+
+
+def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, before: Accel | None = None) -> Accel:
+    """Builds a search structure, or makes it from one of the same primitives in other places.
+
+    Args:
+        geometry: the primitives, on the device where rays will live.
+        kind: ``auto``, ``torch``, ``numba`` or ``brute``.
+        threads: CPU threads of ``numba`` and ``brute``; ``None`` is torch's own number. Results do not depend on it.
+        before: a structure that may be refitted where it is of the kind that is wanted; it stays as it is.
+
+    Returns:
+        The structure. ``auto`` gives ``torch`` on an accelerator; on a CPU ``brute`` for few primitives of like scale and
+        no quadrics, else ``numba``.
+
+    Raises:
+        SceneError: an unknown kind, or one that cannot serve this geometry.
+    """
+    if kind not in KINDS:
+        raise SceneError("render.accel", kind, " | ".join(KINDS))
+    on_cpu = geometry.p0.device.type == "cpu"
+    if geometry.copies is not None and kind == "brute":
+        raise SceneError("render.accel", kind, "numba or torch (this scene has instances)")
+    if kind == "auto":
+        kind = _choose(geometry) if on_cpu else "torch"
+    if before is not None and before.name == kind:
+        refitted = before.refit(geometry, threads)
+        if refitted is not None:
+            return refitted
+    if kind == "torch":
+        from torchpt.search.instances import Instanced
+        from torchpt.search.lbvh import Lbvh
+
+        return Lbvh(geometry) if geometry.copies is None else Instanced(geometry, Lbvh(geometry))
+    if not on_cpu:
+        raise SceneError("render.accel", kind, f"torch (this scene is on {geometry.p0.device.type})")
+    if kind == "brute":
+        from torchpt.search.brute import Brute
+
+        return Brute(geometry, threads)
+    if geometry.copies is not None:
+        from torchpt.search.instances import WideInstanced
+
+        return WideInstanced(geometry, threads)
+    from torchpt.search.tree import Wide
+
+    return Wide(geometry, threads)
+
+
+def _choose(geometry: Geometry) -> str:
+    # Packets know no quadrics: from three on the tree is as fast or faster.
+    if geometry.size > BRUTE_LIMIT or geometry.copies is not None or geometry.counts[4]:
+        return "numba"
+    from torchpt.search.brute import eligible
+
+    return "brute" if eligible(geometry) else "numba"

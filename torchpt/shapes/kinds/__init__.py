@@ -1,1 +1,0 @@
-"""One kind of shape a file, see :mod:`torchpt.shapes`."""

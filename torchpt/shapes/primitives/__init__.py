@@ -1,1 +1,0 @@
-"""One kind of primitive a file, see :mod:`torchpt.shapes.primitive`."""
