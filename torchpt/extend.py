@@ -16,6 +16,7 @@ parameters            :class:`Scalar`, :class:`Color`, ... with :class:`Moves` a
 ====================  =====================================================================================
 """
 
+from torchpt.math.hashing import as_int32, mix, to_unit
 from torchpt.math.sampling import (
     concentric_disk,
     cosine_hemisphere,
@@ -45,24 +46,30 @@ from torchpt.paths.state import (
 from torchpt.paths.surface import shading_normal
 from torchpt.physics.bsdfs.base import Bsdf, Parameters
 from torchpt.physics.bsdfs.records import BsdfSample
+from torchpt.physics.bsdfs.specs import GREY, reflectance
 from torchpt.physics.cameras.base import Camera
 from torchpt.physics.film.filters import Filter, Tabulated
-from torchpt.physics.lights.base import Cone, Light, Row, Setting
+from torchpt.physics.lights.base import Cone, Light, Row, Setting, bright
+from torchpt.physics.lights.kinds.point import Point
 from torchpt.physics.lights.records import Lights, LightSample
 from torchpt.physics.samplers import Dimension, Draws
 from torchpt.physics.samplers.base import Points
+from torchpt.physics.samplers.bits import reverse_bits, scramble
 from torchpt.physics.shapes import interact, offset_origin
-from torchpt.physics.shapes.base import Shape, Surface, placed
+from torchpt.physics.shapes.base import BOTTOM, UPRIGHT, Matrix, Place, Shape, Size, Surface, placed
 from torchpt.physics.shapes.geometry import Hit, Interaction
-from torchpt.physics.shapes.quadrics import Form, Quadric
+from torchpt.physics.shapes.quadrics import Form, Quadric, octahedral
 from torchpt.physics.textures.computed import Computed
 from torchpt.physics.world import World
 from torchpt.spec import Angle, Choice, Color, Flag, Moves, Other, Refused, Scalar, Whole
 
 __all__ = [
+    "BOTTOM",
+    "GREY",
     "LIGHT_CHOICE",
     "SAMPLES",
     "STRATEGY",
+    "UPRIGHT",
     "Angle",
     "Bsdf",
     "BsdfSample",
@@ -90,11 +97,14 @@ __all__ = [
     "LightSample",
     "Lights",
     "Limits",
+    "Matrix",
     "Moves",
     "Other",
     "Parameters",
     "Path",
     "PathState",
+    "Place",
+    "Point",
     "Points",
     "Quadric",
     "Refused",
@@ -104,6 +114,7 @@ __all__ = [
     "Setting",
     "Shadow",
     "Shape",
+    "Size",
     "Splat",
     "StageContext",
     "Surface",
@@ -114,17 +125,25 @@ __all__ = [
     "VertexOutput",
     "Whole",
     "World",
+    "as_int32",
+    "bright",
     "concentric_disk",
     "cosine_hemisphere",
     "dot",
     "interact",
     "luminance",
+    "mix",
     "no_shadow",
     "normalize",
+    "octahedral",
     "offset_origin",
     "placed",
     "power_heuristic",
+    "reflectance",
+    "reverse_bits",
+    "scramble",
     "shading_normal",
+    "to_unit",
     "uniform_hemisphere",
     "uniform_sphere",
 ]

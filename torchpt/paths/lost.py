@@ -1,6 +1,6 @@
 """Samples that are not finite: how many there were, and which the first ones are. They count as black.
 
-Renders only count; what is kept is enough to trace a few of them again (:mod:`torchpt.paths.faults`), since a path is a
+Renders only count; what is kept is enough to trace a few of them again (:mod:`torchpt.paths.explain`), since a path is a
 function of its pixel, sample and stream.
 """
 

@@ -66,7 +66,7 @@ class Rendering:
         rays: rays traced, shadow rays included.
         nonfinite_samples: samples that were NaN or infinite, and counted as black.
         nonfinite_causes: how many of them by cause, such as ``{"infinite light": 3}``; they add up to ``nonfinite_samples``.
-            See :data:`torchpt.paths.faults.CAUSES`. Not known yet of a picture that is still being rendered.
+            See :data:`torchpt.paths.explain.CAUSES`. Not known yet of a picture that is still being rendered.
         nonfinite_first: which sample was the first of them, and what of it stopped being finite; "" where there is none.
         truncated_paths: paths ended by the cap on endless depth.
         clamped: fraction of the light that ``integrator.clamp`` took away; None where it is off.
