@@ -11,6 +11,7 @@ from queue import SimpleQueue
 from typing import Any
 
 import pytest
+import torch
 
 from torchpt.core import threads
 from torchpt.core.errors import RenderError
@@ -241,3 +242,19 @@ def test_a_child_has_a_pool_of_its_own():
     _, status = os.waitpid(child, 0)
     assert os.waitstatus_to_exitcode(status) == 0
     assert dealt(lambda k: k, 5) == list(range(5))
+
+
+def test_torch_uses_no_other_thread_in_those_of_the_pool() -> None:
+    """And threads of the user's own begin with the number of the process, whatever the pool did."""
+    before, found = torch.get_num_threads(), []
+    try:
+        torch.set_num_threads(3)
+        deal(range(4), lambda _: torch.get_num_threads(), 2, lambda number: found.append(number) is not None)
+        assert set(found) - {None} == {1} and torch.get_num_threads() == 3
+        own: list[int] = []
+        thread = threading.Thread(target=lambda: own.append(torch.get_num_threads()))
+        thread.start()
+        thread.join()
+        assert own == [3]
+    finally:
+        torch.set_num_threads(before)

@@ -65,18 +65,28 @@ _FUNCTIONS = "acos asin atan cos erf erfc erfinv exp log log10 log2 sin sqrt tan
 
 
 class _Thread:
-    """A thread of the pool; RuntimeError or MemoryError where there is no memory for it."""
+    """A thread of the pool, in which torch uses no other; RuntimeError or MemoryError where there is no memory for it.
+
+    A team of OpenMP in each would stay for as long as the thread does, and make every other team wait instead of spin.
+    """
 
     def __init__(self) -> None:
-        self.given = SimpleQueue[tuple[Callable[[], object], SimpleQueue[None], int] | None]()
+        self.given = SimpleQueue[tuple[Callable[[], object], SimpleQueue[None]] | None]()
         self.thread = threading.Thread(target=self._run, name=f"torchpt_{next(_numbers)}", daemon=True)
+        self._ready = SimpleQueue[None]()
+        count = torch.get_num_threads()
         self.thread.start()
+        self._ready.get()
+        torch.set_num_threads(count)  # what threads that are yet to come begin with is the process's
 
     def _run(self) -> None:
+        try:
+            torch.get_num_threads()  # a thread takes the process's number when it first asks for it
+            torch.set_num_threads(1)
+        finally:
+            self._ready.put(None)
         while (given := self.given.get()) is not None:
-            work, ended, threads = given
-            if torch.get_num_threads() != threads:  # torch's number is a thread's own; as that of whoever has the work
-                torch.set_num_threads(threads)
+            work, ended = given
             work()
             del given, work  # what it held is free
             _idle.append(self)
@@ -97,7 +107,7 @@ def _assigned(work: Callable[[], object], ended: SimpleQueue[None]) -> bool:
             thread = _Thread()
         except (RuntimeError, MemoryError):
             return False
-    thread.given.put((work, ended, torch.get_num_threads()))
+    thread.given.put((work, ended))
     return True
 
 
