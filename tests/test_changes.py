@@ -1,0 +1,85 @@
+"""What one more of a kind takes: the files named, and no other.
+
+Held elsewhere: one more BSDF, light, shape, camera, sampler, filter, texture, integrator and layer is a file
+(``test_extending.py``); a stop rule is its declaration and its use (``render/test_arguments.py``); fields, fogs and splats are an
+integrator's (``paths/test_own_integrators.py``, ``paths/test_splats.py``); a form of kernels is a ``Form``
+(``render/test_forms.py``).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import torchpt
+from torchpt.extend import Bsdf, BsdfSample, Color, cosine_hemisphere
+from torchpt.scene import meshes
+
+
+def scene_of(shape: dict[str, Any], material: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "camera": {"origin": [0, 0, 3], "target": [0, 0, 0], "fov": 40},
+        "materials": {"own": material},
+        "shapes": {"thing": {**shape, "material": "own"}},
+        "lights": {"sky": {"type": "constant", "radiance": 1.0}},
+    }
+
+
+def test_a_mesh_format_is_a_file_and_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Words of a text file as corners of a triangle."""
+    module = ModuleType("torchpt.scene.meshes.toy")
+
+    def load_toy(path: Path, data: bytes, materials: bool) -> list[meshes.MeshPart]:
+        corners = np.array(data.decode().split(), np.float64).reshape(-1, 3)
+        return [meshes.MeshPart("", corners, np.arange(len(corners)).reshape(-1, 3), None, None, None)]
+
+    vars(module)["load_toy"] = load_toy
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(meshes.FORMATS, ".toy", "toy")
+    file = tmp_path / "one.toy"
+    file.write_text("-1 -1 0  1 -1 0  0 1 0")
+    scene = torchpt.load(scene_of({"type": "mesh", "path": str(file)}, {"type": "diffuse"}), "cpu")
+    assert scene.params["shapes.thing.vertices"].shape == (3, 3)
+    image = torchpt.render(scene, spp=4, film={"width": 16, "height": 16}, compile="off")
+    assert 0.45 < float(image[8, 8, 0]) < 0.55  # the triangle's own reflectance, under a sky of 1
+
+
+class Matte(Bsdf):
+    """Diffuse, with a tint whose gradient nobody else knows of."""
+
+    name = "matte"
+    parameters: ClassVar = {"tint": Color((0.5, 0.5, 0.5), doc="reflectance")}
+
+    def eval_pdf(self, parameters: Mapping[str, Tensor], wo: Tensor, wi: Tensor) -> tuple[Tensor, Tensor]:
+        pdf = wi[2].clamp_min(0.0) / torch.pi
+        return parameters["tint"] * pdf, pdf
+
+    def sample(self, parameters: Mapping[str, Tensor], wo: Tensor, lobe: Tensor | None, u: Tensor) -> BsdfSample:
+        wi = cosine_hemisphere(u)
+        return BsdfSample(wi, wi[2] / torch.pi, parameters["tint"].expand_as(wi))
+
+    def albedo(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        return parameters["tint"]
+
+
+def test_a_parameter_with_a_gradient_is_its_declaration() -> None:
+    scene = torchpt.load(
+        scene_of({"type": "rectangle"}, {"type": "matte", "tint": [0.2, 0.4, 0.6]}), "cpu", bsdfs={"matte": Matte()}
+    )
+    tint = scene.params["materials.own.tint"].clone().requires_grad_()
+    wishes: dict[str, Any] = {
+        "spp": 4,
+        "film": {"width": 8, "height": 8},
+        "integrator": {"type": "path", "strategy": "bsdf"},
+    }
+    image = torchpt.render(scene, params={"materials.own.tint": tint}, **wishes)
+    (gradient,) = torch.autograd.grad(image[3:5, 3:5].mean((0, 1)).sum(), tint)
+    torch.testing.assert_close(gradient, torch.ones(3), rtol=1e-3, atol=0)  # under a sky of 1 radiance is the tint
