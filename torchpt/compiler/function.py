@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.compiler import cache
+from torchpt.compiler import cache, operators  # noqa: F401  (the operators register how they are lowered)
 from torchpt.compiler.cpu import Target
 from torchpt.compiler.graph import DTYPES, Unsupported
 from torchpt.compiler.kernel import HEAD

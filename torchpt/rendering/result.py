@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from torchpt.scene.settings import Film
 
-    pass  # MOVED
 
 __all__ = [
     "Progress",
@@ -170,7 +169,6 @@ class Rendering:
             SceneError: ``path`` is none.
             OutputError: an ending that is not written, or a place that cannot be written.
         """
-        pass  # MOVED
         from torchpt.scene.settings import Film
 
         film = Film() if self.settings is None else self.settings.film
@@ -216,7 +214,6 @@ class Rendering:
         }
 
     def __repr__(self) -> str:
-        pass  # MOVED
 
         facts = table_of(self)
         size = facts.pop("size")
@@ -224,14 +221,10 @@ class Rendering:
 
     def _repr_png_(self) -> bytes:
         """The picture in a notebook."""
-        pass  # MOVED
-
         return png_of(self.image, None if self.settings is None else self.settings.film)
 
     def _repr_html_(self) -> str:
         """The picture and what is known of it, in a notebook."""
-        pass  # MOVED
-
         return html_of(self)
 
     def summary(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ it ask of the ray that left, and leaves what it asks of the ray that came.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,9 +27,6 @@ from torchpt.paths.adjoint import Before, Behind
 from torchpt.paths.state import EXTRA, PathState, Shadow, Splat, VertexInput
 from torchpt.paths.wave import Wave, still_of
 from torchpt.physics.shapes.geometry import Hit
-
-if TYPE_CHECKING:
-    pass  # MOVED
 
 __all__ = ["SLOTS", "JointKernels", "back_bounce", "back_emit", "back_escape", "report", "slots_of", "slots_read"]
 

@@ -279,8 +279,7 @@ def _path_fields(layout: Layout) -> Fields:
 
 # ---- A stage on its way to become a kernel: what it reads of the arena, and how its results go back
 #
-# The functions of :mod:`~torchpt.engines.kernels.stages`, :mod:`~torchpt.engines.kernels.stages`,
-# :mod:`~torchpt.engines.kernels.stages` and :mod:`~torchpt.engines.kernels.stages` take a :class:`Trace` and return sinks.
+# The functions of :mod:`~torchpt.engines.kernels.stages` take a :class:`Trace` and return sinks.
 
 
 class Trace:

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchpt.compiler import cache
+from torchpt.compiler import cache, operators  # noqa: F401  (the operators register how they are lowered)
 from torchpt.compiler.graph import Unsupported
 from torchpt.compiler.program import Program, Tables, TracedStage, bound
 from torchpt.compiler.prologue import Name, pruned
@@ -25,7 +25,6 @@ from torchpt.compiler.sinks import Sinks
 from torchpt.compiler.tracing import Tracer, lanes_for
 from torchpt.core.tree import fingerprint, named_leaves, signature
 from torchpt.engines.kernels import stages
-from torchpt.engines.kernels import stages as packet_kernels
 from torchpt.engines.kernels.layout import Layout, Trace
 from torchpt.engines.kernels.stages import kinds_of
 from torchpt.paths.transmission import non_opaque
@@ -33,7 +32,6 @@ from torchpt.paths.transmission import non_opaque
 if TYPE_CHECKING:
     from torchpt.paths.wave import Wave
 
-    pass  # MOVED
 
 __all__ = ["Handed", "Kernel", "Kernels", "Leaves", "State", "program_of"]
 
@@ -240,7 +238,7 @@ class Kernels(Layout):
         self._results = self.handed.results(self._leaves)
         self._made: dict[tuple[Any, ...], Kernel] = {}
         self._lock = threading.Lock()
-        self.search = packet_kernels.search_words(wave) if packets else None
+        self.search = stages.search_words(wave) if packets else None
         self.non_opaque: np.ndarray | None = None
         if self.has_opacity and not packets:
             prims = torch.arange(sum(self.world.geometry.counts))
@@ -293,11 +291,11 @@ class Kernels(Layout):
 
     def find(self, passed: bool) -> Kernel:
         """See :func:`torchpt.engines.kernels.stages.find`."""
-        return self._get(False, packet_kernels.find, passed)
+        return self._get(False, stages.find, passed)
 
     def block(self) -> Kernel:
         """See :func:`torchpt.engines.kernels.stages.block`."""
-        return self._get(False, packet_kernels.block)
+        return self._get(False, stages.block)
 
     # -- surfaces that are not opaque
 
