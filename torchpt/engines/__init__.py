@@ -6,7 +6,7 @@ whose ``Engine`` is the interface, and give the same pictures but for rounding. 
 that run otherwise where an engine does (:mod:`torchpt.core.dispatch`).
 
 May import: ``paths``, ``search``, ``compiler``, ``physics`` and below; none of these imports an engine. Start with
-    ``tensors.py``.
+``tensors.py``.
 """
 
 from torchpt.engines import taken_over  # noqa: F401  (registers)
