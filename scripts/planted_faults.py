@@ -333,7 +333,7 @@ class Campaign:
         """
         own, *others = fault.tests.split()
         *_, stem = module = file.with_suffix("").parts
-        dotted, room = ".".join(module), ".".join(module[:2])
+        dotted, room = ".".join(module), ".".join(module[: 3 if "physics" in module else 2])
 
         def order(test: Path) -> tuple[int, str]:
             return 0 if stem in test.stem else 1 if dotted in self.tests[test] else 2, test.as_posix()
