@@ -21,12 +21,12 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and
 #: Two kernels; the numbers that they give, how many were compiled and how many loaded.
 _SCRIPT = """
 import torch
-from torchpt.compiler import engine
+from torchpt.compiler import cpu
 from torchpt.compiler.function import lanewise
 x = torch.arange(4.0)
 found = [lanewise(lambda x: [x * 2 + 1], [x])(x)[0].tolist(), lanewise(lambda x: [x.exp() > 3], [x])(x)[0].tolist()]
 assert found == [[1, 3, 5, 7], [False, False, True, True]], found
-print(*engine.counts())
+print(*cpu.counts())
 """
 
 

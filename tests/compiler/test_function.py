@@ -166,19 +166,19 @@ def test_a_trace_of_classes_that_are_not_the_packages_is_not_kept():
 
 SCRIPT = """
 import torch
-from torchpt.compiler import engine, programs
+from torchpt.compiler import cache, cpu
 from torchpt.compiler.function import Lanewise
 from torchpt.math.hashing import mix
-traced, kept = [0], programs.compiled
+traced, kept = [0], cache.compiled
 def counting(*args):
     traced[0] += 1
     return kept(*args)
-programs.compiled = counting
+cache.compiled = counting
 x = torch.arange(1000, dtype=torch.int32)
 assert torch.equal(Lanewise(mix, ("x",))(x), mix(x))
 own = Lanewise(lambda x: x + 1, ("x",))
 assert torch.equal(own(x), x + 1)
-print(*engine.counts(), *traced)
+print(*cpu.counts(), *traced)
 """
 
 

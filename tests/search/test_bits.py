@@ -102,8 +102,8 @@ accel = Wide(g, 1)
 for kind in KINDS:
     for sort in (False, True):
         check(g, accel, kind, 20_000, 5, sort)
-from torchpt.search import kernels_search
-code = next(iter(kernels_search.nearest.inspect_asm().values()))
+from torchpt.search import tree_packet
+code = next(iter(tree_packet.nearest.inspect_asm().values()))
 print(*(name in code for name in ("zmm", "ymm", "xmm")))
 """
 

@@ -21,10 +21,10 @@ from torchpt.search import build
 from torchpt.search import tree as topology
 from torchpt.search import tree as wide
 from torchpt.search.bounds import primitive_bounds
-from torchpt.search.instances import WideInstanced
 from torchpt.search.tables import prepare
 from torchpt.search.tree import REBUILD, Wide
 from torchpt.search.tree_build import mesh_tree
+from torchpt.search.tree_instances import WideInstanced
 from torchpt.search.tree_layout import CHILDREN, FLOOR, IDS, LINE, PLANES
 
 EMPTY = np.array([np.inf] * 3 + [-np.inf] * 3, np.float32)

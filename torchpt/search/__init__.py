@@ -7,8 +7,8 @@ One contract (:class:`~torchpt.search.base.Accel`: start there), three backends:
   packets and single rays go through it (``tree_packet.py``, ``tree_single.py``, ``tree.py``).
 - ``torch`` (any device, the reference): a linear BVH built and traversed by tensor operations (``lbvh.py``).
 
-Instances of meshes are a second level above the last two (``instances.py``). Nothing here imports numba until a numba backend
-is built.
+Instances of meshes are a second level above the last two (``instances.py``, ``tree_instances.py``). Nothing here imports numba
+until a numba backend is built.
 
 May import: ``compiler`` and what lies below it; of physics the geometry.
 """
@@ -66,7 +66,7 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
 
         return Brute(geometry, threads)
     if geometry.copies is not None:
-        from torchpt.search.instances import WideInstanced
+        from torchpt.search.tree_instances import WideInstanced
 
         return WideInstanced(geometry, threads)
     from torchpt.search.tree import Wide
