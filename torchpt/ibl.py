@@ -3,22 +3,11 @@
 ``torchpt.ibl.maps(sky)`` makes them, ``torchpt.ibl.shade(maps, n, v, base_color, roughness, metallic)`` looks them up.
 """
 
-from torchpt.physics.ibl import (
-    IblMaps,
-    Sky,
-    SplitSumMaterial,
-    brdf_table,
-    cube_to_equirect,
-    equirect_to_cube,
-    fresnel,
-    hammersley,
-    irradiance_map,
-    maps,
-    prefiltered,
-    roughnesses,
-    shade,
-    van_der_corput,
-)
+from torchpt.physics.ibl.convolve import irradiance_map, prefiltered, roughnesses
+from torchpt.physics.ibl.cube import cube_to_equirect, equirect_to_cube
+from torchpt.physics.ibl.points import hammersley, van_der_corput
+from torchpt.physics.ibl.shading import IblMaps, Sky, SplitSumMaterial, fresnel, maps, shade
+from torchpt.physics.ibl.table import brdf_table
 
 __all__ = [
     "IblMaps",

@@ -12,10 +12,10 @@ from few import few
 from torch import Tensor
 
 import torchpt
+from torchpt.ibl import IblMaps, Sky, brdf_table
 from torchpt.math.sampling import Discrete
 from torchpt.paths.integrators.split_sum import under
 from torchpt.physics import bsdfs
-from torchpt.physics.ibl import IblMaps, Sky, brdf_table
 from torchpt.physics.lights import without_environment
 
 IBL = {"type": "ibl"}

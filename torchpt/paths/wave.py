@@ -35,7 +35,7 @@ class Tally:
 
     Attributes:
         rays: that were searched for, those of shadows too.
-        truncated: paths that were still alive at :data:`torchpt.paths.integrators.path.ENDLESS`.
+        truncated: paths that were still alive at :data:`torchpt.paths.integrators.base.ENDLESS`.
     """
 
     rays: int = 0

@@ -204,7 +204,7 @@ def _corner(tree, at, axes, p, s):
 
 @part(forceinline=True)
 def _rectangles(tree, at, axes, o, d, p, s):
-    """Eight rectangles: which are met, ``t``, u and v; the operations of :func:`torchpt.search.leaf.rectangle_hits`."""
+    """Eight rectangles: which are met, ``t``, u and v; the operations of :func:`torchpt.search.leaf.distances`."""
     zero = splat(_ZERO, 8)
     n0, n1 = load(tree, at + RULED, 8), load(tree, at + RULED + 8, 8)
     n2, n3 = load(tree, at + RULED + 16, 8), load(tree, at + RULED + 24, 8)

@@ -9,7 +9,7 @@ from torchpt.math.microfacet import fresnel_dielectric, refract
 from torchpt.math.vectors import dot
 from torchpt.physics.bsdfs import Bsdf, Parameters
 from torchpt.physics.bsdfs.records import SplitSumMaterial
-from torchpt.physics.ibl import Sky, fresnel
+from torchpt.physics.ibl.shading import Sky, fresnel
 
 __all__ = ["under"]
 

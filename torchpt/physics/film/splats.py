@@ -86,20 +86,22 @@ class SplatSums:
 
     def join(self, sums: Tensor) -> None:
         """Add the sums of another one, see :meth:`state`."""
-        self._sums += sums
-        self._carry()
+        with self._lock:
+            self._sums += sums
+            self._carry()
 
     def state(self) -> Tensor:
         """Return the sums ``(3, 3, streams * pixels)`` int64, in the one form in which carries are taken."""
-        self._carry()
+        with self._lock:
+            self._carry()
         return self._sums
 
-    def values(self) -> Tensor:
-        """Return the sums ``(streams, 3, pixels)`` float64."""
-        self._carry()
-        high, middle, low = (part.double() for part in self._sums)
-        total = high + (middle + low * 2.0**-BITS) * 2.0**-BITS
-        return total.view(3, self._streams, self._pixels).transpose(0, 1)
+    def values(self, stream: int) -> Tensor:
+        """Return the sums of a stream ``(3, pixels)`` float64."""
+        with self._lock:  # a picture that is looked at on the way: others may be adding
+            self._carry()
+            high, middle, low = (part.double() for part in self._sums.view(3, 3, -1, self._pixels)[:, :, stream])
+        return high + (middle + low * 2.0**-BITS) * 2.0**-BITS
 
     def _count(self, splats: int) -> None:
         self._added += splats

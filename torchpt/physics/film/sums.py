@@ -125,14 +125,15 @@ class Film:
         """Return means of the pixels ``(C, pixels)``."""
         mean = self._sums.sum(0) / self._counts.sum(0).clamp_min(1)
         if self.splats is not None:
-            mean += self.splats.values().sum(0) / _samples(self._counts.sum(0))
+            total = sum(self.splats.values(k) for k in range(self.randomizations))
+            mean += total / _samples(self._counts.sum(0))
         return mean
 
     def _stream(self, k: int) -> Tensor:
         """Return means of the pixels by one stream ``(C, pixels)``."""
         mean = self._sums[k] / self._counts[k].clamp_min(1)
         if self.splats is not None:
-            mean += self.splats.values()[k] / _samples(self._counts[k])
+            mean += self.splats.values(k) / _samples(self._counts[k])
         return mean
 
     def values(self) -> Tensor:

@@ -1,27 +1,5 @@
 """Image-based lighting by split sum: maps of a sky as tensors, differentiable in the sky, and shading with them.
 
-``torchpt.ibl.maps(sky)`` makes them, ``torchpt.ibl.shade(maps, n, v, base_color, roughness, metallic)`` looks them up.
+``convolve.py`` and ``pyramid.py`` make the maps, ``table.py`` the BRDF's, ``shading.py`` looks them up: start there. What users
+import is :mod:`torchpt.ibl`.
 """
-
-from torchpt.physics.ibl.convolve import irradiance_map, prefiltered, roughnesses
-from torchpt.physics.ibl.cube import cube_to_equirect, equirect_to_cube
-from torchpt.physics.ibl.points import hammersley, van_der_corput
-from torchpt.physics.ibl.shading import IblMaps, Sky, SplitSumMaterial, fresnel, maps, shade
-from torchpt.physics.ibl.table import brdf_table
-
-__all__ = [
-    "IblMaps",
-    "Sky",
-    "SplitSumMaterial",
-    "brdf_table",
-    "cube_to_equirect",
-    "equirect_to_cube",
-    "fresnel",
-    "hammersley",
-    "irradiance_map",
-    "maps",
-    "prefiltered",
-    "roughnesses",
-    "shade",
-    "van_der_corput",
-]

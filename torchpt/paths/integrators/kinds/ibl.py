@@ -19,7 +19,8 @@ from torchpt.paths.integrators.first_surface import FirstSurface, FirstSurfaceIn
 from torchpt.paths.integrators.split_sum import under
 from torchpt.paths.state import StageContext, VertexInput, VertexOutput
 from torchpt.physics import lights
-from torchpt.physics.ibl import IblMaps, Sky, brdf_table, maps
+from torchpt.physics.ibl.shading import IblMaps, Sky, maps
+from torchpt.physics.ibl.table import brdf_table
 from torchpt.physics.shapes import interact
 from torchpt.physics.world import World
 
