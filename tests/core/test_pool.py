@@ -258,3 +258,26 @@ def test_torch_uses_no_other_thread_in_those_of_the_pool() -> None:
         assert own == [3]
     finally:
         torch.set_num_threads(before)
+
+
+def test_an_error_of_a_task_that_was_on_its_way_is_not_lost() -> None:
+    """Whoever asks for an end while a task fails is told of the failure, after what the others came to."""
+    begun, go, seen = threading.Event(), threading.Event(), list[int]()
+
+    def task(number: int) -> int:
+        if number == 1:
+            begun.set()
+            go.wait(10)
+            raise ValueError("half of a sum")
+        begun.wait(10)
+        return number
+
+    def each(number: int | None) -> bool:
+        if number is not None:
+            seen.append(number)
+            go.set()
+        return number == 0
+
+    with pytest.raises(ValueError, match="half of a sum"):
+        deal([0, 1], task, 2, each)
+    assert seen == [0]

@@ -74,10 +74,11 @@ class _Thread:
         self.given = SimpleQueue[tuple[Callable[[], object], SimpleQueue[None]] | None]()
         self.thread = threading.Thread(target=self._run, name=f"torchpt_{next(_numbers)}", daemon=True)
         self._ready = SimpleQueue[None]()
-        count = torch.get_num_threads()
-        self.thread.start()
-        self._ready.get()
-        torch.set_num_threads(count)  # what threads that are yet to come begin with is the process's
+        with _starting:
+            count = torch.get_num_threads()
+            self.thread.start()
+            self._ready.get()
+            torch.set_num_threads(count)  # what threads that are yet to come begin with is the process's
 
     def _run(self) -> None:
         try:
@@ -94,6 +95,8 @@ class _Thread:
 
 
 _numbers = itertools.count()
+#: Threads are started one by one: each changes the process's number for a moment.
+_starting = threading.Lock()
 #: Threads that wait for work.
 _idle: list[_Thread] = []
 
@@ -124,8 +127,9 @@ def _before_fork() -> None:
 
 def _after_fork() -> None:
     """A child has none of its parent's threads, torch's included: waiting for those would never end."""
-    global _wish
+    global _wish, _starting
     _idle.clear()
+    _starting = threading.Lock()
     _wish = _Wish(forked=True)
 
 
@@ -237,7 +241,12 @@ def deal(
             result = found.pop(told)
             told += 1
             if isinstance(result, BaseException):
-                raise result
+                try:
+                    raise result
+                finally:
+                    del (
+                        result
+                    )  # or the error would hold this frame, and this frame the error with all that the task held
             if each(result):
                 halt.set()
         return told > first
@@ -264,10 +273,13 @@ def deal(
         crew.close()
     while (came := crew.next(wait=False)) is not None:  # of tasks that were on their way
         found[came[0]] = came[1]
-    for number in sorted(found):
-        result = found[number]
+    late = [found[number] for number in sorted(found)]
+    for result in late:
         if not isinstance(result, BaseException):
             each(result)
+    for result in late:
+        if isinstance(result, BaseException):
+            raise result
 
 
 def share(work: Callable[[int, int], object], items: int, threads: int) -> None:

@@ -101,21 +101,28 @@ class Tensors:
         lanes: how many camera rays the paths are of.
         tally: counts rays and paths that are cut short.
         keeps: whether populations keep what stages returned, for an observer.
+        splats: gets what the paths bring to other pixels; None: nobody asks.
 
     Attributes:
         radiance: ``(3, lanes)`` what ended paths brought.
-        splats: what they brought to other pixels.
-        lost: lanes with splats that are not finite.
+        lost: ``(lanes,)`` bool: those with splats that are not finite; None: the integrator has no splats.
     """
 
-    def __init__(self, wave: Wave, lanes: int, tally: Tally | None = None, keeps: bool = False) -> None:
+    def __init__(
+        self,
+        wave: Wave,
+        lanes: int,
+        tally: Tally | None = None,
+        keeps: bool = False,
+        splats: list[Splats] | None = None,
+    ) -> None:
         self.keeps = keeps
         self.wave, self.context, self.tally = wave, wave.context, Tally() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
         self.passing = self.world.materials.opacity is not None or wave.integrator.own_transmit
         self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=wave.centre.device)
-        self.splats: list[Splats] = []
-        self.lost: list[Tensor] = []
+        self.splats = splats
+        self.lost = torch.zeros_like(self.radiance[0], dtype=torch.bool) if wave.integrator.splats else None
 
     def spawn(self, state: PathState) -> Paths:
         """Start paths with rays."""
@@ -262,19 +269,19 @@ class Tensors:
             self._splat(lane, splat, paths.splat_clear[-1])
 
     def _splat(self, lane: Tensor, splat: Splat, clear: Tensor) -> None:
-        """Note the light of splats that gets through; a sample with one that is not finite is lost."""
+        """Note the light of splats that gets through; one that is not finite is left out, and its sample's own light too."""
         value = splat.light.radiance * clear
         finite = (value.detach().abs() < LARGEST).all(0)
         comes = (splat.pixel >= 0) & (clear.detach() != 0)
-        on = (comes & finite).nonzero().squeeze(1)
-        self.splats.append(Splats(take(lane, on), take(splat.pixel, on), take(value, on)))
-        self.lost.append(take(lane, (comes & ~finite).nonzero().squeeze(1)))
+        assert self.lost is not None
+        self.lost = self.lost.index_copy(0, lane, take(self.lost, lane) | (comes & ~finite))
+        if self.splats is not None:
+            on = (comes & finite).nonzero().squeeze(1)
+            self.splats.append(Splats(take(lane, on), take(splat.pixel, on), take(value, on)))
 
     def brought(self) -> Tensor:
         """Return the radiance ``(3, lanes)`` of all paths, which ended; NaN where a splat of theirs is not finite."""
-        for lane in self.lost:
-            self.radiance = self.radiance.index_fill(1, lane, math.nan)
-        return self.radiance
+        return self.radiance if self.lost is None else torch.where(self.lost, math.nan, self.radiance)
 
     def clear(self, shadow: Shadow) -> Tensor:
         """Return how much of the light gets through ``(n,)``: 0 or 1 where all surfaces are opaque.
@@ -337,11 +344,9 @@ def trace(
         observer: looks on, and finds what stages returned in populations.
         splats: gets what they bring to other pixels; None: nobody asks.
     """
-    engine = Tensors(wave, len(state.lane), tally, observer is not None)
+    engine = Tensors(wave, len(state.lane), tally, observer is not None, splats)
     if len(state.lane):
         walk(engine, engine.spawn(state), wave.integrator.limits, observer)
-    if splats is not None:
-        splats += engine.splats
     return engine.brought()
 
 

@@ -119,7 +119,8 @@ class _Chunk:
 
     def run(self, pixels: Tensor) -> None:
         """Add what a loss asks, by pixels of the picture ``(3, H W)``, to the sums."""
-        self.picture = pixels
+        if self.wave.integrator.splats:
+            self.cotangent = pixels.to(self.plan.dtype) / self.settings.render.spp
         pixels = pixels[:, self.span[0] : self.span[0] + self.span[1]]
         with torch.no_grad():
             start = self.wave.rays(*self.span)
@@ -228,8 +229,7 @@ class _Chunk:
         def landed(splat: Splat) -> tuple[Tensor, Tensor]:
             kept = next(splat_clear)
             through = self.engine.clear(splat.light) if self.passing else take(kept, turn)
-            cotangent = self.picture.to(through.dtype) / self.settings.render.spp
-            return adjoint.splatted(self.settings.integrator.clamp, cotangent, splat, through)
+            return adjoint.splatted(self.settings.integrator.clamp, self.cotangent, splat, through)
 
         limits = self.wave.integrator.limits
         with gathered_by(self.sums):

@@ -85,6 +85,8 @@ class Sweep(Worker):
         settings: of the backward pass.
     """
 
+    keeps_splats = False  # it goes back along their vertices
+
     def __init__(self, kernels: JointKernels, assembly: Assembly, settings: Settings) -> None:
         super().__init__(kernels)
         self.joint, self.assembly, self.settings = kernels, assembly, settings

@@ -92,8 +92,7 @@ def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> N
         values = torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0)
         if not wave.integrator.splats:
             return values, share
-        other, clamp = [one.value for one in splats], settings.integrator.clamp
-        other = [value if clamp is None else value * clamp_scale(value, clamp) for value in other]
+        other = [counted(settings, one.value) for one in splats]
         pixels = torch.cat([values.new_zeros(0, dtype=torch.int64), *(one.pixel for one in splats)])
         wanted = take(asked, pixels).to(share.dtype) / settings.render.spp
         return torch.cat((values.flatten(1), *other), 1), torch.cat((share.flatten(1), wanted), 1)

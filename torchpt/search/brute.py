@@ -116,7 +116,9 @@ class Brute(Accel):
             call(ctypes.addressof(block), end - start)
 
         most = max(count * sum(self.counts) // _GRAIN, 1)
-        share(part, -(-count // _BLOCK), min(thread_count(self.threads), most))
+        # In threads of the pool torch has but one: loops that search there share the work already.
+        threads = min(thread_count(self.threads), torch.get_num_threads(), most)
+        share(part, -(-count // _BLOCK), threads)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; there are no nodes, and the cost is one test a primitive."""

@@ -14,7 +14,7 @@ import ctypes
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -361,8 +361,10 @@ class Worker:
         slots: radiance of the chunk's samples.
         shown: layers of the chunk's samples, once they were asked for.
         tally: rays and paths of the chunk.
-        splats: what its samples bring to other pixels.
+        splats: what its samples bring to other pixels, where it ``keeps_splats``.
     """
+
+    keeps_splats: ClassVar[bool] = True
 
     def __init__(self, kernels: Kernels, halt: threading.Event | None = None) -> None:
         self.kernels, self.wave = kernels, kernels.wave
@@ -409,6 +411,7 @@ class Worker:
         """Make samples NaN, all of whose paths ended, where a splat of theirs is not finite."""
         for lanes in self._lost:
             self.slots.floats[:3, lanes] = np.nan
+        self._lost.clear()
 
     def layers(self, chunk: Chunk, names: tuple[str, ...]) -> int:
         """Fill ``shown`` with layers of the first surfaces, channel after channel; return how many rays it took."""
@@ -567,7 +570,7 @@ class Worker:
             self.search.light(paths.arena, paths.count)
 
     def _splat(self, paths: Paths) -> None:
-        """Note the light of splats that gets through; a sample with one that is not finite is lost."""
+        """Note the light of splats that gets through; one that is not finite is left out, and its sample's own light too."""
         rows, floats, words, n = self.kernels.state, paths.arena.floats, paths.arena.words, paths.count
         splat, shadow = (slice(rows.first(f"{name}_o"), rows.first(f"{name}_radiance")) for name in ("splat", "shadow"))
         own = words[shadow, :n].copy()  # the search reads rays in the rows of shadow rays
@@ -580,8 +583,9 @@ class Worker:
         value = floats[first : first + 3, :n] * floats[rows.first("splat_clear"), :n]
         comes, finite = (pixel >= 0) & (clear != 0), (np.abs(value) < LARGEST).all(0)
         lane, on = words[rows.first("lane"), :n].astype(np.int64), comes & finite
-        parts = lane[on], pixel[on].astype(np.int64), value[:, on]
-        self.splats.append(Splats(*(torch.from_numpy(part) for part in parts)))
+        if self.keeps_splats:
+            parts = lane[on], pixel[on].astype(np.int64), value[:, on]
+            self.splats.append(Splats(*(torch.from_numpy(part) for part in parts)))
         lost = comes & ~finite
         if lost.any():
             self._lost.append(lane[lost])

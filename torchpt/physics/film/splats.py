@@ -65,12 +65,12 @@ class SplatSums:
         """
         # By numpy: torch would start a team of threads for each thread that renders.
         place, sums = stream.numpy() * self._pixels + pixel.numpy(), self._sums.numpy()
-        parts = list(_parts(value.numpy().astype(np.float64), np.trunc))
+        parts = [part.astype(np.int64) for part in _parts(value.numpy().astype(np.float64), np.trunc)]
         with self._lock:
-            for total, part in zip(sums, parts, strict=True):
-                for row, values in zip(total, part.astype(np.int64), strict=True):
-                    np.add.at(row, place, values)
             self._count(len(place))
+            for total, part in zip(sums, parts, strict=True):
+                for row, values in zip(total, part, strict=True):
+                    np.add.at(row, place, values)
 
     def after(self, stream: Tensor, pixel: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what :meth:`add` would change, on any device: sums, places ``(n,)`` in their last axis, and values there.
@@ -78,16 +78,18 @@ class SplatSums:
         Writing these twice does no harm; see :meth:`torchpt.physics.film.Film.after`.
         """
         place, where = torch.unique(stream * self._pixels + pixel, return_inverse=True)
-        total = self._sums[..., place]
+        with self._lock:
+            self._count(len(pixel))
+            total = self._sums[..., place]
         for own, part in zip(total, _parts(value.double(), torch.trunc), strict=True):
             own.index_add_(1, where, part.to(torch.int64))
-        self._count(len(pixel))
         return self._sums, place, total
 
     def join(self, sums: Tensor) -> None:
         """Add the sums of another one, see :meth:`state`."""
         with self._lock:
             self._sums += sums
+            self._added += 1
             self._carry()
 
     def state(self) -> Tensor:
@@ -104,11 +106,14 @@ class SplatSums:
         return high + (middle + low * 2.0**-BITS) * 2.0**-BITS
 
     def _count(self, splats: int) -> None:
-        self._added += splats
-        if self._added > CARRY:
+        """Make room for so many splats."""
+        if self._added + splats > CARRY:
             self._carry()
+        self._added += splats
 
     def _carry(self) -> None:
+        if not self._added:
+            return
         high, middle, low = self._sums
         middle += low >> BITS
         low &= (1 << BITS) - 1
