@@ -20,7 +20,7 @@ from typing import Any
 
 import bounds
 
-from torchpt.scene.settings import Every
+from torchpt.scene.settings import RenderWishes
 from torchpt.spec import REQUIRED, Color, Index, Scalar, Spec, parameters_of
 from torchpt.spec.arguments import declared
 
@@ -142,7 +142,7 @@ def written(name: str) -> str:
     if name == "bounds":
         return bounds.table()
     if name == "arguments":
-        return arguments(Every)
+        return arguments(RenderWishes)
     if first == "summary":
         return summary(kinds(second))
     if first == "common":

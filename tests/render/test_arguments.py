@@ -17,7 +17,7 @@ import torch
 import torchpt
 from torchpt.cli.arguments import GROUPS, path_keys
 from torchpt.core.errors import SceneError
-from torchpt.scene.settings import BLOCKS, RECORDS, Common, Every, Render, Traced, Wishes
+from torchpt.scene.settings import BLOCKS, RECORDS, Common, Render, RenderWishes, TraceWishes, Wishes
 from torchpt.spec import Role, parameters_of
 from torchpt.spec.arguments import declared, spelled
 
@@ -39,7 +39,7 @@ def scene() -> torchpt.Scene:
     ("function", "own", "form"),
     [
         (torchpt.render, ("scene", "full"), Wishes),
-        (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), Traced),
+        (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), TraceWishes),
         (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), Common),
         (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), Common),
         (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), Common),
@@ -71,7 +71,7 @@ def test_help_says_what_each_argument_is() -> None:
 
 def test_the_block_of_scene_files_has_the_settings_among_them() -> None:
     own = {"params", "full", "dtype", "adjoint", "seed_grad", "spp_grad", "edges", "edge_spp", "ranks"}
-    assert {*declared(Every)} - own == {*parameters_of(Render), *BLOCKS} - {"preview", "render"}
+    assert {*declared(RenderWishes)} - own == {*parameters_of(Render), *BLOCKS} - {"preview", "render"}
 
 
 def test_the_command_line_knows_blocks_and_files() -> None:

@@ -116,7 +116,7 @@ def after_import() -> int:
 
 
 def _status(key: str) -> int:
-    """A line of what Linux tells of the process; elsewhere the peak, which is all that is known; 0 where nothing is."""
+    """Return a line of what Linux tells of the process; elsewhere the peak, which is all that is known; 0 where nothing is."""
     try:
         with open("/proc/self/status", "rb") as file:
             for line in file:
@@ -154,7 +154,7 @@ def _of_machine() -> int | None:
 
 
 def _of_group() -> int | None:
-    """What the limit of a control group (version 2) leaves, what it keeps of files not counted as taken."""
+    """Return what the limit of a control group (version 2) leaves; what it keeps of files is not counted as taken."""
     try:
         limit = int((_GROUP / "memory.max").read_text())
         taken = int((_GROUP / "memory.current").read_text())
@@ -391,7 +391,7 @@ class Budget:
             sample += samples
 
     def _whole(self, work: Callable[[Span], object], span: Span) -> Iterator[Span]:
-        """A piece at once, or in halves of halves."""
+        """Take a piece at once, or in halves of halves."""
         todo = [span]
         while todo:
             pixel, n, sample, samples = span = todo.pop()
@@ -428,12 +428,12 @@ class Budget:
     # -- what lanes cost, measured
 
     def _begins(self) -> None:
-        """A wave begins."""
+        """Note that a wave begins."""
         if self.limit is not None:
             self._before = self.meter.peak()
 
     def _ended(self, taken: int) -> None:
-        """A wave of ``taken`` lanes ended: how many the next may have."""
+        """Note that a wave of ``taken`` lanes ended, and decide how many the next may have."""
         if self.limit is None:
             return
         if self._start is None:

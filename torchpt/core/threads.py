@@ -126,7 +126,7 @@ def _before_fork() -> None:
 
 
 def _after_fork() -> None:
-    """A child has none of its parent's threads, torch's included: waiting for those would never end."""
+    """Forget threads: a child has none of its parent's, torch's included, and waiting for those would never end."""
     global _wish, _starting
     _idle.clear()
     _starting = threading.Lock()

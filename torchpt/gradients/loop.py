@@ -20,6 +20,7 @@ from torchpt.gradients.replay import replay
 from torchpt.gradients.sums import ChunkSums, Sums
 from torchpt.gradients.sweep import KEPT, Sweep
 from torchpt.scene import Scene
+from torchpt.scene.prepare import own_models, packets_of
 from torchpt.scene.settings import Settings
 
 __all__ = ["compiled_replay"]
@@ -39,12 +40,11 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
         replay(assembly, settings, asked, sums)
         return
     wave = assembly.wave
-    packets = wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
     splats = wave.integrator.splats
     cotangent = (asked.float() / settings.render.spp).contiguous() if splats else None
-    kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets, cotangent)
+    kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets_of(wave), cotangent)
     models = wave.context.world.materials.models
-    kernels.eager = kernels.probe([k for k, model in enumerate(models) if any(model is x for x in scene.own_models)])
+    kernels.eager = kernels.probe(own_models(scene, wave))
     budget = _budget(kernels, settings)
     blocks = assembly.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
     chunks = [Chunk(*span) for span in _spans(blocks, settings.render.spp)]
@@ -91,7 +91,7 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
 
 
 def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
-    """The chunks of blocks of pixels, first and how many: always the same."""
+    """Yield the chunks of blocks of pixels, first and how many: always the same."""
     for sample in range(0, samples, LANES):
         count = min(LANES, samples - sample)
         step = max(LANES // count, 1)

@@ -92,7 +92,7 @@ def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) ->
 
 
 def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:
-    """The sums of a chunk."""
+    """Return the sums of a chunk."""
     sums = assembly.sums()
     _Chunk(assembly, settings, span, sums).run(asked)
     return sums

@@ -60,7 +60,7 @@ class Sums:
         return None if number is None else _Taken.apply(table, index, self, number)
 
     def total(self, number: int) -> Tensor:
-        """The sum of a table as ``(M, R)``, R numbers an entry."""
+        """Return the sum of a table as ``(M, R)``, R numbers an entry."""
         found = self._totals[number]
         if found is None:
             table = self.tables[number]
@@ -130,7 +130,7 @@ class Sums:
         add_at(self.total(number).numpy(), index, values)
 
     def gradients(self) -> list[Tensor | None]:
-        """The sums in the shapes of their tables; None where nothing was added."""
+        """Return the sums in the shapes of their tables; None where nothing was added."""
         return [
             None if total is None else total.T.reshape(table.shape).to(table.dtype)
             for total, table in zip(self._totals, self.tables, strict=True)
@@ -211,7 +211,7 @@ class ChunkSums:
 
 
 def _form(table: Tensor) -> tuple[int, int]:
-    """Entries and numbers of an entry: the last axis is the one that is looked up."""
+    """Return how many entries a table has, and numbers an entry: the last axis is the one that is looked up."""
     return (table.shape[-1], math.prod(table.shape[:-1])) if table.dim() else (1, 1)
 
 

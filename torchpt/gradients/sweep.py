@@ -97,7 +97,7 @@ class Sweep(Worker):
         self._start = 1
 
     def run(self, chunk: Chunk, pixels: Tensor, whole: Sums | None) -> ChunkSums:
-        """Derivatives of a chunk, of what is asked of its pixels ``(3, n)``; ``whole``: see :class:`ChunkSums`."""
+        """Return the derivatives of a chunk, of what is asked of its pixels ``(3, n)``; ``whole``: see :class:`ChunkSums`."""
         self.sums = ChunkSums((*self.assembly.leaves, *self.assembly.held), whole)
         n = chunk.pixels * chunk.samples
         self._chunk = chunk

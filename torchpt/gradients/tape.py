@@ -50,7 +50,7 @@ def asked_of(settings: Settings, radiance: Tensor, pixels: Tensor) -> Tensor:
 
 
 def counted(settings: Settings, values: Tensor) -> Tensor:
-    """Samples ``(3, ...)`` as pixels count them, differentiable: none that is not finite, each scaled to the clamp at most."""
+    """Return samples ``(3, ...)`` as pixels count them, differentiable: none that is not finite, each within the clamp."""
     values = torch.where(torch.isfinite(values.detach()).all(0), values, 0.0)
     clamp = settings.integrator.clamp
     return values if clamp is None else values * clamp_scale(values, clamp)
@@ -122,7 +122,7 @@ def chunk_by_chunk(assembly: Assembly, settings: Settings, sums: Sums, part: Par
 
 
 def piece(assembly: Assembly, part: Part, span: Span) -> Sums:
-    """The sums of a chunk."""
+    """Return the sums of a chunk."""
     found = assembly.sums()
     with torch.enable_grad(), gathered_by(found):
         values, asked = part(span)

@@ -66,7 +66,7 @@ class Plate:
 
 
 def clamp_scale(values: Tensor, clamp: float) -> Tensor:
-    """What samples ``(3, ...)`` are scaled with ``(...)``, so that no channel is beyond ``clamp``; hue stays as it is."""
+    """Return what samples ``(3, ...)`` are scaled with ``(...)``, so that no channel is beyond ``clamp``; hue stays."""
     return clamp / values.abs().amax(0).clamp_min(clamp)
 
 
@@ -139,7 +139,7 @@ class Wave:
         return self.rays_of(x.repeat(samples), y.repeat(samples), sample, None if plate is None else plate.streams)
 
     def rays_of(self, x: Tensor, y: Tensor, sample: Tensor, streams: Streams | None = None) -> PathState:
-        """Rays of single samples: the camera's, or those that are given.
+        """Return rays of single samples: the camera's, or those that are given.
 
         Args:
             x: of pixels on the whole film ``(N,)`` int64.
@@ -188,7 +188,7 @@ def still_of(wave: Wave) -> Wave:
 
 
 def camera_state(o: Tensor, d: Tensor, key: Tensor) -> PathState:
-    """Paths that begin with rays ``o, d (3, N)``, d unit, and draw by ``key``."""
+    """Return paths that begin with rays ``o, d (3, N)``, d unit, and draw by ``key``."""
     n = d.shape[1]
     forever = torch.full((n,), math.inf, dtype=d.dtype, device=d.device)
     lane, nothing = torch.arange(n, device=d.device), torch.zeros_like(d)

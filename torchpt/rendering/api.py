@@ -13,7 +13,7 @@ from torchpt.rendering import Progress, Rendering, render_scene
 from torchpt.rendering.graphs import opaque, outside
 from torchpt.rendering.orders import ordered, ordered_along, rendered
 from torchpt.scene import Scene
-from torchpt.scene.settings import FILTERS, Settings, Traced, Wishes
+from torchpt.scene.settings import FILTERS, Settings, TraceWishes, Wishes
 from torchpt.spec.arguments import check_names, spelled
 from torchpt.spec.schema import Described
 
@@ -59,7 +59,7 @@ def trace(
     spp: int | None = 1,
     seed: int | None = 0,
     params: Mapping[str, Tensor] | None = None,
-    **wishes: Unpack[Traced],
+    **wishes: Unpack[TraceWishes],
 ) -> Tensor:
     """Return the radiance that arrives at ``o`` from ``d``, linear RGB ``(..., 3)``; differentiable in both and in ``params``.
 
@@ -76,15 +76,15 @@ def trace(
         spp: samples a ray, which are averaged.
         seed: any integer from 0; the same seed gives the same numbers.
         params: tensors in place of ``scene.params`` by dotted name, but for those of the camera.
-        wishes: others, as of :func:`render`: those that :class:`torchpt.scene.settings.Traced` declares. What a scene file says
-            of its film, and of when a picture is done, does not count here.
+        wishes: others, as of :func:`render`: those that :class:`torchpt.scene.settings.TraceWishes` declares. What a scene file
+            says of its film, and of when a picture is done, does not count here.
 
     Raises:
         SceneError: a setting, parameter or ray that is not accepted: a direction that is zero, numbers that are not finite.
         RenderError: a device or compiler that is not there.
         TypeError: an argument that there is not.
     """
-    check_names("trace", wishes, Traced, ("spp", "seed", "params"))
+    check_names("trace", wishes, TraceWishes, ("spp", "seed", "params"))
     order = ordered_along(scene, o, d, spp=spp, seed=seed, params=params, **wishes)
     assert order.rays is not None
     o, d = order.rays

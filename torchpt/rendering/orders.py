@@ -166,7 +166,7 @@ def _broadcast(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
-    """Parameters in place of the scene's, those of its own that want gradients among them.
+    """Return parameters in place of the scene's, those of its own that want gradients among them.
 
     Raises:
         SceneError: an unknown name, or no tensor that holds numbers. All else is checked where they are plain tensors
@@ -260,7 +260,7 @@ _Make = Callable[[Mapping[str, Tensor], tuple[Tensor, ...]], Rendering]
 
 
 def _differentiable(order: Order, render: _Make) -> Rendering:
-    """A rendering whose picture is on a tape from the parameters (and rays) that are wanted; ``render`` makes it without."""
+    """Return a rendering whose picture is on a tape from the parameters and rays wanted; ``render`` makes it without."""
     from torchpt import gradients as adjoint
     from torchpt.gradients import edges
 
@@ -339,7 +339,7 @@ def _differentiable(order: Order, render: _Make) -> Rendering:
 
 
 def _constant(order: Order, render: _Make) -> Rendering:
-    """A rendering without gradients, of parameters and rays that may still be those of a transform of ``torch.func``."""
+    """Return a rendering without gradients, of parameters and rays that may still be those of a transform of ``torch.func``."""
     params, made = order.params, list[Rendering]()
 
     def forward(*tensors: Tensor) -> tuple[Tensor]:

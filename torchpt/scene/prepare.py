@@ -33,7 +33,19 @@ if TYPE_CHECKING:
     from torchpt.paths.integrators.first_surface import FirstSurface
     from torchpt.paths.layer import SurfaceLayer
 
-__all__ = ["Kept", "kept", "kernels_of", "loop_facts", "loop_of", "looped", "make_wave", "rebound", "surface_layers"]
+__all__ = [
+    "Kept",
+    "kept",
+    "kernels_of",
+    "loop_facts",
+    "loop_of",
+    "looped",
+    "make_wave",
+    "own_models",
+    "packets_of",
+    "rebound",
+    "surface_layers",
+]
 
 
 # ---- What renders of a scene leave for the next one
@@ -252,18 +264,24 @@ def looped(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool
     return not missing
 
 
+def packets_of(wave: Wave) -> bool:
+    """Return True where kernels search by packets, which know no quadrics."""
+    return wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
+
+
+def own_models(scene: Scene, wave: Wave) -> list[int]:
+    """Return the numbers of the models that are the caller's own: no kernel may be made of them."""
+    models = wave.context.world.materials.models
+    return [k for k, model in enumerate(models) if any(model is mine for mine in scene.own_models)]
+
+
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
     """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
-    packets = wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
+    packets = packets_of(wave)
     opaque = wave.context.world.materials.opacity is None and not wave.integrator.own_transmit
     fused = packets and opaque and wave.first is None and not wave.integrator.splats
     kernels = Kernels(wave, packets, fused, before, fixed=not scene.own_models)
-    own = [
-        k
-        for k, model in enumerate(wave.context.world.materials.models)
-        if any(model is mine for mine in scene.own_models)
-    ]
-    eager = kernels.probe(own) if wave.integrator.light else {}
+    eager = kernels.probe(own_models(scene, wave)) if wave.integrator.light else {}
     if eager and kernels.fused:  # what runs as tensor operations hands its rays to the search structure
         kernels = Kernels(wave, packets, False)
     kernels.eager = eager

@@ -31,11 +31,11 @@ __all__ = [
     "TYPED",
     "Call",
     "Common",
-    "Every",
     "Film",
     "Render",
+    "RenderWishes",
     "Settings",
-    "Traced",
+    "TraceWishes",
     "Wishes",
     "blocks_of",
     "having",
@@ -182,7 +182,7 @@ class _Samples(TypedDict, total=False):
     spp: Annotated[int | None, Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take")]
 
 
-class Traced(TypedDict, total=False):
+class TraceWishes(TypedDict, total=False):
     """Arguments of whatever traces paths."""
 
     integrator: Annotated[
@@ -259,7 +259,7 @@ class Traced(TypedDict, total=False):
     ]
 
 
-class Common(_Samples, Traced, total=False):
+class Common(_Samples, TraceWishes, total=False):
     """Arguments of :func:`torchpt.render` that are the same for all pictures of a batch."""
 
     film: Annotated[
@@ -343,7 +343,7 @@ class Wishes(Common, total=False):
     ]
 
 
-class Every(Wishes, total=False):
+class RenderWishes(Wishes, total=False):
     """All keyword arguments of :func:`torchpt.render`."""
 
     full: Annotated[
@@ -352,7 +352,7 @@ class Every(Wishes, total=False):
     ]
 
 
-_ARGUMENTS = {name: argument.spec for name, argument in declared(Every).items()}
+_ARGUMENTS = {name: argument.spec for name, argument in declared(RenderWishes).items()}
 
 
 class Render(Valued):
@@ -402,7 +402,7 @@ class Call(Valued):
         values: dict[str, Any] = {}
         for name in [name for name in cls.parameters if name in wishes]:
             try:
-                values[name] = declared(Every)[name].read(wishes[name])
+                values[name] = declared(RenderWishes)[name].read(wishes[name])
             except Refused as error:
                 raise refused(error, name, wishes[name], None) from None
         return cls(**values)

@@ -57,7 +57,7 @@ class Declared:
 
     @property
     def default(self) -> Any:
-        """In Python: None, where that may be given, for whatever the spec or a scene file says; else the spec's own."""
+        """Return the default in Python: None where that may be given, as a scene file may say it, else the spec's own."""
         return None if type(None) in get_args(self.type) else self.spec.default
 
     @property

@@ -62,7 +62,7 @@ def _release() -> None:
 
 
 def _after_fork() -> None:
-    """Another thread of the parent may have held the lock."""
+    """Take a new lock: another thread of the parent may have held the old one."""
     global _lock
     _lock = threading.Lock()
 
@@ -145,7 +145,7 @@ class Loop:
         return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
 
     def blocks(self, spans: Sequence[tuple[Plate, int, int]], tasks: int) -> list[Block]:
-        """Samples of plates cut into blocks of pixels: ``tasks`` for each plate, as far as they repay."""
+        """Cut samples of plates into blocks of pixels: ``tasks`` for each plate, as far as they repay."""
         return [
             (plate, start, size, first, count)
             for plate, first, count in spans
@@ -177,7 +177,7 @@ class Loop:
         return rest
 
     def _smaller(self, blocks: list[Block]) -> list[Block]:
-        """The blocks that are left, for fewer threads, or cut for chunks of fewer lanes.
+        """Return the blocks that are left, for fewer threads, or cut for chunks of fewer lanes.
 
         Raises:
             RenderError: there is no memory for one thread and a vector of lanes.
@@ -192,7 +192,7 @@ class Loop:
         ]
 
     def _cut(self, plate: Plate, samples: int, tasks: int) -> Iterator[tuple[int, int]]:
-        """Consecutive pixels of each task."""
+        """Yield the consecutive pixels of each task."""
         pixels = plate.film.width * plate.film.height
         size = pixels
         threads = self.budget.threads
@@ -248,7 +248,7 @@ class Loop:
         return worker
 
     def _chunk(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
-        """A chunk into the films: all of it, or nothing where memory runs out."""
+        """Add a chunk to the films: all of it, or nothing where memory runs out."""
         names, light = tuple(plate.layers), self.kernels.wave.integrator.light
         rays = worker.layers(chunk, names) if names else 0
         for film in plate.layers.values():

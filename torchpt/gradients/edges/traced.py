@@ -79,11 +79,11 @@ class Traced:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Of the lanes."""
+        """Return the dtype of the lanes."""
         return self.wave.context.plan.dtype
 
     def key(self, number: Tensor, row: int = 0) -> Tensor:
-        """The sampler's keys of samples ``(N,)`` int64; those of one ``row`` share their numbers with those of no other."""
+        """Return the sampler's keys of samples ``(N,)`` int64; those of one ``row`` share numbers with no other row."""
         return self.wave.sampler.key(number, torch.full_like(number, row))
 
     def nearest(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
@@ -96,11 +96,11 @@ class Traced:
         return self.wave.along(Rays(o.to(self.dtype), (d / (d * d).sum(0).sqrt()).to(self.dtype), number))
 
     def state(self, o: Tensor, d: Tensor, number: Tensor) -> PathState:
-        """Paths that begin with rays, as of :meth:`given`."""
+        """Return paths that begin with rays, as of :meth:`given`."""
         return self.given(o, d, number).rays(0, len(number), 0, 1)
 
     def radiance(self, o: Tensor, d: Tensor, number: Tensor, row: int = 0, depth: int | None = None) -> Tensor:
-        """Radiance ``(3, N)`` float64 that rays bring; black where it is not finite, as in pictures.
+        """Return the radiance ``(3, N)`` float64 that rays bring; black where it is not finite, as in pictures.
 
         Args:
             o: origins ``(3, N)``.
@@ -116,7 +116,7 @@ class Traced:
 
 
 def traced_of(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Traced:
-    """The wave of a scene under ``params``; its numbers are independent from sample to sample."""
+    """Return the wave of a scene under ``params``; its numbers are independent from sample to sample."""
     render = settings.render
     plain = replace(settings, sampler=Described(SAMPLERS["independent"], {}))
     wave = make_wave(scene, plain, params, dtype)

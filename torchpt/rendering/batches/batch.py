@@ -24,7 +24,7 @@ from torchpt.rendering.orders import Order, ordered, rendered
 from torchpt.scene import Scene
 from torchpt.scene.editions import check_unchanged
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import Common, Every
+from torchpt.scene.settings import Common, RenderWishes
 from torchpt.spec.arguments import check_names, spelled
 
 __all__ = ["Renderings", "render_batch"]
@@ -117,7 +117,7 @@ def render_batch(
         RenderError: as :func:`torchpt.render`.
         TypeError: an argument that ``render`` does not know.
     """
-    check_names("render_batch", wishes, Every, ("cameras", "on_progress"))
+    check_names("render_batch", wishes, RenderWishes, ("cameras", "on_progress"))
     if on_progress is not None and not callable(on_progress):
         raise SceneError("on_progress", on_progress, "a function")
     scenes = scenes_of(scenes)
