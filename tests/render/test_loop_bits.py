@@ -112,6 +112,7 @@ def test_progress_may_end_it_early(threads):
         return len(seen) == 9
 
     with few_lanes(1000):
+        rendered(scene, 1, film, threads=threads)  # progress is also told of while kernels are made
         found = rendered(scene, 64, film, on_progress=stop, threads=threads)
     assert not found.complete and found.paths < 64 * 64 * 64
     assert len(seen) == 9  # who has asked for an end is not asked again

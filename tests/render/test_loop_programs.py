@@ -163,8 +163,8 @@ def test_larger_pictures_and_maps(work, tmp_path):
 
 AGAIN = """
 import sys, torchpt
-from torchpt.engines.kernels import chunk, programs
-from torchpt.compiler import engine
+from torchpt.engines.kernels import programs
+from torchpt.compiler import cpu
 traced, kept = [0], programs._traced
 def counting(*args):
     traced[0] += 1
@@ -174,7 +174,7 @@ scene = torchpt.load("cornell_box", "cpu")
 wish = dict(film={"width": 16, "height": 16, "aovs": ["albedo"]}, threads=1)
 image = torchpt.render(scene, spp=4, full=True, **wish).image
 torchpt.render(scene, spp=300, seed=5, full=True, **wish)
-print(*engine.counts(), traced[0], float(image.double().sum()).hex())
+print(*cpu.counts(), traced[0], float(image.double().sum()).hex())
 """
 
 

@@ -233,23 +233,19 @@ def deal(
     found: dict[int, R | BaseException] = {}
     begun = told = 0
 
-    def tell() -> bool:
+    def tell() -> None:
         """Hand over what is next, as far as it is there."""
         nonlocal told
-        first = told
         while told in found:
             result = found.pop(told)
             told += 1
             if isinstance(result, BaseException):
                 try:
                     raise result
-                finally:
-                    del (
-                        result
-                    )  # or the error would hold this frame, and this frame the error with all that the task held
+                finally:  # or the error would hold this frame, which holds the error with all that the task had
+                    del result
             if each(result):
                 halt.set()
-        return told > first
 
     try:
         while not halt.is_set():
@@ -264,7 +260,8 @@ def deal(
             came = crew.next(wait=True)
             if came is not None:
                 found[came[0]] = came[1]
-            if not tell() and each(None):
+            tell()
+            if came is None and each(None):
                 halt.set()
     except BaseException:
         halt.set()
