@@ -10,8 +10,8 @@ from few import few
 from gradient_rooms import gradient_of, room
 
 import torchpt
-from torchpt.engines.kernels import engine
-from torchpt.gradients import replay, sweep
+from torchpt.engines.kernels import backward, engine
+from torchpt.gradients import replay
 from torchpt.gradients.tape import asked_of, counted
 from torchpt.scene.formats.description import settings
 
@@ -33,9 +33,9 @@ def test_paths_of_more_vertices_than_are_kept(monkeypatch, mode):
     scene = torchpt.load(room(PLATE), "cpu")
     wish = {"compile": mode, "integrator": {"type": "path", "max_depth": 14, "rr_depth": 100}}
     whole = gradient_of(scene, NAME, **wish)
-    for module in (replay, sweep):
+    for module in (replay, backward):
         monkeypatch.setattr(module, "KEPT", 2)
-        monkeypatch.setattr(module, "MARKS", 3)
+    monkeypatch.setattr(replay, "MARKS", 3)
     parts = gradient_of(scene, NAME, **wish)
     assert torch.equal(whole, parts)
 
@@ -115,7 +115,7 @@ def test_stages_of_which_no_kernel_can_be_made(monkeypatch, name, capfd):
 @pytest.mark.parametrize("threads", few([1, 2], 1))
 def test_memory_that_runs_out_between_kernels(monkeypatch, threads):
     scene = torchpt.load(room(PLATE), "cpu")
-    whole, run, calls = gradient_of(scene, NAME, spp=16), sweep.Sweep.run, []
+    whole, run, calls = gradient_of(scene, NAME, spp=16), replay.Chunk.run, []
 
     def failing(*args: Any) -> Any:
         calls.append(1)
@@ -123,10 +123,8 @@ def test_memory_that_runs_out_between_kernels(monkeypatch, threads):
             raise MemoryError
         return run(*args)
 
-    from torchpt.gradients import loop
-
-    monkeypatch.setattr(loop, "LANES", engine.LANES // 64)
-    monkeypatch.setattr(sweep.Sweep, "run", failing)
+    monkeypatch.setattr(replay, "LANES_OF_KERNELS", engine.LANES // 64)
+    monkeypatch.setattr(replay.Chunk, "run", failing)
     found = gradient_of(scene, NAME, spp=16, threads=threads)
     assert len(calls) >= 3
     assert torch.allclose(found, whole, rtol=1e-4)

@@ -1,4 +1,4 @@
-"""Sums of gradients: the order that ``torchpt/gradients/sums.py`` states, whatever places lanes have and whoever adds."""
+"""Sums of gradients: the order that ``torchpt/math/sums.py`` states, whatever places lanes have and whoever adds."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ import torchpt
 from torchpt.compiler.graph import Unsupported
 from torchpt.engines import tensors
 from torchpt.engines.kernels import engine
-from torchpt.engines.kernels.backward import JointKernels
-from torchpt.gradients import loop, replay, sums, sweep
-from torchpt.gradients.kernels import COLUMNS, add_at, add_by_columns, sort_by_sample
+from torchpt.engines.kernels.backward import JointKernels, KernelsBackward
+from torchpt.gradients import replay
 from torchpt.gradients.parameters import Assembly
+from torchpt.math import sums
+from torchpt.math.sum_kernels import COLUMNS, add_at, add_by_columns, sort_by_sample
 from torchpt.paths.integrators.path import partition
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
@@ -155,7 +156,7 @@ def sums_of(scene: torchpt.Scene, name: str, **wish: Any) -> torch.Tensor:
 def shuffled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Lanes take other places in each arena, and lists name them in another order; returns how many were moved."""
     random, moved = np.random.default_rng(5), []
-    scatter, listed = sweep.Sweep.scatter, sweep.Sweep.sort
+    scatter, listed = KernelsBackward.scatter, KernelsBackward.sort
 
     def scattered(self: Any, paths: Any, roulette: float) -> Any:
         after = scatter(self, paths, roulette)
@@ -170,8 +171,8 @@ def shuffled(monkeypatch: pytest.MonkeyPatch) -> list[int]:
             places.words[0, :count] = random.permutation(places.words[0, :count])
         return counts
 
-    monkeypatch.setattr(sweep.Sweep, "scatter", scattered)
-    monkeypatch.setattr(sweep.Sweep, "sort", sort)
+    monkeypatch.setattr(KernelsBackward, "scatter", scattered)
+    monkeypatch.setattr(KernelsBackward, "sort", sort)
     return moved
 
 
@@ -216,8 +217,7 @@ def test_places_of_lanes_do_not_matter_by_tensor_operations(monkeypatch, name, s
         monkeypatch.setattr(sums.Sums, "add_at", sums.Sums.add_sorted)
     scene = several(0.5 if name.endswith("opacity") else 1.0)
     first = sums_of(scene, name, compile="off")
-    for module in (replay, tensors):
-        monkeypatch.setattr(module, "partition", turned)
+    monkeypatch.setattr(tensors, "partition", turned)
     other = sums_of(scene, name, compile="off")
     assert torch.equal(first, other)
 
@@ -227,15 +227,14 @@ def test_places_of_lanes_do_not_matter_to_splats(monkeypatch, compile):
     scene, wish = several(), {"compile": compile, "integrator": Mirrored(**lights())}
     first = sums_of(scene, NAMES[0], **wish)
     shuffled(monkeypatch)
-    for module in (replay, tensors):
-        monkeypatch.setattr(module, "partition", turned)
+    monkeypatch.setattr(tensors, "partition", turned)
     assert torch.equal(first, sums_of(scene, NAMES[0], **wish))
 
 
 @pytest.mark.parametrize("name", few(NAMES, 1))
 @pytest.mark.usefixtures("table")
 def test_bits_do_not_depend_on_threads_nor_memory(monkeypatch, name):
-    monkeypatch.setattr(loop, "LANES", engine.LANES // 32)  # so that there are some chunks
+    monkeypatch.setattr(replay, "LANES_OF_KERNELS", engine.LANES // 32)  # so that there are some chunks
     scene = several()
     wishes: list[dict[str, Any]] = [{"threads": 1}, {"threads": 2}, {"threads": 3}, {"max_memory": "3GB"}]
     first, *others = (sums_of(scene, name, **wish) for wish in wishes)

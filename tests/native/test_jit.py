@@ -115,7 +115,7 @@ def test_each_kernel_has_a_name():
     package = Path(content.__file__).parents[1]
     found: dict[str, str] = {}
     for path in sorted(
-        [*package.glob("search/*.py"), package / "physics/lights/tree_build.py", package / "gradients/kernels.py"]
+        [*package.glob("search/*.py"), package / "physics/lights/tree_build.py", package / "math/sum_kernels.py"]
     ):
         module = importlib.import_module(".".join(("torchpt", *path.relative_to(package).with_suffix("").parts)))
         for name, value in vars(module).items():

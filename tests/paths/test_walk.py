@@ -11,7 +11,7 @@ import pytest
 import torchpt
 from torchpt.engines import tensors
 from torchpt.engines.kernels import engine as chunk
-from torchpt.gradients import replay, sweep
+from torchpt.gradients import replay
 from torchpt.paths.integrators.base import Limits
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.rendering.one_path import one_path
@@ -165,7 +165,7 @@ def test_all_that_follows_paths_is_a_walk(name: str, monkeypatch: pytest.MonkeyP
         walks.append(args[0])
         walk(*args)
 
-    for module in (tensors, chunk, sweep, replay):
+    for module in (tensors, chunk, replay):
         monkeypatch.setattr(module, "walk", counted)
     job, expected = JOBS[name]
     scene = torchpt.load("cornell_box", "cpu")

@@ -71,6 +71,7 @@ class Paths:
         emissions: light that lanes met here by chance, where an engine keeps it.
         outputs: of the vertex before: number of the BSDF model, lanes of the wave, and what its surfaces made of them, where an
             engine keeps it.
+        passed: ``clear`` and ``splat_clear`` of the light that was sampled here, where an engine goes back.
     """
 
     state: PathState
@@ -85,6 +86,7 @@ class Paths:
     splat_clear: list[Tensor] = field(default_factory=list)
     emissions: list[tuple[Tensor, Emission]] = field(default_factory=list)
     outputs: list[tuple[int, Tensor, VertexOutput]] = field(default_factory=list)
+    passed: tuple[list[Tensor], list[Tensor]] = field(default_factory=lambda: ([], []))
 
     @property
     def met(self) -> Hit:
@@ -120,9 +122,13 @@ class Tensors:
         self.wave, self.context, self.tally = wave, wave.context, Tally() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
         self.passing = self.world.materials.opacity is not None or wave.integrator.own_transmit
-        self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=wave.centre.device)
         self.splats = splats
-        self.lost = torch.zeros_like(self.radiance[0], dtype=torch.bool) if wave.integrator.splats else None
+        self._clear(lanes)
+
+    def _clear(self, lanes: int) -> None:
+        """Begin with so many camera rays, none of which brought anything yet."""
+        self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=self.wave.centre.device)
+        self.lost = torch.zeros_like(self.radiance[0], dtype=torch.bool) if self.wave.integrator.splats else None
 
     def spawn(self, state: PathState) -> Paths:
         """Start paths with rays."""

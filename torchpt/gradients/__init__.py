@@ -1,13 +1,10 @@
 """How gradients are taken: an argument of ``render``, not another integrator; and what of a render they go through.
 
 ==================  =============================================================================
-``loop.py``         ``replay``, the default, by kernels over threads: start here
-``sweep.py``        a chunk of that: paths traced again, and gone back along vertex by vertex
-``replay.py``       the same by tensor operations: on CUDA, in float64, and where no kernels can be made
+``replay.py``       ``replay``, the default: paths traced again, and gone back along vertex by vertex; start here
 ``tape.py``         ``autograd``: chunks rendered again under a plain tape
 ``parameters.py``   from parameters to what waves read, differentiated once a backward pass
 ``camera.py``       what the camera's gradient is where no surface moves: what it sees is held in place
-``sums.py``         sums of gradients, in the order of samples
 ``edges/``          what silhouettes and shadow edges that move add
 ==================  =============================================================================
 
@@ -25,8 +22,8 @@ from torchpt.core.errors import NotBuiltError
 from torchpt.core.memory import check_memory
 from torchpt.core.threads import limited_threads
 from torchpt.gradients.camera import by_film, follows, suits
-from torchpt.gradients.loop import compiled_replay
 from torchpt.gradients.parameters import Assembly, attached
+from torchpt.gradients.replay import replay_paths
 from torchpt.gradients.tape import tape
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group
@@ -95,7 +92,7 @@ def gradients(
         if held:
             by_film(assembly, settings, asked, sums)
         elif kind == "replay" and isinstance(assembly.wave.integrator, PathIntegrator):
-            compiled_replay(scene, assembly, settings, asked, sums)
+            replay_paths(scene, assembly, settings, asked, sums)
         else:
             tape(assembly, settings, asked, sums)
         if ranks is not None:

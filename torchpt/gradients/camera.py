@@ -34,8 +34,8 @@ from torch import Tensor
 from torchpt.core.memory import Span
 from torchpt.engines import tensors
 from torchpt.gradients.parameters import Assembly, attached
-from torchpt.gradients.sums import Sums
 from torchpt.gradients.tape import chunk_by_chunk, counted
+from torchpt.math.sums import Sums
 from torchpt.math.vectors import dot, normalize, take
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.paths.state import PathState

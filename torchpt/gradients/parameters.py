@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from torchpt.core.memory import Budget, Span
-from torchpt.core.tree import leaves, map_leaves
-from torchpt.gradients.sums import Sums
+from torchpt.core.tree import map_leaves
+from torchpt.math.sums import Sums
+from torchpt.paths.adjoint import Tape
 from torchpt.paths.wave import Wave
 from torchpt.ranks import Group, blocks
 from torchpt.scene import Scene
@@ -45,7 +46,7 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
 # ---- From parameters to what waves read, differentiated once a backward pass
 
 
-class Assembly:
+class Assembly(Tape):
     """Tensors that the waves of a backward pass read, as functions of parameters.
 
     Args:
@@ -59,13 +60,6 @@ class Assembly:
         ranks: those that share the pixels; None: there is but one process.
         rays: in place of the camera's, see :func:`torchpt.scene.prepare.make_wave`.
         by_rays: whether they are differentiated too.
-
-    Attributes:
-        wave: with plain tensors.
-        taped: the same with leaves in place of those tensors that depend on the parameters.
-        leaves: these leaves; ``held`` follow them in the sums.
-        plain: the tensors that they stand for.
-        held: see above.
     """
 
     def __init__(
@@ -90,9 +84,6 @@ class Assembly:
         with torch.enable_grad():
             made = make_wave(scene, settings, given, dtype, True, attached, rays=rays)
         self._outputs: list[Tensor] = []
-        self.leaves: list[Tensor] = []
-        self.plain: list[Tensor] = []
-        self.held = tuple(held)
         plain: dict[int, Tensor] = {}
         leaves: dict[int, Tensor] = {}
 
@@ -108,23 +99,10 @@ class Assembly:
             return leaves.get(id(tensor), tensor)
 
         inputs = {id(tensor) for tensor in self._inputs}
-        self.wave = _over(made, detached)
-        for tensor in self._outputs:
-            one = plain[id(tensor)]
-            leaves[id(one)] = one.detach().requires_grad_()
-            self.leaves.append(leaves[id(one)])
-            self.plain.append(one)
-        self.taped = _over(self.wave, leaf)
-
-    @property
-    def passing(self) -> bool:
-        """Return True where it is differentiated by what lets rays pass surfaces."""
-        world = self.taped.context.world
-        opacity, maps = world.materials.opacity, world.textures.opacity
-        if opacity is None:
-            return False
-        read = [] if maps is None else [x for k in maps.tables for x in leaves(world.textures.tables[k])]
-        return any(x.requires_grad for x in (opacity, *read))
+        wave = _over(made, detached)
+        ones = [plain[id(tensor)] for tensor in self._outputs]
+        leaves |= {id(one): one.detach().requires_grad_() for one in ones}
+        super().__init__(wave, _over(wave, leaf), [leaves[id(one)] for one in ones], ones, tuple(held))
 
     def blocks(self, pixels: int, samples: int) -> list[tuple[int, int]]:
         """Consecutive pixels, first and how many, that this process takes: the same ones by kernels and without."""
@@ -142,7 +120,7 @@ class Assembly:
 
     def sums(self) -> Sums:
         """Sums of the gradients of the leaves, and of what is held."""
-        return Sums((*self.leaves, *self.held))
+        return Sums(self.tables)
 
     def gradients(self, sums: Sums) -> list[Tensor]:
         """Gradients of the parameters, of rays, and of what is held, from those of the leaves."""

@@ -1,283 +1,235 @@
-"""Paths are traced again from their random numbers, without a tape, and then gone back along vertex by vertex.
+"""Path replay: paths are traced again from their random numbers, without a tape, and then gone back along vertex by vertex.
 
-Of a chunk of lanes the states at its vertices are kept, some 120 bytes a lane each; a vertex is differentiated alone
-(:mod:`torchpt.paths.adjoint`), from the last one to the first. What is handed from vertex to vertex lies by lanes: each
-path has one, and reads there what those behind it ask of the ray that left. Paths of many vertices are traced again in parts,
-from marks on the way, so that memory does not grow with depth.
+An engine keeps the last vertices of a walk that it can; a vertex is differentiated alone, from the last one to the first. Paths
+of more vertices are traced again in parts, from marks on the way: of n vertices there are never more marks than
+:data:`MARKS` a level, and a part between two of them is again taken in parts, so that what is kept grows with log n at most.
+
+(Vicini, Speierer, Jakob 2021, *Path Replay Backpropagation*, and Griewank, Walther 2000, *Revolve*, for the marks.)
 """
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from torchpt.core.memory import Budget, Span
-from torchpt.engines.tensors import Paths, Tensors, escaped
+from torchpt.compiler.graph import Unsupported
+from torchpt.core.errors import say_once
+from torchpt.core.memory import Budget, Span, ran_out
+from torchpt.core.threads import deal
+from torchpt.engines.engine import LANES_OF_KERNELS, Backward, backward_kernels, backward_tensors
 from torchpt.gradients.parameters import Assembly
-from torchpt.gradients.sums import Sums
 from torchpt.gradients.tape import asked_of
-from torchpt.math.gathers import gathered_by
-from torchpt.math.vectors import rows, take
-from torchpt.paths import adjoint
-from torchpt.paths.adjoint import Behind
-from torchpt.paths.integrators.path import Ends, partition, slides
-from torchpt.paths.state import EXTRA, PathState, Shadow, Splat, VertexInput
-from torchpt.paths.walk import Observer, walk
-from torchpt.physics.samplers import salts
-from torchpt.physics.shapes.geometry import Hit
+from torchpt.math.sums import ChunkSums, Sums
+from torchpt.paths.walk import KEPT, Counts, Observer, Population, walk
+from torchpt.scene import Scene
+from torchpt.scene.prepare import own_models
 from torchpt.scene.settings import Settings
 
-__all__ = ["replay"]
+if TYPE_CHECKING:
+    from torchpt.engines.kernels.backward import JointKernels
 
-#: Lanes of a chunk. Always the same: sums of other chunks would be rounded otherwise.
+__all__ = ["replay_paths"]
+
+#: Lanes of a chunk of tensors. Always the same: sums of other chunks would be rounded otherwise.
 LANES = {"cpu": 1 << 16, "cuda": 1 << 20}
-#: Vertices that are kept at once, and marks beyond them.
-KEPT, MARKS = 24, 8
+#: Marks of a walk.
+MARKS = 8
 
 
-@dataclass
-class Vertex:
-    """The paths of a chunk at a vertex, and how much of the light of their shadow rays got through, group by group."""
-
-    depth: int
-    state: PathState
-    hit: Hit
-    clear: list[Tensor] = field(default_factory=list)
-    splat_clear: list[Tensor] = field(default_factory=list)
+# ---- A chunk: forward, and back
 
 
-class Keeper(Observer[Paths]):
-    """Keeps the vertices of a walk: the first ones all, of those behind some as marks."""
+class Keeper(Observer[Any]):
+    """Keeps the vertices of a walk; where they are too many, marks on the way instead.
 
-    def __init__(self) -> None:
-        self.kept: list[Vertex] = []
-        self.marks: list[Vertex] = []
-        self._step = KEPT
-        self._now: Vertex | None = None
+    Args:
+        engine: whose.
+        first: number of the vertex that the walk begins at.
+        mark: to begin there once more; None: by camera rays.
+    """
 
-    def left(self, paths: Paths) -> None:
+    def __init__(self, engine: Backward[Any, Any, Any], first: int, mark: Any) -> None:
+        self.kept: list[Any] = []
+        self.marks: list[tuple[int, Any]] = []
+        self._engine, self._first, self._mark, self._step = engine, first, mark, KEPT
+
+    def arrived(self, paths: Population) -> bool:
         """See :class:`Observer`."""
-        assert self._now is not None
-        self._now.clear, self._now.splat_clear = paths.clear, paths.splat_clear
-
-    def arrived(self, paths: Paths) -> bool:
-        """See :class:`Observer`."""
-        self._now = Vertex(paths.depth, paths.state, paths.met)
-        if len(self.kept) < KEPT:
-            self.kept.append(self._now)
-        elif (paths.depth - self.kept[-1].depth - 1) % self._step == 0:
-            self.marks.append(self._now)
+        past = paths.depth - self._first
+        if past > 0 and past % self._step == 0:
+            self.marks = self.marks or [(self._first, self._mark)]
+            self.marks.append((paths.depth, self._engine.mark(paths)))
+            self.kept.clear()
             if len(self.marks) > MARKS:
-                self.marks = self.marks[::2]
-                self._step *= 2
+                self.marks, self._step = self.marks[::2], 2 * self._step
+        return False
+
+    def sorted(self, paths: Population, counts: Counts) -> bool:
+        """See :class:`Observer`."""
+        if not self.marks:
+            self.kept.append(paths)
         return False
 
 
-def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
-    """Reverse mode by replaying paths; as :func:`torchpt.gradients.tape.tape`, but memory does not grow with depth.
+class Chunk:
+    """A chunk of samples that is replayed.
 
-    Chunks have fewer lanes only where an allocation failed.
+    Args:
+        engine: runs it.
+        settings: of the backward pass.
+        span: its samples.
+        sums: what is added to.
+    """
+
+    def __init__(self, engine: Backward[Any, Any, Any], settings: Settings, span: Span, sums: Sums | ChunkSums) -> None:
+        self.engine, self.settings, self.span, self.sums = engine, settings, span, sums
+
+    def run(self, pixels: Tensor) -> None:
+        """Add what a loss asks, by the pixels ``(3, H W)`` of the picture."""
+        first, count, _, samples = self.span
+        with torch.no_grad():
+            keeper = self._forward(1, None, None)
+            radiance = self.engine.radiance_of_samples().view(3, samples, -1)
+            asked = asked_of(self.settings, radiance, pixels[:, first : first + count].to(radiance.dtype))
+            self.engine.receive(asked.reshape(3, -1))
+            self._back(keeper, None)
+            self.engine.vjp_rays()
+
+    def _forward(self, first: int, mark: Any, end: int | None) -> Keeper:
+        """Trace paths from a mark (None: the camera) to vertex ``end`` (None: to their ends)."""
+        paths = self.engine.begin(self.span, self.sums) if mark is None else self.engine.resume(mark)
+        keeper = Keeper(self.engine, first, mark)
+        walk(self.engine, paths, self.engine.wave.integrator.limits, keeper, end)
+        return keeper
+
+    def _back(self, keeper: Keeper, end: int | None) -> None:
+        """Go back along what was kept, or from mark to mark."""
+        for paths in reversed(keeper.kept):
+            self.engine.vjp(paths)
+        keeper.kept.clear()
+        while keeper.marks:
+            first, mark = keeper.marks.pop()
+            self._back(self._forward(first, mark, end), end)
+            end = first
+
+
+# ---- All chunks: over threads by kernels, where these can be made; else one after the other by tensor operations
+
+
+def replay_paths(scene: Scene, assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
+    """Reverse mode by replaying paths; as :func:`torchpt.gradients.tape.tape`, but memory hardly grows with depth.
+
+    Sums are joined in the order of chunks, whichever thread took them. Chunks of tensor operations have fewer lanes only
+    where an allocation failed.
+
+    Args:
+        scene: what is rendered.
+        assembly: what waves read.
+        settings: of the backward pass.
+        asked: derivatives by the pixels ``(3, H W)``.
+        sums: what is added to.
+
+    Raises:
+        RenderError: not even a single lane fits in memory.
     """
     wave = assembly.wave
+    share = asked / settings.render.spp if wave.integrator.splats else None
+    if _compiled(assembly, settings):
+        kernels = backward_kernels(assembly, own_models(scene, wave), share)
+        reason = _over_threads(kernels, assembly, settings, asked, sums)
+        models = wave.context.world.materials.models
+        for stage, why in kernels.back_eager.items():
+            model = f" at {models[stage[1]]}" if stage[0] == "bounce" else ""
+            say_once(
+                f"torchpt: {stage[0]}{model} is differentiated by tensor operations, as no kernel can be made of {why}"
+            )
+        if not reason:
+            return
+        say_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
+        sums.clear()
 
     def whole(span: Span) -> None:
-        sums.join(piece(assembly, settings, asked, span))
+        sums.join(piece(assembly, settings, asked, share, span))
 
     device = wave.centre.device
     budget = Budget(device, LANES.get(device.type, LANES["cpu"]), what="the vertices of a single lane")
     assembly.through(budget, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
-def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:
-    """Return the sums of a chunk."""
+def piece(assembly: Assembly, settings: Settings, asked: Tensor, share: Tensor | None, span: Span) -> Sums:
+    """Return the sums of a chunk of tensor operations."""
     sums = assembly.sums()
-    _Chunk(assembly, settings, span, sums).run(asked)
+    engine = backward_tensors(assembly, share)
+    Chunk(engine, settings, span, sums).run(asked)
     return sums
 
 
-class _Chunk:
-    """A chunk of lanes.
+def _over_threads(kernels: JointKernels, assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> str:
+    """Take all chunks by kernels; return why that cannot be, or ""."""
+    wave, asked = assembly.wave, asked.float()
+    budget = _budget(kernels, settings)
+    blocks = assembly.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
+    engines: list[Backward[Any, Any, Any]] = []
+    lock = threading.Lock()
 
-    Args:
-        assembly: what waves read.
-        settings: of the backward pass.
-        span: its samples.
-        sums: what is added to.
-    """
+    def task(span: Span) -> ChunkSums:
+        with lock:
+            engine = engines.pop() if engines else kernels.engine()
+        found = ChunkSums(assembly.tables, sums if budget.threads == 1 else None)
+        Chunk(engine, settings, span, found).run(asked)
+        with lock:
+            engines.append(engine)
+        return found
 
-    def __init__(self, assembly: Assembly, settings: Settings, span: Span, sums: Sums) -> None:
-        self.assembly, self.settings, self.span, self.sums = assembly, settings, span, sums
-        self.wave, self.taped = assembly.wave, assembly.taped
-        self.plan = self.wave.context.plan
-        self.world = self.taped.context.world
-        self.tensors = [*assembly.leaves, *assembly.held]
-        self.passing = assembly.passing
-        self.engine = Tensors(replace(self.wave, context=self.taped.context), 0)
+    def merge(part: ChunkSums | None) -> bool:
+        if part is not None:
+            sums.merge(part)
+        return False
 
-    def run(self, pixels: Tensor) -> None:
-        """Add what a loss asks, by pixels of the picture ``(3, H W)``, to the sums."""
-        if self.wave.integrator.splats:
-            self.cotangent = pixels.to(self.plan.dtype) / self.settings.render.spp
-        pixels = pixels[:, self.span[0] : self.span[0] + self.span[1]]
-        with torch.no_grad():
-            start = self.wave.rays(*self.span)
-            radiance, keeper = self._trace(start, 1, None, None)
-            samples = self.span[3]
-            weight = self.wave.weight(start) if self.wave.filter.signed else None
-            brought = radiance if weight is None else radiance * weight
-            asked = asked_of(self.settings, brought.view(3, samples, -1), pixels.to(radiance.dtype)).reshape(3, -1)
-            # What the rest of its path asks of each lane's ray, and what that ray met.
-            self.radiance = asked if weight is None else asked * weight
-            self.behind = {name: torch.zeros_like(asked) for name in ("throughput", "o", "d")[: self._rows]}
-            n = asked.shape[1]
-            for own in self.wave.integrator.fields:
-                if not own.whole:
-                    self.behind[EXTRA + own.name] = torch.zeros_like(own.begin(asked[0]))
-            zero = torch.zeros(n, dtype=asked.dtype, device=asked.device)
-            self.met = Hit(zero.clone(), torch.full_like(start.lane, -1), zero.clone(), zero.clone())
-            self._back(keeper)
-        self._camera(start)
+    while True:
+        try:
+            deal(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
+            return ""
+        except Unsupported as error:
+            return f"no kernel can be made of {error}"
+        except Exception as error:
+            if not ran_out(error):
+                raise
+        engines.clear()
+        sums.clear()
+        if budget.threads == 1:
+            return "memory ran out"
+        budget.shrink()
 
-    @property
-    def _rows(self) -> int:
-        return 3 if self.plan.attached else 1
 
-    # -- forward
+def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
+    """Yield the chunks of blocks of pixels, first and how many: always the same."""
+    for sample in range(0, samples, LANES_OF_KERNELS):
+        count = min(LANES_OF_KERNELS, samples - sample)
+        step = max(LANES_OF_KERNELS // count, 1)
+        for start, pixels in blocks:
+            for pixel in range(start, start + pixels, step):
+                yield pixel, min(step, start + pixels - pixel), sample, count
 
-    def _trace(self, state: PathState, depth: int, hit: Hit | None, end: int | None) -> tuple[Tensor, Keeper]:
-        keeper, engine = Keeper(), Tensors(self.wave, self.span[1] * self.span[3])
-        paths = engine.spawn(state) if depth == 1 else Paths(state, depth, hit)
-        walk(engine, paths, self.wave.integrator.limits, keeper, end)
-        return engine.brought(), keeper
 
-    # -- back
+def _budget(kernels: JointKernels, settings: Settings) -> Budget:
+    """Return how many threads there are, fewer where the arenas of all would take more than half of ``render.max_memory``."""
+    threads = torch.get_num_threads()
+    budget = Budget(torch.device("cpu"), LANES_OF_KERNELS, threads, what="a gradient", instead="one thread")
+    limit, depth = settings.render.max_memory, settings.integrator.limits.max_depth
+    if limit is not None:
+        levels = min(depth, KEPT) if depth >= 0 else KEPT
+        budget.fit(limit // 2, kernels.bytes_per_lane(levels), LANES_OF_KERNELS)
+    return budget
 
-    def _back(self, keeper: Keeper, end: int | None = None) -> None:
-        """Back from vertex ``end`` (None: from the last)."""
-        marks = keeper.marks
-        for k in reversed(range(len(marks))):
-            mark, until = marks[k], marks[k + 1].depth if k + 1 < len(marks) else end
-            state = replace(mark.state, radiance=torch.zeros_like(mark.state.radiance))
-            _, part = self._trace(state, mark.depth, mark.hit, until)
-            self._back(part, until)
-        for vertex in reversed(keeper.kept):
-            self._vertex(vertex)
 
-    def _vertex(self, vertex: Vertex) -> None:
-        """Back through a vertex: its lanes came grouped by the models before it, and are taken in the order of samples."""
-        depth, order = vertex.depth, vertex.state.lane.argsort()
-        place = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
-        state, hit = rows(vertex.state, order), rows(vertex.hit, order)
-        slide = slides(self.plan, self.world, depth)
-        ends, groups = partition(self.world, vertex.hit)
-        ends = Ends(take(place, ends.emissive).msort(), take(place, ends.missed).msort())
-        chance, asked = self._chance(state, depth)
-        hit = replace(hit, chance=chance)
-        limits = self.wave.integrator.limits
-        clear, splat_clear = iter(vertex.clear), iter(vertex.splat_clear)
-        if depth < limits.last:
-            for model, came in groups:
-                index, turn = take(place, came).sort()
-                self._bounce(model, depth, slide, clear, splat_clear, turn, state, hit, index, asked)
-        self._light(ends, depth, slide, state, hit, asked)
-        if chance is not None and asked is not None:
-            found = torch.autograd.grad(chance, self.tensors, asked, allow_unused=True)
-            self.sums.add_each(found)
-        if self.plan.attached:
-            for name in ("t", "prim", "u", "v"):
-                getattr(self.met, name).index_copy_(0, state.lane, getattr(hit, name))
-
-    def _chance(self, state: PathState, depth: int) -> tuple[Tensor | None, Tensor | None]:
-        """The chance to get here under a tape, where it has derivatives, and zeros for what is asked of it."""
-        if not self.passing:
-            return None, None
-        with torch.enable_grad(), gathered_by(self.sums):
-            chance = self.engine.hits(state, depth).chance
-        if chance is None or not chance.requires_grad:
-            return None, None
-        return chance, torch.zeros_like(chance)
-
-    def _bounce(
-        self,
-        model: int,
-        depth: int,
-        slide: bool,
-        clear: Iterator[Tensor],
-        splat_clear: Iterator[Tensor],
-        turn: Tensor,
-        state: PathState,
-        hit: Hit,
-        index: Tensor,
-        asked: Tensor | None,
-    ) -> None:
-        lane = take(state.lane, index)
-        following = rows(self.met, lane) if self.plan.attached else None
-        behind = Behind(
-            take(self.radiance, lane),
-            take(self.behind["throughput"], lane),
-            *(take(self.behind[name], lane) if self.plan.attached else None for name in ("o", "d")),
-            extra={k.removeprefix(EXTRA): take(x, lane) for k, x in self.behind.items() if k.startswith(EXTRA)},
-        )
-
-        def passed(shadow: Shadow) -> Tensor:
-            kept = next(clear)
-            return self.engine.clear(shadow) if self.passing else take(kept, turn)
-
-        def landed(splat: Splat) -> tuple[Tensor, Tensor]:
-            kept = next(splat_clear)
-            through = self.engine.clear(splat.light) if self.passing else take(kept, turn)
-            return adjoint.splatted(self.settings.integrator.clamp, self.cotangent, splat, through)
-
-        limits = self.wave.integrator.limits
-        with gathered_by(self.sums):
-            context = self.taped.context.at(salts(depth, lane.device), slide, limits.roulette(depth))
-            vertex = VertexInput(rows(state, index), rows(hit, index))
-            stage = self.wave.integrator.bounce
-            before = adjoint.bounce(stage, context, model, vertex, following, passed, behind, self._others, landed)
-        for name, found, like in before.of_rays(vertex.state, self.plan.attached):
-            self.behind[name].index_copy_(-1, lane, torch.zeros_like(like) if found is None else found)
-        self.sums.add_each(before.others)
-        if asked is not None and before.chance is not None:
-            asked.index_add_(0, index, before.chance)
-
-    def _light(self, ends: Ends, depth: int, slide: bool, state: PathState, hit: Hit, asked: Tensor | None) -> None:
-        """Back through light that was met by chance; what a bounce asks of the same lanes is there already."""
-        table = self.world.lights
-        if table is None:
-            return
-        for index, here in ((ends.emissive, True), (escaped(self.wave, state, ends), False)):
-            if not len(index) or (not here and table.environment is None):
-                continue
-            lane = take(state.lane, index)
-            vertex = VertexInput(rows(state, index), rows(hit, index))
-            integrator = self.wave.integrator
-            context = self.taped.context.at(salts(depth, lane.device), slide)
-            stage = integrator.emit if here else integrator.escape
-            with gathered_by(self.sums):
-                before = adjoint.gather(stage, context, vertex, take(self.radiance, lane), self._others)
-            for name, found, _ in before.of_rays(vertex.state, self.plan.attached):
-                if found is not None:
-                    behind = self.behind[name]
-                    behind.index_copy_(-1, lane, take(behind, lane) + found)
-            self.sums.add_each(before.others)
-            if asked is not None and before.chance is not None:
-                asked.index_add_(0, index, before.chance)
-
-    def _camera(self, start: PathState) -> None:
-        """Back through the camera rays."""
-        if not self.plan.attached:
-            return
-        with torch.enable_grad(), gathered_by(self.sums):
-            state = self.taped.rays(*self.span)
-            pairs = [(x, self.behind[name]) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
-            if pairs:
-                found = torch.autograd.grad(
-                    [x for x, _ in pairs], self.tensors, [g for _, g in pairs], allow_unused=True
-                )
-                self.sums.add_each(found)
-
-    def _others(self) -> Sequence[Tensor]:
-        return self.tensors
+def _compiled(assembly: Assembly, settings: Settings) -> bool:
+    """Return True where kernels may be made: on a CPU, in float32, without derivatives by weights of modules or opacity."""
+    wave = assembly.wave
+    if wave.centre.device.type != "cpu" or wave.context.plan.dtype != torch.float32 or settings.render.compile == "off":
+        return False
+    return not assembly.held and not assembly.passing

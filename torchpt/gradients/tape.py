@@ -11,8 +11,8 @@ from torchpt.core.memory import Budget, Span
 from torchpt.core.threads import one_thread
 from torchpt.engines import tensors
 from torchpt.gradients.parameters import Assembly
-from torchpt.gradients.sums import Sums
 from torchpt.math.gathers import gathered_by
+from torchpt.math.sums import Sums
 from torchpt.math.vectors import take
 from torchpt.paths.wave import clamp_scale
 from torchpt.physics.film.splats import Splats

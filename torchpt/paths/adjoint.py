@@ -16,11 +16,45 @@ from torch import Tensor
 from torchpt.core.tree import leaves
 from torchpt.math.vectors import take
 from torchpt.paths.state import EXTRA, Emission, PathState, Plan, Shadow, Splat, StageContext, VertexInput
-from torchpt.paths.wave import Bounce, clamp_scale
+from torchpt.paths.wave import Bounce, Wave, clamp_scale
 from torchpt.physics.film.splats import LARGEST
 from torchpt.physics.shapes.geometry import Hit
 
-__all__ = ["Before", "Behind", "bounce", "gather", "splatted"]
+__all__ = ["Before", "Behind", "Tape", "bounce", "gather", "splatted"]
+
+
+@dataclass
+class Tape:
+    """A wave and what is differentiated in it.
+
+    Attributes:
+        wave: with plain tensors.
+        taped: the same with leaves in place of those tensors that are differentiated.
+        leaves: these leaves.
+        plain: the tensors that they stand for.
+        held: tensors that stages use by themselves and that are differentiated too, such as weights of modules.
+    """
+
+    wave: Wave
+    taped: Wave
+    leaves: list[Tensor]
+    plain: list[Tensor]
+    held: tuple[Tensor, ...]
+
+    @property
+    def tables(self) -> tuple[Tensor, ...]:
+        """Return all tensors that derivatives are summed for, in the order of their sums."""
+        return (*self.leaves, *self.held)
+
+    @property
+    def passing(self) -> bool:
+        """Return True where it is differentiated by what lets rays pass surfaces."""
+        world = self.taped.context.world
+        opacity, maps = world.materials.opacity, world.textures.opacity
+        if opacity is None:
+            return False
+        read = [] if maps is None else [x for k in maps.tables for x in leaves(world.textures.tables[k])]
+        return any(x.requires_grad for x in (opacity, *read))
 
 
 @dataclass(frozen=True)

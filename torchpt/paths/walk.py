@@ -13,7 +13,10 @@ from typing import Generic, Protocol, TypeVar
 
 from torchpt.paths.integrators.base import Limits
 
-__all__ = ["Counts", "Engine", "Observer", "Population", "find", "walk"]
+__all__ = ["KEPT", "Counts", "Engine", "Observer", "Population", "find", "walk"]
+
+#: Vertices, one after the other, that an engine keeps at once for the way back.
+KEPT = 16
 
 
 class Population(Protocol):

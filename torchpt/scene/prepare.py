@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError, say_once
+from torchpt.engines.engine import packets_of
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.kernels.threads import Loop
 from torchpt.images.denoiser import GUIDES
@@ -42,7 +43,6 @@ __all__ = [
     "looped",
     "make_wave",
     "own_models",
-    "packets_of",
     "rebound",
     "surface_layers",
 ]
@@ -262,11 +262,6 @@ def looped(settings: Settings, device: torch.device, dtype: torch.dtype) -> bool
     if missing and settings.render.compile == "on":
         raise SceneError("render.compile", "on", f"auto or off ({missing})")
     return not missing
-
-
-def packets_of(wave: Wave) -> bool:
-    """Return True where kernels search by packets, which know no quadrics."""
-    return wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
 
 
 def own_models(scene: Scene, wave: Wave) -> list[int]:

@@ -9,26 +9,44 @@ it ask of the ray that left, and leaves what it asks of the ray that came.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchpt.compiler.form import CAPACITY
 from torchpt.compiler.graph import Unsupported
 from torchpt.compiler.operators.derivatives import summands
 from torchpt.compiler.sinks import Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
-from torchpt.engines.kernels.layout import HIT, Fields, Layout, Rows, Trace
+from torchpt.core.memory import Span
+from torchpt.engines.kernels.engine import Chunk, Paths, Worker
+from torchpt.engines.kernels.layout import HIT, Fields, Layout, Memory, Rows, Trace, path_state
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.math.gathers import gathered_by
+from torchpt.math.sums import ChunkSums
 from torchpt.paths import adjoint
-from torchpt.paths.adjoint import Before, Behind
+from torchpt.paths.adjoint import Before, Behind, Tape
+from torchpt.paths.integrators.path import slides
 from torchpt.paths.state import EXTRA, PathState, Shadow, Splat, VertexInput
-from torchpt.paths.wave import Wave, still_of
+from torchpt.paths.walk import KEPT
+from torchpt.paths.wave import still_of
+from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
 
-__all__ = ["SLOTS", "JointKernels", "back_bounce", "back_emit", "back_escape", "report", "slots_of", "slots_read"]
+__all__ = [
+    "SLOTS",
+    "JointKernels",
+    "KernelsBackward",
+    "back_bounce",
+    "back_emit",
+    "back_escape",
+    "report",
+    "slots_of",
+    "slots_read",
+]
 
 
 # ---- Vertices of paths gone back along, as kernels: each traces a stage of :mod:`torchpt.paths.adjoint`, its tape included
@@ -79,7 +97,7 @@ class _Noted:
 
     def leaves(self) -> list[Tensor]:
         """Inputs of the lane, then the tables themselves."""
-        return [*(leaf for _, _, leaf in self.taken), *self.kernels.tapes]
+        return [*(leaf for _, _, leaf in self.taken), *self.kernels.tape.leaves]
 
 
 def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks:
@@ -234,10 +252,7 @@ class JointKernels(Kernels):
     """The kernels of one backward pass.
 
     Args:
-        wave: with plain tensors.
-        taped: the same with leaves in place of those that are differentiated.
-        plain: tensors that are differentiated, as the wave has them.
-        tapes: their leaves.
+        tape: the wave, and what is differentiated in it.
         packets: see :class:`~torchpt.engines.kernels.layout.Layout`.
         cotangent: ``(3, H W)`` float32 of the picture, over the samples of a pixel: what splats read.
 
@@ -248,24 +263,16 @@ class JointKernels(Kernels):
         slots: rows of :func:`torchpt.engines.kernels.backward.slots_of`.
     """
 
-    def __init__(
-        self,
-        wave: Wave,
-        taped: Wave,
-        plain: Sequence[Tensor],
-        tapes: Sequence[Tensor],
-        packets: bool,
-        cotangent: Tensor | None = None,
-    ) -> None:
-        super().__init__(still_of(wave), packets, False, cotangent=cotangent)
-        self.cotangent = cotangent
-        self.taped = taped.context
-        self.plain, self.tapes = tuple(plain), tuple(tapes)
-        self.numbers_of = {id(tape): number for number, tape in enumerate(tapes)}
-        paths = [self._leaves.ids[id(one)][0] if id(one) in self._leaves.ids else None for one in plain]
-        for path, tape in zip(paths, tapes, strict=True):
+    def __init__(self, tape: Tape, packets: bool, cotangent: Tensor | None = None) -> None:
+        super().__init__(still_of(tape.wave), packets, False, cotangent=cotangent)
+        self.tape, self.cotangent = tape, cotangent
+        self.taped = tape.taped.context
+        self.plain = tape.plain
+        self.numbers_of = {id(leaf): number for number, leaf in enumerate(tape.leaves)}
+        paths = [self._leaves.ids[id(one)][0] if id(one) in self._leaves.ids else None for one in tape.plain]
+        for path, leaf in zip(paths, tape.leaves, strict=True):
             if path is not None:
-                self._leaves.ids[id(tape)] = path, tape
+                self._leaves.ids[id(leaf)] = path, leaf
         self.structure = (*self.structure, self.taped.plan.attached, tuple(paths))
         self.slots = Rows(slots_of(self))
         self.back_eager: dict[tuple[Any, ...], str] = {}
@@ -286,3 +293,195 @@ class JointKernels(Kernels):
     def report(self) -> Kernel:
         """See :func:`torchpt.engines.kernels.backward.report`."""
         return self._get(False, report)
+
+    def engine(self) -> KernelsBackward:
+        """Return an engine for one more thread."""
+        return KernelsBackward(self)
+
+    def bytes_per_lane(self, levels: int) -> int:
+        """Return what a lane costs that keeps so many vertices."""
+        return 4 * (levels + 2) * (self.state.count + self.models + 2)
+
+
+# ---- The engine of one thread that also goes back
+
+
+@dataclass(frozen=True)
+class Mark:
+    """The arena of a vertex as it was before lanes were listed."""
+
+    depth: int
+    words: np.ndarray
+
+
+class KernelsBackward(Worker):
+    """See :class:`torchpt.engines.engine.Backward`: the way back from arena to arena.
+
+    Lanes lie in an arena as they come; stages are gone back through in the order of samples, as :mod:`torchpt.math.sums` asks.
+
+    Args:
+        kernels: of the backward pass.
+    """
+
+    keeps_splats = False  # it goes back along their vertices
+
+    def __init__(self, kernels: JointKernels) -> None:
+        super().__init__(kernels)
+        self.back = kernels
+        self._levels: list[Paths] = []
+        self._behind = Memory(kernels.slots.count)
+        self._results = Memory(1)
+        self._sorted = Memory(2), np.zeros(CAPACITY, np.uint8)  # slots of a list's lanes, and what sorting takes
+        self._first = 1
+
+    def begin(self, span: Span, sums: ChunkSums) -> Paths:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        self.sums, self._chunk, self._first = sums, Chunk(*span), 1
+        paths = self.spawn(self._chunk)
+        self._weight = None
+        if "weight" in self.kernels.state:
+            row = self.kernels.state.first("weight")
+            self._weight = torch.from_numpy(paths.arena.floats[row, : paths.count].copy())
+        return paths
+
+    def room(self, depth: int) -> Paths:
+        """See :class:`Worker`: the first vertices of a part are all kept, of those behind two take turns."""
+        number = depth - self._first
+        if number >= KEPT:
+            return self._rooms[number % 2]
+        if number == len(self._levels):
+            self._levels.append(self._room())
+        return self._levels[number]
+
+    def mark(self, paths: Paths) -> Mark:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        return Mark(paths.depth, paths.arena.words[:, : paths.count].copy())
+
+    def resume(self, mark: Mark) -> Paths:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        self._first, count = mark.depth, mark.words.shape[1]
+        self._lost.clear()
+        paths = self._begin(self.room(mark.depth), mark.depth, count)
+        paths.arena.words[:, :count] = mark.words
+        paths.arrived = True
+        return paths
+
+    def radiance_of_samples(self) -> Tensor:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        self.mark_lost()
+        return torch.from_numpy(self.slots.floats[:, : self._chunk.pixels * self._chunk.samples])
+
+    def receive(self, cotangent: Tensor) -> None:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        n, first = cotangent.shape[1], self.back.slots.first("radiance")
+        self._behind.words[:, :n] = 0
+        asked = cotangent if self._weight is None else cotangent * self._weight
+        self._behind.floats[first : first + 3, :n] = asked.numpy()
+
+    def vjp(self, paths: Paths) -> None:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        kernels, calls, depth = self.back, self.calls, paths.depth
+        limits = self.wave.integrator.limits
+        slide = slides(kernels.taped.plan, kernels.world, depth)
+        calls.name_salts(depth)
+        if depth < limits.last:
+            for model, count in enumerate(paths.groups):
+                if count:
+                    key = ("bounce", model, limits.roulette(depth), slide)
+                    self._one(key, paths, paths.lists[model], count, False)
+        if kernels.has_emitters and paths.places[kernels.emissive]:
+            place = kernels.emissive
+            self._one(("emit", slide), paths, paths.lists[place], paths.places[place], True)
+        if kernels.has_environment and paths.places[kernels.missed]:
+            place = kernels.missed
+            self._one(("escape",), paths, paths.lists[place], paths.places[place], True)
+        if depth > 1:
+            calls.run(kernels.report(), paths.count, paths.arena, paths.arena, slots=self._behind)
+
+    def _one(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
+        """Back through one stage on the lanes of a list, by its kernel or by tensor operations."""
+        kernel = self.back.back_kernel(key)
+        slots = self._by_sample(paths, places, count) if kernel is None or kernel.program.sums else None
+        if kernel is None:
+            self._eagerly(key, paths, places, count, added)
+            return
+        self._results = self._results_of(kernel)
+        self.calls.run(kernel, count, paths.arena, self._results, places, slots=self._behind)
+        if slots is None:
+            return
+        floats, words = self._results.floats, self._results.words
+        for number, index, first, width in kernel.program.sums:
+            values = floats[first : first + width, :count]
+            if index < 0:
+                self.sums.add_all(number, values, slots)
+            else:
+                self.sums.add_rows(number, words[index, :count], values, slots)
+
+    def _by_sample(self, paths: Paths, places: Memory, count: int) -> np.ndarray:
+        """Sort the lanes of a list by their samples; return the slots of these, rising."""
+        from torchpt.math.sum_kernels import sort_by_sample
+
+        lanes, (memory, taken) = paths.arena.words[self.back.state.first("lane")], self._sorted
+        slots, found = memory.words
+        sort_by_sample(places.words[0], count, lanes, slots, found, taken)
+        return slots[:count]
+
+    def _results_of(self, kernel: Kernel) -> Memory:
+        rows = max((max(index + 1, first + width) for _, index, first, width in kernel.program.sums), default=1)
+        return self._results if len(self._results.words) >= rows else Memory(rows)
+
+    def _eagerly(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
+        """Back through a stage by tensor operations, for what no kernel can be made of."""
+        kernels, integrator, salt = self.back, self.wave.integrator, salts(paths.depth, torch.device("cpu"))
+        plan = kernels.taped.plan
+        lanes = places.words[0, :count]
+        state = path_state(kernels.state.take(paths.arena, lanes, kernels.state.state))
+        vertex = VertexInput(state, Hit(**kernels.state.take(paths.arena, lanes, tuple(HIT))))
+        lane = state.lane.numpy()
+        rows = kernels.slots.take(self._behind, lane, slots_read(kernels))
+
+        def clear(_: Shadow) -> Tensor:
+            return rows["clear"]
+
+        def landed(splat: Splat) -> tuple[Tensor, Tensor]:
+            assert kernels.cotangent is not None
+            return adjoint.splatted(integrator.clamp, kernels.cotangent, splat, rows["splat_clear"])
+
+        before: Before
+        with gathered_by(self.sums):
+            if key[0] == "bounce":
+                extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
+                behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
+                following = Hit(*(rows[name] for name in HIT)) if plan.attached else None
+                _, model, roulette, slide = key
+                context = kernels.taped.at(salt, slide, roulette)
+                before = adjoint.bounce(
+                    integrator.bounce, context, model, vertex, following, clear, behind, self._tables, landed
+                )
+            else:
+                stage = integrator.emit if key[0] == "emit" else integrator.escape
+                before = adjoint.gather(stage, kernels.taped.at(salt, *key[1:]), vertex, rows["radiance"], self._tables)
+        for name, found, like in before.of_rays(state, plan.attached):
+            first = kernels.slots.first(name)
+            values = np.zeros(like.shape, np.float32) if found is None else found.numpy()
+            values = values.reshape(-1, count)
+            held = self._behind.floats[first : first + len(values)]
+            held[:, lane] = values + held[:, lane] if added else values
+        self.sums.add_each(before.others)
+
+    def _tables(self) -> Sequence[Tensor]:
+        return self.back.tape.tables
+
+    def vjp_rays(self) -> None:
+        """See :class:`torchpt.engines.engine.Backward`: by tensor operations."""
+        if not self.back.taped.plan.attached:
+            return
+        chunk, first, n = self._chunk, self.back.slots.first, self._chunk.pixels * self._chunk.samples
+        with torch.enable_grad(), gathered_by(self.sums):
+            state = self.back.tape.taped.rays(chunk.first_pixel, chunk.pixels, chunk.first_sample, chunk.samples)
+            pairs = [(x, first(name)) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
+            if not pairs:
+                return
+            asked = [torch.from_numpy(self._behind.floats[row : row + 3, :n].copy()) for _, row in pairs]
+            found = torch.autograd.grad([x for x, _ in pairs], self._tables(), asked, allow_unused=True)
+        self.sums.add_each(found)

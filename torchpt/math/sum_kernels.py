@@ -74,7 +74,7 @@ def add_at(total: Any, index: Any, values: Any) -> None:
 
 @jit()
 def add_by_columns(total: Any, index: Any, values: Any, slots: Any) -> None:
-    """As :func:`add_at`, what an entry is given summed by columns of slots first: see :mod:`torchpt.gradients.sums`.
+    """As :func:`add_at`, what an entry is given summed by columns of slots first: see :mod:`torchpt.math.sums`.
 
     Args:
         total: ``(M, R)`` float64.

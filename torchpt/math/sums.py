@@ -5,7 +5,7 @@ come by sample: by the slot that a lane's sample has in its chunk, wherever in a
 entry is,
 
 - in tables of few numbers (:data:`FEW`), summed by columns: slot s is in column s modulo C
-  (:data:`~torchpt.gradients.kernels.COLUMNS`). An entry's terms of a column are added one after the other, from 0; then each
+  (:data:`~torchpt.math.sum_kernels.COLUMNS`). An entry's terms of a column are added one after the other, from 0; then each
   column of the second half is added to its fellow of the first, and so on with those that are left, until there is one, which
   is added to the entry. A slot without a term may be left out or count 0. A derivative by all of a table is a term of each lane
   for each of its numbers, and is summed alike;
@@ -73,7 +73,7 @@ class Sums:
         """Add ``values (..., n)`` to the entries ``index (n,)`` of a table, in their order."""
         total = self.total(number)
         if total.device.type == "cpu":
-            from torchpt.gradients.kernels import add_at
+            from torchpt.math.sum_kernels import add_at
 
             add_at(total.numpy(), index.numpy(), values.reshape(total.shape[1], -1).numpy())
         else:
@@ -125,7 +125,7 @@ class Sums:
 
     def add_rows(self, number: int, index: np.ndarray, values: np.ndarray) -> None:
         """Add ``values (R, n)`` to the entries ``index (n,)`` of a table on a CPU, one after the other."""
-        from torchpt.gradients.kernels import add_at
+        from torchpt.math.sum_kernels import add_at
 
         add_at(self.total(number).numpy(), index, values)
 
@@ -178,7 +178,7 @@ class ChunkSums:
             else:
                 self._whole.add_rows(number, index, values)
             return
-        from torchpt.gradients.kernels import add_at, add_by_columns
+        from torchpt.math.sum_kernels import add_at, add_by_columns
 
         if numbers <= FEW:
             add_by_columns(self._total(number).numpy(), index, values, slots)
@@ -187,7 +187,7 @@ class ChunkSums:
 
     def add_all(self, number: int, values: np.ndarray, slots: np.ndarray) -> None:
         """Add the sums over lanes of ``values (all numbers of a table, n)``; ``slots`` as of :meth:`add_rows`."""
-        from torchpt.gradients.kernels import add_by_columns
+        from torchpt.math.sum_kernels import add_by_columns
 
         total = torch.zeros(self.tables[number].shape, dtype=torch.float64)
         add_by_columns(total.view(1, -1).numpy(), np.zeros(len(slots), np.int32), values, slots)

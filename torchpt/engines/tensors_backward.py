@@ -1,0 +1,206 @@
+"""The way back by tensor operations: on CUDA, in float64, and where no kernels can be made.
+
+What is handed from vertex to vertex lies by lanes: each path has one, and reads there what those behind it ask of the ray that
+left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchpt.core.memory import Span
+from torchpt.engines.tensors import Paths, Tensors, escaped
+from torchpt.math.gathers import gathered_by
+from torchpt.math.sums import Sums
+from torchpt.math.vectors import rows, take
+from torchpt.paths import adjoint
+from torchpt.paths.adjoint import Behind, Tape
+from torchpt.paths.integrators.path import Ends, slides
+from torchpt.paths.state import EXTRA, Emission, PathState, Shadow, Splat, StageContext, VertexInput
+from torchpt.physics.samplers import salts
+from torchpt.physics.shapes.geometry import Hit
+
+__all__ = ["TensorsBackward"]
+
+
+class TensorsBackward(Tensors):
+    """The engine of one chunk after the other that also goes back; see :class:`torchpt.engines.engine.Backward`.
+
+    Args:
+        tape: the wave, and what is differentiated in it.
+        cotangent: ``(3, H W)`` of the picture, over the samples of a pixel: what splats read.
+    """
+
+    def __init__(self, tape: Tape, cotangent: Tensor | None = None) -> None:
+        super().__init__(tape.wave, 0)
+        self.tape, self.taped, self._cotangent = tape, tape.taped, cotangent
+        # What is asked of what lets rays pass is asked under a tape.
+        self._under_tape = Tensors(replace(tape.wave, context=tape.taped.context), 0)
+        self._rows = ("throughput", "o", "d") if self.plan.attached else ("throughput",)
+
+    def begin(self, span: Span, sums: Sums) -> Paths:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        self.sums, self._span = sums, span
+        state = self.wave.rays(*span)
+        self._clear(len(state.lane))
+        self._weight = self.wave.weight(state) if self.wave.filter.signed else None
+        return self.spawn(state)
+
+    def mark(self, paths: Paths) -> Paths:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        return Paths(paths.state, paths.depth, paths.hit)
+
+    def resume(self, mark: Paths) -> Paths:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        state = replace(mark.state, radiance=torch.zeros_like(mark.state.radiance))
+        return Paths(state, mark.depth, mark.hit)
+
+    def scatter(self, paths: Paths, roulette: float) -> Paths:
+        """See :class:`torchpt.paths.walk.Engine`; how much of the light got through is kept with the vertex it left."""
+        after = super().scatter(paths, roulette)
+        paths.passed = after.clear, after.splat_clear
+        return after
+
+    def radiance_of_samples(self) -> Tensor:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        found = self.brought()
+        return found if self._weight is None else found * self._weight
+
+    def receive(self, cotangent: Tensor) -> None:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        # What the rest of its path asks of each lane's ray, and what that ray met.
+        self._asked = cotangent if self._weight is None else cotangent * self._weight
+        self._behind = {name: torch.zeros_like(cotangent) for name in self._rows}
+        for own in self.wave.integrator.fields:
+            if not own.whole:
+                self._behind[EXTRA + own.name] = torch.zeros_like(own.begin(cotangent[0]))
+        zero = torch.zeros_like(cotangent[0])
+        none = torch.full(zero.shape, -1, dtype=torch.int64, device=zero.device)
+        self._met = Hit(zero.clone(), none, zero.clone(), zero.clone())
+
+    def vjp(self, paths: Paths) -> None:
+        """See :class:`torchpt.engines.engine.Backward`: lanes came grouped by the models before, and are taken by sample."""
+        depth, order = paths.depth, paths.state.lane.argsort()
+        place = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
+        state, hit = rows(paths.state, order), rows(paths.met, order)
+        ends = Ends(take(place, paths.ends.emissive).msort(), take(place, paths.ends.missed).msort())
+        chance, asked = self._chance(state, depth)
+        hit = replace(hit, chance=chance)
+        if depth < self.wave.integrator.limits.last:
+            clear, splat_clear = (iter(kept) for kept in paths.passed)
+            for model, came in paths.groups or ():
+                index, turn = take(place, came).sort()
+                self._bounce(model, depth, clear, splat_clear, turn, state, hit, index, asked)
+        self._light(ends, depth, state, hit, asked)
+        if chance is not None and asked is not None:
+            self.sums.add_each(torch.autograd.grad(chance, self.tape.tables, asked, allow_unused=True))
+        if self.plan.attached:
+            for name in ("t", "prim", "u", "v"):
+                getattr(self._met, name).index_copy_(0, state.lane, getattr(hit, name))
+
+    def _chance(self, state: PathState, depth: int) -> tuple[Tensor | None, Tensor | None]:
+        """The chance to get here under a tape, where it has derivatives, and zeros for what is asked of it."""
+        if not self.tape.passing:
+            return None, None
+        with torch.enable_grad(), gathered_by(self.sums):
+            chance = self._under_tape.hits(state, depth).chance
+        if chance is None or not chance.requires_grad:
+            return None, None
+        return chance, torch.zeros_like(chance)
+
+    def _at(self, depth: int, lanes: Tensor, roulette: float = 0.0) -> StageContext:
+        slide = slides(self.plan, self.taped.context.world, depth)
+        return self.taped.context.at(salts(depth, lanes.device), slide, roulette)
+
+    def _bounce(
+        self,
+        model: int,
+        depth: int,
+        clear: Iterator[Tensor],
+        splat_clear: Iterator[Tensor],
+        turn: Tensor,
+        state: PathState,
+        hit: Hit,
+        index: Tensor,
+        asked: Tensor | None,
+    ) -> None:
+        """Back through what happened at the surfaces of a model, at lanes ``index``."""
+        lane = take(state.lane, index)
+        following = rows(self._met, lane) if self.plan.attached else None
+        behind = Behind(
+            take(self._asked, lane),
+            take(self._behind["throughput"], lane),
+            *(take(self._behind[name], lane) if self.plan.attached else None for name in ("o", "d")),
+            extra={k.removeprefix(EXTRA): take(x, lane) for k, x in self._behind.items() if k.startswith(EXTRA)},
+        )
+
+        def passed(shadow: Shadow) -> Tensor:
+            kept = next(clear)
+            return self._under_tape.clear(shadow) if self.tape.passing else take(kept, turn)
+
+        def landed(splat: Splat) -> tuple[Tensor, Tensor]:
+            kept = next(splat_clear)
+            through = self._under_tape.clear(splat.light) if self.tape.passing else take(kept, turn)
+            assert self._cotangent is not None
+            return adjoint.splatted(self.wave.integrator.clamp, self._cotangent, splat, through)
+
+        with gathered_by(self.sums):
+            context = self._at(depth, lane, self.wave.integrator.limits.roulette(depth))
+            vertex = VertexInput(rows(state, index), rows(hit, index))
+            stage = self.wave.integrator.bounce
+            before = adjoint.bounce(stage, context, model, vertex, following, passed, behind, self._tables, landed)
+        for name, found, like in before.of_rays(vertex.state, self.plan.attached):
+            self._behind[name].index_copy_(-1, lane, torch.zeros_like(like) if found is None else found)
+        self.sums.add_each(before.others)
+        if asked is not None and before.chance is not None:
+            asked.index_add_(0, index, before.chance)
+
+    def _light(self, ends: Ends, depth: int, state: PathState, hit: Hit, asked: Tensor | None) -> None:
+        """Back through light that was met by chance; what a bounce asks of the same lanes is there already."""
+        table, integrator = self.world.lights, self.wave.integrator
+        if table is None:
+            return
+        self._gathered(integrator.emit, ends.emissive, depth, state, hit, asked)
+        if table.environment is not None:
+            self._gathered(integrator.escape, escaped(self.wave, state, ends), depth, state, hit, asked)
+
+    def _gathered(
+        self,
+        stage: Callable[[StageContext, VertexInput], Emission],
+        index: Tensor,
+        depth: int,
+        state: PathState,
+        hit: Hit,
+        asked: Tensor | None,
+    ) -> None:
+        if not len(index):
+            return
+        lane = take(state.lane, index)
+        vertex = VertexInput(rows(state, index), rows(hit, index))
+        with gathered_by(self.sums):
+            before = adjoint.gather(stage, self._at(depth, lane), vertex, take(self._asked, lane), self._tables)
+        for name, found, _ in before.of_rays(vertex.state, self.plan.attached):
+            if found is not None:
+                behind = self._behind[name]
+                behind.index_copy_(-1, lane, take(behind, lane) + found)
+        self.sums.add_each(before.others)
+        if asked is not None and before.chance is not None:
+            asked.index_add_(0, index, before.chance)
+
+    def vjp_rays(self) -> None:
+        """See :class:`torchpt.engines.engine.Backward`."""
+        if not self.plan.attached:
+            return
+        with torch.enable_grad(), gathered_by(self.sums):
+            state = self.taped.rays(*self._span)
+            pairs = [(x, self._behind[name]) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
+            if pairs:
+                rays, asked = [x for x, _ in pairs], [g for _, g in pairs]
+                self.sums.add_each(torch.autograd.grad(rays, self.tape.tables, asked, allow_unused=True))
+
+    def _tables(self) -> Sequence[Tensor]:
+        return self.tape.tables
