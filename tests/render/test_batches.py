@@ -14,10 +14,11 @@ from few import few
 import torchpt
 from torchpt import search
 from torchpt.core.errors import RenderError, SceneError
+from torchpt.engines import tensors
 from torchpt.engines.kernels import engine, programs
 from torchpt.engines.kernels import programs as loop_kernels
 from torchpt.paths.integrators import base
-from torchpt.rendering import Run, run
+from torchpt.rendering import Run
 from torchpt.scene import scene as scenes_room
 
 SIZE = {"width": 24, "height": 16, "filter": "box"}
@@ -293,15 +294,15 @@ def test_scenes_by_tensor_operations_are_rendered_before_the_next_is_loaded():
 def test_memory_that_runs_out_by_tensor_operations(monkeypatch):
     scenes = [room(0.2), room(0.3)]
     expected = torchpt.render_batch(scenes, compile="off")
-    plain, taken = run.take, []
+    plain, taken = tensors.brought, []
 
-    def limited(wave, plate, light, span):
-        if span[1] * span[3] > 500:
+    def limited(wave, state, *args, **rest):
+        if len(state.lane) > 500:
             raise MemoryError
-        taken.append(span)
-        return plain(wave, plate, light, span)
+        taken.append(state)
+        return plain(wave, state, *args, **rest)
 
-    monkeypatch.setattr(run, "take", limited)
+    monkeypatch.setattr(tensors, "brought", limited)
     assert torch.equal(torchpt.render_batch(scenes, compile="off"), expected) and len(taken) > 4
 
 

@@ -137,7 +137,7 @@ def test_renders_that_are_taken_alone_have_all_threads(scene: torchpt.Scene, mon
     """In a batch, while other pictures are traced."""
     threads: list[int] = []
     go = Run.go
-    monkeypatch.setattr(Run, "go", lambda self, told: (threads.append(self.loop.budget.threads), go(self, told))[1])
+    monkeypatch.setattr(Run, "go", lambda self, told: (threads.append(self.engine.budget.threads), go(self, told))[1])
     timed = torchpt.load({**SCENE, "render": {"spp": 4, "time_limit": 100.0}}, "cpu")
     torchpt.render_batch([scene, timed], threads=2, compile="on")
     assert threads == [2]

@@ -58,7 +58,7 @@ def box() -> torchpt.Scene:
 @contextmanager
 def in_pieces(which: Callable[[int], bool], error: Callable[[], Exception]) -> Iterator[list[int]]:
     """Context in which operations within pieces of passes fail, counted over the whole render; gives how many there were."""
-    from torchpt.rendering import run
+    from torchpt.engines.tensors_forward import TensorsForward
 
     counted = [0]
 
@@ -73,7 +73,7 @@ def in_pieces(which: Callable[[int], bool], error: Callable[[], Exception]) -> I
         return work
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(run.Run, "_piece", failing(run.Run._piece))
+        patched.setattr(TensorsForward, "_take", failing(TensorsForward._take))
         yield counted
 
 

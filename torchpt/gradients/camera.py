@@ -32,7 +32,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.memory import Span
-from torchpt.engines import tensors
+from torchpt.engines.engine import hits, trace
 from torchpt.gradients.parameters import Assembly, attached
 from torchpt.gradients.tape import chunk_by_chunk, counted
 from torchpt.math.sums import Sums
@@ -126,7 +126,7 @@ def interior(still: Wave, wave: Wave, span: Span) -> Tensor:
     Args:
         still: a wave of detached parameters.
         wave: the same under a tape.
-        span: as of :func:`torchpt.engines.tensors.radiance`.
+        span: as of :func:`torchpt.engines.engine.radiance`.
     """
     with torch.no_grad():
         state = still.rays(*span)
@@ -246,14 +246,14 @@ def _rays(still: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
 
 def _brought(wave: Wave, state: PathState) -> Tensor:
     """Radiance ``(3, N)`` that camera rays bring."""
-    return tensors.trace(wave, state)
+    return trace(wave, state)
 
 
 def _held(still: Wave, wave: Wave, state: PathState) -> _Seen:
     """Return what camera rays of detached parameters meet, as a camera under a tape sees it."""
     world = still.context.world
     with torch.no_grad():
-        hit = tensors.hits(still, state)
+        hit = hits(still, state)
         missed = hit.prim < 0
         at = interact(world, state.o, state.d, replace(hit, prim=hit.prim.clamp_min(0)), True)
         p, n = torch.where(missed, 0.0, at.p), torch.where(missed, 0.0, at.ng)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import say_once
 from torchpt.core.memory import Budget, Span, ran_out
 from torchpt.core.threads import deal
-from torchpt.engines.engine import LANES_OF_KERNELS, Backward, backward_kernels, backward_tensors
+from torchpt.engines.engine import LANES_OF_KERNELS, Backward, BackwardKernels, backward_kernels, backward_tensors
 from torchpt.gradients.parameters import Assembly
 from torchpt.gradients.tape import asked_of
 from torchpt.math.sums import ChunkSums, Sums
@@ -28,9 +28,6 @@ from torchpt.paths.walk import KEPT, Counts, Observer, Population, walk
 from torchpt.scene import Scene
 from torchpt.scene.prepare import own_models
 from torchpt.scene.settings import Settings
-
-if TYPE_CHECKING:
-    from torchpt.engines.kernels.backward import JointKernels
 
 __all__ = ["replay_paths"]
 
@@ -168,7 +165,7 @@ def piece(assembly: Assembly, settings: Settings, asked: Tensor, share: Tensor |
     return sums
 
 
-def _over_threads(kernels: JointKernels, assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> str:
+def _over_threads(kernels: BackwardKernels, assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> str:
     """Take all chunks by kernels; return why that cannot be, or ""."""
     wave, asked = assembly.wave, asked.float()
     budget = _budget(kernels, settings)
@@ -216,7 +213,7 @@ def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
                 yield pixel, min(step, start + pixels - pixel), sample, count
 
 
-def _budget(kernels: JointKernels, settings: Settings) -> Budget:
+def _budget(kernels: BackwardKernels, settings: Settings) -> Budget:
     """Return how many threads there are, fewer where the arenas of all would take more than half of ``render.max_memory``."""
     threads = torch.get_num_threads()
     budget = Budget(torch.device("cpu"), LANES_OF_KERNELS, threads, what="a gradient", instead="one thread")

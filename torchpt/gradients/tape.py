@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchpt.core.memory import Budget, Span
 from torchpt.core.threads import one_thread
-from torchpt.engines import tensors
+from torchpt.engines.engine import radiance as radiance_of
 from torchpt.gradients.parameters import Assembly
 from torchpt.math.gathers import gathered_by
 from torchpt.math.sums import Sums
@@ -86,7 +86,7 @@ def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> N
 
     def part(span: Span) -> tuple[Tensor, Tensor]:
         splats: list[Splats] = []
-        radiance = tensors.radiance(wave, *span, splats=splats)
+        radiance = radiance_of(wave, *span, splats=splats)
         share = asked_of(settings, radiance.detach(), asked[:, span[0] : span[0] + span[1]].to(radiance.dtype))
         # What is not finite must not meet its share of 0.
         values = torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0)

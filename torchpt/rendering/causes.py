@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
-from torchpt.engines.tensors import brought
+from torchpt.engines.engine import brought
 from torchpt.paths.lost import Lost, Place
 from torchpt.paths.state import PathState
 from torchpt.paths.wave import Wave

@@ -11,7 +11,7 @@ import torch
 
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.threads import Crew, one_thread, undisturbed
-from torchpt.engines.kernels.threads import Block, Share
+from torchpt.engines.engine import Block, Share
 from torchpt.rendering.result import Rendering
 from torchpt.rendering.run import Run
 
@@ -75,19 +75,19 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 del entry.run
                 continue
             with _blamed(entry):
-                loop = entry.run.loop
-                assert loop is not None
+                engine = entry.run.tasks
+                assert engine is not None
                 begun[id(entry)] = entry
-                blocks = loop.blocks(spans, tasks)
+                blocks = engine.blocks(spans, tasks)
                 entry.left = len(blocks)
                 for block in blocks:
-                    crew.add(entry, partial(loop.task, block))
+                    crew.add(entry, partial(engine.task, block))
             _drain(crew, begun, AHEAD * crew.threads * tasks)
         _drain(crew, begun, 0)
     finally:
         for entry in begun.values():  # those that are not done stop at their next kernel
-            if entry.run.loop is not None:
-                entry.run.loop.halt()
+            if entry.run.tasks is not None:
+                entry.run.tasks.halt()
         crew.close()
 
 
@@ -121,8 +121,8 @@ def _drain(crew: Crew[Entry, Share], begun: dict[int, Entry], most: int) -> None
         with undisturbed(entry.device), _blamed(entry), _beside(crew):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
-                assert entry.run.loop is not None
-                entry.run.loop.halt()
+                assert entry.run.tasks is not None
+                entry.run.tasks.halt()
             elif isinstance(share, BaseException):
                 raise share
             else:

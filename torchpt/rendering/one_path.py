@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.core.threads import limited_threads
-from torchpt.engines import tensors
+from torchpt.engines.engine import brought
 from torchpt.paths.explain import Bounced, Explainer, Left, Met, Shone
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.integrators.path import PathIntegrator
@@ -187,8 +187,8 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         x, y, number = (torch.tensor([value], device=scene.device) for value in (*pixel, sample))
         state = wave.rays_of(x, y, number)
         explainer.began(state)
-        brought = tensors.brought(wave, state, observer=explainer)
-        return _Story(scene, explainer).told(settings, pixel, sample, brought)
+        radiance = brought(wave, state, observer=explainer)
+        return _Story(scene, explainer).told(settings, pixel, sample, radiance)
 
 
 class _Story:

@@ -74,7 +74,7 @@ def rendering_of(run: Run) -> Rendering:
         stopped_by=run.stop.reason,
         complete=bool(run.stop.reason) and not run.ended,
         peak_memory=max(meter.peak() - meter.base(), 0),
-        lanes=run.waves.lanes if run.waves is not None and run.waves.short else None,
+        lanes=run.engine.budget.lanes if run.engine.budget.short and not run.engine.compiled else None,
         eager=tuple(run.eager),
         scene=run.name,
         settings=run.settings,

@@ -6,7 +6,6 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import torch
@@ -14,9 +13,9 @@ from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import LostRankError, OutputError, RenderError, SceneError, say_once
-from torchpt.core.memory import Budget, Meter, Span, check_memory, mb, needing, retried
+from torchpt.core.memory import Budget, Meter, check_memory, mb, needing, retried
 from torchpt.core.threads import limited_threads, undisturbed
-from torchpt.engines.kernels.threads import Block, Loop, Share
+from torchpt.engines.engine import Block, Forward, Share, Tasks, forward_tensors
 from torchpt.native import compile_time
 from torchpt.paths.lost import Lost
 from torchpt.paths.wave import Plate, Tally, Wave
@@ -27,7 +26,6 @@ from torchpt.rendering.causes import told
 from torchpt.rendering.checkpoint import EVERY, Keeper, State, check_samples, check_whole, identity
 from torchpt.rendering.error import FIRST_ROUND, Shares, second_values
 from torchpt.rendering.picture import final, known_of, rendering_of
-from torchpt.rendering.piece import take
 from torchpt.rendering.result import Progress, Rendering
 from torchpt.rendering.split import Split, stamp
 from torchpt.rendering.stopping import Stop
@@ -71,7 +69,6 @@ class Run:
         self.start = time.perf_counter()
         self._others = compile_time.seconds()
         self._kernels = 0.0  # seconds of kernels that were given up
-        self.loop: Loop | None = None
         self.split = None if group is None or group.size == 1 else Split(group)
         self.shared: tuple[int, int] = 0, 1  # samples before this pass, and how many ranks take it
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
@@ -97,19 +94,25 @@ class Run:
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
             self.keeper.check(settings.render.resume)
-        self.loop = loop_of(scene, self.wave, self.eager, threads) if compiled else None
-        how = "eager" if self.loop is None else "compiled"
-        rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
+        self.tasks: Tasks | None = loop_of(scene, self.wave, self.eager, threads) if compiled else None
+        self.engine: Forward = self._by_tensors() if self.tasks is None else self.tasks
+        rows = self.engine.rows(self.seen)
+        how = "compiled" if self.engine.compiled else "eager"
         self.need = need_of(settings, self.device, how, len(self.wave.context.world.materials.models), rows)
         if limit is not None:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
             check_memory(limit, self.device, self.need.least, loading)
-            if self.loop is not None:
-                self.loop.budget.fit(self.need.left(limit, meter.above()), 4 * rows, FEWEST_OF_LOOP)
+            if self.engine.compiled:
+                self.engine.budget.fit(self.need.left(limit, meter.above()), 4 * rows, FEWEST_OF_LOOP)
         films = mb(self.need.films)
         retried(lambda: f"films of {self.width} x {self.height} pixels, which take {films}", self._begin)
         self._compiled = self.compile_seconds()
         self.build_seconds = time.perf_counter() - self.start - self._compiled
+
+    def _by_tensors(self) -> Forward:
+        lanes = LANES.get(self.device.type, LANES["cpu"])
+        limit, what = self.settings.render.max_memory, "a wave of a single lane"
+        return forward_tensors(self.wave, Budget(self.device, lanes, what=what, limit=limit, per_lane=BYTES_PER_LANE))
 
     def _begin(self) -> None:
         """Nothing is sampled yet."""
@@ -135,7 +138,6 @@ class Run:
         self.lost = Lost()
         self._unlooked: tuple[dict[str, Any], Tensor] = {}, torch.empty(0)  # counted before pixels were looked at again
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
-        self.waves: Budget | None = None  # of tensor operations
         self.begun: float | None = None
 
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
@@ -158,7 +160,7 @@ class Run:
         None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
         """
         ends = self.keeps or self.stop.open or self.twice is not None or self.split is not None
-        if self.loop is None or ends or self.settings.render.max_memory is not None:
+        if self.tasks is None or ends or self.settings.render.max_memory is not None:
             return None
         self.begun = time.perf_counter()
         return [(self.picture, 0, self.settings.render.spp)]
@@ -170,16 +172,15 @@ class Run:
                 self._eagerly(self.unsupported)
             else:
                 if rest:
-                    assert self.loop is not None
-                    self.loop.take_rest(rest, self.took)
+                    assert self.tasks is not None
+                    self.tasks.take_rest(rest, self.took)
                 self.taken = self.settings.render.spp
                 self.stop.told(self.taken, self.seconds_of_sampling(), None)
         return self._final()
 
     def _final(self) -> Rendering:
-        loaded("eager" if self.loop is None else "compiled")
-        if self.loop is not None:
-            self.loop.dismiss(keeps=self.settings.render.max_memory is None)
+        loaded("compiled" if self.engine.compiled else "eager")
+        self.engine.dismiss(keeps=self.settings.render.max_memory is None)
         return final(self)
 
     def _all(self) -> None:
@@ -187,7 +188,7 @@ class Run:
         try:
             self._complete()
         except Unsupported as error:
-            if self.loop is None:
+            if not self.engine.compiled:
                 raise
             self._eagerly(error)
 
@@ -201,9 +202,8 @@ class Run:
             raise SceneError("render.compile", "on", f"auto or off (no kernel can be made of {error})")
         self.eager.append(f"all stages: {error}")
         say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
-        assert self.loop is not None
-        self._kernels += self.loop.kernels.seconds
-        self.loop = None
+        self._kernels += self.engine.seconds
+        self.tasks, self.engine = None, self._by_tensors()
         self._begin()
         self._complete()
 
@@ -403,8 +403,7 @@ class Run:
 
     def compile_seconds(self) -> float:
         """Since the start, for kernels: those of stages, and others that a first call makes, such as those of searches."""
-        made = 0.0 if self.loop is None else self.loop.kernels.seconds
-        return self._kernels + made + compile_time.seconds() - self._others
+        return self._kernels + self.engine.seconds + compile_time.seconds() - self._others
 
     def write_seconds(self) -> float:
         """For checkpoints."""
@@ -427,22 +426,7 @@ class Run:
     def take_alone(self, spans: list[tuple[Plate, int, int]]) -> bool:
         """The same by this process alone."""
         self.left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
-        if self.loop is not None:
-            return self.loop.run(spans, self.took)
-        if self.waves is None:
-            self.waves = Budget(
-                self.device,
-                LANES.get(self.device.type, LANES["cpu"]),
-                what="a wave of a single lane",
-                limit=self.settings.render.max_memory,
-                per_lane=BYTES_PER_LANE,
-            )
-        for plate, first, count in spans:
-            pixels = plate.film.width * plate.film.height
-            for _, n, _, samples in self.waves.through(partial(self._piece, plate), pixels, first, count):
-                if self.took(Share(Tally(), n * samples)):
-                    return False
-        return True
+        return self.engine.run(spans, self.took)
 
     def took(self, share: Share | None) -> bool:
         """Count what a task brought; returns whether the render is to stop."""
@@ -455,14 +439,6 @@ class Run:
             self.light += torch.tensor(share.light, dtype=torch.float64, device=self.device)
         self.left -= share.samples
         return self._advanced(share.samples, self.left == 0 and self.split is None)
-
-    def _piece(self, plate: Plate, span: Span) -> None:
-        """A piece by tensor operations: all of it, or nothing where it raises."""
-        piece = take(self.wave, plate, self.light, span)
-        self._count(piece.lost)
-        piece.write()
-        self.tally.rays += piece.tally.rays
-        self.tally.truncated += piece.tally.truncated
 
     def _advanced(self, samples: int, ends: bool) -> bool:
         """Tell of progress; returns whether to stop."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchpt.engines import tensors
+from torchpt.engines.engine import hits, seen
 from torchpt.math.vectors import Frame, dot, rows
 from torchpt.paths.integrators.path import PathIntegrator, partition
 from torchpt.paths.state import PathState
@@ -113,10 +113,10 @@ def _dark(search: _Search, black: Tensor) -> float:
         wave.centre.device
     )
     state = _through(wave, asked)
-    hit = tensors.hits(wave, state)
+    hit = hits(wave, state)
     reflects = hit.prim >= 0
     with suppress(NotImplementedError):  # a model of the caller's own without an albedo
-        reflects = tensors.seen(wave, ("albedo",), state)["albedo"].abs().amax(0) > 0
+        reflects = seen(wave, ("albedo",), state)["albedo"].abs().amax(0) > 0
     on = reflects.nonzero()[:, 0]
     if not len(on) or not _in_sight(wave, rows(state, on), rows(hit, on)):
         return 0.0

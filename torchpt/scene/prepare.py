@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError, say_once
-from torchpt.engines.engine import packets_of
-from torchpt.engines.kernels.programs import Kernels
-from torchpt.engines.kernels.threads import Loop
+from torchpt.engines import engine
+from torchpt.engines.engine import Kernels, Tasks
 from torchpt.images.denoiser import GUIDES
 from torchpt.math.vectors import dot, normalize
 from torchpt.paths.integrators import LAYERS
@@ -271,16 +270,8 @@ def own_models(scene: Scene, wave: Wave) -> list[int]:
 
 
 def kernels_of(scene: Scene, wave: Wave, before: Kernels | None = None) -> Kernels:
-    """The kernels of a render; models of the user's own that no kernel can be made of are named in ``eager``."""
-    packets = packets_of(wave)
-    opaque = wave.context.world.materials.opacity is None and not wave.integrator.own_transmit
-    fused = packets and opaque and wave.first is None and not wave.integrator.splats
-    kernels = Kernels(wave, packets, fused, before, fixed=not scene.own_models)
-    eager = kernels.probe(own_models(scene, wave)) if wave.integrator.light else {}
-    if eager and kernels.fused:  # what runs as tensor operations hands its rays to the search structure
-        kernels = Kernels(wave, packets, False)
-    kernels.eager = eager
-    return kernels
+    """Return the kernels of a wave of a scene, see :func:`torchpt.engines.engine.kernels_of`."""
+    return engine.kernels_of(wave, own_models(scene, wave), before)
 
 
 def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
@@ -288,21 +279,11 @@ def loop_facts(scene: Scene, settings: Settings) -> dict[str, Any]:
     with torch.no_grad():
         if not looped(settings, scene.device, torch.float32):
             return {"stages": "eager, by tensor operations"}
-        wave = make_wave(scene, settings, None, torch.float32)
-        kernels = kernels_of(scene, wave)
-    search = "inside the stages" if kernels.fused else "kernels of packets" if kernels.packets else wave.accel.name
-    names = [str(model) for model in wave.context.world.materials.models]
-    eager = {names[number]: reason for number, reason in kernels.eager.items()}
-    return {
-        "stages": "compiled to loops over lanes",
-        "search": search,
-        "rows_a_path": kernels.state.count,
-        **({"eager": eager} if eager else {}),
-    }
+        return engine.told(kernels_of(scene, make_wave(scene, settings, None, torch.float32)))
 
 
-def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Loop:
-    """The compiled loop of a render on ``threads`` (None: as many as torch's), whose kernels are kept with the scene.
+def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = None) -> Tasks:
+    """Return the compiled loop of a render on ``threads`` (None: as many as torch's), whose kernels are kept with the scene.
 
     Materials without kernels join ``eager``.
     """
@@ -312,5 +293,4 @@ def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = No
         name = str(wave.context.world.materials.models[number])
         eager.append(f"{name}: {reason}")
         say_once(f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}")
-    integrator = wave.integrator
-    return Loop(kernels, threads or torch.get_num_threads(), integrator.clamp, integrator.strict)
+    return engine.forward_kernels(kernels, threads, wave.integrator.strict)

@@ -6,8 +6,8 @@ import ctypes
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,11 +18,12 @@ from torchpt.core.memory import Budget, needing, ran_out, when_short
 from torchpt.core.threads import deal
 from torchpt.engines.kernels.engine import LANES, Chunk, Halted, Worker
 from torchpt.engines.kernels.programs import Kernels
+from torchpt.engines.work import TASKS, Block, Share
 from torchpt.paths.lost import Lost
 from torchpt.paths.wave import Plate, Tally, clamp_scale
 from torchpt.physics.film import Film
 
-__all__ = ["TASKS", "Block", "Loop", "Share", "keep", "taken"]
+__all__ = ["Loop", "keep", "taken"]
 
 
 # ---- Workers that no render has at the moment: the next one of the same structure takes them over, as fresh memory costs time
@@ -75,38 +76,16 @@ if hasattr(os, "register_at_fork"):
 # ---- Which thread takes which samples, and how they add up to a picture
 
 
-#: Tasks of a pass for each thread, so that none waits long for the last one.
-TASKS = 6
 #: Fewest lanes that repay a task.
 FEWEST = 1024
 #: Pixels of a task, unless threads would be idle: a chunk of many samples of few pixels adds them up in as many steps.
 NARROW = 128
 
-#: A plate, its first pixel and how many, the first sample and how many of each.
-Block = tuple[Plate, int, int, int, int]
-
-
-@dataclass
-class Share:
-    """Results of a task beside its samples.
-
-    Attributes:
-        tally: rays and paths.
-        samples: camera samples taken.
-        lost: samples that were not finite.
-        light: before and after the clamp.
-        rest: what memory did not suffice for.
-    """
-
-    tally: Tally
-    samples: int = 0
-    lost: Lost = field(default_factory=Lost)
-    light: tuple[float, float] = (0.0, 0.0)
-    rest: list[Block] = field(default_factory=list)
-
 
 class Loop:
-    """A render's tasks over threads. A pixel's samples are summed in their order, whichever thread takes them.
+    """A render's tasks over threads; see :class:`torchpt.engines.engine.Tasks`.
+
+    A pixel's samples are summed in their order, whichever thread takes them.
 
     Args:
         kernels: of the render.
@@ -117,6 +96,8 @@ class Loop:
     Attributes:
         budget: how many threads, and most lanes of a chunk.
     """
+
+    compiled = True
 
     def __init__(self, kernels: Kernels, threads: int, clamp: float | None, strict: bool) -> None:
         self.kernels, self.clamp, self.strict = kernels, clamp, strict
@@ -130,6 +111,15 @@ class Loop:
         )
         self._workers: list[Worker] = []
         self._halt = threading.Event()
+
+    @property
+    def seconds(self) -> float:
+        """Return the seconds that were spent on making kernels."""
+        return self.kernels.seconds
+
+    def rows(self, layers: Mapping[str, Any]) -> int:
+        """Return how many 32-bit numbers a lane takes in a thread, where the picture has such layers."""
+        return self.kernels.rows(layers)
 
     def run(self, spans: Sequence[tuple[Plate, int, int]], each: Callable[[Share | None], bool]) -> bool:
         """Take samples of every pixel of plates.

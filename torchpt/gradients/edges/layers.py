@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchpt.core import autograd
 from torchpt.core.threads import limited_threads
-from torchpt.engines import tensors
+from torchpt.engines.engine import layers as layers_of
+from torchpt.engines.engine import seen
 from torchpt.gradients.edges.gradients import Boundary, boundary_of
 from torchpt.paths import layer
 from torchpt.paths.integrators import LAYERS
@@ -93,7 +94,7 @@ def _gradients(
             traced = boundary.traced
 
             def values(o: Tensor, d: Tensor, number: Tensor) -> Tensor:
-                found = tensors.seen(traced.wave, names, traced.state(o, d, number))
+                found = seen(traced.wave, names, traced.state(o, d, number))
                 return torch.cat([found[name] for name in names]).double()
 
             return values
@@ -122,7 +123,7 @@ def _interior(asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], w
             with torch.enable_grad():
                 leaves = [plain[name].clone().requires_grad_() for name in asked.wanted]
                 wave = rebound(still, scene, settings, {**plain, **dict(zip(asked.wanted, leaves, strict=True))})
-                found = tensors.layers(wave, names, first, count, sample, many, slide=True)
+                found = layers_of(wave, names, first, count, sample, many, slide=True)
                 mean = torch.cat([found[name] for name in names]).sum(1) / spp
             if mean.requires_grad:
                 grads = torch.autograd.grad(mean, leaves, flat[:, first : first + count], allow_unused=True)

@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
-from torchpt.engines import tensors
-from torchpt.engines.kernels.programs import Kernels
-from torchpt.engines.kernels.threads import Loop
+from torchpt.engines.engine import Kernels, forward_kernels, trace
 from torchpt.paths.state import FOREVER, PathState
 from torchpt.paths.wave import Plate, Rays, Wave, clamp_scale
 from torchpt.physics.film import Film
@@ -54,16 +52,16 @@ class Along:
                 return self._by_kernels(wave, sample)
             except Unsupported:  # the render has said so
                 self._compiled = False
-        values = tensors.trace(wave, wave.rays(0, wave.crop[2], sample, 1))
+        values = trace(wave, wave.rays(0, wave.crop[2], sample, 1))
         values = torch.where(torch.isfinite(values).all(0), values, 0.0).double()
         return values if self._clamp is None else values * clamp_scale(values, self._clamp)
 
     def _by_kernels(self, wave: Wave, sample: int) -> Tensor:
         self._kernels = kernels_of(self._scene, wave, self._kernels)
-        loop = Loop(self._kernels, torch.get_num_threads(), self._clamp, False)
+        engine = forward_kernels(self._kernels)
         plate = Plate(Film(wave.crop[2], 1, 1, wave.centre.device))
-        loop.run([(plate, sample, 1)], lambda _: False)
-        loop.dismiss(self._keep)
+        engine.run([(plate, sample, 1)], lambda _: False)
+        engine.dismiss(self._keep)
         return plate.film.sums[0]
 
 

@@ -16,7 +16,7 @@ from torchpt.core.autograd import in_transform
 from torchpt.core.errors import SceneError
 from torchpt.core.memory import check_limit, mb
 from torchpt.core.threads import lasting, limited_threads
-from torchpt.engines.kernels.threads import TASKS
+from torchpt.engines.engine import TASKS
 from torchpt.paths.wave import Wave
 from torchpt.rendering import Entry, Rendering, Run, render_many
 from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, named, params_of, scenes_of, seeds_of

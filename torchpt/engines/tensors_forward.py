@@ -1,23 +1,64 @@
-"""A piece of a pass by tensor operations, all or nothing: no allocation that fails leaves half a piece in the films."""
+"""Samples by tensor operations, in pieces, each all or nothing: no allocation that fails leaves half a piece in the films."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import Span, suffices
-from torchpt.engines import tensors
+from torchpt.core.memory import Budget, Span, suffices
+from torchpt.engines import tensors, work
+from torchpt.engines.work import Share
 from torchpt.paths.lost import Lost
 from torchpt.paths.wave import Plate, Tally, Wave, clamp_scale
 from torchpt.physics.film.splats import Splats
 
-__all__ = ["Piece", "take"]
+__all__ = ["TensorsForward"]
 
 #: How often it is tried to write what is computed already.
 ATTEMPTS = 16
+
+
+class TensorsForward:
+    """Takes samples, see :class:`torchpt.engines.engine.Forward`.
+
+    Args:
+        wave: of the render.
+        budget: lanes of a piece.
+    """
+
+    compiled = False
+    seconds = 0.0
+
+    def __init__(self, wave: Wave, budget: Budget) -> None:
+        self.wave, self.budget = wave, budget
+
+    def rows(self, layers: Mapping[str, Any]) -> int:
+        """Return 0: no memory is taken beforehand."""
+        return 0
+
+    def run(self, spans: Sequence[work.Span], each: Callable[[Share | None], bool]) -> bool:
+        """See :class:`torchpt.engines.engine.Forward`."""
+        for plate, first, count in spans:
+            pixels = plate.film.width * plate.film.height
+            for _ in self.budget.through(partial(self._take, plate), pixels, first, count):
+                if each(self._share):
+                    return False
+        return True
+
+    def _take(self, plate: Plate, span: Span) -> None:
+        """Take a piece: all of it, or nothing where it raises."""
+        piece = _piece(self.wave, plate, span)
+        self._share = Share(piece.tally, span[1] * span[3], piece.lost, piece.light)
+        piece.write()
+
+    def dismiss(self, keeps: bool) -> None:
+        """See :class:`torchpt.engines.engine.Forward`: there is nothing to keep."""
 
 
 @dataclass
@@ -27,12 +68,14 @@ class Piece:
     Attributes:
         tally: rays and paths.
         lost: samples that were not finite.
+        light: before and after the clamp.
         writes: places, and what they are to hold then.
         splats: the same of sums of splats: these, places in their last axis, values.
     """
 
     tally: Tally = field(default_factory=Tally)
     lost: Lost = field(default_factory=Lost)
+    light: tuple[float, float] = (0.0, 0.0)
     writes: list[tuple[Tensor, Tensor]] = field(default_factory=list)
     splats: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list)
 
@@ -54,15 +97,8 @@ class Piece:
             sums.index_copy_(2, place, value)
 
 
-def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
-    """Compute a piece.
-
-    Args:
-        wave: of the render.
-        plate: that its samples go to.
-        light: all light before and after the clamp so far, ``(2,)`` float64.
-        span: which samples.
-    """
+def _piece(wave: Wave, plate: Plate, span: Span) -> Piece:
+    """Compute a piece: samples ``span`` of a plate."""
     piece = Piece()
     first, pixels, sample, samples = span
     if wave.integrator.light:
@@ -75,11 +111,10 @@ def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
             radiance = torch.where(finite, radiance, 0.0)
         clamp = wave.integrator.clamp
         if clamp is not None:
-            before = radiance.double().sum() + sum(one.value.double().sum() for one in splats)
+            before = _light(radiance, splats)
             radiance = radiance * clamp_scale(radiance, clamp)
             splats = [replace(one, value=one.value * clamp_scale(one.value, clamp)) for one in splats]
-            after = radiance.double().sum() + sum(one.value.double().sum() for one in splats)
-            piece.writes.append((light, light + torch.stack((before, after))))
+            piece.light = before, _light(radiance, splats)
         piece.writes += plate.film.after(radiance, first, sample)
         if plate.film.splats is not None and splats:
             lane, pixel, value = (
@@ -92,3 +127,7 @@ def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
         for name, values in tensors.layers(wave, tuple(plate.layers), *span, plate).items():
             piece.writes += plate.layers[name].after(values, first, sample)
     return piece
+
+
+def _light(radiance: Tensor, splats: Sequence[Splats]) -> float:
+    return float(radiance.double().sum() + sum(one.value.double().sum() for one in splats))

@@ -1,0 +1,37 @@
+"""What is asked of an engine that takes samples, and what a part of that came to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torchpt.paths.lost import Lost
+from torchpt.paths.wave import Plate, Tally
+
+__all__ = ["TASKS", "Block", "Share", "Span"]
+
+#: Tasks of a pass for each thread, so that none waits long for the last one.
+TASKS = 6
+
+#: A plate, the first sample of all its pixels, and how many.
+Span = tuple[Plate, int, int]
+#: A plate, its first pixel and how many, the first sample and how many of each.
+Block = tuple[Plate, int, int, int, int]
+
+
+@dataclass
+class Share:
+    """Results of a task beside its samples.
+
+    Attributes:
+        tally: rays and paths.
+        samples: camera samples taken.
+        lost: samples that were not finite.
+        light: before and after the clamp.
+        rest: what memory did not suffice for.
+    """
+
+    tally: Tally
+    samples: int = 0
+    lost: Lost = field(default_factory=Lost)
+    light: tuple[float, float] = (0.0, 0.0)
+    rest: list[Block] = field(default_factory=list)
