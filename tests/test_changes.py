@@ -3,13 +3,13 @@
 Held elsewhere: one more BSDF, light, shape, camera, sampler, filter, texture, integrator and layer is a file
 (``test_extending.py``); a stop rule is its declaration and its use (``render/test_arguments.py``); fields, fogs and splats are
 an integrator's (``paths/test_own_integrators.py``, ``paths/test_splats.py``); a form of kernels is a ``Form``
-(``render/test_forms.py``).
+(``render/test_forms.py``); a command is a file and a row of ``cli/main.py`` (``cli/``).
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
@@ -20,7 +20,11 @@ import torch
 from torch import Tensor
 
 import torchpt
+from torchpt.core.memory import Budget
+from torchpt.engines.engine import Forward, Share, radiance
 from torchpt.extend import Bsdf, BsdfSample, Color, cosine_hemisphere
+from torchpt.paths.wave import Plate, Tally, Wave
+from torchpt.rendering import run
 from torchpt.scene import meshes
 
 
@@ -83,3 +87,46 @@ def test_a_parameter_with_a_gradient_is_its_declaration() -> None:
     image = torchpt.render(scene, params={"materials.own.tint": tint}, **wishes)
     (gradient,) = torch.autograd.grad(image[3:5, 3:5].mean((0, 1)).sum(), tint)
     torch.testing.assert_close(gradient, torch.ones(3), rtol=1e-3, atol=0)  # under a sky of 1 radiance is the tint
+
+
+class OneByOne:
+    """An engine that takes a sample of all pixels after the other: what :class:`torchpt.engines.engine.Forward` asks of one."""
+
+    compiled, seconds = False, 0.0
+
+    def __init__(self, wave: Wave, budget: Budget) -> None:
+        self.wave, self.budget, self.taken = wave, budget, 0
+
+    def rows(self, layers: Mapping[str, Any]) -> int:
+        return 0
+
+    def run(self, spans: Sequence[tuple[Plate, int, int]], each: Callable[[Share | None], bool]) -> bool:
+        for plate, first, count in spans:
+            pixels = plate.film.width * plate.film.height
+            for sample in range(first, first + count):
+                values = radiance(self.wave, 0, pixels, sample, 1, plate)
+                for place, value in plate.film.after(values, 0, sample):
+                    place.copy_(value)
+                self.taken += 1
+                if each(Share(Tally(pixels), pixels)):
+                    return False
+        return True
+
+    def dismiss(self, keeps: bool) -> None:
+        pass
+
+
+def test_an_engine_is_a_file_and_a_line_of_the_door(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[OneByOne] = []
+
+    def door(wave: Wave, budget: Budget) -> Forward:
+        made.append(OneByOne(wave, budget))
+        return made[-1]
+
+    scene = torchpt.load(scene_of({"type": "rectangle"}, {"type": "diffuse"}), "cpu")
+    wish: dict[str, Any] = {"spp": 6, "film": {"width": 8, "height": 8}, "compile": "off"}
+    expected = torchpt.render(scene, **wish)
+    monkeypatch.setattr(run, "forward_tensors", door)
+    found = torchpt.render(scene, full=True, **wish)
+    assert torch.equal(found.image, expected)
+    assert made[0].taken == 6 and found.paths == 6 * 64

@@ -16,7 +16,7 @@ from torchpt.compiler.graph import DTYPES
 from torchpt.compiler.sinks import Note, Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
 from torchpt.paths.state import EXTRA, PathState
-from torchpt.physics import lights
+from torchpt.paths.wave import camera_state
 from torchpt.physics.samplers import Dimension
 from torchpt.physics.shapes.geometry import Hit
 
@@ -244,24 +244,11 @@ def _key_field(wave: Wave) -> Fields:
 
 
 def _path_fields(layout: Layout) -> Fields:
-    """Fields of a path's state: only what the scene needs."""
+    """Fields of a path's state, those that a path of this scene begins with, and what travels with them."""
     wave, world = layout.wave, layout.world
-    fields: Fields = {
-        "o": ((3,), "f"),
-        "d": ((3,), "f"),
-        "t_max": ((), "f"),
-        "throughput": ((3,), "f"),
-        "radiance": ((3,), "f"),
-        "pdf": ((), "f"),
-        "lane": ((), "l"),
-        **_key_field(wave),
-    }
-    if any(model.refracts for model in world.materials.models):
-        fields["eta"] = ((), "f")
-    if lights.local(world.lights):
-        fields |= {"p": ((3,), "f"), "n": ((3,), "f")}
-    for own in wave.integrator.fields:
-        fields[EXTRA + own.name] = ((own.rows,) if own.rows > 1 else (), "l" if own.whole else "f")
+    d = torch.zeros(3, 1)
+    state = wave.begun(camera_state(d, d, torch.zeros(wave.sampler.points.rows, 1, dtype=torch.int32)))
+    fields: Fields = {name: (tuple(x.shape[:-1]), DTYPES[x.dtype]) for name, x in state_values(state).items()}
     if wave.filter.signed:
         fields["weight"] = ((), "f")
     fields |= HIT
