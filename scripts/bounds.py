@@ -1,4 +1,4 @@
-"""What a scene and its files may ask for at most: the table of docs/stability.md, from the constants themselves.
+"""What a scene and its files may ask for at most: the table of docs/guides/stability.md, from the constants themselves.
 
 ``python scripts/make_tables.py`` writes it.
 """

@@ -1,6 +1,6 @@
-"""The convergence pictures of ``docs/``: what samplers and strategies do at equal numbers of samples.
+"""The convergence pictures of the docs: what samplers and strategies do at equal numbers of samples.
 
-python scripts/make_convergence.py [--out docs] [--only samplers points veach blue_noise]
+python scripts/make_convergence.py [--out docs/images] [--only samplers points veach blue_noise]
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
 def main() -> None:
     """Make the pictures that were asked for, or all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent.parent / "docs")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent.parent / "docs" / "images")
     parser.add_argument("--only", nargs="+", choices=list(PICTURES), default=list(PICTURES))
     arguments = parser.parse_args()
     for name in arguments.only:

@@ -1,6 +1,6 @@
 """Write the tables of the docs from what kinds declare, between ``<!-- generated: NAME -->`` and ``<!-- end -->``.
 
-    python scripts/make_tables.py            # writes docs/*.md
+    python scripts/make_tables.py            # writes pages of docs/
     python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
 
 A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), ``common.lights``: what all kinds
@@ -168,11 +168,11 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="write nothing")
     check = parser.parse_args().check
     stale = []
-    for file in sorted(DOCS.glob("*.md")):
+    for file in sorted(DOCS.rglob("*.md")):
         text = file.read_text(encoding="utf-8")
         fresh = page(text)
         if fresh != text:
-            stale.append(file.name)
+            stale.append(file.relative_to(DOCS).as_posix())
             if not check:
                 file.write_text(fresh, encoding="utf-8")
     print(f"{'stale' if check else 'written'}: {', '.join(stale) or 'none'}")

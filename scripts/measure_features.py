@@ -1,7 +1,7 @@
 """What a feature costs where a scene has it, and where it does not: nodes of its files in kernels, rows, tables, time.
 
-Prints a table in Markdown for ``docs/lanes.md``: ``python scripts/measure_features.py``. A plain scene of three rectangles
-(``tests/references/features.py``) gets one feature at a time. Times are of one thread, the least of several renders.
+Print a table in Markdown for ``docs/explanations/lanes.md``: ``python scripts/measure_features.py``. A plain scene of three
+rectangles (``tests/references/features.py``) gets one feature at a time. Times are of one thread, the least of several renders.
 """
 
 from __future__ import annotations

@@ -7,14 +7,16 @@ import re
 import pytest
 from make_tables import DOCS, MARKED, page, written
 
+PAGES = sorted(file.relative_to(DOCS).as_posix() for file in DOCS.rglob("*.md"))
 
-@pytest.mark.parametrize("name", sorted(file.name for file in DOCS.glob("*.md")))
+
+@pytest.mark.parametrize("name", PAGES)
 def test_tables_are_as_they_would_be_written(name: str) -> None:
     text = (DOCS / name).read_text(encoding="utf-8")
     assert page(text) == text, "run scripts/make_tables.py"
 
 
-@pytest.mark.parametrize("name", ["README.md", *sorted(f"docs/{file.name}" for file in DOCS.glob("*.md"))])
+@pytest.mark.parametrize("name", ["README.md", *(f"docs/{name}" for name in PAGES)])
 def test_python_blocks_compile(name: str) -> None:
     text = (DOCS.parent / name).read_text(encoding="utf-8")
     for block in re.finditer(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
@@ -35,7 +37,8 @@ def test_the_last_column_of_the_glossary_is_in_the_code() -> None:
 
 
 def test_a_changed_table_is_noticed() -> None:
-    text = (DOCS / "lights.md").read_text(encoding="utf-8")
+    text = (DOCS / "reference/lights.md").read_text(encoding="utf-8")
     assert page(text.replace("power per solid angle", "power")) == text
-    assert any(MARKED.search((DOCS / name).read_text(encoding="utf-8")) for name in ("materials.md", "scenes.md"))
+    marked = ("reference/materials.md", "reference/scenes.md")
+    assert any(MARKED.search((DOCS / name).read_text(encoding="utf-8")) for name in marked)
     assert "`exponent`" in written("materials.phong") and "`opacity`" not in written("materials.phong")

@@ -1,4 +1,4 @@
-"""docs/extending.md is carried out: its files are put where it says, and a scene uses all of them."""
+"""docs/guides/extending.md is carried out: its files are put where it says, and a scene uses all of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "guides" / "extending.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"`(torchpt/[\w/]+\.py)`:\n\n```python\n(.*?)```\n", PAGE, re.DOTALL))
 KINDS = {
     *(f"physics/{room}/kinds" for room in ("bsdfs", "lights", "shapes", "cameras", "samplers", "film", "textures")),

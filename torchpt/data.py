@@ -111,8 +111,8 @@ class RenderDataset(Dataset):
 
     Item ``i`` is a dict of tensors: ``image (H, W, 3)`` linear RGB; each of ``layers`` by name, ``(H, W, C)``; the camera as
     ``to_world (4, 4)`` and, of a perspective or thin lens one, as OpenCV's ``K (3, 3)`` in pixels, ``R (3, 3)`` and ``t (3,)``
-    (docs/cameras.md); ``index ()`` int64. ``torch.utils.data.DataLoader`` puts them into batches as they are, where all are of
-    one size.
+    (docs/reference/cameras.md); ``index ()`` int64. ``torch.utils.data.DataLoader`` puts them into batches as they are, where
+    all are of one size.
 
     Its seed is ``seed + i``. In workers a render takes one thread, else as many as the scene wishes, unless ``threads``
     says otherwise.

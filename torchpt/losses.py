@@ -2,9 +2,9 @@
 
 ``l1 l2 relmse smape`` compare a picture with its target, ``unbiased_squared_error`` and ``unbiased_relmse`` two independent
 renders of one scene with it. Which of them have gradients without bias is a matter of the samples behind the pictures, and
-docs/ml.md says it in full. In short: a backward pass of ``torchpt.render`` draws its own samples, so the gradient of a loss
-that is quadratic in the picture has no bias with one render. Its *value* has: noise adds its variance. Two renders take that
-away.
+docs/guides/ml.md says it in full. In short: a backward pass of ``torchpt.render`` draws its own samples, so the gradient of a
+loss that is quadratic in the picture has no bias with one render. Its *value* has: noise adds its variance. Two renders take
+that away.
 """
 
 from __future__ import annotations

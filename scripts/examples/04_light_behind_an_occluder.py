@@ -4,7 +4,7 @@
 
 Three coordinates and a power; the lamp is a point, which no picture shows. A near, dim one and a far, bright one may light
 the floor alike, but not throw the same shadow. What tells the place is where the borders of shadows run: jumps, which the
-renderer samples by themselves (docs/gradients.md, "Edges that move").
+renderer samples by themselves (docs/explanations/gradients.md, "Edges that move").
 """
 
 from __future__ import annotations

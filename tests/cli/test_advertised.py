@@ -22,7 +22,7 @@ from torchpt.images import write_image
 from .conftest import Renderer
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 #: Settings by which a render takes no time, in place of what a command says.
 SMALL = {"film.width": "8", "film.height": "6", "render.spp": "2", "render.compile": "off"}
 #: The same for `torchpt converge`; what a command says itself stays where it is smaller.
@@ -112,7 +112,8 @@ TORCHPT = commands("torchpt")
 
 def test_there_are_commands_from_everywhere() -> None:
     where = {place for place, _ in TORCHPT}
-    assert {"cli.HELP", "README.md", "docs/ibl.md", "configs/config.yaml", "configs/integrator/direct.yaml"} <= where
+    assert {"cli.HELP", "README.md", "docs/explanations/ibl.md", "configs/config.yaml"} <= where
+    assert "configs/integrator/direct.yaml" in where
     assert len(TORCHPT) > 40 and {command.split()[1] for _, command in TORCHPT} == {
         "render",
         "orbit",

@@ -2,7 +2,8 @@
 
 float32 is measured against numpy's float64, float64 against 80-bit floats where numpy has them (skipped elsewhere), and these
 against mpmath. An error is the distance from the exact value in the spacing of floats there. Bounds are the measured maxima,
-rounded up to the next half with room for other samples; ``docs/lanes.md`` has the same table, which a test compares.
+rounded up to the next half with room for other samples; ``docs/explanations/lanes.md`` has the same table, and a test compares
+them.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from torchpt.compiler.function import lanewise
 from torchpt.compiler.functions import FUNCTIONS
 
 DENSE = np.finfo(np.longdouble).nmant >= 63
-DOCS = Path(__file__).parents[2] / "docs" / "lanes.md"
+DOCS = Path(__file__).parents[2] / "docs" / "explanations" / "lanes.md"
 Array = NDArray[Any]
 
 
@@ -274,7 +275,7 @@ def test_powers_of_bases_are_exact():
 
 
 def test_documentation():
-    """The table in docs/lanes.md says what is asserted here."""
+    """The table in docs/explanations/lanes.md says what is asserted here."""
     rows = re.findall(r"^\| `(\w+)` \| ([\d.]+) \| ([\d.]+) \| (.+?) \|$", DOCS.read_text(encoding="utf-8"), re.M)
     said = {name: (float(single), float(double), domain) for name, single, double, domain in rows}
     assert said == {name: (b.single, b.double, b.domain) for name, b in BOUNDS.items()}

@@ -722,7 +722,7 @@ def test_models_that_cannot_be_taken(name: str) -> None:
 
 
 def test_the_example_in_the_docs_learns(capsys: pytest.CaptureFixture[str]) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "materials.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "materials.md").read_text()
     code = text.partition("```python\n")[2].partition("```")[0]
     exec(code.replace("    loss.backward()", "    print(loss.item())\n    loss.backward()"), {})
     losses = [float(line) for line in capsys.readouterr().out.splitlines()]

@@ -1,4 +1,4 @@
-"""Materials of mesh files: each rule of docs/assets.md, as the dict a user could have written."""
+"""Materials of mesh files: each rule of docs/reference/assets.md, as the dict a user could have written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/ml.md: its Python runs, and its tables name what there is."""
+"""docs/guides/ml.md: its Python runs, and its tables name what there is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 import torchpt
 
-PAGE = Path(__file__).parents[2] / "docs" / "ml.md"
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "ml.md"
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 

@@ -207,9 +207,7 @@ def test_a_new_stop_rule_is_one_declaration_and_its_use(tmp_path: Path) -> None:
     tree = tmp_path / "tree"
     for folder in ("torchpt", "configs", "scripts", "scenes"):
         shutil.copytree(ROOT / folder, tree / folder, ignore=shutil.ignore_patterns("__pycache__", "*.png"))
-    (tree / "docs").mkdir()
-    for page in (ROOT / "docs").glob("*.md"):
-        shutil.copy(page, tree / "docs")
+    shutil.copytree(ROOT / "docs", tree / "docs", ignore=shutil.ignore_patterns("images"))
     for name, (place, line) in TOY.items():
         file = tree / "torchpt" / name
         text = file.read_text(encoding="utf-8")
@@ -222,10 +220,16 @@ def test_a_new_stop_rule_is_one_declaration_and_its_use(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     *said, last = done.stdout.splitlines()
-    assert said[:2] == ["written: render/default.yaml", "written: ml.md, scenes.md"]
+    assert said[:2] == ["written: render/default.yaml", "written: guides/ml.md, reference/scenes.md"]
     row = "a whole number 1..2147483647"
-    assert f"\n| `enough` | samples that are enough | {row} | `None` |\n" in (tree / "docs" / "ml.md").read_text()
-    assert f"\n| `enough` |  | {row} | samples that are enough |\n" in (tree / "docs" / "scenes.md").read_text()
+    assert (
+        f"\n| `enough` | samples that are enough | {row} | `None` |\n"
+        in (tree / "docs" / "guides" / "ml.md").read_text()
+    )
+    assert (
+        f"\n| `enough` |  | {row} | samples that are enough |\n"
+        in (tree / "docs" / "reference" / "scenes.md").read_text()
+    )
 
     answers = json.loads(last)
     assert answers["file"] == str(tree / "torchpt" / "__init__.py")

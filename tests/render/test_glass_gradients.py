@@ -3,7 +3,7 @@ own) against central differences of independent renders.
 
 Both are random, so each is drawn from several independent seeds and judged by its standard error; the two sides of one
 difference draw the same samples. What is lit falls off smoothly and no silhouette moves in view, so that the derivative
-has no part that docs/gradients.md leaves out.
+has no part that docs/explanations/gradients.md leaves out.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
                       writes x_0.exr, x_1.exr, ...; stderr and the summaries say which job has which settings
   --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
 
-  torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/ranks.md)
+  torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/guides/ranks.md)
 
 A sentence on stdout says what came of it; the last line is a summary in JSON. Samples that are not finite count as
 black, and stderr says why.

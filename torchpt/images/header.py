@@ -51,8 +51,8 @@ def read_header(path: str | PathLike[str]) -> dict[str, Fact]:
     """Read what an EXR file that torchpt wrote says of its picture.
 
     ``torchpt render`` and ``Rendering.write`` write ``relmse``, ``relmse_low`` and ``relmse_high`` (where the picture knows its
-    error), ``spp``, ``seed``, ``load_seconds build_seconds compile_seconds render_seconds`` and others; docs/error.md lists
-    them. Other programs find them as attributes ``torchpt:relmse`` and so on.
+    error), ``spp``, ``seed``, ``load_seconds build_seconds compile_seconds render_seconds`` and others;
+    docs/guides/error.md lists them. Other programs find them as attributes ``torchpt:relmse`` and so on.
 
     Args:
         path: a picture file.

@@ -37,7 +37,7 @@ def render(scene: Scene, *, full: bool = False, **wishes: Unpack[Wishes]) -> Ten
         wishes: settings, which win over the scene file's (None keeps the scene's own wish), and what is said of this call
             alone, as :class:`torchpt.scene.settings.Wishes` declares them: ``spp``, ``seed``, ``params`` (tensors in place of
             those of ``scene.params``: where one requires gradients, so does the picture), ``film``, ``integrator``, ...
-            ``help`` lists them, and docs/ml.md has them as a table.
+            ``help`` lists them, and docs/guides/ml.md has them as a table.
 
     Raises:
         SceneError: a setting or parameter that is not accepted.

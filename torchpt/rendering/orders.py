@@ -357,4 +357,4 @@ def _warn_of_edges(missing: Sequence[str], every: bool) -> None:
         if not missing:
             return
         edges = f"some edges: {'; '.join(missing)}"
-    warn_caller(f"the gradient leaves out {edges}; see docs/gradients.md", EdgeWarning)
+    warn_caller(f"the gradient leaves out {edges}; see docs/explanations/gradients.md", EdgeWarning)

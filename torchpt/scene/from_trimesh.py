@@ -39,7 +39,7 @@ def from_trimesh(
     render: Mapping[str, Any] | None = None,
     device: str | torch.device | None = None,
 ) -> Scene:
-    """A scene of a ``trimesh.Trimesh`` or ``trimesh.Scene`` (docs/assets.md says what becomes of it).
+    """A scene of a ``trimesh.Trimesh`` or ``trimesh.Scene`` (docs/reference/assets.md says what becomes of it).
 
     Args:
         source: the object, which stays as it is.

@@ -31,7 +31,7 @@ def load(
         source: the name of a scene that ships, a path ending in ``.yaml``, an open file, YAML text (of more than one line),
             or a dict of the same schema. Relative paths in it start at the file's folder, else at the current one. In a dict
             numbers, colours, poses, texels and vertices may be arrays, and tensors on any device: those that require
-            gradients get them from every picture (docs/scenes.md, *Tensors in dicts*).
+            gradients get them from every picture (docs/reference/scenes.md, *Tensors in dicts*).
         device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
             ``render.device``, which is ``auto`` where it does not say.
         bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.

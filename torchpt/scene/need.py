@@ -1,6 +1,6 @@
-"""What a render is foreseen to take beside its scene, by how it runs; the numbers are measured (docs/stability.md), in bytes.
+"""What a render is foreseen to take beside its scene, by how it runs; in bytes.
 
-What is done where there is less, :mod:`torchpt.core.memory` says.
+The numbers are measured (docs/guides/stability.md). What is done where there is less, :mod:`torchpt.core.memory` says.
 """
 
 from __future__ import annotations

@@ -225,7 +225,7 @@ class TraceWishes(TypedDict, total=False):
             None,
             reader=reading.memory_size,
             words="null, bytes, or a size such as 4GB",
-            doc="of all that the process holds above what import took; see docs/stability.md",
+            doc="of all that the process holds above what import took; see docs/guides/stability.md",
             role=Role.FREE,
         ),
     ]

@@ -1,4 +1,4 @@
-"""Lights and cameras of a glTF file's nodes: the rules, which ``docs/assets.md`` tells users.
+"""Lights and cameras of a glTF file's nodes: the rules, which ``docs/reference/assets.md`` tells users.
 
 Khronos glTF 2.0 extension ``KHR_lights_punctual`` and specification 3.10 (cameras). Both look along their node's -z.
 """

@@ -1,4 +1,4 @@
-"""What the materials of a glTF file come to: the rules, which ``docs/assets.md`` tells users.
+"""What the materials of a glTF file come to: the rules, which ``docs/reference/assets.md`` tells users.
 
 Khronos glTF 2.0 specification, 3.9 and appendix B, and the extensions ``KHR_materials_*``. The metallic-roughness model is
 close to Burley's principled one (roughness^2 is alpha in both, F0 of 0.04 is ``specular: 0.5``), so that is what it becomes.

@@ -1,4 +1,4 @@
-"""What the statements of an MTL file come to: the rules, which ``docs/assets.md`` tells users.
+"""What the statements of an MTL file come to: the rules, which ``docs/reference/assets.md`` tells users.
 
 The format was made for Phong's model (Alias Wavefront, *Object Files*, appendix B: MTL 3.0); ``Pr Pm Ps Pc Pcr aniso
 anisor norm`` are the extension of Clara.io's and Blender's exporters, whose meaning is Burley's principled model.
