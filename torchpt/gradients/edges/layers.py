@@ -12,9 +12,7 @@ from torchpt.core import autograd
 from torchpt.core.threads import limited_threads
 from torchpt.engines import tensors
 from torchpt.gradients.edges.gradients import Boundary, boundary_of
-from torchpt.paths import layer
-from torchpt.paths.integrators import LAYERS
-from torchpt.paths.layer import SurfaceLayer
+from torchpt.paths.layers import LAYERS, SurfaceLayer, surface_layer
 from torchpt.scene import Scene
 from torchpt.scene.prepare import make_wave, rebound
 from torchpt.scene.settings import Settings
@@ -81,7 +79,7 @@ def _gradients(
 ) -> list[Tensor | None]:
     """The gradients of the parameters that are wanted."""
     scene, settings, unit = asked.scene, asked.settings, asked.scene.space.unit
-    kinds = [layer.surface_layer(name) for name in names]
+    kinds = [surface_layer(name) for name in names]
     worth = torch.cat([c * (unit if kind.length else 1.0) for c, kind in zip(cotangents, kinds, strict=True)], 2)
     worth = worth.permute(2, 0, 1).to(asked.dtype)
     with limited_threads(settings.render.threads):
