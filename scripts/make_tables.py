@@ -33,7 +33,7 @@ TABLES = {
     "cameras": ("torchpt.physics.cameras", "KINDS"),
     "filters": ("torchpt.physics.film", "FILTERS"),
     "integrators": ("torchpt.paths.integrators", "KINDS"),
-    "layers": ("torchpt.paths.integrators", "LAYERS"),
+    "layers": ("torchpt.paths.layers", "LAYERS"),
     "settings": ("torchpt.scene.settings", "RECORDS"),
     "shapes": ("torchpt.physics.shapes", "KINDS"),
     "studies": ("torchpt.reports.study", "RECORDS"),

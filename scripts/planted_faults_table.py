@@ -325,7 +325,7 @@ FAULTS = (
     ),
     Fault(
         "position_in_lanes",
-        "paths/layers/position.py",
+        "paths/layers.py",
         "integrators render",
         "Position.values",
         "seen.at.p + seen.centre.to(seen.dtype)[:, None]",

@@ -1,9 +1,9 @@
 """What one more of a kind takes: the files named, and no other.
 
-Held elsewhere: one more BSDF, light, shape, camera, sampler, filter, texture, integrator and layer is a file
-(``test_extending.py``); a stop rule is its declaration and its use (``render/test_arguments.py``); fields, fogs and splats are
-an integrator's (``paths/test_own_integrators.py``, ``paths/test_splats.py``); a form of kernels is a ``Form``
-(``render/test_forms.py``); a command is a file and a row of ``cli/main.py`` (``cli/``).
+Held elsewhere: one more BSDF, light, shape, camera, sampler, filter, texture and integrator is a file, and one more layer a
+class (``test_extending.py``); a stop rule is its declaration and its use (``render/test_arguments.py``); fields, fogs and
+splats are an integrator's (``paths/test_own_integrators.py``, ``paths/test_splats.py``); a form of kernels is a ``Form``
+(``render/test_forms.py``); a command is a file and a row of ``cli/main.py``.
 """
 
 from __future__ import annotations

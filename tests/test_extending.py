@@ -15,8 +15,11 @@ FILES = dict(re.findall(r"`(torchpt/[\w/]+\.py)`:\n\n```python\n(.*?)```\n", PAG
 KINDS = {
     *(f"physics/{room}/kinds" for room in ("bsdfs", "lights", "shapes", "cameras", "samplers", "film", "textures")),
     "paths/integrators/kinds",
-    "paths/layers",
 }
+#: What is one class more of a file that is there: where, and the class.
+ENTRIES = dict(
+    re.findall(r"In `(torchpt/[\w/]+\.py)`, among the others:\n\n```python\n(class .*?)```\n", PAGE, re.DOTALL)
+)
 
 #: What a process does once its packages also look into the folder of the new files.
 USES = """
@@ -27,6 +30,8 @@ from pathlib import Path
 folder = Path(sys.argv[1])
 for package in json.loads(sys.argv[2]):
     import_module("torchpt." + package.replace("/", ".")).__path__.append(str(folder / package))
+import torchpt.paths
+torchpt.paths.__path__.insert(0, str(folder / "entries"))  # its layers.py comes before the one that is there
 
 import torch
 import torchpt
@@ -66,9 +71,10 @@ for name, value in (("materials.clay.sigma", 91.0), ("lights.lamp.exponent", -1.
 """
 
 
-def test_there_is_one_file_of_each_kind() -> None:
+def test_there_is_one_file_of_each_kind_and_a_layer() -> None:
     assert {path.removeprefix("torchpt/").rpartition("/")[0] for path in FILES} == KINDS
     assert not [path for path in FILES if (ROOT / path).exists()]
+    assert list(ENTRIES) == ["torchpt/paths/layers.py"]
 
 
 @pytest.mark.slow
@@ -78,6 +84,12 @@ def test_they_work_where_they_are_put(tmp_path: Path) -> None:
         place = tmp_path / path.removeprefix("torchpt/")
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_text(text, encoding="utf-8")
+    for path, text in ENTRIES.items():
+        place = tmp_path / "entries" / Path(path).name
+        place.parent.mkdir(exist_ok=True)
+        head, mark, tail = (ROOT / path).read_text(encoding="utf-8").partition("\n\nclass Alpha(")
+        assert mark
+        place.write_text(f"{head}\n\n{text}{mark}{tail}", encoding="utf-8")
     packages = str(sorted(KINDS)).replace("'", '"')
     words = [sys.executable, "-W", "ignore", "-c", USES, str(tmp_path), packages]
     done = subprocess.run(words, capture_output=True, text=True, timeout=240, check=False, cwd=ROOT)

@@ -28,7 +28,7 @@ from torchpt.math.vectors import Frame, dot, luminance, normalize
 from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
 from torchpt.paths.integrators.first_surface import FirstSurface, FirstSurfaceIntegrator
 from torchpt.paths.integrators.kinds.path import Path
-from torchpt.paths.layer import FilmLayer, Seen, SurfaceLayer
+from torchpt.paths.layers import FilmLayer, Seen, SurfaceLayer
 from torchpt.paths.state import (
     DirectLight,
     Drawn,

@@ -13,8 +13,9 @@ from few_lanes import few_lanes
 
 import torchpt
 from torchpt.core.errors import SceneError
-from torchpt.paths.integrators import KINDS, LAYERS
+from torchpt.paths.integrators import KINDS
 from torchpt.paths.integrators.base import Integrator
+from torchpt.paths.layers import LAYERS
 from torchpt.scene.formats.description import read_description, settings
 from torchpt.spec import Scalar, parameters_of
 

@@ -146,9 +146,8 @@ FEATURES: dict[str, Feature] = {
         module="torchpt.physics.shapes.kinds.cylinder",
     ),
     "layer": Feature(
-        ("paths/layer.py", "paths/layers/normal.py"),
+        ("paths/layers.py",),
         lambda scene: scene["film"].update(aovs=["normal"]),
-        module="torchpt.paths.layers.normal",
     ),
     "lens": Feature(
         ("physics/cameras/kinds/thinlens.py",),

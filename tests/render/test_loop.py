@@ -22,7 +22,7 @@ from torchpt.engines.kernels.engine import Chunk, Worker
 from torchpt.engines.kernels.layout import HIT
 from torchpt.engines.kernels.threads import Loop
 from torchpt.math.vectors import rows
-from torchpt.paths.integrators import LAYERS
+from torchpt.paths.layers import LAYERS
 from torchpt.paths.vertex import STRATEGIES
 from torchpt.physics.bsdfs import KINDS
 from torchpt.physics.film import Film

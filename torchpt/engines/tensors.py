@@ -16,10 +16,10 @@ from torch import Tensor
 
 from torchpt.core.tree import map_leaves
 from torchpt.math.vectors import joined, rows, take
-from torchpt.paths import layer as aov
-from torchpt.paths.integrators import LAYERS
+from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.integrators.path import Ends, partition, slides
+from torchpt.paths.layers import LAYERS
 from torchpt.paths.state import Emission, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
 from torchpt.paths.transmission import beyond, non_opaque, opacity_at
 from torchpt.paths.walk import Counts, Observer, find, walk

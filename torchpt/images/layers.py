@@ -6,14 +6,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from torchpt.spec import Kinds
+from importlib import import_module
 
 __all__ = ["channel_names", "group_channels"]
 
-#: The layers of ``film.aovs``, by their folder's name: nothing of that room is imported before such a layer is written.
-LAYERS: Kinds[Any] = Kinds("torchpt.paths.layers")
 _SUFFIXES = {2: "XY", 3: "RGB", 4: "RGBA"}
 _ORDER = "RGBXYZUVA"
 
@@ -23,8 +19,10 @@ def channel_names(layer: str, components: int) -> tuple[str, ...]:
     if layer == "image":
         known = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
         return known.get(components) or tuple(f"image.{i}" for i in range(components))
-    if layer in LAYERS and len(LAYERS[layer].channels) == components:
-        return LAYERS[layer].channels
+    # By the module's name: nothing of a room below is imported before a layer is written.
+    own = import_module("torchpt.paths.layers").LAYERS.get(layer)
+    if own is not None and len(own.channels) == components:
+        return own.channels
     if components == 1:
         return (layer,)
     suffixes = _SUFFIXES.get(components) or [str(i) for i in range(components)]

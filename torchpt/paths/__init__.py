@@ -8,7 +8,7 @@
 ``surface.py``        points on surfaces with their materials resolved
 ``transmission.py``   what lets rays pass
 ``integrators/``      what an integrator is, and one kind a file
-``layer.py``          layers (AOVs), one kind a file in ``layers/``
+``layers.py``         layers (AOVs), one entry each
 ``wave.py``           what a render fixes for all of its waves
 ``adjoint.py``        stages gone back through, for gradients
 ``explain.py``        the observer that keeps what happened along a path

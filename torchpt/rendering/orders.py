@@ -14,8 +14,7 @@ from torchpt.core.autograd import in_batch, on_tape, wants_gradients
 from torchpt.core.errors import EdgeWarning, NoLightWarning, SceneError, warn_caller
 from torchpt.images.denoiser import check_denoiser
 from torchpt.paths.integrators import KINDS as INTEGRATORS
-from torchpt.paths.integrators import LAYERS
-from torchpt.paths.layer import SurfaceLayer
+from torchpt.paths.layers import LAYERS, SurfaceLayer
 from torchpt.ranks import together
 from torchpt.rendering import Rendering, render_scene
 from torchpt.rendering.graphs import known

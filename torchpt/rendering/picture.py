@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpt.core.memory import Meter, mb, retried
 from torchpt.images.denoiser import GUIDES
-from torchpt.paths.integrators import LAYERS
+from torchpt.paths.layers import LAYERS
 from torchpt.physics.film import KnownError
 from torchpt.rendering.causes import causes_of
 from torchpt.rendering.result import Rendering

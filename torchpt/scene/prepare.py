@@ -16,8 +16,8 @@ from torchpt.engines import engine
 from torchpt.engines.engine import Kernels, Tasks
 from torchpt.images.denoiser import GUIDES
 from torchpt.math.vectors import dot, normalize
-from torchpt.paths.integrators import LAYERS
 from torchpt.paths.integrators.base import Integrator
+from torchpt.paths.layers import LAYERS, SurfaceLayer
 from torchpt.paths.state import Plan, StageContext
 from torchpt.paths.wave import Rays, Wave
 from torchpt.physics.cameras import Camera
@@ -31,7 +31,6 @@ from torchpt.spec.schema import Described
 
 if TYPE_CHECKING:
     from torchpt.paths.integrators.first_surface import FirstSurface
-    from torchpt.paths.layer import SurfaceLayer
 
 __all__ = [
     "Kept",
@@ -203,8 +202,6 @@ def surface_layers(settings: Settings) -> dict[str, type[SurfaceLayer]]:
     names = (*(settings.film.aovs or settings.integrator.layers), *(GUIDES if settings.film.denoise else ()))
     if not names:
         return {}
-    from torchpt.paths.layer import SurfaceLayer
-
     layers = {name: LAYERS[name] for name in names}
     return {name: layer for name, layer in layers.items() if issubclass(layer, SurfaceLayer)}
 

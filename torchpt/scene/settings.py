@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.paths.integrators import KINDS as INTEGRATORS
-from torchpt.paths.integrators import LAYERS
 from torchpt.paths.integrators.base import Integrator
+from torchpt.paths.layers import LAYERS
 from torchpt.physics.film import FILTERS
 from torchpt.physics.samplers import KINDS as SAMPLERS
 from torchpt.ranks import Group

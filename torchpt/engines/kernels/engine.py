@@ -25,8 +25,8 @@ from torchpt.compiler.kernel import HEAD
 from torchpt.engines.kernels.layout import HIT, Memory, Rows, path_state, state_values
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.engines.kernels.stages import PLACE
-from torchpt.paths.integrators import LAYERS
 from torchpt.paths.integrators.base import check_output
+from torchpt.paths.layers import LAYERS
 from torchpt.paths.state import Shadow, Splat, VertexInput, no_shadow
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.paths.wave import Plate, Tally

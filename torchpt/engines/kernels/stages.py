@@ -16,6 +16,7 @@ from torchpt.compiler.packet import KINDS
 from torchpt.compiler.sinks import Note, Pack, Scatter, Sinks, Store
 from torchpt.compiler.tracing import Tracer
 from torchpt.engines.kernels.layout import Trace, path_state
+from torchpt.paths import layers as aov
 from torchpt.paths import vertex
 from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.state import PathState, Shadow, Splat, VertexInput, no_shadow
@@ -385,15 +386,13 @@ def _passed(trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor
 
 def layers(trace: Trace, model: int, names: tuple[str, ...]) -> Sinks:
     """Write what the first surfaces of a model are."""
-    from torchpt.paths import layer
-
     wave = trace.layout.wave
     state, unseen = trace.state()
     hit = trace.hit()
     with trace.tracer:
-        values = layer.values(names, wave.context, model, state.o, state.d, hit, wave.centre)
+        values = aov.values(names, wave.context, model, state.o, state.d, hit, wave.centre)
         if "weight" in unseen:
-            values = layer.weighted(values, unseen["weight"])
+            values = aov.weighted(values, unseen["weight"])
     nodes = [node for name in names for node in trace.tracer.nodes(values[name])]
     return Sinks(scatter=[Scatter(-1, trace.node(state.lane), tuple(enumerate(nodes)), slots=True)])
 

@@ -13,9 +13,7 @@ from torchpt.core.threads import limited_threads
 from torchpt.engines.engine import layers as layers_of
 from torchpt.engines.engine import seen
 from torchpt.gradients.edges.gradients import Boundary, boundary_of
-from torchpt.paths import layer
-from torchpt.paths.integrators import LAYERS
-from torchpt.paths.layer import SurfaceLayer
+from torchpt.paths.layers import LAYERS, SurfaceLayer, surface_layer
 from torchpt.scene import Scene
 from torchpt.scene.prepare import make_wave, rebound
 from torchpt.scene.settings import Settings
@@ -82,7 +80,7 @@ def _gradients(
 ) -> list[Tensor | None]:
     """The gradients of the parameters that are wanted."""
     scene, settings, unit = asked.scene, asked.settings, asked.scene.space.unit
-    kinds = [layer.surface_layer(name) for name in names]
+    kinds = [surface_layer(name) for name in names]
     worth = torch.cat([c * (unit if kind.length else 1.0) for c, kind in zip(cotangents, kinds, strict=True)], 2)
     worth = worth.permute(2, 0, 1).to(asked.dtype)
     with limited_threads(settings.render.threads):

@@ -12,14 +12,8 @@ from torchpt.spec import Kinds
 
 if TYPE_CHECKING:
     from torchpt.paths.integrators.base import Integrator
-    from torchpt.paths.layer import Layer
 
 #: The integrators.
 KINDS: Kinds[Integrator] = Kinds("torchpt.paths.integrators.kinds", ("path", "direct", "aov", "ibl"))
-#: The layers of pictures.
-LAYERS: Kinds[Layer] = Kinds(
-    "torchpt.paths.layers",
-    ("albedo", "normal", "depth", "position", "uv", "object_id", "alpha", "variance", "samples"),
-)
 
-__all__ = ["KINDS", "LAYERS"]
+__all__ = ["KINDS"]

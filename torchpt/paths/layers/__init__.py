@@ -1,1 +1,0 @@
-"""The layers of a picture, one a file."""
