@@ -3,7 +3,7 @@
 Held elsewhere: one more BSDF, light, shape, camera, sampler, filter, texture and integrator is a file, and one more layer a
 class (``test_extending.py``); a stop rule is its declaration and its use (``render/test_arguments.py``); fields, fogs and
 splats are an integrator's (``paths/test_own_integrators.py``, ``paths/test_splats.py``); a form of kernels is a ``Form``
-(``render/test_forms.py``); a command is a file and a row of ``cli/main.py``.
+(``render/test_forms.py``).
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ import torch
 from torch import Tensor
 
 import torchpt
+import torchpt.cli
+from torchpt.cli import main as cli
 from torchpt.core.memory import Budget
 from torchpt.engines.engine import Forward, Share, radiance
 from torchpt.extend import Bsdf, BsdfSample, Color, cosine_hemisphere
@@ -130,3 +132,48 @@ def test_an_engine_is_a_file_and_a_line_of_the_door(monkeypatch: pytest.MonkeyPa
     found = torchpt.render(scene, full=True, **wish)
     assert torch.equal(found.image, expected)
     assert made[0].taken == 6 and found.paths == 6 * 64
+
+
+SHAPES = '''
+"""`torchpt shapes`: the names of a scene's shapes."""
+
+from torchpt.cli.interrupt import Interrupt
+
+HELP = "torchpt shapes FILE.yaml\\n\\n  Prints the names of the shapes of a scene.\\n"
+
+
+def run(words: list[str], _: Interrupt) -> int:
+    """Print them, one a line; returns the exit code."""
+    from torchpt.scene.formats.description import read_description
+
+    print("\\n".join(read_description(words[0]).shapes))
+    return 0
+'''
+#: In torchpt/cli/main.py: what stands there, and what does with the row.
+ROW = {
+    "COMMANDS = (\n": 'COMMANDS = (\n    Command("shapes", "cornell_box", "names of shapes", shapes.HELP, shapes.run),\n',
+    "from torchpt.cli import collector,": "from torchpt.cli import shapes\nfrom torchpt.cli import collector,",
+}
+
+
+def test_a_command_is_a_file_and_a_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "shapes.py").write_text(SHAPES)
+    text = Path(str(cli.__file__)).read_text(encoding="utf-8")
+    for before, after in ROW.items():
+        assert text.count(before) == 1
+        text = text.replace(before, after)
+    patched = ModuleType("patched")
+    torchpt.cli.__path__.append(str(tmp_path))
+    sys.modules["patched"] = patched
+    try:
+        exec(compile(text, "main.py", "exec"), vars(patched))
+        main = vars(patched)["main"]
+        assert main(["shapes", "cornell_box"]) == 0
+        assert capsys.readouterr().out.split()[:2] == ["floor", "ceiling"]
+        assert main(["--help"]) == 0 and "torchpt shapes cornell_box" in capsys.readouterr().out
+        assert main(["shapes", "--help"]) == 0 and "Prints the names" in capsys.readouterr().out
+        assert main(["shapes", "nope"]) == 2 and "torchpt: scene: expected one of" in capsys.readouterr().err
+    finally:
+        torchpt.cli.__path__.remove(str(tmp_path))
+        for name in ("patched", "torchpt.cli.shapes"):
+            sys.modules.pop(name, None)

@@ -40,8 +40,9 @@ shapes: {ball: {type: sphere, emission: 1}}
 
 def texts() -> Iterator[tuple[str, str]]:
     """Return where a command may stand, and the text."""
-    for name in ("HELP", "HELP_RENDER", "HELP_ORBIT", "HELP_INFO", "HELP_COMPARE", "HELP_CONVERGE", "HELP_STRESS"):
-        yield f"cli.{name}", getattr(cli, name)
+    yield "cli.HELP", "\n".join(f"torchpt {command.name} {command.example}" for command in cli.COMMANDS)
+    for command in cli.COMMANDS:
+        yield f"cli.{command.name}.HELP", command.help
     for page in PAGES:
         yield str(page.relative_to(ROOT)), page.read_text(encoding="utf-8")
     for path in sorted(configs().rglob("*.yaml")):

@@ -14,8 +14,8 @@ from .conftest import Renderer
 
 S = "scene=s.yaml"
 CASES = [
-    ([], "expected one of the commands render, orbit, info, converge"),
-    (["paint"], "paint: expected one of the commands render, orbit, info, converge"),
+    ([], "expected one of the commands render, orbit, info, compare"),
+    (["paint"], "paint: expected one of the commands render, orbit, info, compare"),
     (["render"], "scene: expected scene=NAME"),
     (["render", "cornell_box"], "expected key=value, for example scene=cornell_box"),
     (["render", "scene=nowhere"], "cornell_box"),

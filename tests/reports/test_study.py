@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from torchpt.cli.arguments import UsageError, parse
+from torchpt.cli.arguments import UsageError, parse_study
 from torchpt.cli.converge import HELP, raw_study
 from torchpt.core.errors import SceneError
 from torchpt.reports.study import OWN_KEYS, read_study, study_of
@@ -125,13 +125,11 @@ def test_files_of_a_study_file_start_at_its_folder(tmp_path: Path) -> None:
 
 def test_words_win_over_the_file_and_names_are_kept_as_written(tmp_path: Path) -> None:
     (tmp_path / "s.yaml").write_text("scene: cornell_box\nspp: [1, 2]\nreference: {spp: 8, seeds: 2}\n")
-    words = parse(
-        ["converge", f"study={tmp_path}/s.yaml", "spp=[2,4]", "reference.spp=16", "integrator.clamp=[null,1e-1]"]
-    )
-    raw, _ = raw_study(words.study)
+    words = parse_study([f"study={tmp_path}/s.yaml", "spp=[2,4]", "reference.spp=16", "integrator.clamp=[null,1e-1]"])
+    raw, _ = raw_study(words)
     assert raw["spp"] == [2, 4] and raw["reference"] == {"spp": 16, "seeds": 2}
     assert raw["integrator.clamp"] == [None, 0.1]
-    raw, _ = raw_study(parse(["converge", "scene=[a b.yaml,c]", "reference=a [1]: b.exr"]).study)
+    raw, _ = raw_study(parse_study(["scene=[a b.yaml,c]", "reference=a [1]: b.exr"]))
     assert raw["scene"] == ["a b.yaml", "c"] and raw["reference"] == "a [1]: b.exr"
 
 
@@ -148,4 +146,4 @@ def test_words_win_over_the_file_and_names_are_kept_as_written(tmp_path: Path) -
 )
 def test_words_that_are_none(words: list[str], line: str) -> None:
     with pytest.raises(UsageError, match=line):
-        parse(["converge", *words])
+        parse_study(words)

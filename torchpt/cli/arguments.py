@@ -14,9 +14,8 @@ from pathlib import Path
 from torchpt.core.errors import TorchptError
 from torchpt.core.files import configs
 
-__all__ = ["COMMANDS", "DEBUG_KEYS", "GROUPS", "Arguments", "UsageError", "parse", "path_keys"]
+__all__ = ["DEBUG_KEYS", "GROUPS", "Arguments", "UsageError", "parse", "parse_study", "path_keys"]
 
-COMMANDS = ("render", "orbit", "info", "converge", "compare", "stress")  # the last two take their words themselves
 GROUPS = ("film", "integrator", "sampler", "render")
 #: Keys of `torchpt orbit` alone.
 TURN_KEYS = ("frames", "degrees", "fps", "keep")
@@ -35,7 +34,7 @@ _OPTIONS = {
     "--package": ("-p", True),
     "--resolve": ("", False),
     "--json": ("", False),
-    "--help": ("-h", False),
+    "--help": ("-h", False),  # which main knows
     "--hydra-help": ("", False),
 }
 _CHOICE = re.compile(r"[A-Za-z_][\w,-]*\Z|\[[\w,-]+\]\Z|\{")
@@ -51,18 +50,16 @@ class Arguments:
     """A command line in parts.
 
     Attributes:
-        command: one of `COMMANDS`.
+        command: its name.
         scenes: names or paths; several only with ``multirun``.
         outs: pictures to write, as given; empty where nothing was said.
         paths: values of the settings that are files.
         turn: values of the keys in `TURN_KEYS`, as written.
         debug: values of the keys in `DEBUG_KEYS`, as written.
-        study: of `converge` all words by key, as written: its lists are axes, which Hydra has no part in.
         overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``.
         options: what Hydra gets besides, such as ``--multirun`` or ``--cfg job``.
         multirun: whether this is a sweep.
         json: print `info`, or the path of `render debug.pixel=...`, as JSON.
-        help: print help and stop.
     """
 
     command: str
@@ -71,12 +68,10 @@ class Arguments:
     paths: dict[str, str | None] = field(default_factory=dict)
     turn: dict[str, str] = field(default_factory=dict)
     debug: dict[str, str] = field(default_factory=dict)
-    study: dict[str, str] = field(default_factory=dict)
     overrides: list[str] = field(default_factory=list)
     options: list[str] = field(default_factory=list)
     multirun: bool = False
     json: bool = False
-    help: bool = False
 
     @property
     def only_shows(self) -> bool:
@@ -91,22 +86,18 @@ def path_keys() -> tuple[str, ...]:
     return tuple(f"{group}.{key}" for group, file in files for key in _PATH.findall(file.read_text(encoding="utf-8")))
 
 
-def parse(argv: list[str]) -> Arguments:
-    """Take the words after ``torchpt`` apart.
+def parse(command: str, words: list[str]) -> Arguments:
+    """Take the words after the name of a command apart.
 
     Raises:
-        UsageError: an unknown command or option, a word that is no ``key=value``, a key that is given twice.
+        UsageError: an unknown option, a word that is no ``key=value``, a key that is given twice.
     """
-    if not argv or argv[0] not in COMMANDS:
-        raise UsageError(f"{argv[0] if argv else 'no command'}: expected one of the commands {', '.join(COMMANDS)}")
-    arguments = Arguments(argv[0])
-    if arguments.command == "converge":
-        return _study(arguments, argv[1:])
+    arguments = Arguments(command)
     taken: dict[str, str] = {}
-    words = iter(argv[1:])
-    for word in words:
+    rest = iter(words)
+    for word in rest:
         if word.startswith("-"):
-            _option(arguments, word, words)
+            _option(arguments, word, rest)
             continue
         match = _TAKEN.match(word)
         if match is None or match[1] not in ("scene", "out", *path_keys()):
@@ -159,25 +150,28 @@ def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
     return found
 
 
-def _study(arguments: Arguments, words: list[str]) -> Arguments:
-    """The words of `torchpt converge`."""
+def parse_study(words: list[str]) -> dict[str, str]:
+    """Return the words of `torchpt converge` by key, as written: its lists are axes, which Hydra has no part in.
+
+    Raises:
+        UsageError: an option, a word that is no ``key=value``, a key that is given twice.
+    """
+    study: dict[str, str] = {}
     for word in words:
         key, equals, value = word.partition("=")
-        if word in ("--help", "-h"):
-            arguments.help = True
-        elif word in ("--multirun", "-m"):
+        if word in ("--multirun", "-m"):
             raise UsageError(f"{word}: `torchpt converge` takes lists without it, such as sampler=[independent,sobol]")
         elif word.startswith("-"):
             raise UsageError(f"{word}: unknown option; `torchpt converge` knows --help")
         elif not equals or not re.match(r"[A-Za-z_][\w.]*\Z", key) or "_target_" in key:
             raise UsageError(f"{word}: expected key=value, for example sampler=[independent,sobol]")
-        elif key in arguments.study:
-            raise UsageError(f"{key}: given twice, as {arguments.study[key]!r} and {value!r}")
+        elif key in study:
+            raise UsageError(f"{key}: given twice, as {study[key]!r} and {value!r}")
         elif not value:
             raise UsageError(f"{key}: expected a value, got nothing")
         else:
-            arguments.study[key] = value
-    return arguments
+            study[key] = value
+    return study
 
 
 def _option(arguments: Arguments, word: str, rest: object) -> None:
@@ -192,8 +186,6 @@ def _option(arguments: Arguments, word: str, rest: object) -> None:
         arguments.options += [long, value]
     elif value:
         raise UsageError(f"{word}: {long} takes no value")
-    elif long == "--help":
-        arguments.help = True
     elif long == "--json":
         arguments.json = True
     else:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchpt.cli import collector
 from torchpt.cli.arguments import UsageError
+from torchpt.cli.interrupt import Interrupt
 from torchpt.cli.render import plain
 from torchpt.cli.streams import speaking
 from torchpt.core.errors import AssetError, OutputError, SceneError
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
     from torchpt.images.comparison import Comparison, Shown
 
-__all__ = ["HELP", "Wishes", "compare"]
+__all__ = ["HELP", "run"]
 
 HELP = """\
 torchpt compare TEST REFERENCE [--json] [map=FILE.png|FILE.exr] [key=value ...]
@@ -55,13 +56,11 @@ class Wishes:
         pictures: the picture and its reference, as written.
         given: key to value, as written.
         json: print JSON.
-        help: print help and stop.
     """
 
     pictures: list[str] = field(default_factory=list)
     given: dict[str, str] = field(default_factory=dict)
     json: bool = False
-    help: bool = False
 
     @classmethod
     def read(cls, words: list[str]) -> Wishes:
@@ -74,9 +73,7 @@ class Wishes:
         wishes = cls()
         end = words.index("--") if "--" in words else len(words)
         for word in words[:end]:
-            if word in ("--help", "-h"):
-                wishes.help = True
-            elif word == "--json":
+            if word == "--json":
                 wishes.json = True
             elif word.startswith("-"):
                 raise UsageError(f"{word}: unknown option; known: --json, --help, -- (before names of files)")
@@ -92,8 +89,7 @@ class Wishes:
             else:
                 wishes.pictures.append(word)
         wishes.pictures += words[end + 1 :]
-        if not wishes.help:
-            wishes._check()
+        wishes._check()
         return wishes
 
     def _check(self) -> None:
@@ -114,17 +110,13 @@ class _Map:
     top: float | None
 
 
-def compare(words: list[str]) -> int:
+def run(words: list[str], interrupt: Interrupt) -> int:
     """Compare two files, print what came of it, write the map; returns the exit code.
 
     Raises:
         TorchptError: bad input.
     """
     wishes = Wishes.read(words)
-    if wishes.help:
-        with speaking():
-            print(HELP, end="")
-        return 0
     from torchpt.images.comparison import compare as measure
 
     collector.resume()

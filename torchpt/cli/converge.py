@@ -10,14 +10,15 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from torchpt.cli import collector
+from torchpt.cli import collector, keys
+from torchpt.cli.arguments import UsageError, parse_study
 from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.notices import notices
 from torchpt.cli.progress import Bar
 from torchpt.cli.streams import speaking
 from torchpt.core.errors import OutputError, SceneError
 
-__all__ = ["HELP", "converge", "raw_study"]
+__all__ = ["HELP", "converge", "raw_study", "run"]
 
 #: What a folder says that it is of.
 _STUDY = "study.json"
@@ -50,6 +51,15 @@ torchpt converge study=NAME|FILE.yaml [key=value ...]
 A study that was stopped resumes: the same command takes up the runs that are in FOLDER/runs. The last line on stdout is a
 summary in JSON. Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the finished runs kept.
 """
+
+
+def run(words: list[str], interrupt: Interrupt) -> int:
+    """Run a study of the words after ``converge``; returns the exit code."""
+    study = parse_study(words)
+    if not {"scene", "study"} & study.keys():
+        ship = ", ".join(keys.options("scene"))
+        raise UsageError(f"scene: expected scene=NAME, scene=FILE.yaml or study=FILE.yaml; scenes that ship: {ship}")
+    return converge(study, interrupt)
 
 
 def raw_study(words: Mapping[str, str]) -> tuple[dict[str, Any], str | None]:

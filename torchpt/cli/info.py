@@ -9,13 +9,28 @@ from dataclasses import replace
 from typing import Any
 
 from torchpt.cli import collector
+from torchpt.cli.arguments import Arguments
 from torchpt.cli.interrupt import Interrupt
 from torchpt.cli.notices import notices, which_job
 from torchpt.cli.render import Job, described, knowing, plain
 from torchpt.cli.streams import speaking
 from torchpt.core.errors import TorchptError
 
-__all__ = ["info", "lines"]
+__all__ = ["HELP", "info", "lines", "run"]
+
+HELP = """\
+torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
+
+  What the scene holds, what was built for it, and what was left out because nothing needs it.
+  scene=   a file ending in .yaml, or a scene that ships:
+{scenes}
+  {keys}
+"""
+
+
+def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
+    """Print what a scene holds; returns the exit code."""
+    return info(job, interrupt, arguments.json)
 
 
 def info(job: Job, interrupt: Interrupt, as_json: bool = False) -> int:

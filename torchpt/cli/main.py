@@ -7,27 +7,22 @@ wrong with the input ends as one line on stderr and exit code 2.
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchpt.cli import collector, keys, ranked
+from torchpt.cli import collector, compare, converge, info, keys, orbit, ranked, render, stress
 from torchpt.cli.arguments import GROUPS, Arguments, UsageError, parse
-from torchpt.cli.compare import HELP as HELP_COMPARE
-from torchpt.cli.compare import compare
-from torchpt.cli.converge import HELP as HELP_CONVERGE
-from torchpt.cli.converge import converge
 from torchpt.cli.hydra_process import hydra_process
 from torchpt.cli.interrupt import Interrupt, Interrupted
-from torchpt.cli.orbit import HELP as HELP_ORBIT
+from torchpt.cli.render import Job
 from torchpt.cli.streams import ready, speaking
-from torchpt.cli.stress import HELP as HELP_STRESS
-from torchpt.cli.stress import stress
 from torchpt.cli.sweep_folder import sweep_folder
 from torchpt.core.errors import LostRankError, OtherRankError, TorchptError
 from torchpt.core.version import __version__
@@ -35,54 +30,35 @@ from torchpt.core.version import __version__
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from torchpt.cli.render import Job
-
-__all__ = ["HELP_COMPARE", "HELP_STRESS", "main", "run"]
+__all__ = ["COMMANDS", "HELP", "Command", "main", "run"]
 
 HELP = """\
 torchpt: a wavefront path tracer that is a PyTorch program
 
-  torchpt render scene=cornell_box render.spp=64 out=cornell.exr    render a picture
-  torchpt orbit  scene=cornell_box frames=48 out=turn.gif           turn the camera about it: .gif, .mp4
-  torchpt info   scene=cornell_box                                  what the scene holds, what was built, what left out
-  torchpt compare test.exr reference.exr                            how far a picture is from its reference
-  torchpt converge scene=cornell_box sampler=[independent,sobol]    error against run time, as a report
-  torchpt stress quick=true                                         stiff and extreme cases, measured
+{commands}
 
 torchpt COMMAND --help says more. Scenes that ship:
 {scenes}
 """
-HELP_RENDER = """\
-torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
 
-  scene=   a file ending in .yaml, or a scene that ships:
-{scenes}
-  out=     .exr .hdr .png .jpg .ppm; several as out=[a.exr,a.png]; NAME.png where nothing is said
-  {keys}
-  debug.pixel=[x,y] debug.sample=k [--json]
-                      print that path vertex by vertex, in place of a picture: [0,0] is at the upper left of the film
 
-  integrator=NAME, sampler=NAME, ... take a group's file from configs/: integrator=direct sampler=independent
-  --multirun, -m      one render for every combination: sampler=sobol,independent render.spp=16,64 scene=a,b out=x.exr
-                      writes x_0.exr, x_1.exr, ...; stderr and the summaries say which job has which settings
-  --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
+@dataclass(frozen=True)
+class Command:
+    """A row of the table of commands.
 
-  torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/guides/ranks.md)
+    Attributes:
+        name: the first word.
+        example: words after it, for the list of commands.
+        line: what it does, in a line.
+        help: what ``--help`` prints; ``{scenes}`` and ``{keys}`` stand for lists of them.
+        run: called with the words after the name and the signals that came; returns the exit code.
+    """
 
-A sentence on stdout says what came of it; the last line is a summary in JSON. Samples that are not finite count as
-black, and stderr says why.
-Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the partial picture saved.
-"""
-HELP_INFO = """\
-torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
-
-  What the scene holds, what was built for it, and what was left out because nothing needs it.
-  scene=   a file ending in .yaml, or a scene that ships:
-{scenes}
-  {keys}
-"""
-
-_HELPS = {"render": HELP_RENDER, "orbit": HELP_ORBIT, "info": HELP_INFO, "converge": HELP_CONVERGE}
+    name: str
+    example: str
+    line: str
+    help: str
+    run: Callable[[list[str], Interrupt], int]
 
 
 def run() -> None:
@@ -102,19 +78,10 @@ def main(argv: list[str] | None = None) -> int:
             if argv == ["--version"]:
                 return _say(f"torchpt {__version__}\n")
             _check_place()
-            if argv[:1] == ["compare"]:  # takes files, and no scene
-                return compare(argv[1:])
-            if argv[:1] == ["stress"]:
-                return stress(argv[1:])
-            arguments = parse(argv)
-            if arguments.help:
-                return _say(_help(_HELPS[arguments.command]))
-            if arguments.command == "converge":
-                return _converge(arguments, interrupt)
-            if not arguments.scenes and not arguments.only_shows:
-                ship = ", ".join(keys.options("scene"))
-                raise UsageError(f"scene: expected scene=NAME or scene=FILE.yaml; scenes that ship: {ship}")
-            return _compose_and_run(arguments, interrupt)
+            command = _command(argv)
+            if _asks_for_help(argv[1:]):
+                return _say(_help(command.help))
+            return command.run(argv[1:], interrupt)
         except TorchptError as error:
             return _refuse(str(error))
         except Interrupted as interrupted:
@@ -132,11 +99,24 @@ def _out_of_memory(error: Exception) -> int:
     return _refuse("not enough memory: a smaller film, or render.max_memory, needs less")
 
 
-def _converge(arguments: Arguments, interrupt: Interrupt) -> int:
-    if not {"scene", "study"} & arguments.study.keys():
-        ship = ", ".join(keys.options("scene"))
-        raise UsageError(f"scene: expected scene=NAME, scene=FILE.yaml or study=FILE.yaml; scenes that ship: {ship}")
-    return converge(arguments.study, interrupt)
+def _command(argv: list[str]) -> Command:
+    """Return the command of a command line.
+
+    Raises:
+        UsageError: there is no such one.
+    """
+    for command in COMMANDS:
+        if argv[:1] == [command.name]:
+            return command
+    names = [command.name for command in COMMANDS]
+    close = difflib.get_close_matches(argv[0], names, 1) if argv else []
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    raise UsageError(f"{argv[0] if argv else 'no command'}: expected one of the commands {', '.join(names)}{hint}")
+
+
+def _asks_for_help(words: list[str]) -> bool:
+    options = words[: words.index("--")] if "--" in words else words
+    return "--help" in options or "-h" in options
 
 
 def _check_place() -> None:
@@ -174,13 +154,8 @@ class JobFailedError(Exception):
 class _Task:
     """What Hydra calls with every composed configuration. Plain data, so that launchers may send it elsewhere."""
 
-    command: str
-    scenes: list[str]
-    outs: list[str]
-    paths: dict[str, str | None]
-    json: bool
-    turn: dict[str, str]
-    debug: dict[str, str]
+    job: Callable[[Job, Arguments, Interrupt], int]
+    arguments: Arguments
     process: int = field(default_factory=os.getpid)
 
     def __call__(self, cfg: DictConfig) -> int:
@@ -192,19 +167,9 @@ class _Task:
 
     def _run(self, cfg: DictConfig) -> int:
         """Run the job of a composed configuration and return the exit code."""
-        from torchpt.cli.debug import Wish, debug
-        from torchpt.cli.info import info
-        from torchpt.cli.orbit import Turn, orbit
-        from torchpt.cli.render import render
-
         with Interrupt() as interrupt:
             try:
-                job = self._job(cfg)
-                if self.command == "orbit":
-                    return orbit(job, Turn.read(self.turn), interrupt)
-                if self.debug:
-                    return debug(job, Wish.read(self.debug), interrupt, self.json)
-                return info(job, interrupt, self.json) if self.command == "info" else render(job, interrupt)
+                return self.job(self._job(cfg), self.arguments, interrupt)
             except (LostRankError, OtherRankError) as error:
                 return ranked.parted(error)
             except TorchptError as error:
@@ -225,8 +190,6 @@ class _Task:
         from omegaconf import OmegaConf
         from omegaconf.errors import OmegaConfBaseException
 
-        from torchpt.cli.render import Job
-
         hydra = HydraConfig.get()
         try:
             composed = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
@@ -234,14 +197,14 @@ class _Task:
             raise UsageError(f"{error.full_key or 'settings'}: {_first_line(error)}") from error
         assert isinstance(composed, dict)
         number = hydra.job.num if hydra.mode == RunMode.MULTIRUN else None
-        scene = self.scenes[composed.pop("scene_number", 0)]
+        scene = self.arguments.scenes[composed.pop("scene_number", 0)]
         words = list(hydra.overrides.task)
         overrides = _given(composed, words)
         words = [f"scene={scene}" if word.startswith("+scene_number=") else word for word in words]
-        for key, path in self.paths.items():
+        for key, path in self.arguments.paths.items():
             group, _, name = key.partition(".")
             overrides.setdefault(group, {})[name] = path
-        return Job(scene, overrides, tuple(self.outs), number, () if number is None else tuple(words))
+        return Job(scene, overrides, tuple(self.arguments.outs), number, () if number is None else tuple(words))
 
 
 def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, Any]]:
@@ -283,20 +246,14 @@ def _refuse_targets(value: Any, where: str) -> None:
             _refuse_targets(item, f"{where}{index}.")
 
 
-def _compose_and_run(arguments: Arguments, interrupt: Interrupt) -> int:
+def _compose_and_run(
+    job: Callable[[Job, Arguments, Interrupt], int], arguments: Arguments, interrupt: Interrupt
+) -> int:
     """Hand the words over to Hydra, which calls a task with each composition; returns the exit code."""
     import hydra
     from hydra.core.global_hydra import GlobalHydra
 
-    task = _Task(
-        arguments.command,
-        arguments.scenes,
-        arguments.outs,
-        arguments.paths,
-        arguments.json,
-        arguments.turn,
-        arguments.debug,
-    )
+    task = _Task(job, arguments)
     words = [*arguments.options, *arguments.overrides]
     single = not arguments.multirun and not any("hydra" in word for word in words)
     with sweep_folder() if arguments.multirun else nullcontext() as folder:
@@ -399,4 +356,60 @@ def _configs() -> Path:
 
 
 def _help(text: str) -> str:
-    return text.format(scenes=keys.scenes(), keys=keys.listed().replace("\n", "\n  "))
+    wide = max(len(f"{command.name} {command.example}") for command in COMMANDS)
+    lines = [f"  torchpt {f'{command.name} {command.example}':{wide}}   {command.line}" for command in COMMANDS]
+    return text.format(scenes=keys.scenes(), keys=keys.listed().replace("\n", "\n  "), commands="\n".join(lines))
+
+
+def _composed(name: str, job: Callable[[Job, Arguments, Interrupt], int]) -> Callable[[list[str], Interrupt], int]:
+    """Return a command whose words are settings: Hydra composes them, and ``job`` is called with what each job came to."""
+
+    def command(words: list[str], interrupt: Interrupt) -> int:
+        arguments = parse(name, words)
+        if not arguments.scenes and not arguments.only_shows:
+            ship = ", ".join(keys.options("scene"))
+            raise UsageError(f"scene: expected scene=NAME or scene=FILE.yaml; scenes that ship: {ship}")
+        return _compose_and_run(job, arguments, interrupt)
+
+    return command
+
+
+#: All commands, in the order of the help: a new one is a file in this folder and a row here.
+COMMANDS = (
+    Command(
+        "render",
+        "scene=cornell_box render.spp=64 out=cornell.exr",
+        "render a picture",
+        render.HELP,
+        _composed("render", render.run),
+    ),
+    Command(
+        "orbit",
+        "scene=cornell_box frames=48 out=turn.gif",
+        "turn the camera about it: .gif, .mp4",
+        orbit.HELP,
+        _composed("orbit", orbit.run),
+    ),
+    Command(
+        "info",
+        "scene=cornell_box",
+        "what the scene holds, what was built, what left out",
+        info.HELP,
+        _composed("info", info.run),
+    ),
+    Command(
+        "compare",
+        "test.exr reference.exr",
+        "how far a picture is from its reference",
+        compare.HELP,
+        compare.run,
+    ),
+    Command(
+        "converge",
+        "scene=cornell_box sampler=[independent,sobol]",
+        "error against run time, as a report",
+        converge.HELP,
+        converge.run,
+    ),
+    Command("stress", "quick=true", "stiff and extreme cases, measured", stress.HELP, stress.run),
+)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpt.cli import collector
+from torchpt.cli.arguments import Arguments
 from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.notices import notices, which_job
 from torchpt.cli.progress import Bar
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from torchpt.scene import Scene
     from torchpt.scene.settings import Settings
 
-__all__ = ["HELP", "Turn", "orbit", "poses"]
+__all__ = ["HELP", "Turn", "orbit", "poses", "run"]
 
 HELP = """\
 torchpt orbit scene=NAME|FILE.yaml [out=FILE.gif|FILE.mp4] [frames=48] [degrees=360] [key=value ...]
@@ -126,6 +127,11 @@ def poses(scene: Scene, turn: Turn) -> Iterator[NDArray[np.float64]]:
         pose = start.copy()
         pose[:3, :3], pose[:3, 3] = by @ start[:3, :3], place
         yield pose
+
+
+def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
+    """Turn the camera about a scene; returns the exit code."""
+    return orbit(job, Turn.read(arguments.turn), interrupt)
 
 
 def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:

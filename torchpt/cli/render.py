@@ -16,13 +16,36 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.cli import collector, ranked
+from torchpt.cli.arguments import Arguments
 from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.notices import not_finite, notices, unknown_error, which_job
 from torchpt.cli.progress import Bar
 from torchpt.cli.streams import speaking
 from torchpt.core.errors import OutputError, RenderError, SceneError, TorchptError
 
-__all__ = ["Job", "check_distinct", "described", "knowing", "numbered", "plain", "render", "sentence"]
+__all__ = ["HELP", "Job", "check_distinct", "described", "knowing", "numbered", "plain", "render", "run", "sentence"]
+
+HELP = """\
+torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
+
+  scene=   a file ending in .yaml, or a scene that ships:
+{scenes}
+  out=     .exr .hdr .png .jpg .ppm; several as out=[a.exr,a.png]; NAME.png where nothing is said
+  {keys}
+  debug.pixel=[x,y] debug.sample=k [--json]
+                      print that path vertex by vertex, in place of a picture: [0,0] is at the upper left of the film
+
+  integrator=NAME, sampler=NAME, ... take a group's file from configs/: integrator=direct sampler=independent
+  --multirun, -m      one render for every combination: sampler=sobol,independent render.spp=16,64 scene=a,b out=x.exr
+                      writes x_0.exr, x_1.exr, ...; stderr and the summaries say which job has which settings
+  --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
+
+  torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/guides/ranks.md)
+
+A sentence on stdout says what came of it; the last line is a summary in JSON. Samples that are not finite count as
+black, and stderr says why.
+Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the partial picture saved.
+"""
 
 
 @dataclass(frozen=True)
@@ -54,6 +77,15 @@ def numbered(path: str, number: int | None) -> str:
         return path
     file = Path(path)
     return str(file.with_name(f"{file.stem}_{number}{file.suffix}"))
+
+
+def run(job: Job, arguments: Arguments, interrupt: Interrupt) -> int:
+    """Render a picture, or print one path of it; returns the exit code."""
+    if not arguments.debug:
+        return render(job, interrupt)
+    from torchpt.cli.debug import Wish, debug
+
+    return debug(job, Wish.read(arguments.debug), interrupt, arguments.json)
 
 
 def render(job: Job, interrupt: Interrupt) -> int:

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from torchpt.cli import collector
 from torchpt.cli.arguments import GROUPS, UsageError
+from torchpt.cli.interrupt import Interrupt
 from torchpt.cli.streams import speaking
 from torchpt.core.errors import OutputError, SceneError
 
 if TYPE_CHECKING:
     from torchpt.stress import Bench, Case, Outcome
 
-__all__ = ["HELP", "stress"]
+__all__ = ["HELP", "run"]
 
 HELP = """\
 torchpt stress [quick=true] [case=PATTERN] [out=FOLDER] [key=value|key=[a,b] ...]
@@ -54,7 +55,6 @@ class Wishes:
     given: dict[str, str] = field(default_factory=dict)
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     json: bool = False
-    help: bool = False
 
     @classmethod
     def read(cls, words: list[str]) -> Wishes:
@@ -69,8 +69,8 @@ class Wishes:
         for word in words:
             key, equals, value = word.partition("=")
             group, dot, name = key.partition(".")
-            if word in ("-h", "--help", "--json"):
-                found.help, found.json = found.help or word != "--json", found.json or word == "--json"
+            if word == "--json":
+                found.json = True
             elif equals and key in _KEYS:
                 if key in found.given:
                     raise UsageError(f"{key}: given twice")
@@ -96,17 +96,13 @@ class Wishes:
         return [part.strip() for part in text[1:-1].split(",")] if text[:1] == "[" and text[-1:] == "]" else [text]
 
 
-def stress(words: list[str]) -> int:
+def run(words: list[str], interrupt: Interrupt) -> int:
     """Run the cases that are asked for, print what came of each; returns the exit code.
 
     Raises:
         TorchptError: bad input.
     """
     wishes = Wishes.read(words)
-    if wishes.help:
-        with speaking():
-            print(HELP, end="")
-        return 0
     from torchpt.stress.outcome import outcome_of
     from torchpt.stress.table import facts, heading, line
 
