@@ -316,9 +316,9 @@ FAULTS = (
     ),
     Fault(
         "infinite_counted_twice",
-        "paths/lost.py",
+        "paths/nonfinite.py",
         "integrators render",
-        "Lost.of",
+        "NonFinite.of",
         "count - nans",
         "count",
         "counts wrong: samples that are NaN count as infinite too, so nonfinite_samples is too large",
@@ -413,8 +413,8 @@ FAULTS = (
         "clamp_has_no_derivative",
         "gradients/tape.py",
         "gradients render",
-        "asked_of",
-        "(asked * scale).scatter_add(0, channel, -back)",
+        "sample_cotangents",
+        "(cotangent * scale).scatter_add(0, channel, -back)",
         "asked * scale",
         "dropped term of a gradient: with integrator.clamp the brightest channel still pulls",
     ),
@@ -430,7 +430,7 @@ FAULTS = (
     # -- scenes
     Fault(
         "changed_in_place",
-        "scene/editions.py",
+        "scene/versions.py",
         "scene render",
         "Editions.of",
         "before is None or before[0]() is not value or before[1] != version",

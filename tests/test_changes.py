@@ -25,7 +25,7 @@ from torchpt.cli import main as cli
 from torchpt.core.memory import Budget
 from torchpt.engines.engine import Forward, Share, radiance
 from torchpt.extend import Bsdf, BsdfSample, Color, cosine_hemisphere
-from torchpt.paths.wave import Plate, Tally, Wave
+from torchpt.paths.wave import PixelSet, RayCounts, Wave
 from torchpt.rendering import run
 from torchpt.scene import meshes
 
@@ -102,15 +102,15 @@ class OneByOne:
     def rows(self, layers: Mapping[str, Any]) -> int:
         return 0
 
-    def run(self, spans: Sequence[tuple[Plate, int, int]], each: Callable[[Share | None], bool]) -> bool:
-        for plate, first, count in spans:
-            pixels = plate.film.width * plate.film.height
+    def run(self, spans: Sequence[tuple[PixelSet, int, int]], each: Callable[[Share | None], bool]) -> bool:
+        for pixel_set, first, count in spans:
+            pixels = pixel_set.film.width * pixel_set.film.height
             for sample in range(first, first + count):
-                values = radiance(self.wave, 0, pixels, sample, 1, plate)
-                for place, value in plate.film.after(values, 0, sample):
+                values = radiance(self.wave, 0, pixels, sample, 1, pixel_set)
+                for place, value in pixel_set.film.after(values, 0, sample):
                     place.copy_(value)
                 self.taken += 1
-                if each(Share(Tally(pixels), pixels)):
+                if each(Share(RayCounts(pixels), pixels)):
                     return False
         return True
 

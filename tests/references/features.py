@@ -10,7 +10,7 @@ from typing import Any
 
 import torchpt
 from torchpt.engines.kernels.programs import Kernels
-from torchpt.rendering import kept
+from torchpt.rendering import scene_cache
 
 __all__ = ["FEATURES", "PLAIN", "Feature", "kernels", "with_feature"]
 
@@ -99,7 +99,7 @@ FEATURES: dict[str, Feature] = {
         module="torchpt.physics.textures.kinds.noise",
     ),
     "normal map": Feature(
-        ("paths/relief.py",),
+        ("paths/perturbed_normals.py",),
         lambda scene: _material(scene, normal_map=_squares(color0=[0.6, 0.45, 0.95], color1=[0.4, 0.5, 0.95])),
         ("world.textures.tables", "world.geometry.tangents"),
     ),
@@ -177,6 +177,6 @@ def kernels(described: Mapping[str, Any]) -> tuple[Kernels, torchpt.Scene]:
     """A scene's kernels, all that a render of it asks for made."""
     scene = torchpt.load(described, "cpu")
     torchpt.render(scene, spp=8, compile="on", full=True)  # with the layers that its file asks for
-    made = kept(scene).kernels
+    made = scene_cache(scene).kernels
     assert made is not None
     return made, scene

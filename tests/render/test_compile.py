@@ -13,7 +13,7 @@ import torchpt
 from torchpt.core.errors import SceneError
 from torchpt.engines.kernels import programs
 from torchpt.engines.kernels.threads import Loop
-from torchpt.rendering import kept, looped
+from torchpt.rendering import looped, scene_cache
 from torchpt.rendering.api import Rendering, render_scene
 from torchpt.scene.formats.description import settings
 
@@ -29,11 +29,11 @@ def run(scene: torchpt.Scene, spp: int, mode: str | bool, seed: int = 1, **more:
 def passes(monkeypatch) -> list[int]:
     """Samples of each pass that the loop took."""
     taken: list[int] = []
-    kept = Loop.run
+    original = Loop.run
 
     def noted(self: Loop, spans: Any, each: Any) -> bool:
         taken.append(spans[0][2])
-        return kept(self, spans, each)
+        return original(self, spans, each)
 
     monkeypatch.setattr(Loop, "run", noted)
     return taken
@@ -47,7 +47,7 @@ def test_auto_and_on_take_the_loop(passes, mode, looped):
     found = run(scene, 8, mode)
     assert sum(passes) == (8 if looped else 0)
     assert found.eager == ()
-    assert (kept(scene).kernels is not None) == looped
+    assert (scene_cache(scene).kernels is not None) == looped
 
 
 def test_the_summary_tells_the_time_that_compiling_took(monkeypatch):
@@ -62,7 +62,7 @@ def test_the_summary_tells_the_time_that_compiling_took(monkeypatch):
     clock = iter(range(1000))
     monkeypatch.setattr(programs.time, "perf_counter", lambda: float(next(clock)))
     ticks = run(scene, 1, "auto").compile_seconds
-    made = kept(scene).kernels
+    made = scene_cache(scene).kernels
     assert made is not None
     assert ticks >= len(made._made) > 0
 
@@ -70,7 +70,7 @@ def test_the_summary_tells_the_time_that_compiling_took(monkeypatch):
 def test_float64_stays_eager(passes):
     scene = torchpt.load("cornell_box", device="cpu")
     found = run(scene, 2, "auto", dtype=torch.float64)
-    assert found.image.dtype == torch.float64 and not passes and kept(scene).kernels is None
+    assert found.image.dtype == torch.float64 and not passes and scene_cache(scene).kernels is None
     assert torch.equal(found.image, run(scene, 2, "off", dtype=torch.float64).image)
 
 

@@ -199,10 +199,10 @@ class BackwardKernels(Protocol):
     """The kernels of a way back.
 
     Attributes:
-        back_eager: stages that run by tensor operations (``("bounce", model, ...)``, ``("emit", ...)``), and why.
+        eager_vjps: stages that run by tensor operations (``("bounce", model, ...)``, ``("emit", ...)``), and why.
     """
 
-    back_eager: dict[tuple[Any, ...], str]
+    eager_vjps: dict[tuple[Any, ...], str]
 
     def engine(self) -> Backward[Any, Any, ChunkSums]:
         """Return an engine for one more thread."""
@@ -238,8 +238,8 @@ def backward_kernels(tape: Tape, own: Sequence[int], cotangent: Tensor | None) -
         own: numbers of the models of which no kernel may be made.
         cotangent: as of :func:`backward_tensors`.
     """
-    from torchpt.engines.kernels.backward import JointKernels
+    from torchpt.engines.kernels.backward import VjpKernels
 
-    kernels = JointKernels(tape, packets_of(tape.wave), None if cotangent is None else cotangent.float().contiguous())
+    kernels = VjpKernels(tape, packets_of(tape.wave), None if cotangent is None else cotangent.float().contiguous())
     kernels.eager = kernels.probe(own)
     return kernels

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import Budget, Span, suffices
+from torchpt.core.memory import Budget, Span, fits_in_memory
 from torchpt.engines import tensors, work
 from torchpt.engines.work import Share
-from torchpt.paths.lost import Lost
-from torchpt.paths.wave import Plate, Tally, Wave, clamp_scale
+from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.wave import PixelSet, RayCounts, Wave, clamp_scale
 from torchpt.physics.film.splats import Splats
 
 __all__ = ["TensorsForward"]
@@ -44,16 +44,16 @@ class TensorsForward:
 
     def run(self, spans: Sequence[work.Span], each: Callable[[Share | None], bool]) -> bool:
         """See :class:`torchpt.engines.engine.Forward`."""
-        for plate, first, count in spans:
-            pixels = plate.film.width * plate.film.height
-            for _ in self.budget.through(partial(self._take, plate), pixels, first, count):
+        for pixel_set, first, count in spans:
+            pixels = pixel_set.film.width * pixel_set.film.height
+            for _ in self.budget.through(partial(self._take, pixel_set), pixels, first, count):
                 if each(self._share):
                     return False
         return True
 
-    def _take(self, plate: Plate, span: Span) -> None:
+    def _take(self, pixel_set: PixelSet, span: Span) -> None:
         """Take a piece: all of it, or nothing where it raises."""
-        piece = _piece(self.wave, plate, span)
+        piece = _piece(self.wave, pixel_set, span)
         self._share = Share(piece.tally, span[1] * span[3], piece.lost, piece.light)
         piece.write()
 
@@ -73,8 +73,8 @@ class Piece:
         splats: the same of sums of splats: these, places in their last axis, values.
     """
 
-    tally: Tally = field(default_factory=Tally)
-    lost: Lost = field(default_factory=Lost)
+    tally: RayCounts = field(default_factory=RayCounts)
+    lost: NonFinite = field(default_factory=NonFinite)
     light: tuple[float, float] = (0.0, 0.0)
     writes: list[tuple[Tensor, Tensor]] = field(default_factory=list)
     splats: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list)
@@ -86,7 +86,7 @@ class Piece:
             RenderError: copying failed for want of memory again and again.
         """
         for _ in range(ATTEMPTS):
-            if suffices(self._copied):
+            if fits_in_memory(self._copied):
                 return
         raise RenderError("not enough memory to add samples to the film")
 
@@ -97,17 +97,17 @@ class Piece:
             sums.index_copy_(2, place, value)
 
 
-def _piece(wave: Wave, plate: Plate, span: Span) -> Piece:
+def _piece(wave: Wave, pixel_set: PixelSet, span: Span) -> Piece:
     """Compute a piece: samples ``span`` of a plate."""
     piece = Piece()
     first, pixels, sample, samples = span
     if wave.integrator.light:
         splats: list[Splats] = []
-        brought = tensors.brought(wave, wave.rays(*span, plate), piece.tally, splats=splats)
+        brought = tensors.brought(wave, wave.rays(*span, pixel_set), piece.tally, splats=splats)
         radiance = brought.view(3, samples, pixels)
         finite = torch.isfinite(radiance).all(0)
         if not bool(finite.all()):
-            piece.lost = Lost.of(radiance, first, sample, wave.crop, plate)
+            piece.lost = NonFinite.of(radiance, first, sample, wave.crop, pixel_set)
             radiance = torch.where(finite, radiance, 0.0)
         clamp = wave.integrator.clamp
         if clamp is not None:
@@ -115,17 +115,17 @@ def _piece(wave: Wave, plate: Plate, span: Span) -> Piece:
             radiance = radiance * clamp_scale(radiance, clamp)
             splats = [replace(one, value=one.value * clamp_scale(one.value, clamp)) for one in splats]
             piece.light = before, _light(radiance, splats)
-        piece.writes += plate.film.after(radiance, first, sample)
-        if plate.film.splats is not None and splats:
+        piece.writes += pixel_set.film.after(radiance, first, sample)
+        if pixel_set.film.splats is not None and splats:
             lane, pixel, value = (
                 torch.cat([getattr(one, name) for one in splats], -1) for name in ("lane", "pixel", "value")
             )
-            stream = plate.film.stream(sample + lane // pixels)
-            piece.splats.append(plate.film.splats.after(stream, pixel, value))
-    if plate.layers:
+            stream = pixel_set.film.stream(sample + lane // pixels)
+            piece.splats.append(pixel_set.film.splats.after(stream, pixel, value))
+    if pixel_set.layers:
         piece.tally.rays += pixels * samples
-        for name, values in tensors.layers(wave, tuple(plate.layers), *span, plate).items():
-            piece.writes += plate.layers[name].after(values, first, sample)
+        for name, values in tensors.layers(wave, tuple(pixel_set.layers), *span, pixel_set).items():
+            piece.writes += pixel_set.layers[name].after(values, first, sample)
     return piece
 
 

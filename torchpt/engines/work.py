@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from torchpt.paths.lost import Lost
-from torchpt.paths.wave import Plate, Tally
+from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.wave import PixelSet, RayCounts
 
 __all__ = ["TASKS", "Block", "Share", "Span"]
 
@@ -13,9 +13,9 @@ __all__ = ["TASKS", "Block", "Share", "Span"]
 TASKS = 6
 
 #: A plate, the first sample of all its pixels, and how many.
-Span = tuple[Plate, int, int]
+Span = tuple[PixelSet, int, int]
 #: A plate, its first pixel and how many, the first sample and how many of each.
-Block = tuple[Plate, int, int, int, int]
+Block = tuple[PixelSet, int, int, int, int]
 
 
 @dataclass
@@ -30,8 +30,8 @@ class Share:
         rest: what memory did not suffice for.
     """
 
-    tally: Tally
+    tally: RayCounts
     samples: int = 0
-    lost: Lost = field(default_factory=Lost)
+    lost: NonFinite = field(default_factory=NonFinite)
     light: tuple[float, float] = (0.0, 0.0)
     rest: list[Block] = field(default_factory=list)
