@@ -13,7 +13,7 @@ from torchpt.paths.walk import KEPT, Engine, Population
 from torchpt.paths.wave import Wave
 
 if TYPE_CHECKING:  # the way back is imported where somebody goes it
-    from torchpt.engines.kernels.backward import JointKernels
+    from torchpt.engines.kernels.backward import VjpKernels
     from torchpt.math.sums import Sums
     from torchpt.paths.adjoint import Tape
 
@@ -76,7 +76,7 @@ def backward_tensors(tape: Tape, cotangent: Tensor | None) -> Backward[Any, Any,
     return TensorsBackward(tape, None if cotangent is None else cotangent.to(tape.wave.context.plan.dtype))
 
 
-def backward_kernels(tape: Tape, own: Sequence[int], cotangent: Tensor | None) -> JointKernels:
+def backward_kernels(tape: Tape, own: Sequence[int], cotangent: Tensor | None) -> VjpKernels:
     """Return the kernels of a way back, which make an engine for each thread.
 
     Args:
@@ -84,8 +84,8 @@ def backward_kernels(tape: Tape, own: Sequence[int], cotangent: Tensor | None) -
         own: numbers of the models of which no kernel may be made.
         cotangent: as of :func:`backward_tensors`.
     """
-    from torchpt.engines.kernels.backward import JointKernels
+    from torchpt.engines.kernels.backward import VjpKernels
 
-    kernels = JointKernels(tape, packets_of(tape.wave), None if cotangent is None else cotangent.float().contiguous())
+    kernels = VjpKernels(tape, packets_of(tape.wave), None if cotangent is None else cotangent.float().contiguous())
     kernels.eager = kernels.probe(own)
     return kernels

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from torchpt.core.memory import Span
 from torchpt.engines.tensors import Paths, Tensors, escaped
-from torchpt.math.gathers import gathered_by
+from torchpt.math.gathers import recording_gathers
 from torchpt.math.sums import Sums
 from torchpt.math.vectors import rows, take
 from torchpt.paths import adjoint
-from torchpt.paths.adjoint import Behind, Tape
-from torchpt.paths.integrators.path import Ends, slides
+from torchpt.paths.adjoint import Tape, VertexCotangents
+from torchpt.paths.integrators.path import Ends, follows_shape
 from torchpt.paths.state import EXTRA, Emission, PathState, Shadow, Splat, StageContext, VertexInput
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
@@ -104,17 +104,17 @@ class TensorsBackward(Tensors):
 
     def _chance(self, state: PathState, depth: int) -> tuple[Tensor | None, Tensor | None]:
         """The chance to get here under a tape, where it has derivatives, and zeros for what is asked of it."""
-        if not self.tape.passing:
+        if not self.tape.differentiates_opacity:
             return None, None
-        with torch.enable_grad(), gathered_by(self.sums):
+        with torch.enable_grad(), recording_gathers(self.sums):
             chance = self._under_tape.hits(state, depth).chance
         if chance is None or not chance.requires_grad:
             return None, None
         return chance, torch.zeros_like(chance)
 
     def _at(self, depth: int, lanes: Tensor, roulette: float = 0.0) -> StageContext:
-        slide = slides(self.plan, self.taped.context.world, depth)
-        return self.taped.context.at(salts(depth, lanes.device), slide, roulette)
+        follow_shape = follows_shape(self.plan, self.taped.context.world, depth)
+        return self.taped.context.at(salts(depth, lanes.device), follow_shape, roulette)
 
     def _bounce(
         self,
@@ -130,8 +130,8 @@ class TensorsBackward(Tensors):
     ) -> None:
         """Back through what happened at the surfaces of a model, at lanes ``index``."""
         lane = take(state.lane, index)
-        following = rows(self._met, lane) if self.plan.attached else None
-        behind = Behind(
+        next_hit = rows(self._met, lane) if self.plan.attached else None
+        behind = VertexCotangents(
             take(self._asked, lane),
             take(self._behind["throughput"], lane),
             *(take(self._behind[name], lane) if self.plan.attached else None for name in ("o", "d")),
@@ -140,19 +140,19 @@ class TensorsBackward(Tensors):
 
         def passed(shadow: Shadow) -> Tensor:
             kept = next(clear)
-            return self._under_tape.clear(shadow) if self.tape.passing else take(kept, turn)
+            return self._under_tape.clear(shadow) if self.tape.differentiates_opacity else take(kept, turn)
 
         def landed(splat: Splat) -> tuple[Tensor, Tensor]:
             kept = next(splat_clear)
-            through = self._under_tape.clear(splat.light) if self.tape.passing else take(kept, turn)
+            through = self._under_tape.clear(splat.light) if self.tape.differentiates_opacity else take(kept, turn)
             assert self._cotangent is not None
             return adjoint.splatted(self.wave.integrator.clamp, self._cotangent, splat, through)
 
-        with gathered_by(self.sums):
+        with recording_gathers(self.sums):
             context = self._at(depth, lane, self.wave.integrator.limits.roulette(depth))
             vertex = VertexInput(rows(state, index), rows(hit, index))
             stage = self.wave.integrator.bounce
-            before = adjoint.bounce(stage, context, model, vertex, following, passed, behind, self._tables, landed)
+            before = adjoint.bounce(stage, context, model, vertex, next_hit, passed, behind, self._tables, landed)
         for name, found, like in before.of_rays(vertex.state, self.plan.attached):
             self._behind[name].index_copy_(-1, lane, torch.zeros_like(like) if found is None else found)
         self.sums.add_each(before.others)
@@ -181,7 +181,7 @@ class TensorsBackward(Tensors):
             return
         lane = take(state.lane, index)
         vertex = VertexInput(rows(state, index), rows(hit, index))
-        with gathered_by(self.sums):
+        with recording_gathers(self.sums):
             before = adjoint.gather(stage, self._at(depth, lane), vertex, take(self._asked, lane), self._tables)
         for name, found, _ in before.of_rays(vertex.state, self.plan.attached):
             if found is not None:
@@ -195,7 +195,7 @@ class TensorsBackward(Tensors):
         """See :class:`torchpt.engines.engine.Backward`."""
         if not self.plan.attached:
             return
-        with torch.enable_grad(), gathered_by(self.sums):
+        with torch.enable_grad(), recording_gathers(self.sums):
             state = self.taped.rays(*self._span)
             pairs = [(x, self._behind[name]) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if pairs:

@@ -23,7 +23,7 @@ from torchpt.scene.prepare import make_wave
 from torchpt.scene.settings import Settings
 from torchpt.spec import Moves
 
-__all__ = ["Assembly", "attached"]
+__all__ = ["SceneTape", "attached"]
 
 
 # ---- What parameters move: decided once, from their specs, so that a derivative by a colour costs nothing for geometry
@@ -46,7 +46,7 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
 # ---- From parameters to what waves read, differentiated once a backward pass
 
 
-class Assembly(Tape):
+class SceneTape(Tape):
     """Tensors that the waves of a backward pass read, as functions of parameters.
 
     Args:

@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
-from torchpt.core.errors import say_once
-from torchpt.core.memory import Budget, Span, ran_out
+from torchpt.core.errors import warn_once
+from torchpt.core.memory import Budget, Span, is_out_of_memory
 from torchpt.core.threads import deal
 from torchpt.engines.engine import LANES_OF_KERNELS, Backward, backward_kernels, backward_tensors
-from torchpt.gradients.parameters import Assembly
-from torchpt.gradients.tape import asked_of
+from torchpt.gradients.parameters import SceneTape
+from torchpt.gradients.tape import sample_cotangents
 from torchpt.math.sums import ChunkSums, Sums
 from torchpt.paths.walk import KEPT, Counts, Observer, Population, walk
 from torchpt.scene import Scene
@@ -30,7 +30,7 @@ from torchpt.scene.prepare import own_models
 from torchpt.scene.settings import Settings
 
 if TYPE_CHECKING:
-    from torchpt.engines.kernels.backward import JointKernels
+    from torchpt.engines.kernels.backward import VjpKernels
 
 __all__ = ["replay_paths"]
 
@@ -94,8 +94,8 @@ class Chunk:
         with torch.no_grad():
             keeper = self._forward(1, None, None)
             radiance = self.engine.radiance_of_samples().view(3, samples, -1)
-            asked = asked_of(self.settings, radiance, pixels[:, first : first + count].to(radiance.dtype))
-            self.engine.receive(asked.reshape(3, -1))
+            cotangent = sample_cotangents(self.settings, radiance, pixels[:, first : first + count].to(radiance.dtype))
+            self.engine.receive(cotangent.reshape(3, -1))
             self._back(keeper, None)
             self.engine.vjp_rays()
 
@@ -120,7 +120,7 @@ class Chunk:
 # ---- All chunks: over threads by kernels, where these can be made; else one after the other by tensor operations
 
 
-def replay_paths(scene: Scene, assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
+def replay_paths(scene: Scene, assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
     """Reverse mode by replaying paths; as :func:`torchpt.gradients.tape.tape`, but memory hardly grows with depth.
 
     Sums are joined in the order of chunks, whichever thread took them. Chunks of tensor operations have fewer lanes only
@@ -130,47 +130,47 @@ def replay_paths(scene: Scene, assembly: Assembly, settings: Settings, asked: Te
         scene: what is rendered.
         assembly: what waves read.
         settings: of the backward pass.
-        asked: derivatives by the pixels ``(3, H W)``.
+        cotangent: derivatives by the pixels ``(3, H W)``.
         sums: what is added to.
 
     Raises:
         RenderError: not even a single lane fits in memory.
     """
     wave = assembly.wave
-    share = asked / settings.render.spp if wave.integrator.splats else None
+    share = cotangent / settings.render.spp if wave.integrator.splats else None
     if _compiled(assembly, settings):
         kernels = backward_kernels(assembly, own_models(scene, wave), share)
-        reason = _over_threads(kernels, assembly, settings, asked, sums)
+        reason = _over_threads(kernels, assembly, settings, cotangent, sums)
         models = wave.context.world.materials.models
-        for stage, why in kernels.back_eager.items():
+        for stage, why in kernels.eager_vjps.items():
             model = f" at {models[stage[1]]}" if stage[0] == "bounce" else ""
-            say_once(
+            warn_once(
                 f"torchpt: {stage[0]}{model} is differentiated by tensor operations, as no kernel can be made of {why}"
             )
         if not reason:
             return
-        say_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
+        warn_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
         sums.clear()
 
     def whole(span: Span) -> None:
-        sums.join(piece(assembly, settings, asked, share, span))
+        sums.join(piece(assembly, settings, cotangent, share, span))
 
     device = wave.centre.device
     budget = Budget(device, LANES.get(device.type, LANES["cpu"]), what="the vertices of a single lane")
     assembly.through(budget, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
-def piece(assembly: Assembly, settings: Settings, asked: Tensor, share: Tensor | None, span: Span) -> Sums:
+def piece(assembly: SceneTape, settings: Settings, cotangent: Tensor, share: Tensor | None, span: Span) -> Sums:
     """Return the sums of a chunk of tensor operations."""
     sums = assembly.sums()
     engine = backward_tensors(assembly, share)
-    Chunk(engine, settings, span, sums).run(asked)
+    Chunk(engine, settings, span, sums).run(cotangent)
     return sums
 
 
-def _over_threads(kernels: JointKernels, assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> str:
+def _over_threads(kernels: VjpKernels, assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> str:
     """Take all chunks by kernels; return why that cannot be, or ""."""
-    wave, asked = assembly.wave, asked.float()
+    wave, cotangent = assembly.wave, cotangent.float()
     budget = _budget(kernels, settings)
     blocks = assembly.blocks(wave.crop[2] * wave.crop[3], settings.render.spp)
     engines: list[Backward[Any, Any, Any]] = []
@@ -180,7 +180,7 @@ def _over_threads(kernels: JointKernels, assembly: Assembly, settings: Settings,
         with lock:
             engine = engines.pop() if engines else kernels.engine()
         found = ChunkSums(assembly.tables, sums if budget.threads == 1 else None)
-        Chunk(engine, settings, span, found).run(asked)
+        Chunk(engine, settings, span, found).run(cotangent)
         with lock:
             engines.append(engine)
         return found
@@ -197,7 +197,7 @@ def _over_threads(kernels: JointKernels, assembly: Assembly, settings: Settings,
         except Unsupported as error:
             return f"no kernel can be made of {error}"
         except Exception as error:
-            if not ran_out(error):
+            if not is_out_of_memory(error):
                 raise
         engines.clear()
         sums.clear()
@@ -216,7 +216,7 @@ def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
                 yield pixel, min(step, start + pixels - pixel), sample, count
 
 
-def _budget(kernels: JointKernels, settings: Settings) -> Budget:
+def _budget(kernels: VjpKernels, settings: Settings) -> Budget:
     """Return how many threads there are, fewer where the arenas of all would take more than half of ``render.max_memory``."""
     threads = torch.get_num_threads()
     budget = Budget(torch.device("cpu"), LANES_OF_KERNELS, threads, what="a gradient", instead="one thread")
@@ -227,9 +227,9 @@ def _budget(kernels: JointKernels, settings: Settings) -> Budget:
     return budget
 
 
-def _compiled(assembly: Assembly, settings: Settings) -> bool:
+def _compiled(assembly: SceneTape, settings: Settings) -> bool:
     """Return True where kernels may be made: on a CPU, in float32, without derivatives by weights of modules or opacity."""
     wave = assembly.wave
     if wave.centre.device.type != "cpu" or wave.context.plan.dtype != torch.float32 or settings.render.compile == "off":
         return False
-    return not assembly.held and not assembly.passing
+    return not assembly.held and not assembly.differentiates_opacity

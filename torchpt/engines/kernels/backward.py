@@ -25,24 +25,24 @@ from torchpt.core.memory import Span
 from torchpt.engines.kernels.engine import Chunk, Paths, Worker
 from torchpt.engines.kernels.layout import HIT, Fields, Layout, Memory, Rows, Trace, path_state
 from torchpt.engines.kernels.programs import Kernel, Kernels
-from torchpt.math.gathers import gathered_by
+from torchpt.math.gathers import recording_gathers
 from torchpt.math.sums import ChunkSums
 from torchpt.paths import adjoint
-from torchpt.paths.adjoint import Before, Behind, Tape
-from torchpt.paths.integrators.path import slides
+from torchpt.paths.adjoint import InputCotangents, Tape, VertexCotangents
+from torchpt.paths.integrators.path import follows_shape
 from torchpt.paths.state import EXTRA, PathState, Shadow, Splat, VertexInput
 from torchpt.paths.walk import KEPT
-from torchpt.paths.wave import still_of
+from torchpt.paths.wave import with_detached_geometry
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
 
 __all__ = [
     "SLOTS",
-    "JointKernels",
     "KernelsBackward",
-    "back_bounce",
-    "back_emit",
-    "back_escape",
+    "VjpKernels",
+    "bounce_vjp",
+    "emit_vjp",
+    "escape_vjp",
     "report",
     "slots_of",
     "slots_read",
@@ -76,13 +76,13 @@ def slots_of(layout: Layout) -> Fields:
 class _Noted:
     """Look-ups of a trace in tables that are differentiated."""
 
-    def __init__(self, tracer: Tracer, kernels: JointKernels) -> None:
+    def __init__(self, tracer: Tracer, kernels: VjpKernels) -> None:
         self.tracer, self.kernels = tracer, kernels
         self.taken: list[tuple[int, Tensor, Tensor]] = []
         self._known: dict[tuple[int, int], Tensor] = {}
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
-        """See :class:`torchpt.math.gathers.Gathers`."""
+        """See :class:`torchpt.math.gathers.GatherRecorder`."""
         number = self.kernels.numbers_of.get(id(table))
         if number is None or not self.tracer.is_traced(index):
             return None
@@ -100,14 +100,14 @@ class _Noted:
         return [*(leaf for _, _, leaf in self.taken), *self.kernels.tape.leaves]
 
 
-def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks:
+def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) -> Sinks:
     """See :func:`torchpt.paths.adjoint.bounce`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _given(trace)
     extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
-    behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
-    following = Hit(*(rows[name] for name in HIT)) if kernels.taped.plan.attached else None
+    cotangents = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
+    next_hit = Hit(*(rows[name] for name in HIT)) if kernels.taped.plan.attached else None
 
     def clear(_: Shadow) -> Tensor:
         return rows["clear"]
@@ -118,35 +118,35 @@ def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks
         return adjoint.splatted(integrator.clamp, cotangent, splat, rows["splat_clear"])
 
     noted = _Noted(tracer, kernels)
-    with tracer, gathered_by(noted):
-        context = kernels.taped.at(salts, slide, roulette)
+    with tracer, recording_gathers(noted):
+        context = kernels.taped.at(salts, follow_shape, roulette)
         vertex = VertexInput(state, hit)
         before = adjoint.bounce(
-            integrator.bounce, context, model, vertex, following, clear, behind, noted.leaves, landed
+            integrator.bounce, context, model, vertex, next_hit, clear, cotangents, noted.leaves, landed
         )
     return _ended(trace, noted, state, before, {})
 
 
-def back_emit(trace: Trace, slide: bool) -> Sinks:
+def emit_vjp(trace: Trace, follow_shape: bool) -> Sinks:
     """See :func:`torchpt.paths.adjoint.gather`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _given(trace)
     noted = _Noted(tracer, kernels)
-    with tracer, gathered_by(noted):
-        context = kernels.taped.at(salts, slide)
+    with tracer, recording_gathers(noted):
+        context = kernels.taped.at(salts, follow_shape)
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
         before = adjoint.gather(stage, context, vertex, rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
 
 
-def back_escape(trace: Trace) -> Sinks:
+def escape_vjp(trace: Trace) -> Sinks:
     """See :func:`torchpt.paths.adjoint.gather`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _given(trace)
     noted = _Noted(tracer, kernels)
-    with tracer, gathered_by(noted):
+    with tracer, recording_gathers(noted):
         stage, vertex = trace.layout.wave.integrator.escape, VertexInput(state, hit)
         before = adjoint.gather(stage, kernels.taped.at(salts), vertex, rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
@@ -168,7 +168,7 @@ def report(trace: Trace) -> Sinks:
     return Sinks(scatter=[Scatter(-1, trace.node(lane), rows, slots=True)])
 
 
-def slots_read(kernels: JointKernels) -> tuple[str, ...]:
+def slots_read(kernels: VjpKernels) -> tuple[str, ...]:
     """Return the names of what a vertex reads of the slots."""
     extra = tuple(name for name in slots_of(kernels) if name.startswith(EXTRA) or name in _SPLAT)
     return (*SLOTS, *extra) if kernels.taped.plan.attached else ("radiance", "throughput", "clear", *extra)
@@ -188,7 +188,7 @@ def _given(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
     return state, hit, slots.read(tracer, *slots_read(kernels), place=lane)
 
 
-def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added: dict[str, Tensor]) -> Sinks:
+def _ended(trace: Trace, noted: _Noted, state: PathState, before: InputCotangents, added: dict[str, Tensor]) -> Sinks:
     """Rows of derivatives by tables, and what is asked of the ray that came; ``added`` to what lies there."""
     kernels: Any = trace.layout
     tracer, graph = trace.tracer, trace.tracer.graph
@@ -245,10 +245,10 @@ def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added:
 # ---- The kernels of a backward pass: those of the paths as they are traced again, and those that go back along them
 
 
-_STAGES = {"bounce": back_bounce, "emit": back_emit, "escape": back_escape}
+_STAGES = {"bounce": bounce_vjp, "emit": emit_vjp, "escape": escape_vjp}
 
 
-class JointKernels(Kernels):
+class VjpKernels(Kernels):
     """The kernels of one backward pass.
 
     Args:
@@ -259,12 +259,12 @@ class JointKernels(Kernels):
     Attributes:
         taped: what stages read where they are gone back along.
         numbers_of: which of the leaves a tensor is, by its id.
-        back_eager: stages that no kernel can be made of, and why.
+        eager_vjps: stages that no kernel can be made of, and why.
         slots: rows of :func:`torchpt.engines.kernels.backward.slots_of`.
     """
 
     def __init__(self, tape: Tape, packets: bool, cotangent: Tensor | None = None) -> None:
-        super().__init__(still_of(tape.wave), packets, False, cotangent=cotangent)
+        super().__init__(with_detached_geometry(tape.wave), packets, False, cotangent=cotangent)
         self.tape, self.cotangent = tape, cotangent
         self.taped = tape.taped.context
         self.plain = tape.plain
@@ -275,19 +275,19 @@ class JointKernels(Kernels):
                 self._leaves.ids[id(leaf)] = path, leaf
         self.structure = (*self.structure, self.taped.plan.attached, tuple(paths))
         self.slots = Rows(slots_of(self))
-        self.back_eager: dict[tuple[Any, ...], str] = {}
+        self.eager_vjps: dict[tuple[Any, ...], str] = {}
 
-    def back_kernel(self, key: tuple[Any, ...]) -> Kernel | None:
-        """The kernel of ``("bounce", model, roulette, slide)``, ``("emit", slide)`` or ``("escape",)`` gone back through.
+    def vjp_kernel(self, key: tuple[Any, ...]) -> Kernel | None:
+        """The kernel of ``("bounce", model, roulette, follow_shape)``, ``("emit", follow_shape)`` or ``("escape",)`` gone back through.
 
-        None: none can be made; :attr:`back_eager` says why.
+        None: none can be made; :attr:`eager_vjps` says why.
         """
-        if key in self.back_eager:
+        if key in self.eager_vjps:
             return None
         try:
             return self._get(True, _STAGES[key[0]], *key[1:])
         except Unsupported as error:
-            self.back_eager[key] = str(error)
+            self.eager_vjps[key] = str(error)
             return None
 
     def report(self) -> Kernel:
@@ -325,7 +325,7 @@ class KernelsBackward(Worker):
 
     keeps_splats = False  # it goes back along their vertices
 
-    def __init__(self, kernels: JointKernels) -> None:
+    def __init__(self, kernels: VjpKernels) -> None:
         super().__init__(kernels)
         self.back = kernels
         self._levels: list[Paths] = []
@@ -382,16 +382,16 @@ class KernelsBackward(Worker):
         """See :class:`torchpt.engines.engine.Backward`."""
         kernels, calls, depth = self.back, self.calls, paths.depth
         limits = self.wave.integrator.limits
-        slide = slides(kernels.taped.plan, kernels.world, depth)
-        calls.name_salts(depth)
+        follow_shape = follows_shape(kernels.taped.plan, kernels.world, depth)
+        calls.set_dimensions(depth)
         if depth < limits.last:
             for model, count in enumerate(paths.groups):
                 if count:
-                    key = ("bounce", model, limits.roulette(depth), slide)
+                    key = ("bounce", model, limits.roulette(depth), follow_shape)
                     self._one(key, paths, paths.lists[model], count, False)
         if kernels.has_emitters and paths.places[kernels.emissive]:
             place = kernels.emissive
-            self._one(("emit", slide), paths, paths.lists[place], paths.places[place], True)
+            self._one(("emit", follow_shape), paths, paths.lists[place], paths.places[place], True)
         if kernels.has_environment and paths.places[kernels.missed]:
             place = kernels.missed
             self._one(("escape",), paths, paths.lists[place], paths.places[place], True)
@@ -400,7 +400,7 @@ class KernelsBackward(Worker):
 
     def _one(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
         """Back through one stage on the lanes of a list, by its kernel or by tensor operations."""
-        kernel = self.back.back_kernel(key)
+        kernel = self.back.vjp_kernel(key)
         slots = self._by_sample(paths, places, count) if kernel is None or kernel.program.sums else None
         if kernel is None:
             self._eagerly(key, paths, places, count, added)
@@ -447,16 +447,16 @@ class KernelsBackward(Worker):
             assert kernels.cotangent is not None
             return adjoint.splatted(integrator.clamp, kernels.cotangent, splat, rows["splat_clear"])
 
-        before: Before
-        with gathered_by(self.sums):
+        before: InputCotangents
+        with recording_gathers(self.sums):
             if key[0] == "bounce":
                 extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
-                behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
-                following = Hit(*(rows[name] for name in HIT)) if plan.attached else None
-                _, model, roulette, slide = key
-                context = kernels.taped.at(salt, slide, roulette)
+                cotangents = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
+                next_hit = Hit(*(rows[name] for name in HIT)) if plan.attached else None
+                _, model, roulette, follow_shape = key
+                context = kernels.taped.at(salt, follow_shape, roulette)
                 before = adjoint.bounce(
-                    integrator.bounce, context, model, vertex, following, clear, behind, self._tables, landed
+                    integrator.bounce, context, model, vertex, next_hit, clear, cotangents, self._tables, landed
                 )
             else:
                 stage = integrator.emit if key[0] == "emit" else integrator.escape
@@ -477,7 +477,7 @@ class KernelsBackward(Worker):
         if not self.back.taped.plan.attached:
             return
         chunk, first, n = self._chunk, self.back.slots.first, self._chunk.pixels * self._chunk.samples
-        with torch.enable_grad(), gathered_by(self.sums):
+        with torch.enable_grad(), recording_gathers(self.sums):
             state = self.back.tape.taped.rays(chunk.first_pixel, chunk.pixels, chunk.first_sample, chunk.samples)
             pairs = [(x, first(name)) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if not pairs:
