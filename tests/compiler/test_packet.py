@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 import torch
+from accel_reference import SCENES, geometry, soup
 from few import few
 from torch import Tensor
 
@@ -57,24 +58,6 @@ def searches(accel: Brute, kinds: Sequence[str] | None = None, form: Form = VECT
     return run
 
 
-def geometry(p0: np.ndarray, p1: np.ndarray, p2: np.ndarray, counts: tuple[int, int, int, int]) -> Geometry:
-    """From points (P, 3)."""
-    a, b, c = (torch.from_numpy(np.ascontiguousarray(p.T, np.float32)) for p in (p0, p1, p2))
-    return Geometry(a, b, c, (*counts, 0))
-
-
-def soup(seed: int, counts: tuple[int, int, int, int]) -> Geometry:
-    """Random primitives: corner and two neighbours, or a sphere's centre and radius."""
-    rng = np.random.default_rng(seed)
-    n = sum(counts)
-    p0 = rng.uniform(-1, 1, (n, 3))
-    p1, p2 = (p0 + rng.normal(0, 0.4, (n, 3)) for _ in range(2))
-    balls = n - counts[3]
-    p1[balls:], p2[balls:] = 0, 0
-    p1[balls:, 0] = rng.uniform(0.05, 0.4, counts[3])
-    return geometry(p0, p1, p2, counts)
-
-
 def rays(seed: int, n: int) -> tuple[Tensor, Tensor, Tensor]:
     """From within and around the scene, not of unit length, half of them short."""
     rng = torch.Generator().manual_seed(seed)
@@ -84,16 +67,6 @@ def rays(seed: int, n: int) -> tuple[Tensor, Tensor, Tensor]:
     return o, d, t_max
 
 
-SCENES = {
-    "triangles": (20, 0, 0, 0),
-    "rectangles": (0, 12, 0, 0),
-    "disks": (0, 0, 12, 0),
-    "spheres": (0, 0, 0, 12),
-    "one": (1, 0, 0, 0),
-    "triangles and spheres": (9, 0, 0, 7),
-    "rectangles and disks": (0, 5, 6, 0),
-    "all": (10, 6, 6, 6),
-}
 COUNT = 20_000
 
 

@@ -9,26 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from accel_reference import geometry, quadric_table, rays, search, soup, sphere_mesh, triangles
+from accel_reference import SCENES, geometry, quadric_table, rays, search, soup, sphere_mesh, triangles
 from few import few
 from test_arrays import with_quadrics
 
 import torchpt
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.shapes.kinds.sphere import Ellipsoid
-from torchpt.search import build
+from torchpt.search import brute, build, tables
 from torchpt.search.brute import Brute, nearer
 
-SCENES = {
-    "triangles": (20, 0, 0, 0),
-    "rectangles": (0, 12, 0, 0),
-    "disks": (0, 0, 12, 0),
-    "spheres": (0, 0, 0, 12),
-    "one": (1, 0, 0, 0),
-    "triangles and spheres": (9, 0, 0, 7),
-    "rectangles and disks": (0, 5, 6, 0),
-    "all": (10, 6, 6, 6),
-}
 N = 20_000
 
 
@@ -203,3 +193,11 @@ def test_a_render_of_few_primitives_needs_no_numba():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.split() == ["brute", "True", "False"]
+
+
+@pytest.mark.parametrize("kind", ["auto", "brute"])
+def test_primitives_are_inspected_once_a_build(kind, monkeypatch):
+    seen = []
+    monkeypatch.setattr(brute, "prepare", lambda geometry: seen.append(geometry) or tables.prepare(geometry))
+    g = soup(4, SCENES["all"])
+    assert build(g, kind, 1).name == "brute" and seen == [g]

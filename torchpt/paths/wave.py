@@ -16,7 +16,7 @@ from torchpt.paths.state import PathState, StageContext, VertexInput, VertexOutp
 from torchpt.paths.vertex import generate
 from torchpt.physics import lights
 from torchpt.physics.cameras import Camera
-from torchpt.physics.film import FILTERS, Film, Filter
+from torchpt.physics.film import Film, Filter, filter_of
 from torchpt.physics.samplers import Dimension, Draws, Sampler, Streams, salts
 from torchpt.search.base import Accel
 
@@ -163,7 +163,7 @@ class Wave:
         """Return the wave whose paths begin with rays; no filter weighs them."""
         n = rays.d.shape[1]
         # Of filters that weigh nothing nothing is asked: kernels are those of renders.
-        filter = FILTERS["box"]({}, rays.d.device) if self.filter.signed else self.filter
+        filter = filter_of("box", rays.d.device) if self.filter.signed else self.filter
         camera = replace(self.camera, resolution=(n, 1))
         return replace(self, camera=camera, crop=(0, 0, n, 1), filter=filter, given=rays)
 

@@ -88,11 +88,13 @@ def make_wave(
     attached: bool = False,
     like: Wave | None = None,
     rays: tuple[Tensor, Tensor] | None = None,
+    packets: bool = True,
 ) -> Wave:
     """Everything that the waves of a render share; see :class:`Plan` for ``tape`` and ``attached``.
 
     ``like``: a wave of the same scene, settings and parameters, but for those of the camera: what it reads is read again.
     ``rays``: origins and directions ``(..., 3)`` in the scene's coordinates, in place of the camera's.
+    ``packets``: False where a tree is to be searched even if packets would be quicker.
 
     Raises:
         SceneError: a direction that is zero, or a ray that is not finite.
@@ -108,6 +110,8 @@ def make_wave(
         threads = None if settings.render.threads == "auto" else int(settings.render.threads)
         moved = any(name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in shaping)
         accel = scene.accel(settings.render.accel, threads, geometry if moved else None)
+        if accel.name == "brute" and not packets:
+            accel = scene.accel("numba", threads, geometry if moved else None)
         if not integrator.lit:
             world = _dark(scene, world, own)
     else:

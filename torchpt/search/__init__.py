@@ -49,7 +49,10 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
     if geometry.copies is not None and kind == "brute":
         raise SceneError("render.accel", kind, "numba or torch (this scene has instances)")
     if kind == "auto":
-        kind = _choose(geometry) if on_cpu else "torch"
+        packets = _packets(geometry, threads) if on_cpu else None
+        if packets is not None:
+            return packets
+        kind = "numba" if on_cpu else "torch"
     if before is not None and before.name == kind:
         refitted = before.refit(geometry, threads)
         if refitted is not None:
@@ -74,10 +77,12 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
     return Wide(geometry, threads)
 
 
-def _choose(geometry: Geometry) -> str:
+def _packets(geometry: Geometry, threads: int | None) -> Accel | None:
+    """Return the packet search; None where a tree is quicker, or float32 rows are too coarse for these primitives."""
     # Packets know no quadrics: from three on the tree is as fast or faster.
     if geometry.size > BRUTE_LIMIT or geometry.copies is not None or geometry.counts[4]:
-        return "numba"
-    from torchpt.search.brute import eligible
+        return None
+    from torchpt.search.brute import Brute, rows_of
 
-    return "brute" if eligible(geometry) else "numba"
+    rows = rows_of(geometry)
+    return Brute(geometry, threads, rows) if rows.fine else None

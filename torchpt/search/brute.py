@@ -12,7 +12,7 @@ import ctypes
 import functools
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,9 +31,9 @@ from torchpt.native import compile_time
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Hits
 from torchpt.search.leaf import quadric
-from torchpt.search.tables import extent, inverses, prepare, tolerances
+from torchpt.search.tables import Tables, extent, inverses, prepare, tolerances
 
-__all__ = ["MAX_TOLERANCE", "Brute", "eligible", "nearer"]
+__all__ = ["MAX_TOLERANCE", "Brute", "Rows", "nearer", "rows_of"]
 
 #: Largest share of its own size by which a primitive may be enlarged (rays across it, from within the scene).
 MAX_TOLERANCE = 1e-3
@@ -44,10 +44,29 @@ _GRAIN = 100_000
 _SEARCH = HEAD.index("search")
 
 
-def eligible(geometry: Geometry) -> bool:
-    """Return True where float32 rows are fine enough for these primitives (no mixed scales, no slivers)."""
-    size = extent(geometry)
-    return bool((tolerances(prepare(geometry).rows64, size) * size <= MAX_TOLERANCE).all())
+class Rows(NamedTuple):
+    """Primitives as packets read them.
+
+    Attributes:
+        tables: of them.
+        size: largest coordinate of the scene.
+        tolerance: ``(P,)`` float64 by which each is enlarged, see :func:`torchpt.search.tables.tolerances`.
+    """
+
+    tables: Tables
+    size: float
+    tolerance: Tensor
+
+    @property
+    def fine(self) -> bool:
+        """Return True where float32 is fine enough for these primitives: no mixed scales, no slivers."""
+        return bool((self.tolerance * self.size <= MAX_TOLERANCE).all())
+
+
+def rows_of(geometry: Geometry) -> Rows:
+    """Return the rows of primitives; whether they are fine enough is for the caller to ask."""
+    size, tables = extent(geometry), prepare(geometry)
+    return Rows(tables, size, tolerances(tables.rows64, size))
 
 
 class Brute(Accel):
@@ -56,6 +75,7 @@ class Brute(Accel):
     Args:
         geometry: the primitives, on the CPU.
         threads: CPU threads; ``None`` is torch's number, as it is when rays are searched.
+        rows: of the primitives, where they are known already.
 
     Attributes:
         words: what kernels read of the primitives, see :func:`torchpt.compiler.packet.packet_words`.
@@ -66,15 +86,15 @@ class Brute(Accel):
 
     name = "brute"
 
-    def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
+    def __init__(self, geometry: Geometry, threads: int | None = None, rows: Rows | None = None) -> None:
         start = time.perf_counter()
         if geometry.p0.device.type != "cpu":
             raise SceneError("render.accel", "brute", "torch (brute runs on the CPU only)")
-        if not eligible(geometry):
+        tables, size, tolerance = rows = rows_of(geometry) if rows is None else rows
+        if not rows.fine:
             raise SceneError("render.accel", "brute", "numba or torch (this scene's scales are too mixed for brute)")
-        size, tables = extent(geometry), prepare(geometry)
         planar, round_ = sum(geometry.counts[:3]), sum(geometry.counts[:4])
-        table = torch.cat([tables.rows64, tolerances(tables.rows64, size)[:, None]], 1)[:planar]
+        table = torch.cat([tables.rows64, tolerance[:, None]], 1)[:planar]
         self.table = table.float().contiguous()
         balls = torch.cat([geometry.p0, geometry.p1[:1]])[:, planar:round_].T.double()
         self.spheres = torch.where(tables.area[planar:round_, None], balls, torch.nan).contiguous()

@@ -2,8 +2,8 @@
 
 ``bodies`` has what moves, ``curves`` the curves along which visibility may jump, ``primary`` those that the camera sees, and
 their samples; ``shadows`` those that may throw shadows, points on lights, and the edges of shadows; ``vertices`` what surfaces
-make of light; ``traced`` traces their rays. ``gradients`` adds it all up; ``layers`` does so for layers of first surfaces,
-their interior included.
+make of light. ``traced`` draws random numbers by the samplers of renders, and traces rays by their engines. ``gradients`` adds
+it all up; ``layers`` does so for layers of first surfaces, their interior included.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchpt.core.threads import limited_threads
 from torchpt.gradients.edges.bodies import Bodies, bodies_of
-from torchpt.gradients.edges.draws import Numbers
 from torchpt.gradients.edges.film import Worth
 from torchpt.gradients.edges.primary import Look, pieces_of, primary_of
 from torchpt.gradients.edges.shadows import Shadows, occluders_of, sources_of
@@ -104,7 +103,7 @@ class Boundary:
             pieces = pieces_of(self.scene, self.still, self.scene.merged(self.params), self.worth.bounds())
         if pieces is None:
             return
-        primary = primary_of(self.still, pieces, self.traced, Numbers(self.settings.render.seed, 0))
+        primary = primary_of(self.still, pieces, self.traced)
         for first, count in self._chunks(total):
             yield primary.samples(first, count, total, self.worth, look, held)
 
@@ -118,7 +117,7 @@ class Boundary:
                     yield cast
 
     def _shadows(self) -> Iterator[Shadows]:
-        still, integrator, seed = self.still, self.traced.wave.integrator, self.settings.render.seed
+        still, integrator = self.still, self.traced.wave.integrator
         depth = integrator.limits.max_depth
         if not isinstance(integrator, PathIntegrator) or 0 <= depth < 2:
             return
@@ -135,10 +134,9 @@ class Boundary:
             return
         # Where nothing but the camera moves, what it does not see itself stays as it is.
         onward = any(not name.startswith("camera.") for name in self.leaves)
-        for stream, light in enumerate((sources, None), 1):
+        for light in (sources, None):
             if light is not None or (not 0 <= depth < 3 and self.moving.keys() - {"lights"}):
-                numbers = Numbers(seed, stream)
-                yield Shadows(still, occluders, light, self.traced, numbers, reach, depth, onward)
+                yield Shadows(still, occluders, light, self.traced, reach, depth, onward)
 
     def _chunks(self, total: int) -> Iterator[tuple[int, int]]:
         """First samples and how many."""

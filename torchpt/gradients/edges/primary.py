@@ -21,9 +21,9 @@ from torchpt.gradients.edges.curves import (
     round_outline,
     rounds_of,
 )
-from torchpt.gradients.edges.draws import Choice, Numbers
 from torchpt.gradients.edges.film import Worth, film_places, slopes
-from torchpt.gradients.edges.traced import Traced
+from torchpt.gradients.edges.traced import Traced, Use
+from torchpt.math.sampling import Discrete
 from torchpt.math.vectors import cross, dot, rows, take
 from torchpt.scene import Scene
 
@@ -326,15 +326,13 @@ class Primary:
         bodies: detached.
         pieces: what the camera may see.
         choice: among them.
-        traced: what sees.
-        numbers: of samples.
+        traced: what sees, and draws.
     """
 
     bodies: Bodies
     pieces: Pieces
-    choice: Choice
+    choice: Discrete
     traced: Traced
-    numbers: Numbers
 
     @torch.no_grad()
     def samples(self, first: int, count: int, total: int, worth: Worth, look: Look, over: bool = False) -> Along:
@@ -343,8 +341,9 @@ class Primary:
         ``over``: they count as they move over what is seen on both sides, which is held in place.
         """
         number = torch.arange(first, first + count, device=self.pieces.weight.device)
-        u = (number.double() + self.numbers.of(number, 0)) / total
-        index, rest, chance = self.choice.draw(u)
+        u, _ = self.traced.edge(number, self.traced.key(number, Use.PRIMARY), total)
+        index, rest = self.choice.draw(u)
+        chance = take(self.choice.pmf, index)
         pieces = rows(self.pieces, index)
         t, density = pieces.place(rest)
         held, p, along = pieces.curves.moving(self.bodies, t)
@@ -397,6 +396,6 @@ class Primary:
         return torch.where(seen, share_of(self.bodies, held, mate, s, prim, near, step), 0.0)
 
 
-def primary_of(bodies: Bodies, pieces: Pieces, traced: Traced, numbers: Numbers) -> Primary:
-    """The estimator over ``pieces``."""
-    return Primary(bodies, pieces, Choice(pieces.weight), traced, numbers)
+def primary_of(bodies: Bodies, pieces: Pieces, traced: Traced) -> Primary:
+    """Return the estimator over ``pieces``."""
+    return Primary(bodies, pieces, Discrete.of(pieces.weight, torch.float64, even=0.0), traced)

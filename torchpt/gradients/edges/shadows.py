@@ -22,16 +22,17 @@ from torchpt.gradients.edges.curves import (
     rounds_of,
     straight,
 )
-from torchpt.gradients.edges.draws import Choice, Numbers
 from torchpt.gradients.edges.film import Worth, film_places, slopes
-from torchpt.gradients.edges.traced import Traced
+from torchpt.gradients.edges.traced import Traced, Use
 from torchpt.gradients.edges.vertices import Spot, met
-from torchpt.math.sampling import concentric_disk, uniform_sphere, uniform_triangle
-from torchpt.math.vectors import cross, dot, luminance, rows, take
+from torchpt.math.sampling import Discrete, concentric_disk, uniform_sphere, uniform_triangle
+from torchpt.math.vectors import cross, dot, largest, luminance, rows, take
+from torchpt.paths.roulette import chance_of, survived
 from torchpt.paths.vertex import light_radiance
-from torchpt.physics.lights import KINDS, SURFACES
+from torchpt.physics.lights import KINDS, SURFACES, fine
 from torchpt.physics.lights.base import Environment, taken
 from torchpt.physics.lights.records import Lights, LightSample
+from torchpt.physics.samplers import Dimension, Draws
 from torchpt.physics.shapes import quadrics
 from torchpt.physics.shapes.geometry import Interaction
 from torchpt.physics.shapes.quadrics import Form
@@ -77,16 +78,17 @@ class Sources:
 
     bodies: Bodies
     world: World
-    choice: Choice
+    choice: Discrete
     prim: Tensor
     surfaces: int
 
-    def draw(self, numbers: Numbers, sample: Tensor) -> Beam:
-        """Points on lights for samples ``(N,)`` int64."""
+    def draw(self, draws: Draws) -> Beam:
+        """Draw points on lights."""
         lights = self.world.lights
         assert lights is not None
-        row, rest, chance = self.choice.draw(numbers.of(sample, 10))
-        u = torch.stack((rest, numbers.of(sample, 11)))
+        u = draws.two(Dimension.LIGHT)
+        row, rest = self.choice.draw(fine(torch.stack((u[0], draws.one(Dimension.LIGHT_DIGITS)))))
+        chance, u = take(self.choice.pmf, row), torch.stack((rest, u[1].double()))
         a, e, w = torch.zeros(3, len(row), dtype=torch.float64, device=row.device), None, (row < self.surfaces).double()
         prim = take(self.prim, row)
         for k, name in enumerate(lights.kinds):
@@ -201,7 +203,7 @@ def sources_of(bodies: Bodies, world: World, reach: float, met: bool) -> Sources
         weight = torch.where(mine, bright * factor, weight)
     if not bool((weight > 0).any()):
         return None
-    return Sources(bodies, world, Choice(weight / weight.sum() + 0.05 / count * (weight > 0)), prim, surfaces)
+    return Sources(bodies, world, Discrete.of(weight, torch.float64, even=0.05), prim, surfaces)
 
 
 # ---- The curves of a scene that may throw shadows, to be drawn from before it is known where the light comes from
@@ -252,11 +254,12 @@ class Occluders:
     folded: Tensor
     form: Tensor
     forms: list[Form]
-    choice: Choice
+    choice: Discrete
 
     def draw(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Curves ``(N,)``, what is left of ``u``, and their chances."""
-        return self.choice.draw(u)
+        """Return curves ``(N,)``, what is left of ``u``, and their chances."""
+        index, rest = self.choice.draw(u)
+        return index, rest, take(self.choice.pmf, index)
 
     def place(self, index: Tensor, rest: Tensor, chance: Tensor, coin: Tensor, view: View) -> Passed:
         """Places on drawn curves as they are seen from ``view``.
@@ -333,7 +336,7 @@ def occluders_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Occl
     if not curves or not bool((torch.cat(weights) > 0).any()):
         return None
     others = [Held(torch.cat([h.prim for h in x]), torch.cat([h.a for h in x], 1)) for x in (firsts, seconds)]
-    choice = Choice(torch.cat(weights))
+    choice = Discrete.of(torch.cat(weights), torch.float64, even=0.0)
     return Occluders(bodies, joined(curves), (others[0], others[1]), torch.cat(folded), torch.cat(forms), kinds, choice)
 
 
@@ -419,8 +422,7 @@ class Shadows:
         bodies: detached.
         occluders: what throws shadows.
         sources: the lights; None: what surfaces reflect.
-        traced: what sees.
-        numbers: of samples.
+        traced: what sees, and draws.
         reach: radius of the scene.
         depth: vertices of paths at most; -1: any number.
         onward: whether light that reaches the camera by way of further surfaces counts too.
@@ -430,7 +432,6 @@ class Shadows:
     occluders: Occluders
     sources: Sources | None
     traced: Traced
-    numbers: Numbers
     reach: float
     depth: int
     onward: bool
@@ -439,25 +440,23 @@ class Shadows:
     def samples(self, first: int, count: int, total: int, worth: Worth) -> Cast | None:
         """Samples ``first .. first + count`` of ``total``; None where none of them counts."""
         number = torch.arange(first, first + count, device=self.bodies.p0.device)
-        u = (number.double() + self.numbers.of(number, 0)) / total
+        key = self.traced.key(number, Use.REFLECTED if self.sources is None else Use.LIGHTS)
+        u, coin = self.traced.edge(number, key, total)
         index, rest, chance = self.occluders.draw(u)
-        coin = self.numbers.of(number, 1)
         if self.sources is not None:
-            beam = self.sources.draw(self.numbers, number)
+            beam = self.sources.draw(self.traced.draws(key))
             passed = self.occluders.place(index, rest, chance, coin, beam.view)
             beam = rows(beam, passed.lane)
         else:
-            beam, passed = self._reflected(number, index, rest, chance, coin)
+            beam, passed = self._reflected(key, index, rest, chance, coin)
         beam, passed, spot, outward = self._past(beam, passed)
         if not len(passed.lane):
             return None
-        return self._cast(take(number, passed.lane), beam, passed, spot, outward, worth, total)
+        return self._cast(take(number, passed.lane), take(key, passed.lane), beam, passed, spot, outward, worth, total)
 
-    def _reflected(
-        self, number: Tensor, index: Tensor, rest: Tensor, chance: Tensor, coin: Tensor
-    ) -> tuple[Beam, Passed]:
+    def _reflected(self, key: Tensor, index: Tensor, rest: Tensor, chance: Tensor, coin: Tensor) -> tuple[Beam, Passed]:
         """Points of surfaces, by a direction from the edge; of edges that are the same from everywhere."""
-        away = uniform_sphere(torch.stack((self.numbers.of(number, 12), self.numbers.of(number, 13))))
+        away = uniform_sphere(self.traced.draws(key).two(Dimension.BSDF).double())
         known = (take(self.occluders.form, index) < 0).nonzero().squeeze(1)
         index, rest, chance, coin, away = (take(x, known) for x in (index, rest, chance, coin, away))
         passed = self.occluders.place(index, rest, chance, coin, View(away, 0.0))
@@ -507,7 +506,15 @@ class Shadows:
         return rows(beam, index), rows(passed, index), spot.taken(some), take(outward, some)
 
     def _cast(
-        self, number: Tensor, beam: Beam, passed: Passed, spot: Spot, outward: Tensor, worth: Worth, total: int
+        self,
+        number: Tensor,
+        key: Tensor,
+        beam: Beam,
+        passed: Passed,
+        spot: Spot,
+        outward: Tensor,
+        worth: Worth,
+        total: int,
     ) -> Cast:
         x, n = spot.p.double(), spot.n.double()
         toward = beam.view.toward(x)
@@ -535,7 +542,7 @@ class Shadows:
         if self.onward:
             edge = cross(n, along)
             sign = torch.sign(dot(edge, across))
-            surface = -edge * (sign * self._followed(number, spot, wi, brought, worth))
+            surface = -edge * (sign * self._followed(key, spot, wi, brought, worth))
         receiver = self._held(spot.hit.prim, torch.stack((spot.hit.u, spot.hit.v)), x)
         return Cast(beam, self._source(beam), passed.held, receiver, n, film, surface)
 
@@ -562,7 +569,7 @@ class Shadows:
         o, most = x + whole * _BEGIN, self.traced.wave.integrator.limits.max_depth
 
         def brought(k: int, lane: Tensor) -> Tensor:
-            rays = (take(o, lane), take(wi, lane), take(number, lane), 2)
+            rays = (take(o, lane), take(wi, lane), take(number, lane), Use.BEHIND)
             depth = most if most < 0 else most - k
             if not len(lane) or 0 <= depth < 2:  # nothing but light of sources themselves
                 return torch.zeros_like(rays[1])
@@ -600,22 +607,21 @@ class Shadows:
             found[index] = (worth.at(s) * sent * brought(1, index)).sum(0)
         return found
 
-    def _followed(self, number: Tensor, spot: Spot, wi: Tensor, brought: Brought, worth: Worth) -> Tensor:
+    def _followed(self, key: Tensor, spot: Spot, wi: Tensor, brought: Brought, worth: Worth) -> Tensor:
         """What it is worth by way of further surfaces ``(N,)``, by area of the receiver."""
-        found, key = torch.zeros_like(wi[0]), self.traced.key(number, 1)
-        lane = torch.arange(len(number), device=number.device)
+        found = torch.zeros_like(wi[0])
+        lane = torch.arange(len(found), device=found.device)
         carried = torch.ones_like(wi)
         limit = self.depth if self.depth >= 0 else _MOST
         first = 1 if self.sources is not None else 2
         for k in range(2, limit - first + 1):
             o, d, weight = spot.scattered(wi.to(spot.p), take(key, lane), k)
-            weight = weight.double()
+            carried = carried * weight.double()
+            alive = largest(carried) > 0
             if k > _ROULETTE:
-                alive = weight.amax(0).clamp(0.0, 1.0)
-                lucky = self.numbers.of(take(number, lane), 20 + k) < alive
-                weight = torch.where(lucky, weight / torch.where(alive > 0, alive, 1.0), 0.0)
-            carried = carried * weight
-            on = (carried.amax(0) > 0).nonzero().squeeze(1)
+                draws = self.traced.draws(take(key, lane), k)
+                alive, carried = survived(chance_of(None, 1.0, largest(carried), None), draws, alive, carried)
+            on = alive.nonzero().squeeze(1)
             lane, carried = take(lane, on), take(carried, on)
             spot = met(self.traced, take(o, on), take(d, on))
             some = (spot.hit.prim >= 0).nonzero().squeeze(1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import torch
 from torch import Tensor
@@ -13,13 +14,13 @@ from torchpt.engines.engine import Kernels, forward_kernels, trace
 from torchpt.paths.state import FOREVER, PathState
 from torchpt.paths.wave import PixelSet, Rays, Wave, clamp_scale
 from torchpt.physics.film import Film
-from torchpt.physics.samplers import Sampler
+from torchpt.physics.samplers import Dimension, Draws, Sampler, salts
 from torchpt.scene import Scene
 from torchpt.scene.prepare import kernels_of, looped, make_wave
 from torchpt.scene.settings import SAMPLERS, Settings
 from torchpt.spec.schema import ParsedParams
 
-__all__ = ["Along", "Traced", "traced_of"]
+__all__ = ["Along", "Traced", "Use", "traced_of"]
 
 
 # ---- Radiance along rays for those who ask again and again, such as edges: one sample a ray, without a render around it
@@ -68,9 +69,22 @@ class Along:
 # ---- What rays of edges see: the forward render's own search, integrator and engines, without derivatives
 
 
+class Use(IntEnum):
+    """What samples of edges draw numbers for; to the sampler, which sample of a pixel it is."""
+
+    PRIMARY = 0  # edges that the camera sees, and the paths of rays beside them
+    LIGHTS = 1  # edges of shadows of lights, and the way on to the camera
+    REFLECTED = 2  # the same of light that surfaces reflect
+    BEHIND = 3  # the paths by which such light came
+
+
 @dataclass(frozen=True)
 class Traced:
-    """A render's wave whose rays are given one by one, and what traces them."""
+    """A render's wave whose rays are given one by one, what traces them, and the random numbers of edges.
+
+    A number is a function of the seed, the number of the sample, its use and the dimension, as in renders one of the seed, the
+    pixel, the sample and the dimension.
+    """
 
     wave: Wave
     along: Along
@@ -80,9 +94,21 @@ class Traced:
         """Return the dtype of the lanes."""
         return self.wave.context.plan.dtype
 
-    def key(self, number: Tensor, row: int = 0) -> Tensor:
-        """Return the sampler's keys of samples ``(N,)`` int64; those of one ``row`` share numbers with no other row."""
-        return self.wave.sampler.key(number, torch.full_like(number, row))
+    def key(self, number: Tensor, use: Use) -> Tensor:
+        """Return the sampler's keys of samples ``(N,)`` int64; those of different uses share no numbers."""
+        return self.wave.sampler.key(number, torch.full_like(number, int(use)))
+
+    def draws(self, key: Tensor, depth: int = 0) -> Draws:
+        """Return the random numbers of samples at a vertex of their paths; 0: of the edge, and where its light comes from."""
+        return Draws(self.wave.context.plan.sampler, key, salts(depth, key.device))
+
+    def edge(self, number: Tensor, key: Tensor, total: int) -> tuple[Tensor, Tensor]:
+        """Return where on the edges of the scene samples lie ``(N,)`` float64 in [0, 1], and another number of each.
+
+        They are stratified: sample ``number`` of ``total`` lies in the interval of that number.
+        """
+        place, other = self.draws(key).two(Dimension.EDGE).double()
+        return (number + place) / total, other
 
     def nearest(self, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
         """Return how far rays ``(3, N)`` go, in units of ``d``, and the primitives that they meet; -1 for none."""
@@ -97,28 +123,28 @@ class Traced:
         """Return paths that begin with rays, as of :meth:`given`."""
         return self.given(o, d, number).rays(0, len(number), 0, 1)
 
-    def radiance(self, o: Tensor, d: Tensor, number: Tensor, row: int = 0, depth: int | None = None) -> Tensor:
+    def radiance(
+        self, o: Tensor, d: Tensor, number: Tensor, use: Use = Use.PRIMARY, depth: int | None = None
+    ) -> Tensor:
         """Return the radiance ``(3, N)`` float64 that rays bring; black where it is not finite, as in pictures.
 
         Args:
             o: origins ``(3, N)``.
             d: directions ``(3, N)`` of any length.
             number: of the samples ``(N,)``, by which random numbers are drawn.
-            row: of :meth:`key`.
+            use: of them.
             depth: vertices of their paths at most, in place of the integrator's own limit.
         """
         wave = self.given(o, d, number)
         if depth is not None:
             wave = replace(wave, integrator=wave.integrator.but(max_depth=depth))
-        return self.along.radiance(wave, row)
+        return self.along.radiance(wave, int(use))
 
 
 def traced_of(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Traced:
     """Return the wave of a scene under ``params``; its numbers are independent from sample to sample."""
-    render = settings.render
     plain = replace(settings, sampler=ParsedParams(SAMPLERS["independent"], {}))
-    wave = make_wave(scene, plain, params, dtype)
-    if wave.accel.name == "brute":  # packets widen primitives by their rounding, further than edges look beside
-        wave = make_wave(scene, replace(plain, render=render.but(accel="numba")), params, dtype)
+    # Packets widen primitives by their rounding, further than edges look beside.
+    wave = make_wave(scene, plain, params, dtype, packets=False)
     wave = replace(wave, sampler=Sampler(wave.sampler.points, settings.render.seed))
     return Traced(wave, Along(scene, settings, wave))

@@ -17,9 +17,8 @@ from torchpt.gradients.edges.traced import Traced
 from torchpt.math.vectors import dot, rows, take
 from torchpt.paths.integrators.path import partition
 from torchpt.paths.surface import surface_at
-from torchpt.paths.vertex import shared
-from torchpt.physics.samplers import Dimension, Draws, salts
-from torchpt.physics.shapes import interact, offset_origin
+from torchpt.paths.vertex import draw, shared
+from torchpt.physics.shapes import interact
 from torchpt.physics.shapes.geometry import Hit, Interaction
 
 __all__ = ["Spot", "met"]
@@ -83,21 +82,19 @@ class Spot:
     def scattered(self, wi: Tensor, key: Tensor, depth: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return rays by which light from ``wi`` goes on: origins, unit directions, ``f cos_s / cos_g |cos_g(wo)| / pdf``."""
         o, d, weight = torch.zeros_like(wi), wi.clone(), torch.zeros_like(wi)
-        world, plan = self.traced.wave.context.world, self.traced.wave.context.plan
+        context = self.traced.wave.context
+        world = context.world
 
         def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
             kind, back = world.materials.models[model], take(wi, index)
             if kind.smooth:
                 return [torch.zeros_like(at.p), back, torch.zeros_like(back)]
-            surface = surface_at(world, model, -back, at, self.traced.wave.context.pixel)
-            draws = Draws(plan.sampler, take(key, index), salts(depth, key.device))
-            lobe = draws.one(Dimension.LOBE).to(plan.dtype) if kind.lobed else None
-            sample = kind.sample(surface.parameters, surface.wo, lobe, draws.two(Dimension.BSDF).to(plan.dtype))
-            wo = surface.frame.to_world(sample.wi)
-            usable = (sample.pdf > 0) & torch.isfinite(sample.pdf)
-            factor = dot(wo, at.ng).abs() / torch.where(usable, sample.pdf, 1.0)
-            value = self._weighed(model, at, wo, back) * factor
-            return [offset_origin(world, at, wo), wo, torch.where(usable, value, 0.0)]
+            surface = surface_at(world, model, -back, at, context.pixel)
+            drawn = draw(context, model, at, surface, self.traced.draws(take(key, index), depth))
+            usable = (drawn.pdf > 0) & torch.isfinite(drawn.pdf)
+            factor = dot(drawn.d, at.ng).abs() / torch.where(usable, drawn.pdf, 1.0)
+            value = self._weighed(model, at, drawn.d, back) * factor
+            return [drawn.o, drawn.d, torch.where(usable, value, 0.0)]
 
         self._each([o, d, weight], make)
         return o, d, weight

@@ -23,6 +23,7 @@ class Dimension(IntEnum):
     LED_HERE = 8  # no number of its own: by which the vertex was reached, BSDF of the one before or PIXEL
     DISTANCE = 9  # 1D, how far a ray comes in what lies between surfaces
     PHASE = 10  # 2D, where that scatters it to
+    EDGE = 11  # 2D, which edge of the scene and the place on it; which of its two lines where it has two
 
 
 #: More than there are dimensions, so that a new one leaves the numbers of the others as they were.

@@ -6,6 +6,18 @@ import torch
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.shapes.quadrics import quadrics_of, table_of
 
+#: How many of each kind packets are tried on: triangles, rectangles, disks, spheres.
+SCENES = {
+    "triangles": (20, 0, 0, 0),
+    "rectangles": (0, 12, 0, 0),
+    "disks": (0, 0, 12, 0),
+    "spheres": (0, 0, 0, 12),
+    "one": (1, 0, 0, 0),
+    "triangles and spheres": (9, 0, 0, 7),
+    "rectangles and disks": (0, 5, 6, 0),
+    "all": (10, 6, 6, 6),
+}
+
 
 def geometry(p0, p1, p2, counts):
     """A Geometry from (P, 3) arrays."""
