@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.scene.settings import BLOCKS, RECORDS, TYPED
-from torchpt.spec import Choice, Spec, not_built, parameters_of
+from torchpt.spec import Choice, Spec, parameters_of, unsupported
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 #: What the command on a file's first line sets, where it is not the first key with a default.
@@ -83,7 +83,7 @@ def block(rows: Rows, indent: str = "") -> str:
 
 def later(group: str) -> Rows:
     """Keys that are known and not built."""
-    return [(key, "null", "not built yet") for key in not_built.KEYS.get(group, {})]
+    return [(key, "null", "not built yet") for key in unsupported.KEYS.get(group, {})]
 
 
 def typed(group: str, kind: str | None) -> str:

@@ -20,7 +20,7 @@ from typing import Any
 
 import bounds
 
-from torchpt.scene.settings import RenderWishes
+from torchpt.scene.settings import RenderOptions
 from torchpt.spec import REQUIRED, Color, Index, Scalar, Spec, parameters_of
 from torchpt.spec.arguments import declared
 
@@ -142,7 +142,7 @@ def written(name: str) -> str:
     if name == "bounds":
         return bounds.table()
     if name == "arguments":
-        return arguments(RenderWishes)
+        return arguments(RenderOptions)
     if first == "summary":
         return summary(kinds(second))
     if first == "common":

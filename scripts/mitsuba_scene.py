@@ -38,7 +38,7 @@ from torchpt.scene.formats.textures import TextureInput
 from torchpt.scene.settings import Film, Settings
 from torchpt.scene.space import Space
 from torchpt.scene.world import corners_of
-from torchpt.spec.schema import Described, values_of
+from torchpt.spec.schema import ParsedParams, values_of
 
 __all__ = [
     "NoCounterpartError", "bsdf", "comparable", "convert", "find_llvm", "lets_pass", "load_mitsuba", "nearest",
@@ -149,7 +149,7 @@ def _source(mitsuba: Any, scene: Scene, source: Source) -> dict[str, Any]:
     return found
 
 
-def sensor(mitsuba: Any, camera: Described) -> dict[str, Any]:
+def sensor(mitsuba: Any, camera: ParsedParams) -> dict[str, Any]:
     """Mitsuba's dict of a camera, without film and sampler.
 
     Raises:
@@ -227,7 +227,7 @@ class _Nearest:
     def __init__(self) -> None:
         self.said: dict[str, str] = {}
 
-    def camera(self, camera: Described) -> Described:
+    def camera(self, camera: ParsedParams) -> ParsedParams:
         """A round aperture for one of blades."""
         blades = camera.values.get("blades")
         if not blades:
@@ -235,7 +235,7 @@ class _Nearest:
         self.said["camera"] = f"an aperture of {blades} blades is round"
         return replace(camera, values={**camera.values, "blades": 0})
 
-    def shape(self, name: str, shape: Described, shapes: Mapping[str, Described]) -> Described:
+    def shape(self, name: str, shape: ParsedParams, shapes: Mapping[str, ParsedParams]) -> ParsedParams:
         """A mesh for a cone, and for an instance."""
         if shape.name == "cone":
             self.said[name] = f"cone is a mesh of {SIDES} sides with smooth normals"
@@ -245,15 +245,15 @@ class _Nearest:
             own = {"transform": shape["transform"], "flip_normals": shape["flip_normals"], "emission": None}
             material = shape["material"] or mesh["material"]
             shape = replace(mesh, values={**mesh.values, **own, "material": material})
-        if isinstance(shape["material"], Described):
+        if isinstance(shape["material"], ParsedParams):
             material = self.material(f"{name}.material", shape["material"])
             shape = replace(shape, values={**shape.values, "material": material})
         return shape
 
-    def material(self, name: str, material: Described) -> Described:
+    def material(self, name: str, material: ParsedParams) -> ParsedParams:
         """A material whose model Mitsuba has, of the same highlight and base."""
         inner = {
-            side: self.material(f"{name}.{side}", item) if isinstance(item, Described) else item
+            side: self.material(f"{name}.{side}", item) if isinstance(item, ParsedParams) else item
             for side, item in inner_of(material).items()
         }
         if inner:
@@ -279,7 +279,7 @@ class _Nearest:
         common = {key: material[key] for key in Bsdf.parameters}
         return _with(plastic, **common, diffuse_reflectance=base, specular_reflectance=tint)
 
-    def _metal(self, name: str, material: Described, reflectance: tuple[float, ...]) -> Described:
+    def _metal(self, name: str, material: ParsedParams, reflectance: tuple[float, ...]) -> ParsedParams:
         """The index 1 with the absorption that reflects as much at normal incidence."""
         if reflectance == (1.0, 1.0, 1.0):
             return material
@@ -288,12 +288,12 @@ class _Nearest:
         return _with(material, material=None, reflectance=None, eta=(1.0, 1.0, 1.0), k=k)
 
 
-def _with(described: Described, /, **values: Any) -> Described:
+def _with(described: ParsedParams, /, **values: Any) -> ParsedParams:
     """The same with other values."""
     return replace(described, values={**described.values, **values})
 
 
-def _coat(name: str, material: Described) -> tuple[Any, float, float, Any] | None:
+def _coat(name: str, material: ParsedParams) -> tuple[Any, float, float, Any] | None:
     """Base, reflectance at normal incidence, alpha and tint of a coated model that Mitsuba lacks; of others None.
 
     ``(h . n)^n`` is as wide as GGX with ``alpha^2 = 2 / (n + 2)`` (Walter et al. 2007); the lobe about the mirror direction
@@ -321,7 +321,7 @@ def _numbers(name: str, value: Any) -> tuple[float, ...]:
     return value if isinstance(value, tuple) else (value,)
 
 
-def _cone(cone: Described) -> Described:
+def _cone(cone: ParsedParams) -> ParsedParams:
     """A mesh in place of a cone: its side with the cone's own normals, and its base."""
     angles = 2.0 * np.pi * np.arange(SIDES) / SIDES
     none, one = np.zeros(SIDES), np.ones(SIDES)

@@ -316,7 +316,7 @@ FAULTS = (
     ),
     Fault(
         "infinite_counted_twice",
-        "paths/lost.py",
+        "paths/nonfinite.py",
         "integrators render",
         "Lost.of",
         "count - nans",
@@ -413,7 +413,7 @@ FAULTS = (
         "clamp_has_no_derivative",
         "gradients/tape.py",
         "gradients render",
-        "asked_of",
+        "sample_cotangents",
         "(asked * scale).scatter_add(0, channel, -back)",
         "asked * scale",
         "dropped term of a gradient: with integrator.clamp the brightest channel still pulls",
@@ -430,7 +430,7 @@ FAULTS = (
     # -- scenes
     Fault(
         "changed_in_place",
-        "scene/editions.py",
+        "scene/versions.py",
         "scene render",
         "Editions.of",
         "before is None or before[0]() is not value or before[1] != version",

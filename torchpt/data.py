@@ -19,7 +19,7 @@ from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from torchpt.core.errors import SceneError
 from torchpt.rendering.api import render
 from torchpt.scene import Scene, load
-from torchpt.scene.settings import RenderWishes
+from torchpt.scene.settings import RenderOptions
 from torchpt.spec.arguments import check_names
 
 __all__ = ["Made", "RenderDataset", "RenderStream"]
@@ -44,7 +44,7 @@ class _Items:
     ) -> None:
         if not callable(make):
             raise SceneError("make", make, "a function from a scene's index to the scene")
-        check_names(call, wishes, RenderWishes, ("cameras", "layers"))
+        check_names(call, wishes, RenderOptions, ("cameras", "layers"))
         for key in ("params", "spp", "seed"):
             if key in wishes:
                 raise SceneError(key, wishes[key], "an argument of the data set, of `make` or none")
@@ -96,7 +96,7 @@ class _Items:
                     "a scene from torchpt.load, a mapping of the scene format, or (one of them, arguments of render)"
                 )
                 raise SceneError(f"make({number})", made, expected)
-            check_names("render", own, RenderWishes)
+            check_names("render", own, RenderOptions)
             _check_wishes(own, f"make({number}).")
             scene = source if isinstance(source, Scene) else load(dict(source), self.device)
             self.latest = number, scene, dict(own)

@@ -7,7 +7,7 @@ import torch
 
 from torchpt.core import memory
 from torchpt.core.errors import RenderError, SceneError
-from torchpt.core.memory import Budget, Span, check_limit, retried, suffices
+from torchpt.core.memory import Budget, Span, check_limit, fits_in_memory, retried
 
 CPU = torch.device("cpu")
 
@@ -96,14 +96,14 @@ def test_a_limit_that_holds_all_lanes_is_forgotten(monkeypatch):
 def test_what_is_kept_goes_before_it_is_an_error(monkeypatch):
     kept = [1]
     monkeypatch.setattr(memory, "_spare", [])
-    memory.when_short(kept.clear)
+    memory.on_low_memory(kept.clear)
 
     def work() -> str:
         if kept:
             raise MemoryError
         return "done"
 
-    assert not suffices(work) and kept
+    assert not fits_in_memory(work) and kept
     assert retried("a thing", work) == "done"
 
     def never() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.physics.film import KnownError, pilots_of
+from torchpt.physics.film import ErrorEstimate, pilots_of
 from torchpt.physics.film.error import STREAMS, Again, around, known_error, pilots_alone, to_look_at
 
 SIDE = 96
@@ -31,7 +31,7 @@ def noisy(radiance: Tensor, sparkle: float, generator: torch.Generator) -> Tenso
     return values
 
 
-def known(radiance: Tensor, sparkle: float, seed: int) -> tuple[KnownError, float]:
+def known(radiance: Tensor, sparkle: float, seed: int) -> tuple[ErrorEstimate, float]:
     """The estimate, and what is true of the same picture."""
     g = torch.Generator().manual_seed(seed)
     mean = radiance + 5.0 * sparkle
@@ -160,4 +160,4 @@ def test_pictures_of_a_few_pixels(side):
 def test_a_picture_without_error():
     pilots = pilots_of(0, (32, 32), (0, 0, 32, 32))
     black, values = torch.zeros(32, 32, 3).double(), torch.zeros(len(pilots), 3).double()
-    assert known_error(black, pilots, values, values, None, True, None) == KnownError(0.0, (0.0, 0.0), False)
+    assert known_error(black, pilots, values, values, None, True, None) == ErrorEstimate(0.0, (0.0, 0.0), False)

@@ -256,7 +256,7 @@ def test_xml_entities_are_refused_in_any_encoding(tmp_path: Path, text: bytes) -
 def test_a_film_that_memory_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """It ended the process: a film of 2^28 pixels takes tens of GiB."""
     scene = torchpt.load({"camera": CAMERA, "film": {"width": 16384, "height": 16384}}, "cpu")
-    monkeypatch.setattr("torchpt.scene.need.free_memory", lambda _: 2**30)
+    monkeypatch.setattr("torchpt.scene.memory_estimate.free_memory", lambda _: 2**30)
     with pytest.raises(
         SceneError, match=r"^film.width: expected a film that fits into memory: .* 1.0 GiB are free, got \[16384"
     ):

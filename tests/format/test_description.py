@@ -14,7 +14,7 @@ from torchpt.core.files import configs
 from torchpt.scene.build import build_parts
 from torchpt.scene.formats.cameras import read_camera
 from torchpt.scene.formats.description import read_description, scene_names, settings
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
 TRIANGLE = {"type": "mesh", "vertices": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "faces": [[0, 1, 2]]}
@@ -205,7 +205,7 @@ def test_a_whole_scene() -> None:
     assert found.version == 1 and found.file is None
     assert list(found.shapes) == ["tri", "ball", "lamp"]
     ball, tri = found.shapes["ball"], found.shapes["tri"]
-    assert ball.name == "sphere" and ball["radius"] == 2 and isinstance(ball["material"], Described)
+    assert ball.name == "sphere" and ball["radius"] == 2 and isinstance(ball["material"], ParsedParams)
     assert ball["material"].name == "diffuse"
     assert tri.name == "mesh" and tri["faces"].dtype == np.int64 and tri["material"] == "red"
     lamp = found.shapes["lamp"]

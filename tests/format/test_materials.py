@@ -39,7 +39,7 @@ from torchpt.scene.formats.description import Description, read_description
 from torchpt.scene.formats.materials import MAX_BLENDS
 from torchpt.scene.materials import resolved
 from torchpt.spec import Color, Flag, Index, Refused, Scalar, parameters_of
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 CAMERA = {"origin": [0, 0, 5], "target": [0, 0, 0]}
 AIR, BK7, PP = 1.000277, 1.5046, 1.49
@@ -501,7 +501,7 @@ def test_blends_of_names_and_of_materials_in_place() -> None:
 def test_a_blend_in_a_shape() -> None:
     found = read({"d": DIFFUSE}, material={"type": "blend", "a": "d", "b": {"type": "phong"}, "weight": 0})
     material = found.shapes["s"]["material"]
-    assert isinstance(material, Described)
+    assert isinstance(material, ParsedParams)
     inner = resolved(material, "shapes.s.material", found.materials).inner
     assert [slot.name for slot in inner] == ["materials.d", "shapes.s.material.b"]
 
@@ -665,7 +665,7 @@ def test_their_own_model_in_a_blend_and_in_a_shape() -> None:
     blend = {"type": "blend", "a": {"type": "mine", "amount": 3}, "b": DIFFUSE, "weight": 0.5}
     found = slot(OWN, **blend).inner[0]
     assert found.name == "materials.m.a" and found.values["amount"] == 3 and found.model is OWN["mine"]
-    assert isinstance(read({}, OWN, material=blend).shapes["s"]["material"], Described)
+    assert isinstance(read({}, OWN, material=blend).shapes["s"]["material"], ParsedParams)
 
 
 OWN_BAD: dict[str, tuple[dict[str, Any], str, str]] = {

@@ -12,7 +12,7 @@ from gradient_rooms import gradient_of, room
 import torchpt
 from torchpt.engines.kernels import engine
 from torchpt.gradients import replay, sweep
-from torchpt.gradients.tape import asked_of, counted
+from torchpt.gradients.tape import counted, sample_cotangents
 from torchpt.scene.formats.description import settings
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
@@ -94,19 +94,19 @@ def test_no_gradient_as_large_as_the_table_for_each_look_up():
 @pytest.mark.parametrize("name", [NAME, "shapes.plate.to_world"])
 def test_stages_of_which_no_kernel_can_be_made(monkeypatch, name, capfd):
     from torchpt.compiler.graph import Unsupported
-    from torchpt.core.errors import say_once
-    from torchpt.engines.kernels.backward import JointKernels
+    from torchpt.core.errors import warn_once
+    from torchpt.engines.kernels.backward import VjpKernels
 
     scene = torchpt.load(room(PLATE, lights={"sky": {"type": "constant", "radiance": [0.2, 0.3, 0.4]}}), "cpu")
-    whole, made = gradient_of(scene, name), JointKernels._get
+    whole, made = gradient_of(scene, name), VjpKernels._get
 
     def get(self: Any, listed: bool, build: Any, *arguments: Any) -> Any:
         if build.__name__.startswith("back_"):
             raise Unsupported("an operator of the test's own")
         return made(self, listed, build, *arguments)
 
-    say_once.cache_clear()
-    monkeypatch.setattr(JointKernels, "_get", get)
+    warn_once.cache_clear()
+    monkeypatch.setattr(VjpKernels, "_get", get)
     eager = gradient_of(scene, name)
     assert float((whole - eager).norm()) < 1e-4 * float(whole.norm())
     assert "is differentiated by tensor operations, as no kernel can be made of an operator" in capfd.readouterr().err
@@ -156,4 +156,4 @@ def test_cotangents_of_samples_are_those_of_how_pixels_count_them():
         leaf = samples.clone().requires_grad_()
         (counted(wishes, leaf).mean(1) * pixels).sum().backward()
         assert leaf.grad is not None
-        torch.testing.assert_close(asked_of(wishes, samples, pixels), leaf.grad)
+        torch.testing.assert_close(sample_cotangents(wishes, samples, pixels), leaf.grad)

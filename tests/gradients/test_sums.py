@@ -15,10 +15,10 @@ import torchpt
 from torchpt.compiler.graph import Unsupported
 from torchpt.engines import tensors
 from torchpt.engines.kernels import engine
-from torchpt.engines.kernels.backward import JointKernels
+from torchpt.engines.kernels.backward import VjpKernels
 from torchpt.gradients import loop, replay, sums, sweep
 from torchpt.gradients.kernels import COLUMNS, add_at, add_by_columns, sort_by_sample
-from torchpt.gradients.parameters import Assembly
+from torchpt.gradients.parameters import SceneTape
 from torchpt.paths.integrators.path import partition
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
@@ -134,14 +134,14 @@ def sums_of(scene: torchpt.Scene, name: str, **wish: Any) -> torch.Tensor:
     So would terms of one size, which float64 adds exactly: those of pixels differ by up to 12 orders of magnitude.
     """
     found: list[torch.Tensor] = []
-    gradients = Assembly.gradients
+    gradients = SceneTape.gradients
 
-    def noted(self: Assembly, whole: sums.Sums) -> Any:
+    def noted(self: SceneTape, whole: sums.Sums) -> Any:
         found.extend(whole.total(number).flatten() for number in range(len(self.leaves)))
         return gradients(self, whole)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Assembly, "gradients", noted)
+        patch.setattr(SceneTape, "gradients", noted)
         leaf = scene.params[name].clone().requires_grad_()
         wish = {"spp": 16, "seed": 3, "threads": 1, "edges": False, **wish}
         picture = torchpt.render(scene, params={name: leaf}, **wish)
@@ -187,14 +187,14 @@ def test_places_of_lanes_do_not_matter(monkeypatch, name):
 
 
 def test_places_of_lanes_do_not_matter_to_stages_by_tensor_operations(monkeypatch):
-    made = JointKernels._get
+    made = VjpKernels._get
 
     def get(self: Any, listed: bool, build: Any, *arguments: Any) -> Any:
         if build.__name__.startswith("back_"):
             raise Unsupported("an operator of the test's own")
         return made(self, listed, build, *arguments)
 
-    monkeypatch.setattr(JointKernels, "_get", get)
+    monkeypatch.setattr(VjpKernels, "_get", get)
     scene = several()
     first = sums_of(scene, NAMES[0])
     shuffled(monkeypatch)

@@ -16,7 +16,7 @@ from torch import Tensor
 import torchpt
 from torchpt.compiler import cpu
 from torchpt.core.errors import SceneError
-from torchpt.core.memory import Meter, let_go
+from torchpt.core.memory import Meter, release_memory
 from torchpt.nn import Renderer
 from torchpt.nn.ranges import Above, Bounded, Free, Rigid, range_of
 from torchpt.spec import Angle, Color, Index, Scalar
@@ -382,7 +382,7 @@ def test_a_thousand_steps_take_no_more_memory_than_a_hundred():
         made.append(cpu.counts())
         if step >= 300 and step % 20 == 0:
             gc.collect()
-            let_go()  # what the allocator keeps for later is no growth
+            release_memory()  # what the allocator keeps for later is no growth
             held.append(meter.now())
 
     before, after, _ = optimized(1000, 32, 4, seen)

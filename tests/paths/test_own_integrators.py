@@ -45,7 +45,7 @@ class Absorbing(Path):
     def emit(self, context: StageContext, vertex: VertexInput) -> Emission:
         light, state = super().emit(context, vertex), vertex.state
         # The distance of a hit has no derivative; that of the point has.
-        at = interact(context.world, state.o, state.d, vertex.hit, context.slide)
+        at = interact(context.world, state.o, state.d, vertex.hit, context.follow_shape)
         whole = state.extra["length"] + length(at.p - state.o)
         return replace(light, brought=light.brought * torch.exp(-self.density * whole))
 
@@ -362,13 +362,13 @@ def test_what_a_class_says_is_read_anew():
 
 
 def test_a_checkpoint_knows_the_code_of_an_integrator(tmp_path):
-    class Kept(Absorbing):
+    class SceneCache(Absorbing):
         name = "kept"
 
     scene, file = torchpt.load(lamp(), "cpu"), str(tmp_path / "kept.ckpt")
-    keys: Mapping[str, Any] = {"film": {"width": 4, "height": 4}, "integrator": Kept(), "checkpoint": file}
+    keys: Mapping[str, Any] = {"film": {"width": 4, "height": 4}, "integrator": SceneCache(), "checkpoint": file}
     torchpt.render(scene, spp=2, **keys)
-    Kept.density = 3.0
+    SceneCache.density = 3.0
     with pytest.raises(torchpt.TorchptError):
         torchpt.render(scene, spp=4, resume=True, **keys)
 
@@ -432,7 +432,7 @@ def test_an_integrator_that_is_made_is_checked_as_one_by_name():
 
 def test_fields_that_cannot_be_are_refused_where_they_are_declared():
     with pytest.raises(TypeError, match="twice"):
-        type("Twice", (Path,), {"fields": (Field("a"), Field("a", 3))})
+        type("ErrorProbes", (Path,), {"fields": (Field("a"), Field("a", 3))})
     with pytest.raises(ValueError, match="whole"):
         Field("count", start=0.5, whole=True)
     with pytest.raises(ValueError, match="rows"):

@@ -99,7 +99,7 @@ FEATURES: dict[str, Feature] = {
         module="torchpt.physics.textures.kinds.noise",
     ),
     "normal map": Feature(
-        ("paths/relief.py",),
+        ("paths/perturbed_normals.py",),
         lambda scene: _material(scene, normal_map=_squares(color0=[0.6, 0.45, 0.95], color1=[0.4, 0.5, 0.95])),
         ("world.textures.tables", "world.geometry.tangents"),
     ),

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from torchpt.engines.kernels import threads as loop
-from torchpt.scene.need import LANES
+from torchpt.scene.memory_estimate import LANES
 
 __all__ = ["few_lanes"]
 

@@ -31,7 +31,7 @@ from torchpt.paths import vertex
 from torchpt.paths.integrators.path import partition
 from torchpt.paths.state import PathState, Shadow, VertexInput
 from torchpt.paths.walk import walk
-from torchpt.paths.wave import Tally, Wave
+from torchpt.paths.wave import RayCounts, Wave
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.rendering import kernels_of, make_wave
@@ -167,7 +167,7 @@ def _generate(found: Differences, wave: Wave, kernels: Kernels, pixels: int, sam
     worker, here = Worker(kernels), arena(kernels)
     worker.start(Chunk(0, pixels, 0, samples))
     worker.calls.clear()
-    worker.calls.name_salts(0)
+    worker.calls.set_dimensions(0)
     worker.calls.run(kernels.generate(False, False), pixels * samples, here, here)
     taken = kernels.state.take(here, np.arange(pixels * samples), _STATE)
     for name, value in taken.items():
@@ -192,7 +192,7 @@ def run_bounce(
         state, hit = rows(state, index), rows(hit, index)
     here, there = arena(kernels, **_fields(state, hit)), arena(kernels)
     worker.calls.clear()
-    worker.calls.name_salts(depth)
+    worker.calls.set_dimensions(depth)
     worker.slots.words[:] = 0
     lists = [Memory(1) for _ in range(kernels.models + 2)]
     places = _listed(index) if kernels.listed else None
@@ -358,7 +358,7 @@ def _search(found: Differences, wave: Wave, kernels: Kernels, recorder: _Recorde
 
 def _first_hits(found: Differences, wave: Wave, kernels: Kernels, pixels: int, samples: int) -> None:
     """The preview has no vertices beyond the first: samples are compared whole."""
-    tally = Tally()
+    tally = RayCounts()
     eager = tensors.brought(wave, wave.rays(0, pixels, 0, samples), tally)
     worker = Worker(kernels)
     took = worker.trace(Chunk(0, pixels, 0, samples))

@@ -17,7 +17,7 @@ import torch
 import torchpt
 from torchpt.cli.arguments import GROUPS, path_keys
 from torchpt.core.errors import SceneError
-from torchpt.scene.settings import BLOCKS, RECORDS, Common, Render, RenderWishes, TraceWishes, Wishes
+from torchpt.scene.settings import BLOCKS, RECORDS, Common, CommonOptions, Render, RenderOptions, TraceOptions
 from torchpt.spec import Role, parameters_of
 from torchpt.spec.arguments import declared, spelled
 
@@ -38,8 +38,8 @@ def scene() -> torchpt.Scene:
 @pytest.mark.parametrize(
     ("function", "own", "form"),
     [
-        (torchpt.render, ("scene", "full"), Wishes),
-        (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), TraceWishes),
+        (torchpt.render, ("scene", "full"), CommonOptions),
+        (torchpt.trace, ("scene", "o", "d", "spp", "seed", "params"), TraceOptions),
         (torchpt.render_batch, ("scenes", "cameras", "params", "seed", "on_progress", "full"), Common),
         (torchpt.nn.Renderer, ("scene", "names", "seed", "rigid", "full"), Common),
         (torchpt.nn.Renderer.forward, ("self", "params", "seed", "full"), Common),
@@ -61,7 +61,7 @@ def test_signatures_are_as_they_were_written_by_hand() -> None:
 
 def test_help_says_what_each_argument_is() -> None:
     lines = [line.strip() for line in (inspect.getdoc(torchpt.render) or "").splitlines()]
-    for name, argument in declared(Wishes).items():
+    for name, argument in declared(CommonOptions).items():
         assert sum(line.startswith(f"{name}: {argument.spec.doc}") for line in lines) == 1
     assert (
         "spp: samples a pixel, and the most that other limits let it take (a whole number 1..2147483647; None: 64)"
@@ -71,7 +71,7 @@ def test_help_says_what_each_argument_is() -> None:
 
 def test_the_block_of_scene_files_has_the_settings_among_them() -> None:
     own = {"params", "full", "dtype", "adjoint", "seed_grad", "spp_grad", "edges", "edge_spp", "ranks"}
-    assert {*declared(RenderWishes)} - own == {*parameters_of(Render), *BLOCKS} - {"preview", "render"}
+    assert {*declared(RenderOptions)} - own == {*parameters_of(Render), *BLOCKS} - {"preview", "render"}
 
 
 def test_the_command_line_knows_blocks_and_files() -> None:
@@ -141,7 +141,7 @@ def test_wrong_values_are_errors_of_a_line(scene: torchpt.Scene, wishes: Any, sa
 
 
 def test_none_is_what_nobody_said(scene: torchpt.Scene) -> None:
-    unsaid = {name: argument.default for name, argument in declared(Wishes).items()}
+    unsaid = {name: argument.default for name, argument in declared(CommonOptions).items()}
     wishes: Any = {**unsaid, "spp": 1, "compile": "off"}
     assert torch.equal(torchpt.render(scene, **wishes), torchpt.render(scene, spp=1, compile="off"))
 

@@ -13,7 +13,7 @@ from torch import Tensor
 import torchpt
 from torchpt.core.errors import RenderError, SceneError
 from torchpt.rendering.run import Run
-from torchpt.scene.editions import Editions
+from torchpt.scene.versions import Editions
 
 WALL, BALL, SKY = "materials.wall.reflectance", "materials.ball.reflectance", "lights.sky.radiance"
 SCENE: dict[str, Any] = {
@@ -41,18 +41,18 @@ def gradient(scene: torchpt.Scene) -> tuple[Tensor, Tensor]:
 
 
 def test_editions_are_numbered() -> None:
-    editions, params = Editions(), {"a": torch.zeros(2), "b": torch.zeros(2)}
-    first = editions.of(params)
-    assert first == editions.of(params) and min(first.values()) > 0
+    versions, params = Editions(), {"a": torch.zeros(2), "b": torch.zeros(2)}
+    first = versions.of(params)
+    assert first == versions.of(params) and min(first.values()) > 0
     params["a"].add_(1)
-    second = editions.of(params)
+    second = versions.of(params)
     assert second["a"] != first["a"] and second["b"] == first["b"]
     params["b"] = params["b"].clone()
-    third = editions.of(params)
+    third = versions.of(params)
     assert third["b"] != second["b"] and third["a"] == second["a"]
     with torch.inference_mode():
         params["a"] = torch.zeros(2)
-    assert editions.of(params)["a"] < 0 < editions.of(params)["b"]
+    assert versions.of(params)["a"] < 0 < versions.of(params)["b"]
 
 
 @pytest.mark.parametrize("compiled", ["on", "off"])

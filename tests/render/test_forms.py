@@ -50,7 +50,7 @@ def stages(monkeypatch) -> Iterator[dict[str, TracedStage]]:
     cache.forget()
 
 
-class Twice:
+class ErrorProbes:
     """Makes each call of :meth:`Calls.run` twice, from the same memory, and compares.
 
     Attributes:
@@ -131,7 +131,7 @@ FAST = ("cornell_box",)
 @pytest.mark.parametrize("name", [x if x in FAST else pytest.param(x, marks=pytest.mark.slow) for x in SCENES])
 def test_calls(name, stages, monkeypatch):
     scene = torchpt.load(name, "cpu")
-    twice = Twice(stages, monkeypatch)
+    twice = ErrorProbes(stages, monkeypatch)
     torchpt.render(scene, spp=4, **SMALL)
     assert not twice.wrong
     assert {kernel.partition("_")[0] for kernel in twice.seen} >= SCENES[name], twice.seen

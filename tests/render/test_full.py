@@ -52,7 +52,7 @@ def halved(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
         seen.append(tuple(guides))
         return 0.5 * image
 
-    monkeypatch.setattr("torchpt.rendering.orders.check_denoiser", lambda: None)
+    monkeypatch.setattr("torchpt.rendering.requests.check_denoiser", lambda: None)
     monkeypatch.setattr("torchpt.images.denoiser.denoise", half)
     return seen
 

@@ -20,7 +20,7 @@ from trials import film_of
 import torchpt
 from torchpt.core.errors import RenderError
 from torchpt.engines.kernels.engine import Chunk, Worker
-from torchpt.paths.wave import Tally
+from torchpt.paths.wave import RayCounts
 from torchpt.rendering.api import Progress, Rendering, render_scene
 from torchpt.scene.formats.description import settings
 
@@ -53,7 +53,7 @@ def broken(monkeypatch) -> set[tuple[int, int]]:
     chosen: set[tuple[int, int]] = set()
     kept = Worker.trace
 
-    def spoiled(self: Worker, chunk: Chunk) -> Tally:
+    def spoiled(self: Worker, chunk: Chunk) -> RayCounts:
         tally = kept(self, chunk)
         for number, (pixel, sample) in enumerate(sorted(chosen)):
             s, p = sample - chunk.first_sample, pixel - chunk.first_pixel
@@ -133,7 +133,7 @@ def test_an_error_in_a_task_ends_the_render(monkeypatch, threads):
     whole, before = rendered(scene, 4, film), set(threading.enumerate())
     kept = Worker.trace
 
-    def fails(self: Worker, chunk: Chunk) -> Tally:
+    def fails(self: Worker, chunk: Chunk) -> RayCounts:
         if chunk.first_pixel > 1000:
             raise RuntimeError("out of order")
         return kept(self, chunk)

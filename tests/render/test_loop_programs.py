@@ -18,7 +18,7 @@ from trials import film_of
 import torchpt
 from torchpt.compiler import cpu
 from torchpt.compiler.graph import Unsupported
-from torchpt.core.errors import SceneError, say_once
+from torchpt.core.errors import SceneError, warn_once
 from torchpt.engines.kernels import engine as chunk
 from torchpt.engines.kernels import programs
 from torchpt.engines.kernels.programs import Kernels
@@ -250,7 +250,7 @@ def close(a: Rendering, b: Rendering) -> bool:
 
 
 def test_a_model_that_no_kernel_can_be_made_of(monkeypatch, capsys):
-    say_once.cache_clear()
+    warn_once.cache_clear()
     scene = torchpt.load(room("odd"), "cpu", bsdfs={"odd": Odd()})
     eager = rendered(scene, render={"compile": "off", "spp": 4})
     asked: list[int] = []
@@ -334,7 +334,7 @@ class Lambert(torchpt.Bsdf):
 
 
 def test_a_stage_that_turns_out_not_to_compile_renders_all_eagerly(monkeypatch, capsys):
-    say_once.cache_clear()
+    warn_once.cache_clear()
     scene = torchpt.load("cornell_box", "cpu")
     eager = rendered(scene, render={"compile": "off"})
 

@@ -20,8 +20,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from trials import film_of
 
 import torchpt
-from torchpt.core.errors import RenderError, SceneError, say_once
-from torchpt.core.memory import let_go, ran_out
+from torchpt.core.errors import RenderError, SceneError, warn_once
+from torchpt.core.memory import is_out_of_memory, release_memory
 from torchpt.engines.kernels import layout
 from torchpt.engines.kernels import threads as spare
 from torchpt.engines.kernels.engine import Worker
@@ -113,7 +113,7 @@ def test_a_failure_at_any_operation_of_a_piece_changes_no_bit(box, step):
 @pytest.mark.parametrize("kind", FAILURES)
 @pytest.mark.slow
 def test_failures_again_and_again_halve_waves_further(box, kind, capsys):
-    say_once.cache_clear()
+    warn_once.cache_clear()
     whole = eager(box, 24, pilots=True)
     with in_pieces(lambda k: k in (299, 1010, 1300, 1700), FAILURES[kind]):
         found = eager(box, 24, pilots=True)
@@ -138,8 +138,8 @@ def test_other_errors_are_not_taken_for_it(box):
 
     with in_pieces(lambda k: k == 40, other), pytest.raises(RuntimeError, match="shapes"):
         eager(box)
-    assert not ran_out(RenderError("not enough memory for it")) and not ran_out(ValueError("memory"))
-    assert ran_out(OSError(12, "Cannot allocate memory"))
+    assert not is_out_of_memory(RenderError("not enough memory for it")) and not is_out_of_memory(ValueError("memory"))
+    assert is_out_of_memory(OSError(12, "Cannot allocate memory"))
 
 
 # -- gradients
@@ -208,7 +208,7 @@ def test_the_compiled_loop_goes_on_with_one_thread_and_fewer_lanes(box, monkeypa
     whole = looped(box, threads)
     made, kept = [0], layout.Memory.__init__
     for number in (*range(0, 8), 17, 23, 31):
-        say_once.cache_clear()
+        warn_once.cache_clear()
         made[0] = 0
 
         def failing(self: layout.Memory, count: int, number: int = number) -> None:
@@ -356,7 +356,7 @@ def test_a_limit_changes_no_bit(box):
 
 
 def test_the_next_render_takes_over_the_memory_of_threads(box, monkeypatch):
-    let_go()
+    release_memory()
     assert not spare._kept
     wish: dict[str, Any] = {"spp": 2, "film": film_of(64, 60)}
     whole, made, new = torchpt.render(box, **wish, threads=2), [], layout.Memory.__init__
@@ -378,7 +378,7 @@ def test_the_next_render_takes_over_the_memory_of_threads(box, monkeypatch):
 
 
 def test_memory_of_threads_is_bounded_and_holds_no_scene(monkeypatch):
-    let_go()
+    release_memory()
     scene = torchpt.load("cornell_box", "cpu")
     for k in range(4):
         torchpt.render(scene, spp=1, film=film_of(64, 60), threads=2, seed=k)
@@ -396,7 +396,7 @@ def test_memory_of_threads_is_bounded_and_holds_no_scene(monkeypatch):
 
 def test_memory_of_threads_goes_where_a_chunk_needs_it(box, monkeypatch, capsys):
     """Workers that nobody has are given back before lanes are made fewer."""
-    say_once.cache_clear()
+    warn_once.cache_clear()
     torchpt.render(box, spp=1, film=film_of(64, 60), threads=2)
     whole, calls, there = torchpt.render(box, spp=2, film=film_of(64, 60)), [0], []
     torchpt.render(torchpt.load("veach_mis", "cpu"), spp=1, film=film_of(8, 8), threads=1)

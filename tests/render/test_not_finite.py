@@ -13,8 +13,8 @@ from torch import Tensor
 
 import torchpt
 from torchpt.core.errors import RenderError
-from torchpt.paths.lost import KEPT, Lost, Place
-from torchpt.paths.wave import Plate
+from torchpt.paths.nonfinite import KEPT, NonFinite, Place
+from torchpt.paths.wave import PixelSet
 from torchpt.physics.bsdfs.kinds.diffuse import Diffuse
 from torchpt.physics.bsdfs.records import BsdfSample
 from torchpt.physics.samplers import Streams
@@ -270,24 +270,26 @@ def test_a_checkpoint_keeps_them(tmp_path: Path):
 def test_the_first_ones_are_kept_in_order():
     values = torch.zeros(3, 4, 30)
     values[0, 1, 2], values[1, 3, 29], values[2, 1, 2] = torch.inf, torch.nan, -torch.inf
-    lost = Lost.of(values, 10, 5, (3, 2, 16, 12))
+    lost = NonFinite.of(values, 10, 5, (3, 2, 16, 12))
     assert (lost.nan, lost.infinite, lost.count) == (1, 1, 2)
     assert lost.places == [Place(6, 2, 15, nan=False), Place(8, 4, 10, nan=True)]
     assert str(lost.places[0]) == "sample 6 of pixel (15, 2)"
-    chosen = Plate(torchpt.physics.film.Film(30, 1, 1, torch.device("cpu")), {}, Streams(2, 3), torch.arange(100, 140))
-    (first, _) = Lost.of(values, 10, 5, (3, 2, 16, 12), chosen).places
+    chosen = PixelSet(
+        torchpt.physics.film.Film(30, 1, 1, torch.device("cpu")), {}, Streams(2, 3), torch.arange(100, 140)
+    )
+    (first, _) = NonFinite.of(values, 10, 5, (3, 2, 16, 12), chosen).places
     assert (first.x, first.y, first.first, first.streams) == (112 % 16 + 3, 112 // 16 + 2, 2, 3)
-    assert Lost.read(lost.plain()) == lost
+    assert NonFinite.read(lost.plain()) == lost
 
 
 def test_no_more_are_kept_than_are_traced():
-    lost = Lost()
+    lost = NonFinite()
     for sample in (9, 3):
-        lost.add(Lost.of(torch.full((3, 1, 50), torch.nan), 0, sample, (0, 0, 50, 1)))
+        lost.add(NonFinite.of(torch.full((3, 1, 50), torch.nan), 0, sample, (0, 0, 50, 1)))
     assert lost.count == 100 and len(lost.places) == KEPT
     assert [place.sample for place in lost.places] == [3] * 50 + [9] * (KEPT - 50)
-    pilots = Plate(torchpt.physics.film.Film(50, 1, 1, torch.device("cpu")), {}, Streams(1, 1))
-    lost.add(Lost.of(torch.full((3, 1, 50), torch.nan), 0, 0, (0, 0, 50, 1), pilots))
+    pilots = PixelSet(torchpt.physics.film.Film(50, 1, 1, torch.device("cpu")), {}, Streams(1, 1))
+    lost.add(NonFinite.of(torch.full((3, 1, 50), torch.nan), 0, 0, (0, 0, 50, 1), pilots))
     assert lost.count == 150 and {place.first for place in lost.places} == {0}, "paths of the picture can be looked at"
 
 
@@ -298,6 +300,6 @@ def test_no_more_are_kept_than_are_traced():
 )  # fmt: skip
 def test_what_a_checkpoint_says_of_lost_samples_is_held_against_its_form(facts: Any) -> None:
     with pytest.raises(ValueError, match="lost samples"):
-        Lost.read(facts)
-    whole = Lost(2, 1, [Place(1, 2, 3, 0, 1, True)])
-    assert Lost.read(whole.plain()) == whole
+        NonFinite.read(facts)
+    whole = NonFinite(2, 1, [Place(1, 2, 3, 0, 1, True)])
+    assert NonFinite.read(whole.plain()) == whole

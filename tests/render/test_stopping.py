@@ -14,7 +14,7 @@ from trials import film_of
 
 import torchpt
 from torchpt.core.errors import SceneError
-from torchpt.physics.film import KnownError, pilots_of
+from torchpt.physics.film import ErrorEstimate, pilots_of
 from torchpt.rendering.api import Rendering, render_scene
 from torchpt.rendering.stopping import Stop
 from torchpt.scene.formats.description import settings
@@ -125,9 +125,9 @@ def test_a_stopped_picture_is_that_of_its_samples(box, compile):
 def test_no_error_in_doubt_ends_a_render(box, monkeypatch, doubt):
     """Pilots alone are certain of it; the picture, once suspects were looked at again, is not."""
     told = {
-        "heavy": (KnownError(0.01, (0.009, 0.011), True), ""),
-        "null": (KnownError(0.01, (0.009, 0.011), False), "a reason"),
-        "wide": (KnownError(0.01, (0.002, 0.05), False), ""),
+        "heavy": (ErrorEstimate(0.01, (0.009, 0.011), True), ""),
+        "null": (ErrorEstimate(0.01, (0.009, 0.011), False), "a reason"),
+        "wide": (ErrorEstimate(0.01, (0.002, 0.05), False), ""),
     }
     monkeypatch.setattr("torchpt.rendering.run.known_of", lambda *_: told[doubt])
     found = shot(box, spp=40, target_error=0.02)

@@ -16,8 +16,8 @@ import torchpt
 from torchpt.cli.main import main
 from torchpt.core.errors import NoLightWarning
 from torchpt.rendering.api import Rendering, render_scene
+from torchpt.rendering.missing_light import MissingLight, unlit
 from torchpt.rendering.run import Run
-from torchpt.rendering.unlit import Unlit, unlit
 from torchpt.scene.formats.description import settings
 
 FLOOR = {"type": "rectangle", "transform": [{"scale": 4}, {"rotate": {"axis": [1, 0, 0], "angle": -90}}]}
@@ -121,18 +121,18 @@ def test_dark_pixels_count_where_they_show_what_reflects():
     }
     run = run_of(torchpt.load(scene, device="cpu"))
 
-    def dark(relmse: float, *pixels: tuple[int, int]) -> Unlit:
+    def dark(relmse: float, *pixels: tuple[int, int]) -> MissingLight:
         picture = torch.ones(48, 64, 3, dtype=torch.float64)
         for x, y in pixels:
             picture[y, x] = 0.0
         return unlit(run.scene, run.wave, run.geometry, picture, relmse)
 
     on_floor, on_black, on_sky = [(x, 40) for x in range(20, 30)], (32, 20), (2, 2)
-    assert dark(0.1) == dark(0.1, on_black) == dark(0.1, on_sky) == Unlit("", 0.0)
-    assert dark(0.1, *on_floor, on_black, on_sky) == Unlit("", 10 / 3072)
+    assert dark(0.1) == dark(0.1, on_black) == dark(0.1, on_sky) == MissingLight("", 0.0)
+    assert dark(0.1, *on_floor, on_black, on_sky) == MissingLight("", 10 / 3072)
     assert dark(0.001, *on_floor).reason == "no sample met any light in 0.33 % of the picture"  # more than is known
     half = [(x, y) for y in range(40, 48) for x in range(20, 40)]
-    assert dark(0.2, *half) == Unlit("no sample met any light in 5.2 % of the picture", 160 / 3072)
+    assert dark(0.2, *half) == MissingLight("no sample met any light in 5.2 % of the picture", 160 / 3072)
 
 
 def test_the_far_side_of_a_ball_that_is_alone_is_known_to_be_black():
@@ -149,7 +149,7 @@ def test_few_dark_pixels_widen_the_interval(monkeypatch):
     """A black pixel may be off by 1 at most, in squared error over radiance squared."""
     scene = torchpt.load("cornell_box", device="cpu")
     plain = shot(scene, film=film_of(32))
-    monkeypatch.setattr("torchpt.rendering.unlit.unlit", lambda *_: Unlit("", 0.003))
+    monkeypatch.setattr("torchpt.rendering.missing_light.unlit", lambda *_: MissingLight("", 0.003))
     wide = shot(scene, film=film_of(32))
     assert plain.relmse_interval is not None and wide.relmse_interval is not None and wide.relmse == plain.relmse
     low, high = plain.relmse_interval

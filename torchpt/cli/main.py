@@ -92,9 +92,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def _out_of_memory(error: Exception) -> int:
     """Refuse where memory ran out; any other error goes on its way."""
-    from torchpt.core.memory import ran_out
+    from torchpt.core.memory import is_out_of_memory
 
-    if not ran_out(error):
+    if not is_out_of_memory(error):
         raise error
     return _refuse("not enough memory: a smaller film, or render.max_memory, needs less")
 

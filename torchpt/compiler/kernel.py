@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 from torchpt.compiler.block import ELEMENTS
-from torchpt.compiler.emission import MEMORY, Body, emit
+from torchpt.compiler.codegen import MEMORY, Body, emit
 from torchpt.compiler.form import Form
 from torchpt.compiler.fusing import fused
 from torchpt.compiler.graph import Graph, Unsupported

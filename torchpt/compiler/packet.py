@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from torchpt.compiler.block import Block
-from torchpt.compiler.emission import MEMORY
+from torchpt.compiler.codegen import MEMORY
 from torchpt.compiler.form import Form
 from torchpt.compiler.graph import Graph
 

@@ -12,9 +12,9 @@ from torch._C import _DisableFuncTorch  # pyright: ignore[reportAttributeAccessI
 from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wrapped_tensor
 
 from torchpt.core.errors import TorchptError
-from torchpt.core.threads import undisturbed
+from torchpt.core.threads import without_autocast
 
-__all__ = ["Backward", "Forward", "in_batch", "in_transform", "on_tape", "outside_transforms", "wants_gradients"]
+__all__ = ["Backward", "Forward", "custom_vjp", "in_batch", "in_transform", "outside_transforms", "wants_gradients"]
 
 Forward = Callable[..., tuple[Tensor, ...]]
 Backward = Callable[..., Sequence[Tensor | None]]
@@ -32,7 +32,7 @@ _BATCHES = (
 )
 
 
-def on_tape(
+def custom_vjp(
     forward: Forward, backward: Backward, tensors: tuple[Tensor, ...], held: tuple[Tensor, ...] = ()
 ) -> tuple[Tensor, ...]:
     """What ``forward`` gives, as a function of ``tensors`` that autograd can go back through.
@@ -114,7 +114,7 @@ class _Back(torch.autograd.Function):
             plain = tuple(t.detach() for t in tensors)
         except RuntimeError as error:  # tensors of torch's older vmap, which has no rule for it
             raise TorchptError(_BATCHES) from error
-        with undisturbed(plain[0].device):
+        with without_autocast(plain[0].device):
             return tuple(work(plain[:count], *plain[count:]))
 
     @staticmethod

@@ -18,8 +18,8 @@ __all__ = [
     "RenderError",
     "SceneError",
     "TorchptError",
-    "say_once",
     "warn_caller",
+    "warn_once",
 ]
 
 
@@ -132,7 +132,7 @@ class NoLightWarning(UserWarning):
 
 
 @cache
-def say_once(text: str) -> None:
+def warn_once(text: str) -> None:
     """Write a line on stderr, the first time only."""
     print(text, file=sys.stderr, flush=True)
 

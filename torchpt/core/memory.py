@@ -2,7 +2,7 @@
 
 A job has some threads, and lanes that each of them takes at once. Under a limit (``render.max_memory``) a :class:`Budget` fits
 both to what is left: by what a lane is known to cost (``fit``), or by what lanes before were measured to cost (``through``).
-Where an allocation fails all the same, what nobody needs is given back (:func:`let_go`). Then one thread goes on alone, then
+Where an allocation fails all the same, what nobody needs is given back (:func:`release_memory`). Then one thread goes on alone, then
 with half as many lanes, and so on (``shrink``). Where not even the fewest fit it is an error of one line.
 
 The limit is about the memory of the process above what it held after import. What is there already (scene, search structure,
@@ -24,7 +24,7 @@ from typing import TypeVar
 
 import torch
 
-from torchpt.core.errors import RenderError, SceneError, TorchptError, say_once
+from torchpt.core.errors import RenderError, SceneError, TorchptError, warn_once
 
 __all__ = [
     "FEWEST",
@@ -35,14 +35,14 @@ __all__ = [
     "check_limit",
     "check_memory",
     "check_room",
+    "fits_in_memory",
     "free_memory",
-    "let_go",
+    "is_out_of_memory",
     "mb",
     "needing",
-    "ran_out",
+    "on_low_memory",
+    "release_memory",
     "retried",
-    "suffices",
-    "when_short",
 ]
 
 #: Lanes of the first wave under a limit, after which all code is there: what it adds for good is no lane's.
@@ -183,12 +183,12 @@ def check_room(size: int = MARGIN) -> None:
 _spare: list[Callable[[], object]] = []
 
 
-def when_short(release: Callable[[], object]) -> None:
-    """Register what gives back memory that is kept for later jobs: :func:`let_go` calls it."""
+def on_low_memory(release: Callable[[], object]) -> None:
+    """Register what gives back memory that is kept for later jobs: :func:`release_memory` calls it."""
     _spare.append(release)
 
 
-def let_go() -> None:
+def release_memory() -> None:
     """Give back what nobody holds any more: what is kept for later jobs, cycles, what allocators keep."""
     for release in _spare:
         release()
@@ -214,7 +214,7 @@ def _trim() -> ctypes._NamedFuncPointer | None:
 # -- that it ran out
 
 
-def ran_out(error: BaseException) -> bool:
+def is_out_of_memory(error: BaseException) -> bool:
     """Return True where an error, or what it came of, says that there is no more memory, on whatever device."""
     if isinstance(error, TorchptError):  # somebody said so already
         return False
@@ -232,12 +232,12 @@ def ran_out(error: BaseException) -> bool:
     return False
 
 
-def suffices(work: Callable[[], object]) -> bool:
+def fits_in_memory(work: Callable[[], object]) -> bool:
     """Do work; return False where memory ran out. What the work held is free only once its error is, so none is handed on."""
     try:
         work()
     except Exception as error:
-        if not ran_out(error):
+        if not is_out_of_memory(error):
             raise
         return False
     return True
@@ -253,7 +253,7 @@ def needing(what: str | Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if not ran_out(error):
+        if not is_out_of_memory(error):
             raise
     else:
         return
@@ -268,8 +268,8 @@ def retried(what: str | Callable[[], str], work: Callable[[], T]) -> T:
         RenderError: as :func:`needing`.
     """
     found: list[T] = []
-    if not suffices(lambda: found.append(work())):
-        let_go()
+    if not fits_in_memory(lambda: found.append(work())):
+        release_memory()
         with needing(what):
             return work()
     return found[0]
@@ -303,7 +303,7 @@ def check_memory(limit: int, device: torch.device, least: Callable[[int], int], 
     Raises:
         SceneError: it is too small; says the least that is not.
     """
-    let_go()
+    release_memory()
     enough = max(least(Meter(device).above()), loading)
     check_limit(limit, enough, f"at least {mb(enough)} for this scene and film")
 
@@ -397,7 +397,7 @@ class Budget:
             pixel, n, sample, samples = span = todo.pop()
             if n * samples <= self.lanes:
                 self._begins()
-                if suffices(partial(work, span)):
+                if fits_in_memory(partial(work, span)):
                     self._ended(n * samples)
                     yield span
                     continue
@@ -414,7 +414,7 @@ class Budget:
         Raises:
             RenderError: there were but one thread and the fewest lanes.
         """
-        let_go()
+        release_memory()
         tried = self.lanes if tried is None else tried
         if self.threads > 1:
             self.threads = 1
@@ -423,7 +423,7 @@ class Budget:
         else:
             self.lanes = max(tried // 2, self.fewest)
         self.limit, self.short = None, True  # waves do not grow any more
-        say_once(f"torchpt: memory ran out: {self.instead} from now on, for the same picture")
+        warn_once(f"torchpt: memory ran out: {self.instead} from now on, for the same picture")
 
     # -- what lanes cost, measured
 
@@ -437,7 +437,7 @@ class Budget:
         if self.limit is None:
             return
         if self._start is None:
-            let_go()
+            release_memory()
             self._start = self.meter.now()
             self._grow(self.limit, self._start, 4 * self.per_lane, False)
             return

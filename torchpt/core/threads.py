@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import check_room, suffices
+from torchpt.core.memory import check_room, fits_in_memory
 
 __all__ = [
     "Crew",
@@ -43,7 +43,7 @@ __all__ = [
     "start_team",
     "sum_all",
     "thread_count",
-    "undisturbed",
+    "without_autocast",
 ]
 
 T = TypeVar("T")
@@ -404,7 +404,7 @@ def start_team() -> None:
     """
     count = torch.get_num_threads()
     if count > 1 and count not in _started:
-        if suffices(lambda: check_room(count * _STACK)):
+        if fits_in_memory(lambda: check_room(count * _STACK)):
             torch.zeros(count * _GRAIN).add_(1.0)
             _started.add(count)
         else:
@@ -422,7 +422,7 @@ def lasting() -> Iterator[None]:
 
 
 @contextmanager
-def undisturbed(device: torch.device) -> Iterator[None]:
+def without_autocast(device: torch.device) -> Iterator[None]:
     """No gradients, no ``torch.autocast`` (which would round products to half precision), and what is made lasts."""
     with lasting(), torch.no_grad(), torch.autocast(device.type, enabled=False):
         yield

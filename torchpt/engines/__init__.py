@@ -9,4 +9,4 @@ May import: ``paths``, ``search``, ``compiler``, ``physics`` and below; none of 
 ``tensors.py``.
 """
 
-from torchpt.engines import taken_over  # noqa: F401  (registers)
+from torchpt.engines import dispatch  # noqa: F401  (registers)

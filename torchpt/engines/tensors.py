@@ -19,11 +19,11 @@ from torchpt.math.vectors import joined, rows, take
 from torchpt.paths import layer as aov
 from torchpt.paths.integrators import LAYERS
 from torchpt.paths.integrators.base import check_fields, check_output
-from torchpt.paths.integrators.path import Ends, partition, slides
+from torchpt.paths.integrators.path import Ends, follows_shape, partition
 from torchpt.paths.state import Emission, PathState, Shadow, Splat, StageContext, VertexInput, VertexOutput
 from torchpt.paths.transmission import beyond, non_opaque, opacity_at
 from torchpt.paths.walk import Counts, Observer, find, walk
-from torchpt.paths.wave import Plate, Tally, Wave
+from torchpt.paths.wave import PixelSet, RayCounts, Wave
 from torchpt.physics.film.splats import LARGEST, Splats
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
@@ -112,12 +112,12 @@ class Tensors:
         self,
         wave: Wave,
         lanes: int,
-        tally: Tally | None = None,
+        tally: RayCounts | None = None,
         keeps: bool = False,
         splats: list[Splats] | None = None,
     ) -> None:
         self.keeps = keeps
-        self.wave, self.context, self.tally = wave, wave.context, Tally() if tally is None else tally
+        self.wave, self.context, self.tally = wave, wave.context, RayCounts() if tally is None else tally
         self.plan, self.world = wave.context.plan, wave.context.world
         self.passing = self.world.materials.opacity is not None or wave.integrator.own_transmit
         self.radiance = torch.zeros(3, lanes, dtype=self.plan.dtype, device=wave.centre.device)
@@ -215,8 +215,11 @@ class Tensors:
 
     def _context(self, paths: Paths, roulette: float = 0.0) -> StageContext:
         """Return what the stages of a vertex read beside their lanes."""
-        slide, salt = slides(self.plan, self.world, paths.depth), salts(paths.depth, paths.state.lane.device)
-        return self.context.at(salt, slide, roulette, partial(self.hits, depth=paths.depth + 1))
+        follow_shape, salt = (
+            follows_shape(self.plan, self.world, paths.depth),
+            salts(paths.depth, paths.state.lane.device),
+        )
+        return self.context.at(salt, follow_shape, roulette, partial(self.hits, depth=paths.depth + 1))
 
     def _input(self, paths: Paths, index: Tensor) -> VertexInput:
         return VertexInput(rows(paths.state, index), rows(paths.met, index))
@@ -226,15 +229,15 @@ class Tensors:
         assert paths.groups is not None
         context, bounce = self._context(paths, roulette), self.wave.bounce
         leaving: list[PathState] = []
-        following: list[Hit] = []
+        next_hit: list[Hit] = []
         after = Paths(paths.state, paths.depth + 1)
         start = 0
         for model, index in paths.groups:
             output = bounce(context, model, self._input(paths, index))
             check_output(self.wave.integrator, output)
             leaving.append(output.leaving)
-            if output.following is not None:
-                following.append(output.following)
+            if output.next_hit is not None:
+                next_hit.append(output.next_hit)
             if output.shadow is not None:
                 after.pending.append((start, output.shadow))
                 self.tally.rays += len(index)
@@ -245,7 +248,7 @@ class Tensors:
                 after.outputs.append((model, take(paths.state.lane, index), output))
             start += len(index)
         after.state = joined(leaving)
-        after.hit = joined(following) if following else None
+        after.hit = joined(next_hit) if next_hit else None
         return after
 
     def occlude(self, paths: Paths) -> None:
@@ -331,7 +334,7 @@ def escaped(wave: Wave, state: PathState, ends: Ends) -> Tensor:
 def trace(
     wave: Wave,
     state: PathState,
-    tally: Tally | None = None,
+    tally: RayCounts | None = None,
     observer: Observer[Paths] | None = None,
     splats: list[Splats] | None = None,
 ) -> Tensor:
@@ -359,7 +362,7 @@ def hits(wave: Wave, state: PathState) -> Hit:
 def brought(
     wave: Wave,
     state: PathState,
-    tally: Tally | None = None,
+    tally: RayCounts | None = None,
     observer: Observer[Paths] | None = None,
     splats: list[Splats] | None = None,
 ) -> Tensor:
@@ -374,19 +377,19 @@ def radiance(
     pixels: int,
     first_sample: int,
     samples: int,
-    plate: Plate | None = None,
+    pixel_set: PixelSet | None = None,
     splats: list[Splats] | None = None,
 ) -> Tensor:
     """Return the radiance ``(3, samples, pixels)`` of consecutive pixels of a plate, weighted by the filter."""
-    state = wave.rays(first_pixel, pixels, first_sample, samples, plate)
+    state = wave.rays(first_pixel, pixels, first_sample, samples, pixel_set)
     return brought(wave, state, splats=splats).view(3, samples, pixels)
 
 
 class _Layers(Observer[Paths]):
     """Reads layers off first surfaces, and ends the walk there."""
 
-    def __init__(self, wave: Wave, names: tuple[str, ...], slide: bool) -> None:
-        self.names, self.context, self.centre = names, replace(wave.context, slide=slide), wave.centre
+    def __init__(self, wave: Wave, names: tuple[str, ...], follow_shape: bool) -> None:
+        self.names, self.context, self.centre = names, replace(wave.context, follow_shape=follow_shape), wave.centre
         self.found: dict[str, Tensor] = {}
 
     def sorted(self, paths: Paths, counts: Counts) -> bool:
@@ -401,12 +404,12 @@ class _Layers(Observer[Paths]):
         return True
 
 
-def seen(wave: Wave, names: tuple[str, ...], state: PathState, slide: bool = False) -> dict[str, Tensor]:
+def seen(wave: Wave, names: tuple[str, ...], state: PathState, follow_shape: bool = False) -> dict[str, Tensor]:
     """Return the layers ``names`` of first surfaces that camera rays meet, each ``(C, N)``; a miss is 0 in all of them.
 
-    They are not weighted by the filter. ``slide``: whether points follow the rays and the geometry, for derivatives.
+    They are not weighted by the filter. ``follow_shape``: whether points follow the rays and the geometry, for derivatives.
     """
-    engine, layer = Tensors(wave, len(state.lane)), _Layers(wave, names, slide)
+    engine, layer = Tensors(wave, len(state.lane)), _Layers(wave, names, follow_shape)
     walk(engine, engine.spawn(state), wave.integrator.limits, layer)
     return layer.found
 
@@ -418,12 +421,12 @@ def layers(
     pixels: int,
     first_sample: int,
     samples: int,
-    plate: Plate | None = None,
-    slide: bool = False,
+    pixel_set: PixelSet | None = None,
+    follow_shape: bool = False,
 ) -> dict[str, Tensor]:
     """Return the layers ``names`` of consecutive pixels of a plate, each ``(C, samples, pixels)``, weighted by the filter."""
-    state = wave.rays(first_pixel, pixels, first_sample, samples, plate)
-    found = seen(wave, names, state, slide)
+    state = wave.rays(first_pixel, pixels, first_sample, samples, pixel_set)
+    found = seen(wave, names, state, follow_shape)
     if wave.filter.signed:
         found = aov.weighted(found, wave.weight(state))
     return {name: value.view(-1, samples, pixels) for name, value in found.items()}

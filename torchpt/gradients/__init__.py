@@ -24,17 +24,17 @@ from torch import Tensor
 from torchpt.core.errors import NotBuiltError
 from torchpt.core.memory import check_memory
 from torchpt.core.threads import limited_threads
-from torchpt.gradients.camera import by_film, follows, suits
+from torchpt.gradients.camera import film_space_applies, film_space_backward, needs_direction_gradients
 from torchpt.gradients.loop import compiled_replay
-from torchpt.gradients.parameters import Assembly, attached
+from torchpt.gradients.parameters import SceneTape, attached
 from torchpt.gradients.tape import tape
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.ranks import Group
 from torchpt.scene import Scene
-from torchpt.scene.need import loaded, need_of
+from torchpt.scene.memory_estimate import loaded, memory_estimate
 from torchpt.scene.settings import Settings
 
-__all__ = ["attached", "gradients", "suits"]
+__all__ = ["attached", "film_space_applies", "gradients"]
 
 
 def gradients(
@@ -45,7 +45,7 @@ def gradients(
     dtype: torch.dtype,
     attached: bool,
     kind: str,
-    asked: Tensor,
+    cotangent: Tensor,
     held: bool = False,
     ranks: Group | None = None,
     rays: tuple[Tensor, Tensor] | None = None,
@@ -61,8 +61,8 @@ def gradients(
         dtype: of the lanes.
         attached: whether geometry is differentiated.
         kind: ``replay`` or ``autograd``.
-        asked: derivatives of a loss by the pixels ``(3, H W)``.
-        held: whether what the camera sees is held in place (:func:`suits`), and the picture moves over it.
+        cotangent: derivatives of a loss by the pixels ``(3, H W)``.
+        held: whether what the camera sees is held in place (:func:`film_space_applies`), and the picture moves over it.
         ranks: those that share the pixels, which are the same on each.
         rays: in place of the camera's, see :func:`torchpt.scene.prepare.make_wave`.
         by_rays: whether they are differentiated: their origins and directions follow the parameters.
@@ -79,13 +79,13 @@ def gradients(
         expected = "one whose samples light their own pixels alone, where geometry or the camera is differentiated"
         raise NotBuiltError("integrator.type", integrator.name, expected)
     with limited_threads(settings.render.threads):
-        attached = follows(scene, wanted) if held else attached
-        assembly = Assembly(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks, rays, by_rays)
+        attached = needs_direction_gradients(scene, wanted) if held else attached
+        assembly = SceneTape(scene, settings, params, wanted, scene.weights(), dtype, attached, ranks, rays, by_rays)
         if settings.render.max_memory is not None:
-            need = need_of(settings, scene.device, "tape", len(assembly.wave.context.world.materials.models))
-            check_memory(settings.render.max_memory, scene.device, need.of_tape, 0)
+            need = memory_estimate(settings, scene.device, "tape", len(assembly.wave.context.world.materials.models))
+            check_memory(settings.render.max_memory, scene.device, need.backward_bytes, 0)
         carried = any(not own.whole for own in integrator.fields)
-        if kind == "replay" and integrator.own_transmit and (carried or assembly.passing):
+        if kind == "replay" and integrator.own_transmit and (carried or assembly.differentiates_opacity):
             what = "its fields" if carried else "opacity"
             raise NotBuiltError(
                 "adjoint", "replay", f"autograd, as {integrator.name} holds rays up and {what} is differentiated"
@@ -93,11 +93,11 @@ def gradients(
         sums = assembly.sums()
         # Integrators that end at the first surface have but one vertex to keep.
         if held:
-            by_film(assembly, settings, asked, sums)
+            film_space_backward(assembly, settings, cotangent, sums)
         elif kind == "replay" and isinstance(assembly.wave.integrator, PathIntegrator):
-            compiled_replay(scene, assembly, settings, asked, sums)
+            compiled_replay(scene, assembly, settings, cotangent, sums)
         else:
-            tape(assembly, settings, asked, sums)
+            tape(assembly, settings, cotangent, sums)
         if ranks is not None:
             sums.join_ranks(ranks)
         loaded("tape")

@@ -33,7 +33,7 @@ from torch import Tensor
 
 from torchpt.core.memory import Span
 from torchpt.engines import tensors
-from torchpt.gradients.parameters import Assembly, attached
+from torchpt.gradients.parameters import SceneTape, attached
 from torchpt.gradients.sums import Sums
 from torchpt.gradients.tape import chunk_by_chunk, counted
 from torchpt.math.vectors import dot, normalize, take
@@ -46,7 +46,7 @@ from torchpt.scene import Scene
 from torchpt.scene.settings import Settings
 from torchpt.spec import Moves
 
-__all__ = ["by_film", "follows", "suits"]
+__all__ = ["film_space_applies", "film_space_backward", "needs_direction_gradients"]
 
 #: Makes the seed of paths through borders another one.
 _OTHER = 0x2545F491
@@ -55,7 +55,7 @@ _OTHER = 0x2545F491
 Count = Callable[[Tensor], Tensor]
 
 
-def suits(scene: Scene, settings: Settings, wanted: Iterable[str]) -> bool:
+def film_space_applies(scene: Scene, settings: Settings, wanted: Iterable[str]) -> bool:
     """Return True where gradients by the parameters ``wanted`` are taken in this form.
 
     The camera moves, no surface does, and every ray ends at the first one: what lets some rays pass has no place to be held at.
@@ -67,46 +67,46 @@ def suits(scene: Scene, settings: Settings, wanted: Iterable[str]) -> bool:
     return scene.description.camera.kind.projects and isinstance(settings.integrator, PathIntegrator)
 
 
-def follows(scene: Scene, wanted: Iterable[str]) -> bool:
+def needs_direction_gradients(scene: Scene, wanted: Iterable[str]) -> bool:
     """Return True where directions follow surfaces in it: those behind mirrors and glass, or where others ask for it."""
     owners = [*scene.built.parts, *scene.built.copies]
     bent = any(material.model.delta for owner in owners for material in owner.material.all())
     return bent or attached(scene, [name for name in wanted if not name.startswith("camera.")])
 
 
-def by_film(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
+def film_space_backward(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
     """Reverse mode in this form, a chunk at a time.
 
     Args:
         assembly: what waves read.
         settings: of the backward pass.
-        asked: derivatives by the pixels ``(3, H W)``.
+        cotangent: derivatives by the pixels ``(3, H W)``.
         sums: what is added to.
 
     Raises:
         RenderError: not even the tape of a single lane fits in memory.
     """
-    still, wave, spp = assembly.wave, assembly.taped, settings.render.spp
+    primal, wave, spp = assembly.wave, assembly.taped, settings.render.spp
     count = partial(counted, settings)
 
     def inner(span: Span) -> tuple[Tensor, Tensor]:
-        return count(interior(still, wave, span)).sum(1) / spp, asked[:, span[0] : span[0] + span[1]]
+        return count(interior(primal, wave, span)).sum(1) / spp, cotangent[:, span[0] : span[0] + span[1]]
 
     def splat(span: Span) -> tuple[Tensor, Tensor]:
-        values = splats(still, wave, span, spp, asked, count)
+        values = splats(primal, wave, span, spp, cotangent, count)
         return values, torch.ones_like(values)
 
     def border(upright: bool, each: int, span: Span) -> tuple[Tensor, Tensor]:
-        values = borders(still, wave, upright, span, each, asked, count)
+        values = borders(primal, wave, upright, span, each, cotangent, count)
         return values, torch.ones_like(values)
 
-    _, _, width, height = still.crop
-    if not still.filter.jumps:
-        chunk_by_chunk(assembly, settings, sums, splat, cells(still), spp)
+    _, _, width, height = primal.crop
+    if not primal.filter.jumps:
+        chunk_by_chunk(assembly, settings, sums, splat, cells(primal), spp)
         return
     each = -(-spp // 4)
     chunk_by_chunk(assembly, settings, sums, inner, width * height, spp)
-    for upright, number in borders_of(still):
+    for upright, number in borders_of(primal):
         chunk_by_chunk(assembly, settings, sums, partial(border, upright, each), number, each)
 
 
@@ -120,97 +120,99 @@ class _Seen:
     stretch: Tensor  # (N,) of value 1: film area, differentiable
 
 
-def interior(still: Wave, wave: Wave, span: Span) -> Tensor:
+def interior(primal: Wave, wave: Wave, span: Span) -> Tensor:
     """Radiance ``(3, samples, pixels)`` whose derivative is that of pixels under a box, but for their borders.
 
     Args:
-        still: a wave of detached parameters.
+        primal: a wave of detached parameters.
         wave: the same under a tape.
         span: as of :func:`torchpt.engines.tensors.radiance`.
     """
     with torch.no_grad():
-        state = still.rays(*span)
-    seen = _held(still, wave, state)
+        state = primal.rays(*span)
+    seen = _held(primal, wave, state)
     return (_brought(wave, seen.state) * seen.stretch).view(3, span[3], span[1])
 
 
-def borders(still: Wave, wave: Wave, upright: bool, span: Span, samples: int, asked: Tensor, count: Count) -> Tensor:
+def borders(
+    primal: Wave, wave: Wave, upright: bool, span: Span, samples: int, cotangent: Tensor, count: Count
+) -> Tensor:
     """Return what moves through borders of pixels is worth, ``(3, N)``: values are 0, derivatives are not.
 
     Args:
-        still: a wave of detached parameters.
+        primal: a wave of detached parameters.
         wave: the same under a tape.
         upright: borders between neighbours in a row; else in a column.
         span: first border, how many, first sample, how many of them.
         samples: of each border, in all.
-        asked: derivatives by the pixels ``(3, H W)``.
+        cotangent: derivatives by the pixels ``(3, H W)``.
         count: how samples count in pixels.
     """
-    x0, y0, width, _ = still.crop
+    x0, y0, width, _ = primal.crop
     columns = width + 1 if upright else width
-    column, row, offset, key = _cells(still, span, columns, samples, int(upright))
+    column, row, offset, key = _cells(primal, span, columns, samples, int(upright))
     along = offset[0]
     with torch.no_grad():
-        state = _rays(still, column + x0 + (0.0 if upright else along), row + y0 + (along if upright else 0.0), key)
-        brought = count(_brought(still, state))
-        before = _of_pixel(asked, column - (1 if upright else 0), row - (0 if upright else 1), width)
-        worth = _of_pixel(asked, column, row, width) - before
-    seen = _held(still, wave, state)
+        state = _rays(primal, column + x0 + (0.0 if upright else along), row + y0 + (along if upright else 0.0), key)
+        brought = count(_brought(primal, state))
+        before = _of_pixel(cotangent, column - (1 if upright else 0), row - (0 if upright else 1), width)
+        worth = _of_pixel(cotangent, column, row, width) - before
+    seen = _held(primal, wave, state)
     at = seen.x if upright else seen.y
     return worth.to(brought.dtype) * brought * (at - at.detach()) / samples
 
 
-def borders_of(still: Wave) -> tuple[tuple[bool, int], ...]:
+def borders_of(primal: Wave) -> tuple[tuple[bool, int], ...]:
     """Upright borders and others: whether they are, and how many."""
-    _, _, width, height = still.crop
+    _, _, width, height = primal.crop
     return (True, (width + 1) * height), (False, width * (height + 1))
 
 
-def splats(still: Wave, wave: Wave, span: Span, samples: int, asked: Tensor, count: Count) -> Tensor:
+def splats(primal: Wave, wave: Wave, span: Span, samples: int, cotangent: Tensor, count: Count) -> Tensor:
     """Return what places all over the film are worth ``(3, N)``, for filters that end without a jump.
 
     Each path counts in all pixels that see its place: what the derivatives of neighbouring filters have in common cancels.
 
     Args:
-        still: a wave of detached parameters.
+        primal: a wave of detached parameters.
         wave: the same under a tape.
         span: first cell, how many, first sample, how many of them; cells are those of :func:`cells`.
         samples: of each cell, in all.
-        asked: derivatives by the pixels ``(3, H W)``.
+        cotangent: derivatives by the pixels ``(3, H W)``.
         count: how samples count in pixels.
     """
-    x0, y0, width, _ = still.crop
-    beyond = _beyond(still)
-    column, row, offset, key = _cells(still, span, width + 2 * beyond, samples, 0)
+    x0, y0, width, _ = primal.crop
+    beyond = _beyond(primal)
+    column, row, offset, key = _cells(primal, span, width + 2 * beyond, samples, 0)
     column, row = column - beyond, row - beyond
     with torch.no_grad():
-        state = _rays(still, column + x0 + offset[0], row + y0 + offset[1], key)
-    seen = _held(still, wave, state)
+        state = _rays(primal, column + x0 + offset[0], row + y0 + offset[1], key)
+    seen = _held(primal, wave, state)
     radiance = count(_brought(wave, seen.state) * seen.stretch)
     reach = range(-beyond, beyond + 1)
-    across = [_filter(still, seen.x - (column + (x0 + k + 0.5))) for k in reach]
-    down = [_filter(still, seen.y - (row + (y0 + k + 0.5))) for k in reach]
+    across = [_filter(primal, seen.x - (column + (x0 + k + 0.5))) for k in reach]
+    down = [_filter(primal, seen.y - (row + (y0 + k + 0.5))) for k in reach]
     worth = torch.zeros_like(radiance)
     for i, along in zip(reach, down, strict=True):
         for k, weight in zip(reach, across, strict=True):
-            worth = worth + _of_pixel(asked, column + k, row + i, width).to(worth.dtype) * (weight * along)
+            worth = worth + _of_pixel(cotangent, column + k, row + i, width).to(worth.dtype) * (weight * along)
     return radiance * worth / samples
 
 
-def cells(still: Wave) -> int:
+def cells(primal: Wave) -> int:
     """Return how many cells of a pixel's size there are that any pixel sees."""
-    _, _, width, height = still.crop
-    return (width + 2 * _beyond(still)) * (height + 2 * _beyond(still))
+    _, _, width, height = primal.crop
+    return (width + 2 * _beyond(primal)) * (height + 2 * _beyond(primal))
 
 
-def _beyond(still: Wave) -> int:
+def _beyond(primal: Wave) -> int:
     """Return how many pixels a filter reaches beyond its own."""
-    return math.ceil(still.filter.radius - 0.5)
+    return math.ceil(primal.filter.radius - 0.5)
 
 
-def _filter(still: Wave, away: Tensor) -> Tensor:
+def _filter(primal: Wave, away: Tensor) -> Tensor:
     """The filter's profile ``(N,)`` at distances, of integral 1, differentiable."""
-    filter, place = still.filter, away.detach().cpu().double().numpy()
+    filter, place = primal.filter, away.detach().cpu().double().numpy()
     ends = np.linspace(-filter.radius, filter.radius, (1 << 12) + 1, dtype=np.float64)
     middle = 0.5 * (ends[1:] + ends[:-1])
     whole, step = filter.profile(middle).mean() * 2.0 * filter.radius, 1e-5 * filter.radius
@@ -219,28 +221,28 @@ def _filter(still: Wave, away: Tensor) -> Tensor:
     return value + torch.from_numpy(slope).to(away) * (away - away.detach())
 
 
-def _of_pixel(asked: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
+def _of_pixel(cotangent: Tensor, column: Tensor, row: Tensor, width: int) -> Tensor:
     """Return what is asked ``(3, N)`` of pixels; nothing beyond the picture."""
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < asked.shape[1] // width)
-    return torch.where(inside, take(asked, torch.where(inside, row * width + column, 0)), 0.0)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < cotangent.shape[1] // width)
+    return torch.where(inside, take(cotangent, torch.where(inside, row * width + column, 0)), 0.0)
 
 
-def _cells(still: Wave, span: Span, columns: int, samples: int, stream: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _cells(primal: Wave, span: Span, columns: int, samples: int, stream: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Columns and rows ``(N,)`` of cells or borders, places within them ``(2, N)`` and keys of paths of their own."""
     first, count, start, several = span
-    device = still.centre.device
+    device = primal.centre.device
     cell = torch.arange(first, first + count, device=device).repeat(several)
     sample = torch.arange(start, start + several, device=device).repeat_interleave(count)
-    sampler = replace(still.sampler, seed=still.sampler.seed ^ _OTHER, spp=samples, randomizations=1)
+    sampler = replace(primal.sampler, seed=primal.sampler.seed ^ _OTHER, spp=samples, randomizations=1)
     key = sampler.key(2 * cell + stream, sample)
-    offset = Draws(sampler.points, key, salts(0, device)).two(Dimension.PIXEL).to(still.context.plan.dtype)
+    offset = Draws(sampler.points, key, salts(0, device)).two(Dimension.PIXEL).to(primal.context.plan.dtype)
     return cell % columns, cell // columns, offset, key
 
 
-def _rays(still: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
+def _rays(primal: Wave, x: Tensor, y: Tensor, key: Tensor) -> PathState:
     """Camera rays through places of the film."""
-    dtype = still.context.plan.dtype
-    o, d = still.camera.rays(x.to(dtype), y.to(dtype), None)
+    dtype = primal.context.plan.dtype
+    o, d = primal.camera.rays(x.to(dtype), y.to(dtype), None)
     return camera_state(o.expand_as(d), d, key)
 
 
@@ -249,11 +251,11 @@ def _brought(wave: Wave, state: PathState) -> Tensor:
     return tensors.trace(wave, state)
 
 
-def _held(still: Wave, wave: Wave, state: PathState) -> _Seen:
+def _held(primal: Wave, wave: Wave, state: PathState) -> _Seen:
     """Return what camera rays of detached parameters meet, as a camera under a tape sees it."""
-    world = still.context.world
+    world = primal.context.world
     with torch.no_grad():
-        hit = tensors.hits(still, state)
+        hit = tensors.hits(primal, state)
         missed = hit.prim < 0
         at = interact(world, state.o, state.d, replace(hit, prim=hit.prim.clamp_min(0)), True)
         p, n = torch.where(missed, 0.0, at.p), torch.where(missed, 0.0, at.ng)

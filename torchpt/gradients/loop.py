@@ -10,12 +10,12 @@ from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY
 from torchpt.compiler.graph import Unsupported
-from torchpt.core.errors import say_once
-from torchpt.core.memory import Budget, Span, ran_out
+from torchpt.core.errors import warn_once
+from torchpt.core.memory import Budget, Span, is_out_of_memory
 from torchpt.core.threads import deal
-from torchpt.engines.kernels.backward import JointKernels
+from torchpt.engines.kernels.backward import VjpKernels
 from torchpt.engines.kernels.engine import LANES, Chunk
-from torchpt.gradients.parameters import Assembly
+from torchpt.gradients.parameters import SceneTape
 from torchpt.gradients.replay import replay
 from torchpt.gradients.sums import ChunkSums, Sums
 from torchpt.gradients.sweep import KEPT, Sweep
@@ -26,7 +26,7 @@ from torchpt.scene.settings import Settings
 __all__ = ["compiled_replay"]
 
 
-def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
+def compiled_replay(scene: Scene, assembly: SceneTape, settings: Settings, asked: Tensor, sums: Sums) -> None:
     """As :func:`torchpt.gradients.replay.replay`, by kernels where these can be made.
 
     Args:
@@ -42,7 +42,7 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
     wave = assembly.wave
     splats = wave.integrator.splats
     cotangent = (asked.float() / settings.render.spp).contiguous() if splats else None
-    kernels = JointKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets_of(wave), cotangent)
+    kernels = VjpKernels(wave, assembly.taped, assembly.plain, assembly.leaves, packets_of(wave), cotangent)
     models = wave.context.world.materials.models
     kernels.eager = kernels.probe(own_models(scene, wave))
     budget = _budget(kernels, settings)
@@ -72,7 +72,7 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
             deal(chunks, task, budget.threads, merge, ahead=2 * budget.threads)
             break
         except Exception as error:
-            if not isinstance(error, Unsupported) and not ran_out(error):
+            if not isinstance(error, Unsupported) and not is_out_of_memory(error):
                 raise
             reason = f"no kernel can be made of {error}" if isinstance(error, Unsupported) else "memory ran out"
         sweeps.clear()
@@ -80,13 +80,13 @@ def compiled_replay(scene: Scene, assembly: Assembly, settings: Settings, asked:
         if reason == "memory ran out" and budget.threads > 1:
             budget.shrink()
             reason = ""
-    for stage, why in kernels.back_eager.items():
+    for stage, why in kernels.eager_vjps.items():
         model = f" at {models[stage[1]]}" if stage[0] == "bounce" else ""
-        say_once(
+        warn_once(
             f"torchpt: {stage[0]}{model} is differentiated by tensor operations, as no kernel can be made of {why}"
         )
     if reason:
-        say_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
+        warn_once(f"torchpt: gradients of this scene are taken by tensor operations, as {reason}")
         replay(assembly, settings, asked, sums)
 
 
@@ -100,7 +100,7 @@ def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
                 yield pixel, min(step, start + pixels - pixel), sample, count
 
 
-def _budget(kernels: JointKernels, settings: Settings) -> Budget:
+def _budget(kernels: VjpKernels, settings: Settings) -> Budget:
     """Return how many threads there are, fewer where the arenas of all would take more than half of ``render.max_memory``."""
     budget = Budget(torch.device("cpu"), CAPACITY, torch.get_num_threads(), what="a gradient", instead="one thread")
     limit, depth = settings.render.max_memory, settings.integrator.limits.max_depth
@@ -110,10 +110,10 @@ def _budget(kernels: JointKernels, settings: Settings) -> Budget:
     return budget
 
 
-def _looped(assembly: Assembly, settings: Settings) -> bool:
+def _looped(assembly: SceneTape, settings: Settings) -> bool:
     """Return True where kernels may be made: on a CPU, in float32, without derivatives by weights of modules or opacity."""
     wave = assembly.wave
     plan = wave.context.plan
     if wave.centre.device.type != "cpu" or plan.dtype != torch.float32 or settings.render.compile == "off":
         return False
-    return not assembly.held and not assembly.passing
+    return not assembly.held and not assembly.differentiates_opacity

@@ -22,7 +22,7 @@ from torchpt.scene.prepare import make_wave
 from torchpt.scene.settings import Settings
 from torchpt.spec import Moves
 
-__all__ = ["Assembly", "attached"]
+__all__ = ["SceneTape", "attached"]
 
 
 # ---- What parameters move: decided once, from their specs, so that a derivative by a colour costs nothing for geometry
@@ -45,7 +45,7 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
 # ---- From parameters to what waves read, differentiated once a backward pass
 
 
-class Assembly:
+class SceneTape:
     """Tensors that the waves of a backward pass read, as functions of parameters.
 
     Args:
@@ -117,7 +117,7 @@ class Assembly:
         self.taped = _over(self.wave, leaf)
 
     @property
-    def passing(self) -> bool:
+    def differentiates_opacity(self) -> bool:
         """Return True where it is differentiated by what lets rays pass surfaces."""
         world = self.taped.context.world
         opacity, maps = world.materials.opacity, world.textures.opacity

@@ -16,14 +16,14 @@ from torch import Tensor
 
 from torchpt.core.memory import Budget, Span
 from torchpt.engines.tensors import Paths, Tensors, escaped
-from torchpt.gradients.parameters import Assembly
+from torchpt.gradients.parameters import SceneTape
 from torchpt.gradients.sums import Sums
-from torchpt.gradients.tape import asked_of
-from torchpt.math.gathers import gathered_by
+from torchpt.gradients.tape import sample_cotangents
+from torchpt.math.gathers import recording_gathers
 from torchpt.math.vectors import rows, take
 from torchpt.paths import adjoint
-from torchpt.paths.adjoint import Behind
-from torchpt.paths.integrators.path import Ends, partition, slides
+from torchpt.paths.adjoint import VertexCotangents
+from torchpt.paths.integrators.path import Ends, follows_shape, partition
 from torchpt.paths.state import EXTRA, PathState, Shadow, Splat, VertexInput
 from torchpt.paths.walk import Observer, walk
 from torchpt.physics.samplers import salts
@@ -76,7 +76,7 @@ class Keeper(Observer[Paths]):
         return False
 
 
-def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
+def replay(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
     """Reverse mode by replaying paths; as :func:`torchpt.gradients.tape.tape`, but memory does not grow with depth.
 
     Chunks have fewer lanes only where an allocation failed.
@@ -84,17 +84,17 @@ def replay(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) ->
     wave = assembly.wave
 
     def whole(span: Span) -> None:
-        sums.join(piece(assembly, settings, asked, span))
+        sums.join(piece(assembly, settings, cotangent, span))
 
     device = wave.centre.device
     budget = Budget(device, LANES.get(device.type, LANES["cpu"]), what="the vertices of a single lane")
     assembly.through(budget, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
-def piece(assembly: Assembly, settings: Settings, asked: Tensor, span: Span) -> Sums:
+def piece(assembly: SceneTape, settings: Settings, cotangent: Tensor, span: Span) -> Sums:
     """Return the sums of a chunk."""
     sums = assembly.sums()
-    _Chunk(assembly, settings, span, sums).run(asked)
+    _Chunk(assembly, settings, span, sums).run(cotangent)
     return sums
 
 
@@ -108,13 +108,13 @@ class _Chunk:
         sums: what is added to.
     """
 
-    def __init__(self, assembly: Assembly, settings: Settings, span: Span, sums: Sums) -> None:
+    def __init__(self, assembly: SceneTape, settings: Settings, span: Span, sums: Sums) -> None:
         self.assembly, self.settings, self.span, self.sums = assembly, settings, span, sums
         self.wave, self.taped = assembly.wave, assembly.taped
         self.plan = self.wave.context.plan
         self.world = self.taped.context.world
         self.tensors = [*assembly.leaves, *assembly.held]
-        self.passing = assembly.passing
+        self.differentiates_opacity = assembly.differentiates_opacity
         self.engine = Tensors(replace(self.wave, context=self.taped.context), 0)
 
     def run(self, pixels: Tensor) -> None:
@@ -128,15 +128,17 @@ class _Chunk:
             samples = self.span[3]
             weight = self.wave.weight(start) if self.wave.filter.signed else None
             brought = radiance if weight is None else radiance * weight
-            asked = asked_of(self.settings, brought.view(3, samples, -1), pixels.to(radiance.dtype)).reshape(3, -1)
+            cotangent = sample_cotangents(
+                self.settings, brought.view(3, samples, -1), pixels.to(radiance.dtype)
+            ).reshape(3, -1)
             # What the rest of its path asks of each lane's ray, and what that ray met.
-            self.radiance = asked if weight is None else asked * weight
-            self.behind = {name: torch.zeros_like(asked) for name in ("throughput", "o", "d")[: self._rows]}
-            n = asked.shape[1]
+            self.radiance = cotangent if weight is None else cotangent * weight
+            self.behind = {name: torch.zeros_like(cotangent) for name in ("throughput", "o", "d")[: self._rows]}
+            n = cotangent.shape[1]
             for own in self.wave.integrator.fields:
                 if not own.whole:
-                    self.behind[EXTRA + own.name] = torch.zeros_like(own.begin(asked[0]))
-            zero = torch.zeros(n, dtype=asked.dtype, device=asked.device)
+                    self.behind[EXTRA + own.name] = torch.zeros_like(own.begin(cotangent[0]))
+            zero = torch.zeros(n, dtype=cotangent.dtype, device=cotangent.device)
             self.met = Hit(zero.clone(), torch.full_like(start.lane, -1), zero.clone(), zero.clone())
             self._back(keeper)
         self._camera(start)
@@ -171,20 +173,20 @@ class _Chunk:
         depth, order = vertex.depth, vertex.state.lane.argsort()
         place = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order), device=order.device))
         state, hit = rows(vertex.state, order), rows(vertex.hit, order)
-        slide = slides(self.plan, self.world, depth)
+        follow_shape = follows_shape(self.plan, self.world, depth)
         ends, groups = partition(self.world, vertex.hit)
         ends = Ends(take(place, ends.emissive).msort(), take(place, ends.missed).msort())
-        chance, asked = self._chance(state, depth)
+        chance, cotangent = self._chance(state, depth)
         hit = replace(hit, chance=chance)
         limits = self.wave.integrator.limits
         clear, splat_clear = iter(vertex.clear), iter(vertex.splat_clear)
         if depth < limits.last:
             for model, came in groups:
                 index, turn = take(place, came).sort()
-                self._bounce(model, depth, slide, clear, splat_clear, turn, state, hit, index, asked)
-        self._light(ends, depth, slide, state, hit, asked)
-        if chance is not None and asked is not None:
-            found = torch.autograd.grad(chance, self.tensors, asked, allow_unused=True)
+                self._bounce(model, depth, follow_shape, clear, splat_clear, turn, state, hit, index, cotangent)
+        self._light(ends, depth, follow_shape, state, hit, cotangent)
+        if chance is not None and cotangent is not None:
+            found = torch.autograd.grad(chance, self.tensors, cotangent, allow_unused=True)
             self.sums.add_each(found)
         if self.plan.attached:
             for name in ("t", "prim", "u", "v"):
@@ -192,9 +194,9 @@ class _Chunk:
 
     def _chance(self, state: PathState, depth: int) -> tuple[Tensor | None, Tensor | None]:
         """The chance to get here under a tape, where it has derivatives, and zeros for what is asked of it."""
-        if not self.passing:
+        if not self.differentiates_opacity:
             return None, None
-        with torch.enable_grad(), gathered_by(self.sums):
+        with torch.enable_grad(), recording_gathers(self.sums):
             chance = self.engine.hits(state, depth).chance
         if chance is None or not chance.requires_grad:
             return None, None
@@ -204,18 +206,18 @@ class _Chunk:
         self,
         model: int,
         depth: int,
-        slide: bool,
+        follow_shape: bool,
         clear: Iterator[Tensor],
         splat_clear: Iterator[Tensor],
         turn: Tensor,
         state: PathState,
         hit: Hit,
         index: Tensor,
-        asked: Tensor | None,
+        cotangent: Tensor | None,
     ) -> None:
         lane = take(state.lane, index)
-        following = rows(self.met, lane) if self.plan.attached else None
-        behind = Behind(
+        next_hit = rows(self.met, lane) if self.plan.attached else None
+        behind = VertexCotangents(
             take(self.radiance, lane),
             take(self.behind["throughput"], lane),
             *(take(self.behind[name], lane) if self.plan.attached else None for name in ("o", "d")),
@@ -224,26 +226,28 @@ class _Chunk:
 
         def passed(shadow: Shadow) -> Tensor:
             kept = next(clear)
-            return self.engine.clear(shadow) if self.passing else take(kept, turn)
+            return self.engine.clear(shadow) if self.differentiates_opacity else take(kept, turn)
 
         def landed(splat: Splat) -> tuple[Tensor, Tensor]:
             kept = next(splat_clear)
-            through = self.engine.clear(splat.light) if self.passing else take(kept, turn)
+            through = self.engine.clear(splat.light) if self.differentiates_opacity else take(kept, turn)
             return adjoint.splatted(self.settings.integrator.clamp, self.cotangent, splat, through)
 
         limits = self.wave.integrator.limits
-        with gathered_by(self.sums):
-            context = self.taped.context.at(salts(depth, lane.device), slide, limits.roulette(depth))
+        with recording_gathers(self.sums):
+            context = self.taped.context.at(salts(depth, lane.device), follow_shape, limits.roulette(depth))
             vertex = VertexInput(rows(state, index), rows(hit, index))
             stage = self.wave.integrator.bounce
-            before = adjoint.bounce(stage, context, model, vertex, following, passed, behind, self._others, landed)
+            before = adjoint.bounce(stage, context, model, vertex, next_hit, passed, behind, self._others, landed)
         for name, found, like in before.of_rays(vertex.state, self.plan.attached):
             self.behind[name].index_copy_(-1, lane, torch.zeros_like(like) if found is None else found)
         self.sums.add_each(before.others)
-        if asked is not None and before.chance is not None:
-            asked.index_add_(0, index, before.chance)
+        if cotangent is not None and before.chance is not None:
+            cotangent.index_add_(0, index, before.chance)
 
-    def _light(self, ends: Ends, depth: int, slide: bool, state: PathState, hit: Hit, asked: Tensor | None) -> None:
+    def _light(
+        self, ends: Ends, depth: int, follow_shape: bool, state: PathState, hit: Hit, cotangent: Tensor | None
+    ) -> None:
         """Back through light that was met by chance; what a bounce asks of the same lanes is there already."""
         table = self.world.lights
         if table is None:
@@ -254,23 +258,23 @@ class _Chunk:
             lane = take(state.lane, index)
             vertex = VertexInput(rows(state, index), rows(hit, index))
             integrator = self.wave.integrator
-            context = self.taped.context.at(salts(depth, lane.device), slide)
+            context = self.taped.context.at(salts(depth, lane.device), follow_shape)
             stage = integrator.emit if here else integrator.escape
-            with gathered_by(self.sums):
+            with recording_gathers(self.sums):
                 before = adjoint.gather(stage, context, vertex, take(self.radiance, lane), self._others)
             for name, found, _ in before.of_rays(vertex.state, self.plan.attached):
                 if found is not None:
                     behind = self.behind[name]
                     behind.index_copy_(-1, lane, take(behind, lane) + found)
             self.sums.add_each(before.others)
-            if asked is not None and before.chance is not None:
-                asked.index_add_(0, index, before.chance)
+            if cotangent is not None and before.chance is not None:
+                cotangent.index_add_(0, index, before.chance)
 
     def _camera(self, start: PathState) -> None:
         """Back through the camera rays."""
         if not self.plan.attached:
             return
-        with torch.enable_grad(), gathered_by(self.sums):
+        with torch.enable_grad(), recording_gathers(self.sums):
             state = self.taped.rays(*self.span)
             pairs = [(x, self.behind[name]) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if pairs:

@@ -55,7 +55,7 @@ class Sums:
         self._totals: list[Tensor | None] = [None] * len(self.tables)
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
-        """See :class:`torchpt.math.gathers.Gathers`: the derivative of the look-up goes straight to the sums."""
+        """See :class:`torchpt.math.gathers.GatherRecorder`: the derivative of the look-up goes straight to the sums."""
         number = self._numbers.get(id(table))
         return None if number is None else _Taken.apply(table, index, self, number)
 
@@ -156,7 +156,7 @@ class ChunkSums:
         self.stream: list[tuple[int, np.ndarray, np.ndarray]] = []
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
-        """See :class:`torchpt.math.gathers.Gathers`."""
+        """See :class:`torchpt.math.gathers.GatherRecorder`."""
         number = self._numbers.get(id(table))
         return None if number is None else _Taken.apply(table, index, self, number)
 

@@ -16,17 +16,17 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY
-from torchpt.engines.kernels.backward import JointKernels, slots_read
+from torchpt.engines.kernels.backward import VjpKernels, slots_read
 from torchpt.engines.kernels.engine import Chunk, Paths, Worker
 from torchpt.engines.kernels.layout import HIT, Memory, path_state
 from torchpt.engines.kernels.programs import Kernel
-from torchpt.gradients.parameters import Assembly
+from torchpt.gradients.parameters import SceneTape
 from torchpt.gradients.sums import ChunkSums, Sums
-from torchpt.gradients.tape import asked_of
-from torchpt.math.gathers import gathered_by
+from torchpt.gradients.tape import sample_cotangents
+from torchpt.math.gathers import recording_gathers
 from torchpt.paths import adjoint
-from torchpt.paths.adjoint import Before, Behind
-from torchpt.paths.integrators.path import slides
+from torchpt.paths.adjoint import Before, VertexCotangents
+from torchpt.paths.integrators.path import follows_shape
 from torchpt.paths.state import EXTRA, Shadow, Splat, VertexInput
 from torchpt.paths.walk import Counts, Observer, walk
 from torchpt.physics.samplers import salts
@@ -87,7 +87,7 @@ class Sweep(Worker):
 
     keeps_splats = False  # it goes back along their vertices
 
-    def __init__(self, kernels: JointKernels, assembly: Assembly, settings: Settings) -> None:
+    def __init__(self, kernels: VjpKernels, assembly: SceneTape, settings: Settings) -> None:
         super().__init__(kernels)
         self.joint, self.assembly, self.settings = kernels, assembly, settings
         self._levels: list[Paths] = []
@@ -103,7 +103,7 @@ class Sweep(Worker):
         self._chunk = chunk
         keeper = self._forward(Mark(1, None), None)
         radiance = torch.from_numpy(self.slots.floats[:, :n])
-        asked = asked_of(self.settings, radiance.reshape(3, chunk.samples, -1), pixels).reshape(3, -1)
+        asked = sample_cotangents(self.settings, radiance.reshape(3, chunk.samples, -1), pixels).reshape(3, -1)
         if self._weight is not None:
             asked = asked * self._weight
         first = self.joint.slots.first
@@ -158,16 +158,16 @@ class Sweep(Worker):
     def _vertex(self, paths: Paths) -> None:
         kernels, calls, depth = self.joint, self.calls, paths.depth
         limits = self.wave.integrator.limits
-        slide = slides(kernels.taped.plan, kernels.world, depth)
-        calls.name_salts(depth)
+        follow_shape = follows_shape(kernels.taped.plan, kernels.world, depth)
+        calls.set_dimensions(depth)
         if depth < limits.last:
             for model, count in enumerate(paths.groups):
                 if count:
-                    key = ("bounce", model, limits.roulette(depth), slide)
+                    key = ("bounce", model, limits.roulette(depth), follow_shape)
                     self._one(key, paths, paths.lists[model], count, False)
         if kernels.has_emitters and paths.places[kernels.emissive]:
             place = kernels.emissive
-            self._one(("emit", slide), paths, paths.lists[place], paths.places[place], True)
+            self._one(("emit", follow_shape), paths, paths.lists[place], paths.places[place], True)
         if kernels.has_environment and paths.places[kernels.missed]:
             place = kernels.missed
             self._one(("escape",), paths, paths.lists[place], paths.places[place], True)
@@ -176,7 +176,7 @@ class Sweep(Worker):
 
     def _one(self, key: tuple, paths: Paths, places: Memory, count: int, added: bool) -> None:
         """Back through one stage on the lanes of a list, by its kernel or by tensor operations."""
-        kernel = self.joint.back_kernel(key)
+        kernel = self.joint.vjp_kernel(key)
         slots = self._by_sample(paths, places, count) if kernel is None or kernel.program.sums else None
         if kernel is None:
             self._eagerly(key, paths, places, count, added)
@@ -224,15 +224,15 @@ class Sweep(Worker):
             return adjoint.splatted(integrator.clamp, kernels.cotangent, splat, rows["splat_clear"])
 
         before: Before
-        with gathered_by(self.sums):
+        with recording_gathers(self.sums):
             if key[0] == "bounce":
                 extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
-                behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
-                following = Hit(*(rows[name] for name in HIT)) if plan.attached else None
-                _, model, roulette, slide = key
-                context = kernels.taped.at(salt, slide, roulette)
+                behind = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
+                next_hit = Hit(*(rows[name] for name in HIT)) if plan.attached else None
+                _, model, roulette, follow_shape = key
+                context = kernels.taped.at(salt, follow_shape, roulette)
                 before = adjoint.bounce(
-                    integrator.bounce, context, model, vertex, following, clear, behind, self._tensors, landed
+                    integrator.bounce, context, model, vertex, next_hit, clear, behind, self._tensors, landed
                 )
             else:
                 stage = integrator.emit if key[0] == "emit" else integrator.escape
@@ -253,7 +253,7 @@ class Sweep(Worker):
     def _camera(self, n: int) -> None:
         """Back through the camera rays, by tensor operations."""
         chunk, first = self._chunk, self.joint.slots.first
-        with torch.enable_grad(), gathered_by(self.sums):
+        with torch.enable_grad(), recording_gathers(self.sums):
             state = self.assembly.taped.rays(chunk.first_pixel, chunk.pixels, chunk.first_sample, chunk.samples)
             pairs = [(x, first(name)) for name, x in (("o", state.o), ("d", state.d)) if x.requires_grad]
             if not pairs:

@@ -10,22 +10,22 @@ from torch import Tensor
 from torchpt.core.memory import Budget, Span
 from torchpt.core.threads import one_thread
 from torchpt.engines import tensors
-from torchpt.gradients.parameters import Assembly
+from torchpt.gradients.parameters import SceneTape
 from torchpt.gradients.sums import Sums
-from torchpt.math.gathers import gathered_by
+from torchpt.math.gathers import recording_gathers
 from torchpt.math.vectors import take
 from torchpt.paths.wave import clamp_scale
 from torchpt.physics.film.splats import Splats
-from torchpt.scene.need import BYTES_PER_LANE
+from torchpt.scene.memory_estimate import BYTES_PER_LANE
 from torchpt.scene.settings import Settings
 
-__all__ = ["asked_of", "chunk_by_chunk", "counted", "tape", "tape_per_lane"]
+__all__ = ["chunk_by_chunk", "counted", "sample_cotangents", "tape", "tape_per_lane"]
 
 
 # ---- What a loss asks of single samples, of what it asks of the picture's pixels
 
 
-def asked_of(settings: Settings, radiance: Tensor, pixels: Tensor) -> Tensor:
+def sample_cotangents(settings: Settings, radiance: Tensor, pixels: Tensor) -> Tensor:
     """Derivatives ``(3, samples, n)`` by the radiance of samples, of those ``(3, n)`` by pixels.
 
     A pixel is the mean of its samples as they are :func:`counted`.
@@ -36,17 +36,17 @@ def asked_of(settings: Settings, radiance: Tensor, pixels: Tensor) -> Tensor:
         pixels: of their pixels.
     """
     finite = torch.isfinite(radiance).all(0)
-    asked = pixels[:, None] * (finite.to(radiance.dtype) / settings.render.spp)
+    cotangent = pixels[:, None] * (finite.to(radiance.dtype) / settings.render.spp)
     clamp = settings.integrator.clamp
     if clamp is None:
-        return asked
+        return cotangent
     values = torch.where(finite, radiance, 0.0)
     # Of v c / m, m the largest channel: what is asked of v, and what it takes back of the channel that is m.
     most, channel = values.abs().max(0, keepdim=True)
     scale = (clamp / most.clamp_min(clamp)).squeeze(0)
-    back = (asked * values).sum(0, keepdim=True) * scale / most.clamp_min(clamp)
+    back = (cotangent * values).sum(0, keepdim=True) * scale / most.clamp_min(clamp)
     back = torch.where(most > clamp, back * values.gather(0, channel).sign(), 0.0)
-    return (asked * scale).scatter_add(0, channel, -back)
+    return (cotangent * scale).scatter_add(0, channel, -back)
 
 
 def counted(settings: Settings, values: Tensor) -> Tensor:
@@ -70,13 +70,13 @@ LONGEST = 64
 Part = Callable[[Span], tuple[Tensor, Tensor]]
 
 
-def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> None:
+def tape(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
     """Reverse mode on a plain tape, a chunk of pixels at a time: memory grows with depth, not with the picture.
 
     Args:
         assembly: what waves read.
         settings: of the backward pass.
-        asked: derivatives by the pixels ``(3, H W)``.
+        cotangent: derivatives by the pixels ``(3, H W)``.
         sums: what is added to.
 
     Raises:
@@ -87,20 +87,22 @@ def tape(assembly: Assembly, settings: Settings, asked: Tensor, sums: Sums) -> N
     def part(span: Span) -> tuple[Tensor, Tensor]:
         splats: list[Splats] = []
         radiance = tensors.radiance(wave, *span, splats=splats)
-        share = asked_of(settings, radiance.detach(), asked[:, span[0] : span[0] + span[1]].to(radiance.dtype))
+        share = sample_cotangents(
+            settings, radiance.detach(), cotangent[:, span[0] : span[0] + span[1]].to(radiance.dtype)
+        )
         # What is not finite must not meet its share of 0.
         values = torch.where(torch.isfinite(radiance.detach()).all(0), radiance, 0.0)
         if not wave.integrator.splats:
             return values, share
         other = [counted(settings, one.value) for one in splats]
         pixels = torch.cat([values.new_zeros(0, dtype=torch.int64), *(one.pixel for one in splats)])
-        wanted = take(asked, pixels).to(share.dtype) / settings.render.spp
+        wanted = take(cotangent, pixels).to(share.dtype) / settings.render.spp
         return torch.cat((values.flatten(1), *other), 1), torch.cat((share.flatten(1), wanted), 1)
 
     chunk_by_chunk(assembly, settings, sums, part, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
-def chunk_by_chunk(assembly: Assembly, settings: Settings, sums: Sums, part: Part, count: int, samples: int) -> None:
+def chunk_by_chunk(assembly: SceneTape, settings: Settings, sums: Sums, part: Part, count: int, samples: int) -> None:
     """Add the derivatives of a part of a loss, chunk by chunk.
 
     Args:
@@ -121,19 +123,19 @@ def chunk_by_chunk(assembly: Assembly, settings: Settings, sums: Sums, part: Par
     assembly.through(_budget(settings, assembly), add, count, samples)
 
 
-def piece(assembly: Assembly, part: Part, span: Span) -> Sums:
+def piece(assembly: SceneTape, part: Part, span: Span) -> Sums:
     """Return the sums of a chunk."""
     found = assembly.sums()
-    with torch.enable_grad(), gathered_by(found):
-        values, asked = part(span)
+    with torch.enable_grad(), recording_gathers(found):
+        values, cotangent = part(span)
     if values.requires_grad:  # else nothing in these pixels depends on the parameters
         leaves = [*assembly.leaves, *assembly.held]
         with one_thread():  # several round sums over lanes otherwise
-            found.add_each(torch.autograd.grad(values, leaves, asked.to(values.dtype), allow_unused=True))
+            found.add_each(torch.autograd.grad(values, leaves, cotangent.to(values.dtype), allow_unused=True))
     return found
 
 
-def _budget(settings: Settings, assembly: Assembly) -> Budget:
+def _budget(settings: Settings, assembly: SceneTape) -> Budget:
     """Chunks of always the same size, or, where that is more than ``render.max_memory`` leaves, of what fits."""
     device, each = assembly.wave.centre.device, tape_per_lane(settings)
     lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE // each, 1))

@@ -13,12 +13,12 @@ from typing import Protocol
 
 from torch import Tensor
 
-__all__ = ["Gathers", "gathered_by", "gatherer"]
+__all__ = ["GatherRecorder", "gather_recorder", "recording_gathers"]
 
 _local = threading.local()
 
 
-class Gathers(Protocol):
+class GatherRecorder(Protocol):
     """Takes look-ups over."""
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
@@ -27,9 +27,9 @@ class Gathers(Protocol):
 
 
 @contextmanager
-def gathered_by(gathers: Gathers | None) -> Iterator[None]:
+def recording_gathers(gathers: GatherRecorder | None) -> Iterator[None]:
     """Look-ups of this thread go to ``gathers`` meanwhile."""
-    before = gatherer()
+    before = gather_recorder()
     _local.gathers = gathers
     try:
         yield
@@ -37,6 +37,6 @@ def gathered_by(gathers: Gathers | None) -> Iterator[None]:
         _local.gathers = before
 
 
-def gatherer() -> Gathers | None:
+def gather_recorder() -> GatherRecorder | None:
     """Who takes the look-ups of this thread over."""
     return getattr(_local, "gathers", None)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.tree import map_leaves
-from torchpt.math.gathers import gatherer
+from torchpt.math.gathers import gather_recorder
 
 __all__ = [
     "SERIES",
@@ -90,7 +90,7 @@ def take(table: Tensor, index: Tensor | None) -> Tensor:
     """
     if index is None:
         return table
-    if table.requires_grad and (gathers := gatherer()) is not None and torch.is_grad_enabled():
+    if table.requires_grad and (gathers := gather_recorder()) is not None and torch.is_grad_enabled():
         taken = gathers.take(table, index)
         if taken is not None:
             return taken

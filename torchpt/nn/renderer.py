@@ -16,7 +16,7 @@ from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import Common, RenderWishes
+from torchpt.scene.settings import Common, RenderOptions
 from torchpt.spec.arguments import check_names, spelled
 
 __all__ = ["Renderer"]
@@ -66,7 +66,7 @@ class Renderer(nn.Module):
         **wishes: Unpack[Common],
     ) -> None:
         super().__init__()
-        check_names("Renderer", wishes, RenderWishes, ("names", "rigid"))
+        check_names("Renderer", wishes, RenderOptions, ("names", "rigid"))
         if type(rigid) is not bool:
             raise SceneError("rigid", rigid, "True or False")
         if "params" in wishes:

@@ -20,11 +20,11 @@ from torchpt.paths.wave import Bounce, clamp_scale
 from torchpt.physics.film.splats import LARGEST
 from torchpt.physics.shapes.geometry import Hit
 
-__all__ = ["Before", "Behind", "bounce", "gather", "splatted"]
+__all__ = ["InputCotangents", "VertexCotangents", "bounce", "gather", "splatted"]
 
 
 @dataclass(frozen=True)
-class Behind:
+class VertexCotangents:
     """Derivatives of a loss by what n paths hand on, ``(3, n)`` each.
 
     Attributes:
@@ -43,7 +43,7 @@ class Behind:
 
 
 @dataclass(frozen=True)
-class Before:
+class InputCotangents:
     """Derivatives with respect to what a vertex was given; None where it does not depend on that.
 
     Attributes:
@@ -71,7 +71,7 @@ class Before:
             yield EXTRA + name, found, state.extra[name]
 
 
-Others = Callable[[], Sequence[Tensor]]
+Leaves = Callable[[], Sequence[Tensor]]
 
 
 def bounce(
@@ -79,12 +79,12 @@ def bounce(
     context: StageContext,
     model: int,
     vertex: VertexInput,
-    following: Hit | None,
+    next_hit: Hit | None,
     clear: Callable[[Shadow], Tensor],
-    behind: Behind,
-    others: Others,
+    cotangents: VertexCotangents,
+    others: Leaves,
     splat: Callable[[Splat], tuple[Tensor, Tensor]] | None = None,
-) -> Before:
+) -> InputCotangents:
     """Go back through what happens at surfaces.
 
     Args:
@@ -92,31 +92,31 @@ def bounce(
         context: as of the stage, its world with leaves where derivatives are wanted.
         model: as of the stage.
         vertex: as of the stage.
-        following: what the rays that leave met; None where geometry is not differentiated.
+        next_hit: what the rays that leave met; None where geometry is not differentiated.
         clear: how much of the light of shadow rays gets through.
-        behind: what is asked of what the vertex hands on.
+        cotangents: what is asked of what the vertex hands on.
         others: tensors whose derivatives are wanted too, asked for after the stage ran.
         splat: says what splats bring to other pixels ``(3, n)``, differentiable, and the cotangents of these.
     """
 
     def found(_: PathState) -> Hit:
-        assert following is not None
-        return following
+        assert next_hit is not None
+        return next_hit
 
     with torch.enable_grad():
         vertex, given = _given(context.plan, vertex)
         output = stage(replace(context, search=found), model, vertex)
         after, shadow = output.leaving, output.shadow
-        asked = [(after.throughput, behind.throughput), (after.radiance, behind.radiance)]
-        if behind.o is not None and behind.d is not None:
-            asked += [(after.o, behind.o), (after.d, behind.d)]
-        asked += [(after.extra[name], cotangent) for name, cotangent in behind.extra.items()]
+        asked = [(after.throughput, cotangents.throughput), (after.radiance, cotangents.radiance)]
+        if cotangents.o is not None and cotangents.d is not None:
+            asked += [(after.o, cotangents.o), (after.d, cotangents.d)]
+        asked += [(after.extra[name], cotangent) for name, cotangent in cotangents.extra.items()]
         if shadow is not None:
             passed = clear(shadow)
             if passed.requires_grad:
-                asked.append((shadow.radiance * passed, behind.radiance))
+                asked.append((shadow.radiance * passed, cotangents.radiance))
             else:
-                asked.append((shadow.radiance, behind.radiance * passed))
+                asked.append((shadow.radiance, cotangents.radiance * passed))
         if output.splat is not None and splat is not None:
             asked.append(splat(output.splat))
         return _back(asked, given, others)
@@ -127,8 +127,8 @@ def gather(
     context: StageContext,
     vertex: VertexInput,
     radiance: Tensor,
-    others: Others,
-) -> Before:
+    others: Leaves,
+) -> InputCotangents:
     """Go back through light that was met by chance.
 
     Args:
@@ -191,7 +191,7 @@ def _given(plan: Plan, vertex: VertexInput) -> tuple[VertexInput, _Given]:
     return VertexInput(state, replace(hit, chance=chance)), _Given(throughput, o, d, chance, extra)
 
 
-def _back(asked: list[tuple[Tensor, Tensor]], given: _Given, others: Others) -> Before:
+def _back(asked: list[tuple[Tensor, Tensor]], given: _Given, others: Leaves) -> InputCotangents:
     asked = [(y, g) for y, g in asked if y.requires_grad]
     own, rest = leaves(given), list(others())
     grads: Sequence[Any] = [None] * (len(own) + len(rest))
@@ -204,4 +204,6 @@ def _back(asked: list[tuple[Tensor, Tensor]], given: _Given, others: Others) -> 
         return None if leaf is None else found[id(leaf)]
 
     extra = {name: of(leaf) for name, leaf in given.extra.items()}
-    return Before(of(given.throughput), of(given.o), of(given.d), of(given.chance), tuple(grads[len(own) :]), extra)
+    return InputCotangents(
+        of(given.throughput), of(given.o), of(given.d), of(given.chance), tuple(grads[len(own) :]), extra
+    )

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchpt.core.tree import leaves
 from torchpt.math.vectors import take
-from torchpt.paths.lost import Place
+from torchpt.paths.nonfinite import Place
 from torchpt.paths.state import Emission, PathState, VertexOutput
 from torchpt.paths.walk import Observer, Population
 from torchpt.paths.wave import Wave
@@ -24,7 +24,19 @@ from torchpt.physics.samplers import Streams
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.world import World
 
-__all__ = ["CAUSES", "Bounced", "Event", "Explainer", "Fault", "Left", "Legible", "Met", "Shone", "Trace", "faults_of"]
+__all__ = [
+    "CAUSES",
+    "CameraRay",
+    "EmitterHit",
+    "Event",
+    "Explainer",
+    "Intersection",
+    "Legible",
+    "NonFiniteCause",
+    "Scattering",
+    "Trace",
+    "causes_of_samples",
+]
 
 
 class Legible(Population, Protocol):
@@ -57,7 +69,7 @@ class Legible(Population, Protocol):
 
 
 @dataclass(frozen=True)
-class Left:
+class CameraRay:
     """Camera rays, as they left.
 
     Attributes:
@@ -70,7 +82,7 @@ class Left:
 
 
 @dataclass(frozen=True)
-class Met:
+class Intersection:
     """Hits of rays at a vertex.
 
     Attributes:
@@ -87,7 +99,7 @@ class Met:
 
 
 @dataclass(frozen=True)
-class Shone:
+class EmitterHit:
     """Light that paths met by chance.
 
     Attributes:
@@ -104,7 +116,7 @@ class Shone:
 
 
 @dataclass(frozen=True)
-class Bounced:
+class Scattering:
     """A vertex from which paths may go on.
 
     Attributes:
@@ -122,7 +134,7 @@ class Bounced:
     clear: Tensor | None
 
 
-Event = Left | Met | Shone | Bounced
+Event = CameraRay | Intersection | EmitterHit | Scattering
 #: From camera rays of a wave to the radiance that they bring, while an observer looks on.
 Trace = Callable[[Wave, PathState, Observer[Legible]], Tensor]
 
@@ -147,12 +159,12 @@ class Explainer(Observer[Legible]):
 
     def began(self, state: PathState) -> None:
         """Look at camera rays."""
-        self.keep(Left(state.lane, state))
+        self.keep(CameraRay(state.lane, state))
 
     def arrived(self, paths: Legible) -> bool:
         """See :class:`Observer`."""
         state = paths.state
-        self.keep(Met(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.met))
+        self.keep(Intersection(paths.depth, state.lane, replace(state, radiance=state.radiance.clone()), paths.met))
         return False
 
     def gathered(self, paths: Legible) -> None:
@@ -160,14 +172,14 @@ class Explainer(Observer[Legible]):
         for index, light in paths.emissions:
             prim = take(paths.met.prim, index)
             slot = None if bool((prim < 0).any()) else self.world.geometry.slot(prim)
-            self.keep(Shone(paths.depth, take(paths.state.lane, index), slot, light))
+            self.keep(EmitterHit(paths.depth, take(paths.state.lane, index), slot, light))
 
     def left(self, paths: Legible) -> None:
         """See :class:`Observer`."""
         clear = iter(paths.clear)
         for model, lanes, output in paths.outputs:
             arrived = None if output.shadow is None else next(clear)
-            self.keep(Bounced(paths.depth - 1, lanes, model, output, arrived))
+            self.keep(Scattering(paths.depth - 1, lanes, model, output, arrived))
 
 
 #: Causes, and what each says.
@@ -189,7 +201,7 @@ CAUSES = {
 
 
 @dataclass(frozen=True)
-class Fault:
+class NonFiniteCause:
     """The reason why a sample is not finite.
 
     Attributes:
@@ -210,7 +222,7 @@ class Fault:
         return self.cause if self.cause == "not repeated" else f"{'nan' if self.nan else 'infinite'} {self.cause}"
 
 
-def faults_of(trace: Trace, wave: Wave, places: Sequence[Place]) -> list[Fault]:
+def causes_of_samples(trace: Trace, wave: Wave, places: Sequence[Place]) -> list[NonFiniteCause]:
     """The faults of samples, each traced again by tensor operations.
 
     Args:
@@ -218,7 +230,7 @@ def faults_of(trace: Trace, wave: Wave, places: Sequence[Place]) -> list[Fault]:
         wave: of their render.
         places: of the samples.
     """
-    found: dict[Place, Fault] = {}
+    found: dict[Place, NonFiniteCause] = {}
     for streams in sorted({(place.first, place.streams) for place in places}):
         own = [place for place in places if (place.first, place.streams) == streams]
         found |= zip(own, _again(trace, wave, own, Streams(*streams)), strict=True)
@@ -226,7 +238,7 @@ def faults_of(trace: Trace, wave: Wave, places: Sequence[Place]) -> list[Fault]:
 
 
 @torch.no_grad()
-def _again(trace: Trace, wave: Wave, places: Sequence[Place], streams: Streams) -> list[Fault]:
+def _again(trace: Trace, wave: Wave, places: Sequence[Place], streams: Streams) -> list[NonFiniteCause]:
     """The same for samples of the same streams."""
     watch = _Watch(wave.context.world, len(places))
     x, y, sample = (
@@ -238,7 +250,7 @@ def _again(trace: Trace, wave: Wave, places: Sequence[Place], streams: Streams) 
     radiance = trace(wave, state, watch)
     if not watch.full:  # a path that is given up has brought nothing
         watch.look("sum", radiance, torch.arange(len(places), device=x.device), 0, None)
-    rest = Fault("not repeated", False, 0)
+    rest = NonFiniteCause("not repeated", False, 0)
     return [fault or rest for fault in watch.faults]
 
 
@@ -255,7 +267,7 @@ class _Watch(Explainer):
 
     def __init__(self, world: World, lanes: int) -> None:
         super().__init__(world)
-        self.faults: list[Fault | None] = [None] * lanes
+        self.faults: list[NonFiniteCause | None] = [None] * lanes
 
     @property
     def full(self) -> bool:
@@ -270,12 +282,12 @@ class _Watch(Explainer):
     def keep(self, event: Event) -> None:
         """See :class:`Explainer`."""
         slot = None
-        depth = 0 if isinstance(event, Left) else event.depth
-        if isinstance(event, Shone):
+        depth = 0 if isinstance(event, CameraRay) else event.depth
+        if isinstance(event, EmitterHit):
             slot = event.slot
-        elif isinstance(event, Bounced):
+        elif isinstance(event, Scattering):
             slot = event.output.at.slot
-        elif isinstance(event, Met):
+        elif isinstance(event, Intersection):
             slot = self.world.geometry.slot(event.hit.prim)
         for cause, value in _checks(event, self.world):
             self.look(cause, value, event.lanes, depth, slot)
@@ -288,23 +300,23 @@ class _Watch(Explainer):
             lane = int(lanes[n])
             if self.faults[lane] is None:
                 nan = bool(torch.isnan(value[:, n]).any())
-                self.faults[lane] = Fault(cause, nan, depth, -1 if slot is None else int(slot[n]))
+                self.faults[lane] = NonFiniteCause(cause, nan, depth, -1 if slot is None else int(slot[n]))
 
 
 def _checks(event: Event, world: World) -> Iterator[tuple[str, Tensor]]:
     """Causes with values ``(C, n)`` or ``(n,)``, in the order in which the values come about."""
-    if isinstance(event, Left):
+    if isinstance(event, CameraRay):
         yield "camera", torch.cat((event.state.o, event.state.d))
-    elif isinstance(event, Met):
+    elif isinstance(event, Intersection):
         hit = event.hit
         yield "surface", torch.where(hit.prim >= 0, torch.stack((hit.t, hit.u, hit.v)), 0.0)
-    elif isinstance(event, Shone):
+    elif isinstance(event, EmitterHit):
         yield "environment" if event.slot is None else "emission", event.light.brought
     else:
         yield from _of_vertex(event, world)
 
 
-def _of_vertex(event: Bounced, world: World) -> Iterator[tuple[str, Tensor]]:
+def _of_vertex(event: Scattering, world: World) -> Iterator[tuple[str, Tensor]]:
     """The same at a vertex from which paths may go on."""
     output = event.output
     after, surface, at, direct, drawn = output.leaving, output.surface, output.at, output.direct, output.drawn

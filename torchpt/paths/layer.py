@@ -113,8 +113,8 @@ def values(
     ``centre``: see :class:`torchpt.paths.wave.Wave`.
     """
     world = context.world
-    at = interact(world, o, d, hit, context.slide)
-    if context.slide:
+    at = interact(world, o, d, hit, context.follow_shape)
+    if context.follow_shape:
         hit = replace(hit, t=dot(at.p - o, d))
     point = texture_point_at(world, model, at, context.pixel)
     seen = Seen(world, model, d, hit, at, point, centre, context.plan.dtype)

@@ -161,7 +161,7 @@ class StageContext:
         pixel: how large a pixel is in the world, see :func:`torchpt.paths.surface.texture_point_at`; None where nothing
             asks.
         salts: names of the random dimensions at this depth, see :func:`torchpt.physics.samplers.salts`.
-        slide: whether points slide along their rays, see :func:`torchpt.physics.shapes.interact`.
+        follow_shape: whether points slide along their rays, see :func:`torchpt.physics.shapes.interact`.
         roulette: the most that roulette lets paths survive with; 0: it does not play.
         search: finds the hits of rays that leave; called only where ``plan.attached``.
         camera: that took the picture; None for an integrator without splats.
@@ -172,7 +172,7 @@ class StageContext:
     world: World
     pixel: Tensor | None = None
     salts: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int32))
-    slide: bool = False
+    follow_shape: bool = False
     roulette: float = 0.0
     search: Callable[[PathState], Hit] = no_search
     camera: Camera | None = None
@@ -181,12 +181,12 @@ class StageContext:
     def at(
         self,
         salts: Tensor,
-        slide: bool = False,
+        follow_shape: bool = False,
         roulette: float = 0.0,
         search: Callable[[PathState], Hit] = no_search,
     ) -> StageContext:
         """Return the same at a vertex."""
-        return replace(self, salts=salts, slide=slide, roulette=roulette, search=search)
+        return replace(self, salts=salts, follow_shape=follow_shape, roulette=roulette, search=search)
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ class VertexOutput:
 
     Attributes:
         leaving: the paths with their next rays; of those that ended ``t_max`` is 0.
-        following: what these rays met, where that had to be found already.
+        next_hit: what these rays met, where that had to be found already.
         shadow: shadow rays whose light is still to be added; None where no light is sampled.
         at: the points.
         splat: light to other pixels; None where there is none. Only of integrators that say that they have ``splats``.
@@ -307,7 +307,7 @@ class VertexOutput:
     """
 
     leaving: PathState
-    following: Hit | None
+    next_hit: Hit | None
     shadow: Shadow | None
     at: Interaction
     surface: Surface | None = None

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.math.vectors import Frame, cross, dot, normalize, take
-from torchpt.paths.relief import Relief, mapped
+from torchpt.paths.perturbed_normals import PerturbedNormal, mapped
 from torchpt.physics import bsdfs
 from torchpt.physics.shapes import surface_uv, vertex_colors
 from torchpt.physics.shapes.geometry import Interaction
@@ -77,7 +77,7 @@ class Surface:
     shown: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
     parameters: bsdfs.Parameters  # lane values of the BSDF
     wo: Tensor  # (3, N) local
-    relief: Relief | None  # None where no map bends the normals
+    relief: PerturbedNormal | None  # None where no map bends the normals
 
 
 def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Tensor | None = None) -> Surface:
@@ -195,7 +195,7 @@ def _mapped(
     d: Tensor,
     at: Interaction,
     side: Tensor | None,
-) -> tuple[Frame, Relief]:
+) -> tuple[Frame, PerturbedNormal]:
     """The frame about the normal of a normal or bump map, and what the map did."""
     local = None if textures.normal is None else _read(world, textures.normal, row, point)
     slope = None

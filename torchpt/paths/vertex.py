@@ -353,7 +353,7 @@ def emit(context: StageContext, vertex: VertexInput) -> Emission:
     """Return what paths gather from the emitters that they hit."""
     world, state = context.world, vertex.state
     assert world.lights is not None
-    at = interact(world, state.o, state.d, vertex.hit, context.slide)
+    at = interact(world, state.o, state.d, vertex.hit, context.follow_shape)
     # Where lights are chosen by place the density is that at the vertex itself, which is not quite where the ray begins.
     x = state.o if state.p is None else state.p
     radiance, pdf = lights.emitted(world.lights, x, at, state.d, state.n)
@@ -380,9 +380,9 @@ def _gathered(vertex: VertexInput, radiance: Tensor, light_pdf: Tensor) -> Emiss
 def bounce(context: StageContext, model: int, vertex: VertexInput) -> VertexOutput:
     """Return what surfaces of one BSDF model make of paths: light that is sampled, the next ray, roulette."""
     world, state, hit = context.world, vertex.state, vertex.hit
-    at = interact(world, state.o, state.d, hit, context.slide)
+    at = interact(world, state.o, state.d, hit, context.follow_shape)
     if hit.chance is not None:
         state = replace(state, throughput=state.throughput * hit.chance)
     surface, direct, shadow = shade(context, model, state, at)
-    leaving, following, drawn, onward = scatter(context, model, state, at, surface)
-    return VertexOutput(leaving, following, shadow, at, surface, direct, drawn, onward.carried, onward.chance)
+    leaving, next_hit, drawn, onward = scatter(context, model, state, at, surface)
+    return VertexOutput(leaving, next_hit, shadow, at, surface, direct, drawn, onward.carried, onward.chance)

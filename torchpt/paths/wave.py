@@ -23,14 +23,14 @@ from torchpt.search.base import Accel
 if TYPE_CHECKING:
     from torchpt.paths.integrators.first_surface import FirstSurface
 
-__all__ = ["Bounce", "Plate", "Rays", "Tally", "Wave", "camera_state", "clamp_scale", "still_of"]
+__all__ = ["Bounce", "PixelSet", "RayCounts", "Rays", "Wave", "camera_state", "clamp_scale", "with_detached_geometry"]
 
 
 # ---- Counts of what waves trace
 
 
 @dataclass
-class Tally:
+class RayCounts:
     """Counts of rays and paths.
 
     Attributes:
@@ -46,7 +46,7 @@ class Tally:
 
 
 @dataclass
-class Plate:
+class PixelSet:
     """Pixels that are sampled alike.
 
     Attributes:
@@ -126,17 +126,19 @@ class Wave:
         return self.integrator.bounce if self.first is None else self.first.bounce
 
     def rays(
-        self, first_pixel: int, pixels: int, first_sample: int, samples: int, plate: Plate | None = None
+        self, first_pixel: int, pixels: int, first_sample: int, samples: int, pixel_set: PixelSet | None = None
     ) -> PathState:
         """Rays of consecutive pixels of a plate (the picture, row by row); lanes run over pixels, then over samples."""
         device = self.centre.device
         x0, y0, width, _ = self.crop
         place = torch.arange(first_pixel, first_pixel + pixels, device=device)
-        if plate is not None and plate.places is not None:
-            place = plate.places[first_pixel : first_pixel + pixels]
+        if pixel_set is not None and pixel_set.places is not None:
+            place = pixel_set.places[first_pixel : first_pixel + pixels]
         x, y = place % width + x0, place // width + y0
         sample = torch.arange(first_sample, first_sample + samples, device=device).repeat_interleave(pixels)
-        return self.rays_of(x.repeat(samples), y.repeat(samples), sample, None if plate is None else plate.streams)
+        return self.rays_of(
+            x.repeat(samples), y.repeat(samples), sample, None if pixel_set is None else pixel_set.streams
+        )
 
     def rays_of(self, x: Tensor, y: Tensor, sample: Tensor, streams: Streams | None = None) -> PathState:
         """Return rays of single samples: the camera's, or those that are given.
@@ -182,7 +184,7 @@ class Wave:
         return self.filter.weight(draws.two(Dimension.PIXEL)).to(self.context.plan.dtype)
 
 
-def still_of(wave: Wave) -> Wave:
+def with_detached_geometry(wave: Wave) -> Wave:
     """Return the wave as where no geometry is differentiated: the same values, and hits found between stages."""
     return replace(wave, context=replace(wave.context, plan=replace(wave.context.plan, attached=False)))
 

@@ -22,15 +22,14 @@ from __future__ import annotations
 from torchpt.rendering.many import Entry, render_many
 from torchpt.rendering.result import Progress, Rendering
 from torchpt.rendering.run import Run, render_scene
-from torchpt.scene.prepare import Kept, kept, kernels_of, loop_facts, looped, make_wave, rebound
+from torchpt.scene.prepare import SceneCache, kernels_of, loop_facts, looped, make_wave, rebound, scene_cache
 
 __all__ = [
     "Entry",
-    "Kept",
     "Progress",
     "Rendering",
     "Run",
-    "kept",
+    "SceneCache",
     "kernels_of",
     "loop_facts",
     "looped",
@@ -38,4 +37,5 @@ __all__ = [
     "rebound",
     "render_many",
     "render_scene",
+    "scene_cache",
 ]

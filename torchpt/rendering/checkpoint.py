@@ -23,7 +23,7 @@ from torchpt.core.files import check_regular
 from torchpt.core.tree import fingerprint
 from torchpt.core.version import __version__
 from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
-from torchpt.paths.lost import Lost, Place
+from torchpt.paths.nonfinite import NonFinite, Place
 from torchpt.rendering.error import FIRST_ROUND
 from torchpt.rendering.stopping import BLOCK, Stop
 from torchpt.scene.fingerprint import fingerprints
@@ -249,7 +249,7 @@ def _check_facts(state: State, like: State, path: Path) -> None:
         there: Any = state.facts.get(name)
         if name == "lost":
             try:
-                Lost.read(there)
+                NonFinite.read(there)
             except ValueError as problem:
                 raise AssetError(path, f"is no whole checkpoint ({problem})") from None
             continue
@@ -327,7 +327,7 @@ def check_whole(run: Run, state: State, path: Path) -> None:
         AssetError: names the first one.
     """
     facts, arrays = state.facts, state.arrays
-    taken, done, lost = facts["taken"], facts["done"], Lost.read(facts["lost"])
+    taken, done, lost = facts["taken"], facts["done"], NonFinite.read(facts["lost"])
     counts = {name: arrays[f"{name}.counts"] for name in run.films()}
     rounds = run.settings.adaptive and taken >= FIRST_ROUND
     problems: dict[str, bool] = {
@@ -344,8 +344,8 @@ def check_whole(run: Run, state: State, path: Path) -> None:
     seen = counts["picture"] if run.integrator.light else next(iter(c for n, c in counts.items() if n != "picture"))
     total = int(seen.sum())
     if rounds:
-        assert run.twice is not None and run.twice.plate.places is not None
-        pilots = seen.sum(0)[run.twice.plate.places.cpu()]
+        assert run.twice is not None and run.twice.pixel_set.places is not None
+        pilots = seen.sum(0)[run.twice.pixel_set.places.cpu()]
         problems["pilots.counts"] |= bool((counts["pilots"].sum(0) != pilots).any())
         for name in run.picture.layers:
             problems[f"layers.{name}.counts"] |= bool((counts[f"layers.{name}"].sum(0) != seen.sum(0)).any())
@@ -367,6 +367,8 @@ def _finite(values: Iterable[Tensor]) -> bool:
 def _is_there(run: Run, place: Place, samples: int) -> bool:
     """Return True for a sample that a plate of the render takes."""
     x, y, width, height = run.wave.crop
-    plates = [run.picture] if run.twice is None else [run.picture, run.twice.plate]
+    pixel_sets = [run.picture] if run.twice is None else [run.picture, run.twice.pixel_set]
     inside = x <= place.x < x + width and y <= place.y < y + height and place.sample < samples
-    return inside and (place.first, place.streams) in [(plate.streams.first, plate.streams.count) for plate in plates]
+    return inside and (place.first, place.streams) in [
+        (pixel_set.streams.first, pixel_set.streams.count) for pixel_set in pixel_sets
+    ]

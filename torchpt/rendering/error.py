@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpt.paths.wave import Plate, Wave
-from torchpt.physics.film import Film, KnownError, Pilots, pilots_of
+from torchpt.paths.wave import PixelSet, Wave
+from torchpt.physics.film import ErrorEstimate, Film, Pilots, pilots_of
 from torchpt.physics.film.error import (
     BLOCK,
     STREAMS,
@@ -25,14 +25,14 @@ from torchpt.physics.film.error import (
 from torchpt.physics.samplers import Streams
 from torchpt.scene.settings import Settings
 
-__all__ = ["FIRST_ROUND", "Shares", "Twice", "second_values"]
+__all__ = ["FIRST_ROUND", "ErrorProbes", "Shares", "error_probes"]
 
 
 # ---- The second values of a render's pilots: pixels that are sampled again by other random numbers
 
 
 @dataclass
-class Twice:
+class ErrorProbes:
     """Pilots and their second values.
 
     Adaptive sampling decides by them where samples go. For no pixel to depend on it they are left out of the picture then, and
@@ -40,23 +40,23 @@ class Twice:
 
     Attributes:
         pilots: where they are.
-        plate: sums of their second values.
+        pixel_set: sums of their second values.
         counted: whether these are part of the picture.
         third: what was looked at again, and how many of those pixels are suspects.
         looked: samples a pixel that the picture had then; None: nothing was looked at yet.
     """
 
     pilots: Pilots
-    plate: Plate
+    pixel_set: PixelSet
     counted: bool
-    third: tuple[Plate, int] | None = None
+    third: tuple[PixelSet, int] | None = None
     looked: float | None = None
 
     def picture(self, film: Film) -> Tensor:
         """The picture ``(H, W, 3)`` in float64."""
         if not self.counted or not len(self.pilots):
             return film.mean()
-        places, second = self.plate.places, self.plate.film
+        places, second = self.pixel_set.places, self.pixel_set.film
         values, first = film.values(), film.counts[places].double()
         again = second.counts.double()
         share = (again / (first + again).clamp_min(1.0))[:, None]
@@ -67,19 +67,19 @@ class Twice:
         """Samples that each pixel of the picture holds ``(pixels,)`` int64."""
         counts = film.counts
         if self.counted and len(self.pilots):
-            counts[self.plate.places] += self.plate.film.counts
+            counts[self.pixel_set.places] += self.pixel_set.film.counts
         return counts
 
-    def known(self, film: Film, picture: Tensor) -> KnownError | None:
+    def known(self, film: Film, picture: Tensor) -> ErrorEstimate | None:
         """What the picture, :meth:`picture` of the film, knows of its error."""
-        if not len(self.pilots) or int(self.plate.film.counts.min()) == 0:
+        if not len(self.pilots) or int(self.pixel_set.film.counts.min()) == 0:
             return None
         again = None
         if self.third is not None:
-            plate, suspects = self.third
-            values = torch.stack(plate.film.streams()).cpu()
-            assert plate.places is not None
-            again = Again(plate.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
+            pixel_set, suspects = self.third
+            values = torch.stack(pixel_set.film.streams()).cpu()
+            assert pixel_set.places is not None
+            again = Again(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
         first = self._first(film)
         return known_error(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
 
@@ -87,7 +87,9 @@ class Twice:
         """Return what looking again takes, as a share of the samples of a picture of so many pixels."""
         return STREAMS * sum(again_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
 
-    def look_again(self, film: Film, agreed: Callable[[Tensor], Tensor] | None = None) -> list[tuple[Plate, int, int]]:
+    def resample_outliers(
+        self, film: Film, agreed: Callable[[Tensor], Tensor] | None = None
+    ) -> list[tuple[PixelSet, int, int]]:
         """What is to be sampled for the picture to know its error better, once it is finished or may be.
 
         ``agreed`` makes whole numbers ``(n,)`` those of the first rank; None: there is but one process.
@@ -99,41 +101,41 @@ class Twice:
         if agreed is not None:
             suspects, doubtful = agreed(suspects), agreed(doubtful)
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
-        streams = Streams(self.plate.streams.first + self.plate.streams.count, STREAMS)
-        plate = Plate(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
-        self.third = plate, len(suspects)
+        streams = Streams(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
+        pixel_set = PixelSet(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
+        self.third = pixel_set, len(suspects)
         self.looked = float(film.counts.double().mean())
         samples = round(self.looked)
-        return [(plate, 0, STREAMS * samples)]
+        return [(pixel_set, 0, STREAMS * samples)]
 
-    def alone(self, film: Film) -> KnownError | None:
+    def alone(self, film: Film) -> ErrorEstimate | None:
         """RelMSE as the pilots alone tell it."""
         if not len(self.pilots):
             return None
         return pilots_alone(self.pilots, self._first(film), self._second(), self._spare(), self.counted)
 
     def _first(self, film: Film) -> Tensor:
-        assert self.plate.places is not None
-        return film.taken(self.plate.places).values().cpu()
+        assert self.pixel_set.places is not None
+        return film.taken(self.pixel_set.places).values().cpu()
 
     def _second(self) -> Tensor:
-        return self.plate.film.values().cpu()
+        return self.pixel_set.film.values().cpu()
 
     def _spare(self) -> Tensor | None:
         """The variance of second values where it is not that of the first ones."""
         if self.counted:
             return None
-        one, other = self.plate.film.streams()
+        one, other = self.pixel_set.film.streams()
         return ((one - other).square() / 4).cpu()
 
 
-def second_values(wave: Wave, settings: Settings, device: torch.device) -> Twice:
+def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorProbes:
     """Pilots of a render, nothing sampled yet."""
     film = settings.film
     pilots = pilots_of(settings.render.seed, (film.width, film.height), wave.crop)
     streams = Streams(wave.sampler.randomizations, 2 if settings.adaptive else 1)
     sums = Film(len(pilots), 1, streams.count, device)
-    return Twice(pilots, Plate(sums, {}, streams, pilots.places.to(device)), not settings.adaptive)
+    return ErrorProbes(pilots, PixelSet(sums, {}, streams, pilots.places.to(device)), not settings.adaptive)
 
 
 # ---- Adaptive sampling: rounds of samples where pilots say that the error is
@@ -161,7 +163,7 @@ class Shares:
         self.pixels = torch.bincount(self.block, minlength=rows * columns)
         self._parts: list[tuple[Film, Tensor, Film]] = []
 
-    def spans(self, picture: Plate, twice: Twice, mean: float, last: bool) -> list[tuple[Plate, int, int]]:
+    def spans(self, picture: PixelSet, twice: ErrorProbes, mean: float, last: bool) -> list[tuple[PixelSet, int, int]]:
         """What is to be sampled for the picture to have ``mean`` samples a pixel: plates of pixels with as many samples.
 
         ``last``: whether no round follows, see :func:`torchpt.physics.film.error.shared_out`.
@@ -169,7 +171,7 @@ class Shares:
         device = picture.film.sums.device
         counts = self._of_blocks(picture.film.counts.cpu())
         aims = shared_out(self._errors(twice), counts, self.pixels, mean, last)
-        spans: list[tuple[Plate, int, int]] = []
+        spans: list[tuple[PixelSet, int, int]] = []
         if self._agreed is not None:
             aims = self._agreed(aims)
         most = int(aims.max()) + 1
@@ -181,7 +183,7 @@ class Shares:
             spans.append((self._part(picture, places, places), have, aim - have))
             seconds = chosen[pilot_blocks].nonzero()[:, 0]
             if len(seconds):
-                part = self._part(twice.plate, seconds.to(device), self.pilots.places[seconds].to(device))
+                part = self._part(twice.pixel_set, seconds.to(device), self.pilots.places[seconds].to(device))
                 spans.append((part, have, aim - have))
         return spans
 
@@ -191,13 +193,13 @@ class Shares:
             whole.put(places, part)
         self._parts.clear()
 
-    def _part(self, plate: Plate, places: Tensor, pixels: Tensor) -> Plate:
+    def _part(self, pixel_set: PixelSet, places: Tensor, pixels: Tensor) -> PixelSet:
         """Some pixels of a plate as a plate of their own."""
         films = {}
-        for name, film in (("", plate.film), *plate.layers.items()):
+        for name, film in (("", pixel_set.film), *pixel_set.layers.items()):
             films[name] = film.taken(places)
             self._parts.append((film, places, films[name]))
-        return Plate(films.pop(""), films, plate.streams, pixels)
+        return PixelSet(films.pop(""), films, pixel_set.streams, pixels)
 
     def _of_blocks(self, counts: Tensor) -> Tensor:
         """Samples of the pixels of each block, which are the same."""
@@ -205,9 +207,9 @@ class Shares:
         found[self.block] = counts
         return found
 
-    def _errors(self, twice: Twice) -> Tensor:
+    def _errors(self, twice: ErrorProbes) -> Tensor:
         """Relative variance of the pixels of each block, up to a factor: second values alone are asked."""
-        a, b = (x.cpu() for x in twice.plate.film.streams())
+        a, b = (x.cpu() for x in twice.pixel_set.film.streams())
         errors, known = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
         at = tuple(self.pilots.block)
         errors[at], known[at] = error_by_pilots(self.pilots, a, b), True

@@ -22,10 +22,10 @@ from torch import Tensor
 from torchpt.core.errors import RenderError
 from torchpt.rendering import Rendering
 from torchpt.scene import Scene
-from torchpt.scene.editions import AFTER, check_unchanged
 from torchpt.scene.formats.description import settings
 from torchpt.scene.scene import numbered
 from torchpt.scene.settings import BLOCKS
+from torchpt.scene.versions import AFTER, check_unchanged
 
 __all__ = ["known", "opaque", "outside"]
 
@@ -151,9 +151,9 @@ class _Order(NamedTuple):
         wishes |= {"dtype": torch.float64 if double else torch.float32, "seed": None if seed < 0 else int(seed)}
         return cls(scene, wishes, names, wanted)
 
-    def editions(self) -> dict[str, int]:
+    def versions(self) -> dict[str, int]:
         """Of the scene's own parameters, but for those that are handed over."""
-        return {name: edition for name, edition in self.scene.editions().items() if name not in self.names}
+        return {name: edition for name, edition in self.scene.versions().items() if name not in self.names}
 
     def like(self) -> Tensor:
         """A picture of the right size, unfilled."""
@@ -196,20 +196,20 @@ def _register(render: Callable[..., Any]) -> None:
             with torch.no_grad():
                 return render(order.scene, params=given, **order.wishes).contiguous()
 
-        editions = order.editions().values()
-        return _apart(work, made, order.scene.device), torch.tensor([made[0].spp, *editions])
+        versions = order.versions().values()
+        return _apart(work, made, order.scene.device), torch.tensor([made[0].spp, *versions])
 
     def like_picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         order = _Order.read(number, text, 0)
-        return order.like(), torch.empty(1 + len(order.editions()), dtype=torch.int64)
+        return order.like(), torch.empty(1 + len(order.versions()), dtype=torch.int64)
 
     def gradients(
         number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor
     ) -> list[Tensor]:
         order = _Order.read(number, text, seed)
-        spp, *editions = facts.tolist()
-        now = order.editions()
-        check_unchanged(dict(zip(now, editions, strict=True)), now, AFTER)
+        spp, *versions = facts.tolist()
+        now = order.versions()
+        check_unchanged(dict(zip(now, versions, strict=True)), now, AFTER)
         made = [Rendering(order.like(), spp=spp)]
 
         def work() -> list[Tensor]:

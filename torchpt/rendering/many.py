@@ -10,7 +10,7 @@ from functools import partial
 import torch
 
 from torchpt.compiler.graph import Unsupported
-from torchpt.core.threads import Crew, one_thread, undisturbed
+from torchpt.core.threads import Crew, one_thread, without_autocast
 from torchpt.engines.kernels.threads import Block, Share
 from torchpt.rendering.result import Rendering
 from torchpt.rendering.run import Run
@@ -65,12 +65,12 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 entry = next(waiting, None)
             if entry is None:
                 break
-            with undisturbed(entry.device), _blamed(entry), _beside(crew):
+            with without_autocast(entry.device), _blamed(entry), _beside(crew):
                 entry.run = entry.make(crew.threads)
                 spans = entry.run.at_once()
             if spans is None:
                 _drain(crew, begun, 0)
-                with undisturbed(entry.device), _blamed(entry):
+                with without_autocast(entry.device), _blamed(entry):
                     entry.done(entry.run.go(None))
                 del entry.run
                 continue
@@ -118,7 +118,7 @@ def _drain(crew: Crew[Entry, Share], begun: dict[int, Entry], most: int) -> None
             continue
         entry, share = found
         entry.left -= 1
-        with undisturbed(entry.device), _blamed(entry), _beside(crew):
+        with without_autocast(entry.device), _blamed(entry), _beside(crew):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
                 assert entry.run.loop is not None

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchpt.core.errors import SceneError
 from torchpt.core.threads import limited_threads
 from torchpt.engines import tensors
-from torchpt.paths.explain import Bounced, Explainer, Left, Met, Shone
+from torchpt.paths.explain import CameraRay, EmitterHit, Explainer, Intersection, Scattering
 from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.paths.state import DirectLight, VertexOutput
@@ -201,7 +201,7 @@ class _Story:
 
     def told(self, settings: Settings, pixel: tuple[int, int], sample: int, brought: Tensor) -> Path:
         left = self.events[0]
-        assert isinstance(left, Left)
+        assert isinstance(left, CameraRay)
         vertices = tuple(self._vertices())
         value = torch.where(torch.isfinite(brought).all(0), brought, 0.0)
         clamp = settings.integrator.clamp
@@ -227,13 +227,15 @@ class _Story:
     def _vertices(self) -> Iterator[Vertex]:
         """One for each time that a ray of the path met something, or nothing."""
         for k, met in enumerate(self.events):
-            if not isinstance(met, Met) or float(met.state.t_max) == 0.0:  # a path that ended has rays without length
+            if (
+                not isinstance(met, Intersection) or float(met.state.t_max) == 0.0
+            ):  # a path that ended has rays without length
                 continue
-            here = [event for event in self.events[k:] if not isinstance(event, Left) and event.depth == met.depth]
-            shone = next((event for event in here if isinstance(event, Shone)), None)
-            yield self._vertex(met, shone, next((event for event in here if isinstance(event, Bounced)), None))
+            here = [event for event in self.events[k:] if not isinstance(event, CameraRay) and event.depth == met.depth]
+            shone = next((event for event in here if isinstance(event, EmitterHit)), None)
+            yield self._vertex(met, shone, next((event for event in here if isinstance(event, Scattering)), None))
 
-    def _vertex(self, met: Met, shone: Shone | None, bounced: Bounced | None) -> Vertex:
+    def _vertex(self, met: Intersection, shone: EmitterHit | None, bounced: Scattering | None) -> Vertex:
         radiance = met.state.radiance if shone is None else met.state.radiance + shone.light.brought
         light, output = None, None if bounced is None else bounced.output
         if bounced is not None and bounced.clear is not None:
@@ -265,7 +267,7 @@ class _Story:
             radiance=_three(radiance),
         )
 
-    def _emission(self, shone: Shone) -> Emission:
+    def _emission(self, shone: EmitterHit) -> Emission:
         lights = self.world.lights
         assert lights is not None
         row = len(lights.area) - 1  # the environment
@@ -296,10 +298,10 @@ class _Story:
 
     def _ended(self) -> str:
         """Return how the path did."""
-        last = next(event for event in reversed(self.events) if not isinstance(event, Shone))
-        if isinstance(last, Met) and float(last.state.t_max) > 0.0:
+        last = next(event for event in reversed(self.events) if not isinstance(event, EmitterHit))
+        if isinstance(last, Intersection) and float(last.state.t_max) > 0.0:
             return "escaped" if int(last.hit.prim) < 0 else "max_depth"
-        output = next(event.output for event in reversed(self.events) if isinstance(event, Bounced))
+        output = next(event.output for event in reversed(self.events) if isinstance(event, Scattering))
         assert output.drawn is not None and output.carried is not None
         if not bool(torch.isfinite(output.carried).all()):
             return "not finite"

@@ -11,8 +11,8 @@ from torch import Tensor
 from torchpt.core.memory import Meter, mb, retried
 from torchpt.images.denoiser import GUIDES
 from torchpt.paths.integrators import LAYERS
-from torchpt.physics.film import KnownError
-from torchpt.rendering.causes import causes_of
+from torchpt.physics.film import ErrorEstimate
+from torchpt.rendering.nonfinite import causes_of
 from torchpt.rendering.result import Rendering
 
 if TYPE_CHECKING:
@@ -81,17 +81,17 @@ def rendering_of(run: Run) -> Rendering:
     )
 
 
-def known_of(run: Run, picture: Tensor) -> tuple[KnownError | None, str]:
+def known_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, str]:
     """Return what the samples tell of the picture's own error, None where nobody asked, and why that is not known, or ""."""
     film = run.picture.film
     if run.twice is not None:
         known = run.twice.known(film, picture)
     else:
         relmse = film.relmse()
-        known = None if relmse is None else KnownError(relmse, None, False)
+        known = None if relmse is None else ErrorEstimate(relmse, None, False)
     if known is None or not run.done:
         return known, ""
-    from torchpt.rendering.unlit import unlit
+    from torchpt.rendering.missing_light import unlit
 
     lacks = unlit(run.scene, run.wave, run.geometry, picture, known.relmse)
     if lacks.reason:

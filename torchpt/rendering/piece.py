@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import Span, suffices
+from torchpt.core.memory import Span, fits_in_memory
 from torchpt.engines import tensors
-from torchpt.paths.lost import Lost
-from torchpt.paths.wave import Plate, Tally, Wave, clamp_scale
+from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.wave import PixelSet, RayCounts, Wave, clamp_scale
 from torchpt.physics.film.splats import Splats
 
 __all__ = ["Piece", "take"]
@@ -31,8 +31,8 @@ class Piece:
         splats: the same of sums of splats: these, places in their last axis, values.
     """
 
-    tally: Tally = field(default_factory=Tally)
-    lost: Lost = field(default_factory=Lost)
+    tally: RayCounts = field(default_factory=RayCounts)
+    lost: NonFinite = field(default_factory=NonFinite)
     writes: list[tuple[Tensor, Tensor]] = field(default_factory=list)
     splats: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list)
 
@@ -43,7 +43,7 @@ class Piece:
             RenderError: copying failed for want of memory again and again.
         """
         for _ in range(ATTEMPTS):
-            if suffices(self._copied):
+            if fits_in_memory(self._copied):
                 return
         raise RenderError("not enough memory to add samples to the film")
 
@@ -54,12 +54,12 @@ class Piece:
             sums.index_copy_(2, place, value)
 
 
-def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
+def take(wave: Wave, pixel_set: PixelSet, light: Tensor, span: Span) -> Piece:
     """Compute a piece.
 
     Args:
         wave: of the render.
-        plate: that its samples go to.
+        pixel_set: that its samples go to.
         light: all light before and after the clamp so far, ``(2,)`` float64.
         span: which samples.
     """
@@ -67,11 +67,11 @@ def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
     first, pixels, sample, samples = span
     if wave.integrator.light:
         splats: list[Splats] = []
-        brought = tensors.brought(wave, wave.rays(*span, plate), piece.tally, splats=splats)
+        brought = tensors.brought(wave, wave.rays(*span, pixel_set), piece.tally, splats=splats)
         radiance = brought.view(3, samples, pixels)
         finite = torch.isfinite(radiance).all(0)
         if not bool(finite.all()):
-            piece.lost = Lost.of(radiance, first, sample, wave.crop, plate)
+            piece.lost = NonFinite.of(radiance, first, sample, wave.crop, pixel_set)
             radiance = torch.where(finite, radiance, 0.0)
         clamp = wave.integrator.clamp
         if clamp is not None:
@@ -80,15 +80,15 @@ def take(wave: Wave, plate: Plate, light: Tensor, span: Span) -> Piece:
             splats = [replace(one, value=one.value * clamp_scale(one.value, clamp)) for one in splats]
             after = radiance.double().sum() + sum(one.value.double().sum() for one in splats)
             piece.writes.append((light, light + torch.stack((before, after))))
-        piece.writes += plate.film.after(radiance, first, sample)
-        if plate.film.splats is not None and splats:
+        piece.writes += pixel_set.film.after(radiance, first, sample)
+        if pixel_set.film.splats is not None and splats:
             lane, pixel, value = (
                 torch.cat([getattr(one, name) for one in splats], -1) for name in ("lane", "pixel", "value")
             )
-            stream = plate.film.stream(sample + lane // pixels)
-            piece.splats.append(plate.film.splats.after(stream, pixel, value))
-    if plate.layers:
+            stream = pixel_set.film.stream(sample + lane // pixels)
+            piece.splats.append(pixel_set.film.splats.after(stream, pixel, value))
+    if pixel_set.layers:
         piece.tally.rays += pixels * samples
-        for name, values in tensors.layers(wave, tuple(plate.layers), *span, plate).items():
-            piece.writes += plate.layers[name].after(values, first, sample)
+        for name, values in tensors.layers(wave, tuple(pixel_set.layers), *span, pixel_set).items():
+            piece.writes += pixel_set.layers[name].after(values, first, sample)
     return piece

@@ -13,26 +13,26 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
-from torchpt.core.errors import LostRankError, OutputError, RenderError, SceneError, say_once
+from torchpt.core.errors import LostRankError, OutputError, RenderError, SceneError, warn_once
 from torchpt.core.memory import Budget, Meter, Span, check_memory, mb, needing, retried
-from torchpt.core.threads import limited_threads, undisturbed
+from torchpt.core.threads import limited_threads, without_autocast
 from torchpt.engines.kernels.threads import Block, Loop, Share
 from torchpt.native import compile_time
-from torchpt.paths.lost import Lost
-from torchpt.paths.wave import Plate, Tally, Wave
-from torchpt.physics.film import Film, KnownError
+from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.wave import PixelSet, RayCounts, Wave
+from torchpt.physics.film import ErrorEstimate, Film
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.ranks import Group, together
-from torchpt.rendering.causes import told
 from torchpt.rendering.checkpoint import EVERY, Keeper, State, check_samples, check_whole, identity
-from torchpt.rendering.error import FIRST_ROUND, Shares, second_values
+from torchpt.rendering.error import FIRST_ROUND, Shares, error_probes
+from torchpt.rendering.nonfinite import told
 from torchpt.rendering.picture import final, known_of, rendering_of
 from torchpt.rendering.piece import take
 from torchpt.rendering.result import Progress, Rendering
 from torchpt.rendering.split import Split, stamp
 from torchpt.rendering.stopping import Stop
 from torchpt.scene import Scene
-from torchpt.scene.need import BYTES_PER_LANE, FEWEST_OF_LOOP, LANES, check_film, loaded, need_of
+from torchpt.scene.memory_estimate import BYTES_PER_LANE, FEWEST_OF_LOOP, LANES, check_film, loaded, memory_estimate
 from torchpt.scene.prepare import loop_of, looped, make_wave, surface_layers
 from torchpt.scene.settings import Settings
 
@@ -46,7 +46,7 @@ __all__ = ["Run", "render_scene"]
 SMALL_ROUND = 8
 
 
-def _most(known: KnownError | None) -> float:
+def _most(known: ErrorEstimate | None) -> float:
     """The upper end of an interval; infinite where there is none that is to be trusted."""
     return math.inf if known is None or known.interval is None or known.heavy_tailed else known.interval[1]
 
@@ -100,7 +100,7 @@ class Run:
         self.loop = loop_of(scene, self.wave, self.eager, threads) if compiled else None
         how = "eager" if self.loop is None else "compiled"
         rows = 0 if self.loop is None else self.loop.kernels.rows(self.seen)
-        self.need = need_of(settings, self.device, how, len(self.wave.context.world.materials.models), rows)
+        self.need = memory_estimate(settings, self.device, how, len(self.wave.context.world.materials.models), rows)
         if limit is not None:
             loading = max(scene.peak, built - meter.base() if built > before else 0)
             check_memory(limit, self.device, self.need.least, loading)
@@ -120,9 +120,9 @@ class Run:
         layers = {
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
         }
-        self.picture = Plate(film, layers, streams)
-        self.twice = second_values(self.wave, self.settings, device) if self.settings.pilots else None
-        self.tally, self.done, self.left, self.taken, self.ended = Tally(), 0, 0, 0, False
+        self.picture = PixelSet(film, layers, streams)
+        self.twice = error_probes(self.wave, self.settings, device) if self.settings.pilots else None
+        self.tally, self.done, self.left, self.taken, self.ended = RayCounts(), 0, 0, 0, False
         self._keeps_no_more = False  # what follows is done again by whoever goes on
         self.cut = False  # whether a round of adaptive sampling was shortened
         self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
@@ -132,7 +132,7 @@ class Run:
             self.stop.after = self.twice.looks(self.width * self.height)
         if self.split is not None:
             self.split.begin()
-        self.lost = Lost()
+        self.lost = NonFinite()
         self._unlooked: tuple[dict[str, Any], Tensor] = {}, torch.empty(0)  # counted before pixels were looked at again
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.waves: Budget | None = None  # of tensor operations
@@ -152,7 +152,7 @@ class Run:
             raise LostRankError(f"{error}; render.resume=true goes on from the last checkpoint") from None
         return self._final()
 
-    def at_once(self) -> list[tuple[Plate, int, int]] | None:
+    def at_once(self) -> list[tuple[PixelSet, int, int]] | None:
         """All samples, to be handed to :meth:`took` as they come, and then :meth:`completed`.
 
         None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
@@ -200,7 +200,7 @@ class Run:
         if self.settings.render.compile == "on":
             raise SceneError("render.compile", "on", f"auto or off (no kernel can be made of {error})")
         self.eager.append(f"all stages: {error}")
-        say_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
+        warn_once(f"torchpt: this scene renders by tensor operations, as no kernel can be made of {error}")
         assert self.loop is not None
         self._kernels += self.loop.kernels.seconds
         self.loop = None
@@ -222,7 +222,7 @@ class Run:
         if self.twice is None or self.twice.looked == self._mean():
             return
         self._unlooked = self._counted()
-        again = self.twice.look_again(self.picture.film, None if self.split is None else self.split.places)
+        again = self.twice.resample_outliers(self.picture.film, None if self.split is None else self.split.places)
         if not self._take(again):
             self.twice.third = None
         self._join()
@@ -235,7 +235,7 @@ class Run:
                 size = min(size, FIRST_ROUND - self.taken)
             spans = [(self.picture, self.taken, size)]
             if self.twice is not None:
-                spans.append((self.twice.plate, self.taken, size))
+                spans.append((self.twice.pixel_set, self.taken, size))
             if not self._take(spans):
                 return
             self.taken += size
@@ -283,7 +283,7 @@ class Run:
         """Return all that samples are added to, by name."""
         films = {"picture": self.picture.film}
         films |= {f"layers.{name}": film for name, film in self.picture.layers.items()}
-        return films if self.twice is None else films | {"pilots": self.twice.plate.film}
+        return films if self.twice is None else films | {"pilots": self.twice.pixel_set.film}
 
     def _keep(self, last: bool = False) -> None:
         """Write a checkpoint where it is time for one."""
@@ -327,14 +327,14 @@ class Run:
             return
         state = None if self.keeper is None else self._kept(self.keeper)
         if state is None and self.keeper is not None:
-            say_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
+            warn_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
         if self.split is not None:
             state = self.split.state(state, self._state())
         if state is None:
             return
         for name, film in self.films().items():
             film.restore({key: state.arrays[f"{name}.{key}"].to(self.device) for key in film.state()})
-        self.lost, self.light = Lost.read(state.facts["lost"]), state.arrays["light"].to(self.device)
+        self.lost, self.light = NonFinite.read(state.facts["lost"]), state.arrays["light"].to(self.device)
         self.taken, self.done, self.before = (state.facts[name] for name in ("taken", "done", "seconds"))
         self.tally.rays, self.tally.truncated = state.facts["rays"], state.facts["truncated"]
         self.cut = bool(state.facts["cut"])
@@ -385,8 +385,8 @@ class Run:
         """Count as if no pixel had been looked at again: the picture gets more samples, and will be then."""
         assert self.twice is not None
         counts, self.light = self._unlooked
-        self.done, self.tally = counts["done"], Tally(counts["rays"], counts["truncated"])
-        self.lost = Lost.read(counts["lost"])
+        self.done, self.tally = counts["done"], RayCounts(counts["rays"], counts["truncated"])
+        self.lost = NonFinite.read(counts["lost"])
         self.twice.third, self.twice.looked = None, None
 
     def geometry(self) -> Geometry:
@@ -412,7 +412,7 @@ class Run:
 
     # -- how they are taken
 
-    def _take(self, spans: list[tuple[Plate, int, int]]) -> bool:
+    def _take(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
         """Samples of plates, with the first one and how many; returns whether all were taken."""
         if not spans:
             return True
@@ -424,9 +424,9 @@ class Run:
             self._advanced(0, True)
         return whole
 
-    def take_alone(self, spans: list[tuple[Plate, int, int]]) -> bool:
+    def take_alone(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
         """The same by this process alone."""
-        self.left = sum(plate.film.width * plate.film.height * samples for plate, _, samples in spans)
+        self.left = sum(pixel_set.film.width * pixel_set.film.height * samples for pixel_set, _, samples in spans)
         if self.loop is not None:
             return self.loop.run(spans, self.took)
         if self.waves is None:
@@ -437,10 +437,10 @@ class Run:
                 limit=self.settings.render.max_memory,
                 per_lane=BYTES_PER_LANE,
             )
-        for plate, first, count in spans:
-            pixels = plate.film.width * plate.film.height
-            for _, n, _, samples in self.waves.through(partial(self._piece, plate), pixels, first, count):
-                if self.took(Share(Tally(), n * samples)):
+        for pixel_set, first, count in spans:
+            pixels = pixel_set.film.width * pixel_set.film.height
+            for _, n, _, samples in self.waves.through(partial(self._piece, pixel_set), pixels, first, count):
+                if self.took(Share(RayCounts(), n * samples)):
                     return False
         return True
 
@@ -456,9 +456,9 @@ class Run:
         self.left -= share.samples
         return self._advanced(share.samples, self.left == 0 and self.split is None)
 
-    def _piece(self, plate: Plate, span: Span) -> None:
+    def _piece(self, pixel_set: PixelSet, span: Span) -> None:
         """A piece by tensor operations: all of it, or nothing where it raises."""
-        piece = take(self.wave, plate, self.light, span)
+        piece = take(self.wave, pixel_set, self.light, span)
         self._count(piece.lost)
         piece.write()
         self.tally.rays += piece.tally.rays
@@ -490,7 +490,7 @@ class Run:
         pixels = self.width * self.height + (0 if self.twice is None else len(self.twice.pilots))
         return pixels * self.settings.render.spp
 
-    def _count(self, lost: Lost) -> None:
+    def _count(self, lost: NonFinite) -> None:
         """Count samples that are not finite; with ``integrator.strict`` the first one ends the render."""
         if lost.count and self.integrator.strict:
             raise RenderError(f"integrator.strict: {told(self.scene, self.wave, lost.places[0])}")
@@ -530,6 +530,6 @@ def render_scene(
         AssetError: a checkpoint that is damaged, or of another render.
         OutputError: a checkpoint that cannot be written, or that is there although nobody wishes to go on from it.
     """
-    with undisturbed(scene.device), limited_threads(settings.render.threads):
+    with without_autocast(scene.device), limited_threads(settings.render.threads):
         with together(ranks, "what is rendered", lambda: stamp(scene, settings, params, dtype)):
             return Run(scene, settings, params, dtype, group=ranks, rays=rays).go(on_progress)

@@ -16,8 +16,8 @@ from torch import Tensor
 from torchpt.compiler.graph import Unsupported
 from torchpt.core import tree
 from torchpt.core.version import __version__
-from torchpt.paths.lost import Lost
-from torchpt.paths.wave import Plate, Tally
+from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.wave import PixelSet, RayCounts
 from torchpt.physics.film import Film
 from torchpt.ranks import Group, dealt
 from torchpt.rendering.checkpoint import State
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["Span", "Split", "stamp"]
 
 #: A plate, its first sample and how many.
-Span = tuple[Plate, int, int]
+Span = tuple[PixelSet, int, int]
 
 
 class Split:
@@ -44,7 +44,7 @@ class Split:
 
     def __init__(self, group: Group) -> None:
         self.group = group
-        self._parts: list[tuple[Plate, Plate]] = []
+        self._parts: list[tuple[PixelSet, PixelSet]] = []
 
     def begin(self) -> None:
         """Nothing is sampled yet."""
@@ -58,10 +58,10 @@ class Split:
         """
         done, rays, truncated = run.done, run.tally.rays, run.tally.truncated
         lost, light = run.lost, run.light
-        run.lost, run.light, run.shared = Lost(), torch.zeros_like(light), (done, self.group.size)
+        run.lost, run.light, run.shared = NonFinite(), torch.zeros_like(light), (done, self.group.size)
         reason = ""
         try:
-            run.take_alone([(self._part(plate), first, count) for plate, first, count in spans])
+            run.take_alone([(self._part(pixel_set), first, count) for pixel_set, first, count in spans])
         except Unsupported as error:
             reason = str(error) or "unsupported"
         own = run.done - done, run.tally.rays - rays, run.tally.truncated - truncated, run.lost.count
@@ -69,7 +69,9 @@ class Split:
         if any(failed for *_, failed in every):
             raise Unsupported(reason or "what another rank met")
         run.done, run.shared = done + sum(int(n) for n, *_ in every), (0, 1)
-        run.tally = Tally(rays + sum(int(said[1]) for said in every), truncated + sum(int(said[2]) for said in every))
+        run.tally = RayCounts(
+            rays + sum(int(said[1]) for said in every), truncated + sum(int(said[2]) for said in every)
+        )
         if any(said[3] for said in every):
             lost.add(self._of_all(run.lost))
         run.lost = lost
@@ -111,17 +113,17 @@ class Split:
             arrays[name] = self.group.first(values.reshape(-1)).view(value.shape)
         return State(json.loads(sent), arrays)
 
-    def _part(self, plate: Plate) -> Plate:
+    def _part(self, pixel_set: PixelSet) -> PixelSet:
         """The pixels of a plate that are this rank's."""
         for whole, part in self._parts:
-            if whole is plate:
+            if whole is pixel_set:
                 return part
-        device = plate.film.sums.device
-        places = dealt(plate.film.width * plate.film.height, self.group.rank, self.group.size).to(device)
-        layers = {name: film.taken(places) for name, film in plate.layers.items()}
-        pixels = places if plate.places is None else plate.places[places]
-        part = Plate(plate.film.taken(places), layers, plate.streams, pixels)
-        self._parts.append((plate, part))
+        device = pixel_set.film.sums.device
+        places = dealt(pixel_set.film.width * pixel_set.film.height, self.group.rank, self.group.size).to(device)
+        layers = {name: film.taken(places) for name, film in pixel_set.layers.items()}
+        pixels = places if pixel_set.places is None else pixel_set.places[places]
+        part = PixelSet(pixel_set.film.taken(places), layers, pixel_set.streams, pixels)
+        self._parts.append((pixel_set, part))
         return part
 
     def _join(self, whole: Film, own: Film) -> None:
@@ -137,17 +139,17 @@ class Split:
             part.restore(state)
             whole.put(places, part)
 
-    def _of_all(self, own: Lost) -> Lost:
+    def _of_all(self, own: NonFinite) -> NonFinite:
         """Samples that are not finite, of all ranks."""
         text = json.dumps(own.plain()).encode()
-        every = Lost()
+        every = NonFinite()
         for values in self.group.gather(torch.tensor(list(text), dtype=torch.uint8)):
-            every.add(Lost.read(json.loads(bytes(values.tolist()))))
+            every.add(NonFinite.read(json.loads(bytes(values.tolist()))))
         return every
 
 
-def _films(plate: Plate) -> list[Film]:
-    return [plate.film, *plate.layers.values()]
+def _films(pixel_set: PixelSet) -> list[Film]:
+    return [pixel_set.film, *pixel_set.layers.values()]
 
 
 def stamp(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype) -> bytes:

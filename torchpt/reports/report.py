@@ -15,7 +15,7 @@ from torchpt.reports.page import Figure, page, sheet_of
 from torchpt.reports.plots import curves, encoded, overview
 from torchpt.reports.runs import Measured, machine, write_whole
 from torchpt.reports.study import Study
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 __all__ = ["facts_of", "write_report"]
 
@@ -87,7 +87,7 @@ def facts_of(study: Study, topics: Sequence[Topic], made: str) -> dict[str, Any]
 
 def plain(value: Any) -> Any:
     """As JSON knows it: what is not finite becomes null."""
-    if isinstance(value, Described):
+    if isinstance(value, ParsedParams):
         return plain({"type": value.name, **value.values})
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}

@@ -29,7 +29,7 @@ from torchpt.reports.study import Study, Variant
 from torchpt.scene.devices import device_of
 from torchpt.scene.fingerprint import fingerprint as fingerprint_of
 from torchpt.scene.formats.description import Description, overridden, read_description
-from torchpt.scene.prepare import Kept, kept
+from torchpt.scene.prepare import SceneCache, scene_cache
 from torchpt.scene.scene import Scene
 from torchpt.scene.settings import Settings, having
 from torchpt.spec import Role
@@ -303,7 +303,7 @@ class Job:
     wishes: Settings
     facts: dict[str, Any]
     purpose: str
-    left: Kept | None = None
+    left: SceneCache | None = None
 
     @property
     def pixels(self) -> int:
@@ -455,9 +455,9 @@ def measure(
 def _turn(latest: Job | None, job: Job) -> None:
     """Another setting's turn: a scene keeps the kernels of its latest render only, and making them anew takes seconds."""
     if latest is not None:
-        latest.left = replace(kept(latest.scene))
+        latest.left = replace(scene_cache(latest.scene))
     if job.left is not None:
-        keeper = kept(job.scene)
+        keeper = scene_cache(job.scene)
         keeper.kernels, keeper.first, keeper.dark = job.left.kernels, job.left.first, job.left.dark
 
 

@@ -12,7 +12,7 @@ from torchpt.physics.textures import Node
 from torchpt.scene.formats.materials import POINTS, inner_of
 from torchpt.scene.formats.textures import TextureInput
 from torchpt.spec import parameters_of
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 __all__ = ["declare", "resolved"]
 
@@ -21,7 +21,7 @@ Resolve = Callable[[TextureInput, str], Node]
 
 
 def resolved(
-    material: Described, name: str, materials: Mapping[str, Described], resolve: Resolve | None = None
+    material: ParsedParams, name: str, materials: Mapping[str, ParsedParams], resolve: Resolve | None = None
 ) -> ResolvedMaterial:
     """What a material comes to: a model and what it is given.
 

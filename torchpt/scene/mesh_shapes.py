@@ -17,7 +17,7 @@ from torchpt.scene.formats.description import Description
 from torchpt.scene.meshes import FileCamera, MeshPart, load_mesh
 from torchpt.scene.meshes.mesh import displaced
 from torchpt.scene.texels import Opener
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 __all__ = ["MOST_FACES", "Mesh", "ignored", "mesh_of", "solid", "warn_of_touching"]
 
@@ -76,7 +76,7 @@ def mesh_of(triangles: Triangles, key: str, description: Description, opener: Op
     return Mesh(pieces, source, triangles.flat)
 
 
-def _displaced(piece: MeshPart, wish: Described, prefix: str, opener: Opener, source: str) -> MeshPart:
+def _displaced(piece: MeshPart, wish: ParsedParams, prefix: str, opener: Opener, source: str) -> MeshPart:
     """A piece of a mesh under its displacement map."""
     key = f"{prefix}.displacement"
     if piece.uvs is None:

@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from torchpt.core.errors import SceneError, say_once
+from torchpt.core.errors import SceneError, warn_once
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.kernels.threads import Loop
 from torchpt.images.denoiser import GUIDES
@@ -27,15 +27,14 @@ from torchpt.physics.world import World
 from torchpt.scene import Scene
 from torchpt.scene.settings import Settings
 from torchpt.spec import Moves
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 if TYPE_CHECKING:
     from torchpt.paths.integrators.first_surface import FirstSurface
     from torchpt.paths.layer import SurfaceLayer
 
 __all__ = [
-    "Kept",
-    "kept",
+    "SceneCache",
     "kernels_of",
     "loop_facts",
     "loop_of",
@@ -44,6 +43,7 @@ __all__ = [
     "own_models",
     "packets_of",
     "rebound",
+    "scene_cache",
     "surface_layers",
 ]
 
@@ -52,7 +52,7 @@ __all__ = [
 
 
 @dataclass
-class Kept:
+class SceneCache:
     """Of one scene.
 
     Attributes:
@@ -70,12 +70,12 @@ class Kept:
     outlines: dict[str, Any] = field(default_factory=dict)
 
 
-_scenes: WeakKeyDictionary[Scene, Kept] = WeakKeyDictionary()
+_scenes: WeakKeyDictionary[Scene, SceneCache] = WeakKeyDictionary()
 
 
-def kept(scene: Scene) -> Kept:
+def scene_cache(scene: Scene) -> SceneCache:
     """Return what is kept for a scene, as long as the scene is; views of it share it."""
-    return _scenes.setdefault(scene.origin, Kept())
+    return _scenes.setdefault(scene.origin, SceneCache())
 
 
 # ---- What all waves of a render share, and how they run: as tensor operations, or as the compiled loop
@@ -168,7 +168,7 @@ def _camera(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtyp
     # By identity: what the ids are of is held beside them, so that they stay their own.
     held = (scene.description.camera, *given)
     made_of = ([id(value) for value in held], [value._version for value in given], film.width, film.height, dtype)
-    keeper = kept(scene)
+    keeper = scene_cache(scene)
     if keeper.camera is None or keeper.camera[0][0] != made_of:
         keeper.camera = (made_of, held), scene.camera(film, merged, dtype)
     return keeper.camera[1]
@@ -194,7 +194,7 @@ def rebound(wave: Wave, scene: Scene, settings: Settings, params: Mapping[str, T
     return replace(wave, context=context, camera=camera, first=None if wave.first is None else wave.first.again(world))
 
 
-def points_of(sampler: Described) -> Points:
+def points_of(sampler: ParsedParams) -> Points:
     """Return where the points lie, of the settings of a sampler."""
     return sampler.kind(**{key: value for key, value in sampler.values.items() if key not in ADAPTIVE})
 
@@ -214,7 +214,7 @@ def _first(scene: Scene, integrator: Integrator, world: World, own: bool) -> Fir
     """Return what happens at first surfaces; kept with the scene, unless the world is not the scene's ``own``."""
     if not own or torch.is_grad_enabled():
         return integrator.first(world)
-    keeper = kept(scene)
+    keeper = scene_cache(scene)
     if keeper.first is not None and keeper.first[0] == integrator and keeper.first[1] is world:
         return keeper.first[2]
     first = integrator.first(world)
@@ -227,7 +227,7 @@ def _dark(scene: Scene, world: World, own: bool) -> World:
     """The world without lights; one of the scene's ``own`` is kept with it."""
     if not own:
         return replace(world, lights=None)
-    keeper = kept(scene)
+    keeper = scene_cache(scene)
     if keeper.dark is None or keeper.dark[0] is not world:
         keeper.dark = world, replace(world, lights=None)
     return keeper.dark[1]
@@ -311,11 +311,11 @@ def loop_of(scene: Scene, wave: Wave, eager: list[str], threads: int | None = No
 
     Materials without kernels join ``eager``.
     """
-    keeper = kept(scene)
+    keeper = scene_cache(scene)
     kernels = keeper.kernels = kernels_of(scene, wave, keeper.kernels)
     for number, reason in kernels.eager.items():
         name = str(wave.context.world.materials.models[number])
         eager.append(f"{name}: {reason}")
-        say_once(f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}")
+        warn_once(f"torchpt: the material model {name} runs by tensor operations, as no kernel can be made of {reason}")
     integrator = wave.integrator
     return Loop(kernels, threads or torch.get_num_threads(), integrator.clamp, integrator.strict)

@@ -28,13 +28,13 @@ from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.world import World
 from torchpt.scene.build import Built, build_parts
 from torchpt.scene.devices import device_of
-from torchpt.scene.editions import Editions, changes
 from torchpt.scene.formats.description import Description, settings
 from torchpt.scene.info import describe
 from torchpt.scene.settings import Film, Settings
 from torchpt.scene.sources import check_sources
 from torchpt.scene.space import FARTHEST, Space, extent_of, middle_of
-from torchpt.scene.vetting import check_tensor, shared, vet
+from torchpt.scene.validation import check_tensor, shared, validate_changes
+from torchpt.scene.versions import Editions, changes
 from torchpt.scene.view import through
 from torchpt.scene.world import assemble
 from torchpt.search import Accel
@@ -99,7 +99,7 @@ class Scene:
         #: The most that was held above import while the scene was read; 0 where it is not known.
         self.peak = after - meter.base() if after > before else 0
         self._begin()
-        self._vetted = self.editions()  # numbers of a file were checked as they were read
+        self._vetted = self.versions()  # numbers of a file were checked as they were read
 
     def _begin(self) -> None:
         """Nothing is made of the parameters yet."""
@@ -252,14 +252,14 @@ class Scene:
             SceneError: likewise, and names that are gone or new.
         """
         with outside_transforms():
-            vet(self, self._vetted)
+            validate_changes(self, self._vetted)
 
     def trust(self, other: Scene) -> None:
         """Take what another scene checked of tensors that both have as checked."""
         self._vetted = shared(self, other, other._vetted)
 
-    def editions(self) -> dict[str, int]:
-        """Numbers of what :attr:`params` hold: see :class:`torchpt.scene.editions.Editions`."""
+    def versions(self) -> dict[str, int]:
+        """Numbers of what :attr:`params` hold: see :class:`torchpt.scene.versions.Editions`."""
         return self._editions.of(self.params)
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:

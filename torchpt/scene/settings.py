@@ -20,7 +20,7 @@ from torchpt.physics.samplers import KINDS as SAMPLERS
 from torchpt.ranks import Group
 from torchpt.spec import Choice, Flag, Other, Refused, Role, Scalar, Valued, Whole, parameters_of, reading
 from torchpt.spec.arguments import Argument, declared
-from torchpt.spec.schema import Described, Memo, check_keys, described, dotted, refuse_foreign, refused, values_of
+from torchpt.spec.schema import Memo, ParsedParams, check_keys, described, dotted, refuse_foreign, refused, values_of
 
 __all__ = [
     "BLOCKS",
@@ -31,12 +31,12 @@ __all__ = [
     "TYPED",
     "Call",
     "Common",
+    "CommonOptions",
     "Film",
     "Render",
-    "RenderWishes",
+    "RenderOptions",
     "Settings",
-    "TraceWishes",
-    "Wishes",
+    "TraceOptions",
     "blocks_of",
     "having",
     "merge",
@@ -182,7 +182,7 @@ class _Samples(TypedDict, total=False):
     spp: Annotated[int | None, Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take")]
 
 
-class TraceWishes(TypedDict, total=False):
+class TraceOptions(TypedDict, total=False):
     """Arguments of whatever traces paths."""
 
     integrator: Annotated[
@@ -259,7 +259,7 @@ class TraceWishes(TypedDict, total=False):
     ]
 
 
-class Common(_Samples, TraceWishes, total=False):
+class Common(_Samples, TraceOptions, total=False):
     """Arguments of :func:`torchpt.render` that are the same for all pictures of a batch."""
 
     film: Annotated[
@@ -327,7 +327,7 @@ class Common(_Samples, TraceWishes, total=False):
     ]
 
 
-class Wishes(Common, total=False):
+class CommonOptions(Common, total=False):
     """Arguments of :func:`torchpt.render` beside the scene and ``full``."""
 
     seed: Annotated[int | None, Whole(0, high=MOST_SEED, doc="the same seed gives the same picture")]
@@ -343,7 +343,7 @@ class Wishes(Common, total=False):
     ]
 
 
-class RenderWishes(Wishes, total=False):
+class RenderOptions(CommonOptions, total=False):
     """All keyword arguments of :func:`torchpt.render`."""
 
     full: Annotated[
@@ -352,7 +352,7 @@ class RenderWishes(Wishes, total=False):
     ]
 
 
-_ARGUMENTS = {name: argument.spec for name, argument in declared(RenderWishes).items()}
+_ARGUMENTS = {name: argument.spec for name, argument in declared(RenderOptions).items()}
 
 
 class Render(Valued):
@@ -402,7 +402,7 @@ class Call(Valued):
         values: dict[str, Any] = {}
         for name in [name for name in cls.parameters if name in wishes]:
             try:
-                values[name] = declared(RenderWishes)[name].read(wishes[name])
+                values[name] = declared(RenderOptions)[name].read(wishes[name])
             except Refused as error:
                 raise refused(error, name, wishes[name], None) from None
         return cls(**values)
@@ -439,7 +439,7 @@ class Settings:
 
     film: Film
     integrator: Integrator
-    sampler: Described
+    sampler: ParsedParams
     render: Render
 
     @property
@@ -475,7 +475,7 @@ class Settings:
 
 
 def _plain(value: Any) -> Any:
-    if not isinstance(value, Valued | Described):
+    if not isinstance(value, Valued | ParsedParams):
         return value
     kind = {"type": value.name} if hasattr(value, "name") else {}
     return kind | {key: _plain(item) for key, item in value.values.items()}
@@ -581,7 +581,7 @@ def _check_pilots(settings: Settings, file: str | None) -> None:
         raise SceneError("render.pilots", True, expected, file)
 
 
-def _open_end(raw: Mapping[str, Any], sampler: Described) -> None:
+def _open_end(raw: Mapping[str, Any], sampler: ParsedParams) -> None:
     """Raise where something else than ``spp`` is to end a render whose points depend on their number."""
     for name in having(Role.ENDS)["render"]:
         if sampler.kind.needs_count and raw.get(name) is not None:
@@ -614,6 +614,6 @@ def _block(block: str, raw: dict[str, Any]) -> Any:
     return Render(**values_of(Render, raw, block, None, "the render settings").values)
 
 
-def _typed(what: str, raw: dict[str, Any], key: str) -> Described:
+def _typed(what: str, raw: dict[str, Any], key: str) -> ParsedParams:
     """A thing whose type picks its kind."""
     return described(what, TYPED[what][0], raw, key, None, TYPED[what][1])

@@ -23,7 +23,7 @@ from torchpt.scene.meshes import FileMaterial, MeshPart
 from torchpt.scene.sources import file_lights, labels_of
 from torchpt.scene.texels import Opener
 from torchpt.spec import Pose, Vertices, parameters_of
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 __all__ = ["Owner", "ShapeBuilder"]
 
@@ -40,7 +40,7 @@ class Owner:
 
     name: str
     number: int
-    shape: Described
+    shape: ParsedParams
 
     @property
     def key(self) -> str:

@@ -16,7 +16,7 @@ from torchpt.physics.parts import Parameters, Part, Source
 from torchpt.scene.formats.description import Description
 from torchpt.scene.meshes import FileLight
 from torchpt.spec import Corners, Refused, parameters_of
-from torchpt.spec.schema import Described, refused
+from torchpt.spec.schema import ParsedParams, refused
 
 __all__ = ["check_coordinates", "check_sources", "declare_corners", "file_lights", "labels_of", "sources_of"]
 
@@ -81,7 +81,7 @@ def sources_of(description: Description, parameters: Parameters) -> list[Source]
     return [Source(f"lights.{name}", light.name, light.values) for name, light in lights.items()]
 
 
-def _file(description: Description, key: str, light: Described, parameter: str) -> Path:
+def _file(description: Description, key: str, light: ParsedParams, parameter: str) -> Path:
     return description.resolve(light[parameter], f"{key}.{parameter}")
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchpt.core.errors import SceneError
 from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.parts import Copy, Part, Source
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 __all__ = ["FARTHEST", "Space", "centre_and_unit", "extent_of", "middle_of"]
 
@@ -73,7 +73,7 @@ def centre_and_unit(
     copies: Sequence[Copy],
     sources: Sequence[Source],
     parameters: Mapping[str, Array],
-    camera: Described,
+    camera: ParsedParams,
     file: str | None,
 ) -> tuple[Array, float]:
     """Where the origin of the lanes' coordinates is put ``(3,)``, and their unit.
@@ -137,7 +137,7 @@ def _boxes(parts: Sequence[Part], copies: Sequence[Copy]) -> tuple[list[str], Ar
 
 
 def _reaches(
-    sources: Sequence[Source], parameters: Mapping[str, Array], camera: Described, centre: Array
+    sources: Sequence[Source], parameters: Mapping[str, Array], camera: ParsedParams, centre: Array
 ) -> list[tuple[str, float]]:
     """Other lengths that lanes hold, by key."""
     found = [("camera", float(np.abs(parameters["camera.to_world"][:3, 3] - centre).max()))]

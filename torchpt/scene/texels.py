@@ -12,7 +12,7 @@ import torch
 
 from torchpt.physics.parts import Parameters
 from torchpt.physics.textures import Named, Node, Opening, TextureInput, TexturePoint
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 __all__ = ["Opener"]
 
@@ -29,7 +29,7 @@ class Opener:
 
     def __init__(
         self,
-        textures: Mapping[str, Described],
+        textures: Mapping[str, ParsedParams],
         resolve: Callable[[tuple[str, ...], str], Path],
         parameters: Parameters,
         file: str | None,

@@ -23,7 +23,7 @@ from torchpt.scene.formats.description import Description
 from torchpt.scene.formats.tensors import Key, Tensors
 from torchpt.spec import parameters_of
 from torchpt.spec.reading import transform
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 __all__ = ["corners_in", "traced", "widened"]
 
@@ -45,7 +45,7 @@ def widened(description: Description, tensors: Tensors) -> Description:
         return description
     values = {**camera.values, **angles(camera["K"], camera["size"])}
     values |= {key: usual for key, usual in USUAL.items() if values[key] is None}
-    return replace(description, camera=Described(camera.kind, values, camera.given))
+    return replace(description, camera=ParsedParams(camera.kind, values, camera.given))
 
 
 def corners_in(tensors: Tensors) -> set[str]:
@@ -172,7 +172,7 @@ def _shape(name: str, key: Key, read: _Reading) -> Iterator[tuple[str, Tensor]]:
         yield from _named(key, _dotted(key), read)
 
 
-def _pose_of(name: str, shape: Described, read: _Reading) -> Tensor:
+def _pose_of(name: str, shape: ParsedParams, read: _Reading) -> Tensor:
     """A shape's pose: its own size and place, then its transform."""
     written, device = read.tensors.raw["shapes"][name], read.device
     operations, specs = written.get("transform"), parameters_of(shape.kind)

@@ -16,7 +16,7 @@ import numpy as np
 
 from torchpt.core.errors import NotBuiltError, SceneError
 from torchpt.core.tree import UNPRINTED
-from torchpt.spec import Map, Refused, not_built
+from torchpt.spec import Map, Refused, unsupported
 from torchpt.spec.parameters import REQUIRED, Spec, spec_of
 from torchpt.spec.reading import within
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Block",
-    "Described",
     "Kinds",
     "Memo",
+    "ParsedParams",
     "Valued",
     "check_keys",
     "described",
@@ -283,7 +283,7 @@ def check_keys(raw: Mapping[str, Any], known: Iterable[str], key: str, what: str
 def refused(error: Refused, key: str, value: Any, file: str | None) -> SceneError:
     """The refusal of a value as the error that names its key."""
     shown = value if error.value is ... else error.value
-    kind = NotBuiltError if error.not_built else SceneError
+    kind = NotBuiltError if error.unsupported else SceneError
     return kind(dotted(key, *error.at), shown, error.expected, file)
 
 
@@ -307,7 +307,7 @@ def refuse_not_built(
 
 
 @dataclass(frozen=True)
-class Described:
+class ParsedParams:
     """A thing of a scene file.
 
     Attributes:
@@ -343,11 +343,11 @@ def described(
     file: str | None,
     default: str = "",
     texture: ReadTexture | None = None,
-) -> Described:
+) -> ParsedParams:
     """The thing of a mapping whose ``type`` picks its kind from a table.
 
     Args:
-        what: what the table holds, e.g. ``light``; a key of :data:`torchpt.spec.not_built.TYPES` where some are not built.
+        what: what the table holds, e.g. ``light``; a key of :data:`torchpt.spec.unsupported.TYPES` where some are not built.
         table: the kinds.
         raw: the mapping as written.
         key: its dotted key.
@@ -359,7 +359,7 @@ def described(
         SceneError: no mapping, an unknown type, an unknown key, a bad value.
         NotBuiltError: a type or key that the format knows and this version does not build.
     """
-    planned = not_built.TYPES.get(what, {})
+    planned = unsupported.TYPES.get(what, {})
     types = ", ".join([*table, *planned])
     if not isinstance(raw, Mapping):
         raise SceneError(key, raw, f"a mapping with a type of {types}", file)
@@ -374,26 +374,26 @@ def described(
         raise NotBuiltError(dotted(key, "type"), name, ", ".join(table), file)
     kind = table[name]
 
-    def read() -> Described:
+    def read() -> ParsedParams:
         return _read(what, kind, name, raw, key, file, texture)
 
     if not isinstance(kind, type):  # an instance of the caller's own, which may change
         return read()
     found = _known.get((what, kind, texture), raw, read)
-    return Described(kind, dict(found.values), found.given)
+    return ParsedParams(kind, dict(found.values), found.given)
 
 
 #: Things by what was written of them.
-_known: Memo[Described] = Memo(4096)
+_known: Memo[ParsedParams] = Memo(4096)
 
 
 def _read(
     what: str, kind: Any, name: str, raw: Mapping[str, Any], key: str, file: str | None, texture: ReadTexture | None
-) -> Described:
+) -> ParsedParams:
     """A thing of a kind that is known."""
     words = f"{what} type {name}"
     names = list(parameters_of(kind))
-    later = {**not_built.KEYS.get(what, {}), **not_built.KEYS.get(name, {})}
+    later = {**unsupported.KEYS.get(what, {}), **unsupported.KEYS.get(name, {})}
     check_keys({k: v for k, v in raw.items() if k not in later}, ("type", *names), key, words, file)
     rest = refuse_not_built(raw, later, key, ", ".join(names), file)
     values = {k: value for k, value in rest.items() if k != "type"}
@@ -407,7 +407,7 @@ def values_of(
     file: str | None,
     words: str | None = None,
     texture: ReadTexture | None = None,
-) -> Described:
+) -> ParsedParams:
     """The values of a kind's parameters, from a mapping that holds nothing else; null means unset.
 
     A kind's own ``check(values, given)`` may fill in values that follow from others, as a camera does with its pose.
@@ -438,7 +438,7 @@ def values_of(
             check(values, frozenset(given))
         except Refused as error:
             raise refused(error, key, None, file) from None
-    return Described(kind, values, frozenset(given))
+    return ParsedParams(kind, values, frozenset(given))
 
 
 def refuse_foreign(what: str, table: Mapping[str, Any], raw: Any, default: str, file: str | None) -> None:
@@ -483,7 +483,7 @@ def _read_value(spec: Spec, value: Any, texture: ReadTexture | None) -> Any:
     return spec.read(value)
 
 
-def _block(spec: Block, texture: ReadTexture | None, value: Any) -> Described | None:
+def _block(spec: Block, texture: ReadTexture | None, value: Any) -> ParsedParams | None:
     if value is None:
         return None
     if not isinstance(value, Mapping):

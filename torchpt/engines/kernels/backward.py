@@ -21,14 +21,14 @@ from torchpt.compiler.sinks import Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
 from torchpt.engines.kernels.layout import HIT, Fields, Layout, Rows, Trace
 from torchpt.engines.kernels.programs import Kernel, Kernels
-from torchpt.math.gathers import gathered_by
+from torchpt.math.gathers import recording_gathers
 from torchpt.paths import adjoint
-from torchpt.paths.adjoint import Before, Behind
+from torchpt.paths.adjoint import InputCotangents, VertexCotangents
 from torchpt.paths.state import EXTRA, PathState, Shadow, Splat, VertexInput
-from torchpt.paths.wave import Wave, still_of
+from torchpt.paths.wave import Wave, with_detached_geometry
 from torchpt.physics.shapes.geometry import Hit
 
-__all__ = ["SLOTS", "JointKernels", "back_bounce", "back_emit", "back_escape", "report", "slots_of", "slots_read"]
+__all__ = ["SLOTS", "VjpKernels", "bounce_vjp", "emit_vjp", "escape_vjp", "report", "slots_of", "slots_read"]
 
 
 # ---- Vertices of paths gone back along, as kernels: each traces a stage of :mod:`torchpt.paths.adjoint`, its tape included
@@ -58,13 +58,13 @@ def slots_of(layout: Layout) -> Fields:
 class _Noted:
     """Look-ups of a trace in tables that are differentiated."""
 
-    def __init__(self, tracer: Tracer, kernels: JointKernels) -> None:
+    def __init__(self, tracer: Tracer, kernels: VjpKernels) -> None:
         self.tracer, self.kernels = tracer, kernels
         self.taken: list[tuple[int, Tensor, Tensor]] = []
         self._known: dict[tuple[int, int], Tensor] = {}
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
-        """See :class:`torchpt.math.gathers.Gathers`."""
+        """See :class:`torchpt.math.gathers.GatherRecorder`."""
         number = self.kernels.numbers_of.get(id(table))
         if number is None or not self.tracer.is_traced(index):
             return None
@@ -82,14 +82,14 @@ class _Noted:
         return [*(leaf for _, _, leaf in self.taken), *self.kernels.tapes]
 
 
-def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks:
+def bounce_vjp(trace: Trace, model: int, roulette: float, follow_shape: bool) -> Sinks:
     """See :func:`torchpt.paths.adjoint.bounce`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _given(trace)
     extra = {name.removeprefix(EXTRA): value for name, value in rows.items() if name.startswith(EXTRA)}
-    behind = Behind(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
-    following = Hit(*(rows[name] for name in HIT)) if kernels.taped.plan.attached else None
+    cotangents = VertexCotangents(rows["radiance"], rows["throughput"], rows.get("o"), rows.get("d"), extra)
+    next_hit = Hit(*(rows[name] for name in HIT)) if kernels.taped.plan.attached else None
 
     def clear(_: Shadow) -> Tensor:
         return rows["clear"]
@@ -100,35 +100,35 @@ def back_bounce(trace: Trace, model: int, roulette: float, slide: bool) -> Sinks
         return adjoint.splatted(integrator.clamp, cotangent, splat, rows["splat_clear"])
 
     noted = _Noted(tracer, kernels)
-    with tracer, gathered_by(noted):
-        context = kernels.taped.at(salts, slide, roulette)
+    with tracer, recording_gathers(noted):
+        context = kernels.taped.at(salts, follow_shape, roulette)
         vertex = VertexInput(state, hit)
         before = adjoint.bounce(
-            integrator.bounce, context, model, vertex, following, clear, behind, noted.leaves, landed
+            integrator.bounce, context, model, vertex, next_hit, clear, cotangents, noted.leaves, landed
         )
     return _ended(trace, noted, state, before, {})
 
 
-def back_emit(trace: Trace, slide: bool) -> Sinks:
+def emit_vjp(trace: Trace, follow_shape: bool) -> Sinks:
     """See :func:`torchpt.paths.adjoint.gather`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _given(trace)
     noted = _Noted(tracer, kernels)
-    with tracer, gathered_by(noted):
-        context = kernels.taped.at(salts, slide)
+    with tracer, recording_gathers(noted):
+        context = kernels.taped.at(salts, follow_shape)
         stage, vertex = trace.layout.wave.integrator.emit, VertexInput(state, hit)
         before = adjoint.gather(stage, context, vertex, rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
 
 
-def back_escape(trace: Trace) -> Sinks:
+def escape_vjp(trace: Trace) -> Sinks:
     """See :func:`torchpt.paths.adjoint.gather`."""
     kernels, tracer = _begun(trace)
     salts = trace.salts()
     state, hit, rows = _given(trace)
     noted = _Noted(tracer, kernels)
-    with tracer, gathered_by(noted):
+    with tracer, recording_gathers(noted):
         stage, vertex = trace.layout.wave.integrator.escape, VertexInput(state, hit)
         before = adjoint.gather(stage, kernels.taped.at(salts), vertex, rows["radiance"], noted.leaves)
     return _ended(trace, noted, state, before, rows)
@@ -150,7 +150,7 @@ def report(trace: Trace) -> Sinks:
     return Sinks(scatter=[Scatter(-1, trace.node(lane), rows, slots=True)])
 
 
-def slots_read(kernels: JointKernels) -> tuple[str, ...]:
+def slots_read(kernels: VjpKernels) -> tuple[str, ...]:
     """Return the names of what a vertex reads of the slots."""
     extra = tuple(name for name in slots_of(kernels) if name.startswith(EXTRA) or name in _SPLAT)
     return (*SLOTS, *extra) if kernels.taped.plan.attached else ("radiance", "throughput", "clear", *extra)
@@ -170,7 +170,7 @@ def _given(trace: Trace) -> tuple[PathState, Hit, dict[str, Tensor]]:
     return state, hit, slots.read(tracer, *slots_read(kernels), place=lane)
 
 
-def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added: dict[str, Tensor]) -> Sinks:
+def _ended(trace: Trace, noted: _Noted, state: PathState, before: InputCotangents, added: dict[str, Tensor]) -> Sinks:
     """Rows of derivatives by tables, and what is asked of the ray that came; ``added`` to what lies there."""
     kernels: Any = trace.layout
     tracer, graph = trace.tracer, trace.tracer.graph
@@ -227,10 +227,10 @@ def _ended(trace: Trace, noted: _Noted, state: PathState, before: Before, added:
 # ---- The kernels of a backward pass: those of the paths as they are traced again, and those that go back along them
 
 
-_STAGES = {"bounce": back_bounce, "emit": back_emit, "escape": back_escape}
+_STAGES = {"bounce": bounce_vjp, "emit": emit_vjp, "escape": escape_vjp}
 
 
-class JointKernels(Kernels):
+class VjpKernels(Kernels):
     """The kernels of one backward pass.
 
     Args:
@@ -244,7 +244,7 @@ class JointKernels(Kernels):
     Attributes:
         taped: what stages read where they are gone back along.
         numbers_of: which of the leaves a tensor is, by its id.
-        back_eager: stages that no kernel can be made of, and why.
+        eager_vjps: stages that no kernel can be made of, and why.
         slots: rows of :func:`torchpt.engines.kernels.backward.slots_of`.
     """
 
@@ -257,7 +257,7 @@ class JointKernels(Kernels):
         packets: bool,
         cotangent: Tensor | None = None,
     ) -> None:
-        super().__init__(still_of(wave), packets, False, cotangent=cotangent)
+        super().__init__(with_detached_geometry(wave), packets, False, cotangent=cotangent)
         self.cotangent = cotangent
         self.taped = taped.context
         self.plain, self.tapes = tuple(plain), tuple(tapes)
@@ -268,19 +268,19 @@ class JointKernels(Kernels):
                 self._leaves.ids[id(tape)] = path, tape
         self.structure = (*self.structure, self.taped.plan.attached, tuple(paths))
         self.slots = Rows(slots_of(self))
-        self.back_eager: dict[tuple[Any, ...], str] = {}
+        self.eager_vjps: dict[tuple[Any, ...], str] = {}
 
-    def back_kernel(self, key: tuple[Any, ...]) -> Kernel | None:
-        """The kernel of ``("bounce", model, roulette, slide)``, ``("emit", slide)`` or ``("escape",)`` gone back through.
+    def vjp_kernel(self, key: tuple[Any, ...]) -> Kernel | None:
+        """The kernel of ``("bounce", model, roulette, follow_shape)``, ``("emit", follow_shape)`` or ``("escape",)`` gone back through.
 
-        None: none can be made; :attr:`back_eager` says why.
+        None: none can be made; :attr:`eager_vjps` says why.
         """
-        if key in self.back_eager:
+        if key in self.eager_vjps:
             return None
         try:
             return self._get(True, _STAGES[key[0]], *key[1:])
         except Unsupported as error:
-            self.back_eager[key] = str(error)
+            self.eager_vjps[key] = str(error)
             return None
 
     def report(self) -> Kernel:

@@ -29,7 +29,7 @@ from torchpt.paths.integrators import LAYERS
 from torchpt.paths.integrators.base import check_output
 from torchpt.paths.state import Shadow, Splat, VertexInput, no_shadow
 from torchpt.paths.walk import Counts, Observer, walk
-from torchpt.paths.wave import Plate, Tally
+from torchpt.paths.wave import PixelSet, RayCounts
 from torchpt.physics.film.splats import LARGEST, Splats
 from torchpt.physics.samplers import salts
 from torchpt.physics.shapes.geometry import Hit
@@ -89,7 +89,7 @@ class Calls:
         """Return how many lanes are in the arena, and how many in each list."""
         return int(self.counters[0]), self.counters[1 : self.kernels.models + 3].tolist()
 
-    def name_salts(self, depth: int, step: int = 0) -> None:
+    def set_dimensions(self, depth: int, step: int = 0) -> None:
         """Set the vertex, or the step on the way there, whose random dimensions kernels draw from."""
         known = self._salts.get((depth, step))
         if known is None:
@@ -239,7 +239,7 @@ class ChunkSearch:
             How many rays are still on their way.
         """
         kernels, calls = self.kernels, self.calls
-        calls.name_salts(depth, step)
+        calls.set_dimensions(depth, step)
         source, target = self.passed[step % 2], self.passed[1 - step % 2]
         if step == 0:
             calls.clear()
@@ -316,7 +316,7 @@ class Chunk:
     pixels: int
     first_sample: int
     samples: int
-    plate: Plate | None = None
+    pixel_set: PixelSet | None = None
 
 
 @dataclass
@@ -372,7 +372,7 @@ class Worker:
         self.search = ChunkSearch(self.calls)
         self.slots = self.calls.slots
         self.shown: Memory | None = None
-        self.tally = Tally()
+        self.tally = RayCounts()
         self.splats: list[Splats] = []
         self._lost: list[np.ndarray] = []  # samples with splats that are not finite
         self._rooms = [self._room() for _ in range(2)]
@@ -400,9 +400,9 @@ class Worker:
         self.calls.serve(kernels, halt)
         self.search.kernels = kernels
 
-    def trace(self, chunk: Chunk) -> Tally:
+    def trace(self, chunk: Chunk) -> RayCounts:
         """Fill ``slots`` with the radiance of a chunk's samples, ``samples`` rows of ``pixels`` one after the other."""
-        self.tally = Tally()
+        self.tally = RayCounts()
         walk(self, self.spawn(chunk), self.wave.integrator.limits)
         self.mark_lost()
         return self.tally
@@ -425,8 +425,8 @@ class Worker:
 
     def start(self, chunk: Chunk) -> None:
         """Say which samples are next."""
-        wave, plate = self.wave, chunk.plate
-        streams = wave.sampler.streams if plate is None else plate.streams
+        wave, pixel_set = self.wave, chunk.pixel_set
+        streams = wave.sampler.streams if pixel_set is None else pixel_set.streams
         x, y, width, _ = wave.crop
         point, turn = divmod(chunk.first_sample, streams.count)
         self.calls.place[:] = np.array(
@@ -442,12 +442,12 @@ class Worker:
         self.start(chunk)
         kernels, calls, given = self.kernels, self.calls, self.wave.given
         self.splats, self._lost = [], []
-        count, places = chunk.pixels * chunk.samples, None if chunk.plate is None else chunk.plate.places
+        count, places = chunk.pixels * chunk.samples, None if chunk.pixel_set is None else chunk.pixel_set.places
         if given is not None:
             places = given.number
         paths, source = self._begin(self.room(1), 1, count), self.room(1).arena
         calls.clear()
-        calls.name_salts(0)
+        calls.set_dimensions(0)
         own = slice(chunk.first_pixel, chunk.first_pixel + chunk.pixels)
         if places is not None or given is not None:  # they lie in the arena of the next vertex until then
             source = self.room(2).arena
@@ -514,7 +514,7 @@ class Worker:
         self._on_list(self.kernels.escape(), paths, self.kernels.missed)
 
     def _on_list(self, kernel: Kernel, paths: Paths, number: int) -> None:
-        self.calls.name_salts(paths.depth)
+        self.calls.set_dimensions(paths.depth)
         self.calls.run(kernel, paths.places[number], paths.arena, paths.arena, paths.lists[number])
 
     def terminate(self, paths: Paths, truncated: bool) -> None:
@@ -540,7 +540,7 @@ class Worker:
         if kernels.fused:
             self.tally.rays += after.count
         calls.clear()
-        calls.name_salts(paths.depth)
+        calls.set_dimensions(paths.depth)
         done = 0
         for model, count in enumerate(paths.groups):
             if not count:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from torchpt.paths.wave import Wave
 
 
-__all__ = ["Handed", "Kernel", "Kernels", "Leaves", "State", "program_of"]
+__all__ = ["Kernel", "KernelCache", "Kernels", "Leaves", "State", "program_of"]
 
 
 # ---- The tensors that a render's kernels read, by name, and which of them another render has read before
@@ -79,7 +79,7 @@ class Leaves:
 # ---- What renders of one structure hand on to each other: kernels, and tables of tensors that are the same ones, unchanged
 
 
-class Handed:
+class KernelCache:
     """The latest kernel of each stage and the latest table of each tensor, with the tensors that they were made of.
 
     Renders that share it may run at the same time, on several threads.
@@ -193,7 +193,7 @@ class Kernels(Layout):
         fused: see there.
         before: kernels of another render, whose tables are taken over where they are made of the same tensors.
         fixed: whether a world says the same of itself as long as it is the same one; models of the caller's own may not.
-        cotangent: see :class:`~torchpt.engines.kernels.backward.JointKernels`.
+        cotangent: see :class:`~torchpt.engines.kernels.backward.VjpKernels`.
 
     Attributes:
         eager: models whose stage does what no kernel can, and what that is; they run as tensor operations.
@@ -233,7 +233,7 @@ class Kernels(Layout):
         asked = (wave.camera.kind(), wave.filter.kind(), self.plan, wave.first, own, self._leaves.tensors)
         self.structure = (self._of_world, *map(signature, asked), packets, fused)
         alike = before is not None and before.structure == self.structure
-        self.handed = before.handed if alike else Handed()  # pyright: ignore[reportOptionalMemberAccess]
+        self.handed = before.handed if alike else KernelCache()  # pyright: ignore[reportOptionalMemberAccess]
         self._laid_out = self.handed.tables(self._leaves)
         self._results = self.handed.results(self._leaves)
         self._made: dict[tuple[Any, ...], Kernel] = {}

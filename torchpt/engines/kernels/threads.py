@@ -14,12 +14,12 @@ import torch
 
 from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD
-from torchpt.core.memory import Budget, needing, ran_out, when_short
+from torchpt.core.memory import Budget, is_out_of_memory, needing, on_low_memory
 from torchpt.core.threads import deal
 from torchpt.engines.kernels.engine import LANES, Chunk, Halted, Worker
 from torchpt.engines.kernels.programs import Kernels
-from torchpt.paths.lost import Lost
-from torchpt.paths.wave import Plate, Tally, clamp_scale
+from torchpt.paths.nonfinite import NonFinite
+from torchpt.paths.wave import PixelSet, RayCounts, clamp_scale
 from torchpt.physics.film import Film
 
 __all__ = ["TASKS", "Block", "Loop", "Share", "keep", "taken"]
@@ -67,7 +67,7 @@ def _after_fork() -> None:
     _lock = threading.Lock()
 
 
-when_short(_release)
+on_low_memory(_release)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
 
@@ -83,7 +83,7 @@ FEWEST = 1024
 NARROW = 128
 
 #: A plate, its first pixel and how many, the first sample and how many of each.
-Block = tuple[Plate, int, int, int, int]
+Block = tuple[PixelSet, int, int, int, int]
 
 
 @dataclass
@@ -98,9 +98,9 @@ class Share:
         rest: what memory did not suffice for.
     """
 
-    tally: Tally
+    tally: RayCounts
     samples: int = 0
-    lost: Lost = field(default_factory=Lost)
+    lost: NonFinite = field(default_factory=NonFinite)
     light: tuple[float, float] = (0.0, 0.0)
     rest: list[Block] = field(default_factory=list)
 
@@ -131,7 +131,7 @@ class Loop:
         self._workers: list[Worker] = []
         self._halt = threading.Event()
 
-    def run(self, spans: Sequence[tuple[Plate, int, int]], each: Callable[[Share | None], bool]) -> bool:
+    def run(self, spans: Sequence[tuple[PixelSet, int, int]], each: Callable[[Share | None], bool]) -> bool:
         """Take samples of every pixel of plates.
 
         Args:
@@ -144,12 +144,12 @@ class Loop:
         """
         return self.take(self.blocks(spans, self.budget.threads * TASKS), each)
 
-    def blocks(self, spans: Sequence[tuple[Plate, int, int]], tasks: int) -> list[Block]:
+    def blocks(self, spans: Sequence[tuple[PixelSet, int, int]], tasks: int) -> list[Block]:
         """Cut samples of plates into blocks of pixels: ``tasks`` for each plate, as far as they repay."""
         return [
-            (plate, start, size, first, count)
-            for plate, first, count in spans
-            for start, size in self._cut(plate, count, tasks)
+            (pixel_set, start, size, first, count)
+            for pixel_set, first, count in spans
+            for start, size in self._cut(pixel_set, count, tasks)
         ]
 
     def take(self, blocks: list[Block], each: Callable[[Share | None], bool]) -> bool:
@@ -186,14 +186,14 @@ class Loop:
         self.budget.shrink()
         lanes = self.budget.lanes
         return [
-            (plate, pixel, min(lanes, start + size - pixel), first, count)
-            for plate, start, size, first, count in blocks
+            (pixel_set, pixel, min(lanes, start + size - pixel), first, count)
+            for pixel_set, start, size, first, count in blocks
             for pixel in range(start, start + size, lanes)
         ]
 
-    def _cut(self, plate: Plate, samples: int, tasks: int) -> Iterator[tuple[int, int]]:
+    def _cut(self, pixel_set: PixelSet, samples: int, tasks: int) -> Iterator[tuple[int, int]]:
         """Yield the consecutive pixels of each task."""
-        pixels = plate.film.width * plate.film.height
+        pixels = pixel_set.film.width * pixel_set.film.height
         size = pixels
         threads = self.budget.threads
         if tasks > 1 and threads > 1:
@@ -215,15 +215,15 @@ class Loop:
 
     def task(self, block: Block) -> Share:
         """Take a block, in a thread of its own."""
-        plate, start, size, first, count = block
-        share = Share(Tally())
+        pixel_set, start, size, first, count = block
+        share = Share(RayCounts())
         sample = first
         try:
             worker = self._worker()
             step = max(self.budget.lanes // size, 1)
             while sample < first + count:
-                chunk = Chunk(start, size, sample, min(step, first + count - sample), plate)
-                self._chunk(worker, chunk, plate, share)
+                chunk = Chunk(start, size, sample, min(step, first + count - sample), pixel_set)
+                self._chunk(worker, chunk, pixel_set, share)
                 sample += chunk.samples
                 share.samples += size * chunk.samples
                 if self.strict and share.lost.count:
@@ -232,9 +232,9 @@ class Loop:
         except Halted:
             pass  # what was added so far counts
         except Exception as error:
-            if not ran_out(error):
+            if not is_out_of_memory(error):
                 raise
-            share.rest = [(plate, start, size, sample, first + count - sample)]
+            share.rest = [(pixel_set, start, size, sample, first + count - sample)]
         return share
 
     def _worker(self) -> Worker:
@@ -247,11 +247,11 @@ class Loop:
         worker.serve(self.kernels, self._halt)
         return worker
 
-    def _chunk(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
+    def _chunk(self, worker: Worker, chunk: Chunk, pixel_set: PixelSet, share: Share) -> None:
         """Add a chunk to the films: all of it, or nothing where memory runs out."""
-        names, light = tuple(plate.layers), self.kernels.wave.integrator.light
+        names, light = tuple(pixel_set.layers), self.kernels.wave.integrator.light
         rays = worker.layers(chunk, names) if names else 0
-        for film in plate.layers.values():
+        for film in pixel_set.layers.values():
             self.kernels.deposit(film.channels, False)
         if light:
             self.kernels.deposit(3, self.clamp is not None)
@@ -261,24 +261,24 @@ class Loop:
         # From here on a failure would leave half a chunk: what little is allocated must be there, or the render ends.
         with needing("the sums of a film"):
             if light:
-                self._radiance(worker, chunk, plate, share)
-                self._splats(worker, chunk, plate.film, share)
+                self._radiance(worker, chunk, pixel_set, share)
+                self._splats(worker, chunk, pixel_set.film, share)
             if names:
-                self._layers(worker, chunk, plate)
+                self._layers(worker, chunk, pixel_set)
         share.tally.rays += rays
 
-    def _radiance(self, worker: Worker, chunk: Chunk, plate: Plate, share: Share) -> None:
+    def _radiance(self, worker: Worker, chunk: Chunk, pixel_set: PixelSet, share: Share) -> None:
         values = worker.slots.floats
         used = values[:, : chunk.pixels * chunk.samples]
         if self.clamp is None:
-            if self._deposit(worker, values, chunk, plate.film, 3, None):
+            if self._deposit(worker, values, chunk, pixel_set.film, 3, None):
                 share.lost.add(self._lost(used, chunk))
             return
         finite = np.isfinite(used).all(0)
         if not finite.all():
             share.lost.add(self._lost(used, chunk))  # the clamp writes over them
         before = float(np.where(finite, used, 0.0).sum(dtype=np.float64))
-        self._deposit(worker, values, chunk, plate.film, 3, self.clamp)
+        self._deposit(worker, values, chunk, pixel_set.film, 3, self.clamp)
         share.light = share.light[0] + before, share.light[1] + float(np.ascontiguousarray(used).sum(dtype=np.float64))
 
     def _splats(self, worker: Worker, chunk: Chunk, film: Film, share: Share) -> None:
@@ -295,10 +295,10 @@ class Loop:
             film.splats.add(stream, splats.pixel, value)
         share.light = share.light[0] + before, share.light[1] + after
 
-    def _layers(self, worker: Worker, chunk: Chunk, plate: Plate) -> None:
+    def _layers(self, worker: Worker, chunk: Chunk, pixel_set: PixelSet) -> None:
         assert worker.shown is not None
         first = 0
-        for film in plate.layers.values():
+        for film in pixel_set.layers.values():
             values = worker.shown.floats[first : first + film.channels]
             self._deposit(worker, values, chunk, film, film.channels, None)
             first += film.channels
@@ -332,7 +332,7 @@ class Loop:
             film.keep_first(values[:, :n], chunk.first_pixel)
         return int(counters[0])
 
-    def _lost(self, used: np.ndarray, chunk: Chunk) -> Lost:
+    def _lost(self, used: np.ndarray, chunk: Chunk) -> NonFinite:
         """Return which samples of a chunk are not finite, of the radiance ``(3, samples * pixels)`` of all."""
         radiance = torch.from_numpy(used).view(3, chunk.samples, chunk.pixels)
-        return Lost.of(radiance, chunk.first_pixel, chunk.first_sample, self.kernels.wave.crop, chunk.plate)
+        return NonFinite.of(radiance, chunk.first_pixel, chunk.first_sample, self.kernels.wave.crop, chunk.pixel_set)

@@ -18,7 +18,7 @@ from torchpt.physics.parts import Part
 from torchpt.physics.shapes.geometry import KINDS
 from torchpt.physics.shapes.quadrics import Form
 from torchpt.scene import Scene
-from torchpt.scene.prepare import kept
+from torchpt.scene.prepare import scene_cache
 from torchpt.scene.settings import Settings
 
 __all__ = [
@@ -307,7 +307,7 @@ def _starts(parts: tuple[Part, ...], bodies: Bodies) -> list[int]:
 
 
 def _topology(scene: Scene, part: Part) -> Edges:
-    made = kept(scene).outlines
+    made = scene_cache(scene).outlines
     if part.name not in made:
         made[part.name] = edges_of(part, scene.device)
     return made[part.name]

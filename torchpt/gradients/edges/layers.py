@@ -73,7 +73,7 @@ def differentiable(
         found = _gradients(asked(), names, given(*values), cotangents)
         return [*found, *(None for _ in values[len(found) :])]
 
-    return dict(zip(names, autograd.on_tape(rendered, work, tensors), strict=True))
+    return dict(zip(names, autograd.custom_vjp(rendered, work, tensors), strict=True))
 
 
 def _gradients(
@@ -122,7 +122,7 @@ def _interior(asked: Asked, names: tuple[str, ...], params: dict[str, Tensor], w
             with torch.enable_grad():
                 leaves = [plain[name].clone().requires_grad_() for name in asked.wanted]
                 wave = rebound(still, scene, settings, {**plain, **dict(zip(asked.wanted, leaves, strict=True))})
-                found = tensors.layers(wave, names, first, count, sample, many, slide=True)
+                found = tensors.layers(wave, names, first, count, sample, many, follow_shape=True)
                 mean = torch.cat([found[name] for name in names]).sum(1) / spp
             if mean.requires_grad:
                 grads = torch.autograd.grad(mean, leaves, flat[:, first : first + count], allow_unused=True)

@@ -13,13 +13,13 @@ from torchpt.engines import tensors
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.kernels.threads import Loop
 from torchpt.paths.state import FOREVER, PathState
-from torchpt.paths.wave import Plate, Rays, Wave, clamp_scale
+from torchpt.paths.wave import PixelSet, Rays, Wave, clamp_scale
 from torchpt.physics.film import Film
 from torchpt.physics.samplers import Sampler
 from torchpt.scene import Scene
 from torchpt.scene.prepare import kernels_of, looped, make_wave
 from torchpt.scene.settings import SAMPLERS, Settings
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 __all__ = ["Along", "Traced", "traced_of"]
 
@@ -61,10 +61,10 @@ class Along:
     def _by_kernels(self, wave: Wave, sample: int) -> Tensor:
         self._kernels = kernels_of(self._scene, wave, self._kernels)
         loop = Loop(self._kernels, torch.get_num_threads(), self._clamp, False)
-        plate = Plate(Film(wave.crop[2], 1, 1, wave.centre.device))
-        loop.run([(plate, sample, 1)], lambda _: False)
+        pixel_set = PixelSet(Film(wave.crop[2], 1, 1, wave.centre.device))
+        loop.run([(pixel_set, sample, 1)], lambda _: False)
         loop.dismiss(self._keep)
-        return plate.film.sums[0]
+        return pixel_set.film.sums[0]
 
 
 # ---- What rays of edges see: the forward render's own search, integrator and engines, without derivatives
@@ -118,7 +118,7 @@ class Traced:
 def traced_of(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dtype: torch.dtype) -> Traced:
     """Return the wave of a scene under ``params``; its numbers are independent from sample to sample."""
     render = settings.render
-    plain = replace(settings, sampler=Described(SAMPLERS["independent"], {}))
+    plain = replace(settings, sampler=ParsedParams(SAMPLERS["independent"], {}))
     wave = make_wave(scene, plain, params, dtype)
     if wave.accel.name == "brute":  # packets widen primitives by their rounding, further than edges look beside
         wave = make_wave(scene, replace(plain, render=render.but(accel="numba")), params, dtype)

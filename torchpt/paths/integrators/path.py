@@ -16,14 +16,14 @@ from torchpt.paths.state import Plan
 from torchpt.physics.shapes.geometry import Hit
 from torchpt.physics.world import World
 
-__all__ = ["Ends", "PathIntegrator", "partition", "slides"]
+__all__ = ["Ends", "PathIntegrator", "follows_shape", "partition"]
 
 
 class PathIntegrator(Integrator):
     """Integrators that follow paths to their :attr:`limits`, vertex by vertex."""
 
 
-def slides(plan: Plan, world: World, depth: int) -> bool:
+def follows_shape(plan: Plan, world: World, depth: int) -> bool:
     """Return True where points at a vertex slide along their rays; see :func:`torchpt.physics.shapes.interact`.
 
     Under derivatives the camera's own point slides along its ray; later ones are held on their surface. In float64 the camera's

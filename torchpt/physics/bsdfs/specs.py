@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from torchpt.physics.bsdfs.presets import INDICES
 from torchpt.spec import REQUIRED, Color, Index, Other, Refused, Scalar, Spec
-from torchpt.spec.schema import Described
+from torchpt.spec.schema import ParsedParams
 
 __all__ = ["GREY", "WHITE", "Heights", "Inner", "Normals", "fraction", "index", "reflectance", "smooth"]
 
@@ -95,6 +95,6 @@ class Inner(Spec):
 
     def read(self, value: Any) -> Any:
         """See :class:`Spec`."""
-        if isinstance(value, Described) or (isinstance(value, str) and value):
+        if isinstance(value, ParsedParams) or (isinstance(value, str) and value):
             return value
         raise Refused(self.expected)

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from torchpt.physics.film.error import KnownError, Pilots, pilots_of
+from torchpt.physics.film.error import ErrorEstimate, Pilots, pilots_of
 from torchpt.physics.film.filters import Filter
 from torchpt.physics.film.sums import Film
 from torchpt.spec import Kinds
@@ -20,9 +20,9 @@ from torchpt.spec.schema import values_of
 
 __all__ = [
     "FILTERS",
+    "ErrorEstimate",
     "Film",
     "Filter",
-    "KnownError",
     "Pilots",
     "filter_of",
     "pilots_of",

@@ -19,7 +19,7 @@ __all__ = [
     "FEWEST_OF_TAIL",
     "STREAMS",
     "Again",
-    "KnownError",
+    "ErrorEstimate",
     "Pilots",
     "again_counts",
     "around",
@@ -171,7 +171,7 @@ BRIGHTER, BRIGHTEST = 4.0, 32.0
 
 
 @dataclass(frozen=True)
-class KnownError:
+class ErrorEstimate:
     """An estimate of relMSE, the mean of ``(x - r)² / (r² + 0.01)`` over pixels and channels.
 
     Attributes:
@@ -224,7 +224,7 @@ def error_by_pilots(pilots: Pilots, a: Tensor, b: Tensor) -> Tensor:
     return error_at(a, b, around(grid, known)[at]).mean(1)
 
 
-def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> KnownError:
+def pilots_alone(pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool) -> ErrorEstimate:
     """By the pilots alone, so that no other pixel has a say: the relMSE that decisions are made by."""
     share = error_by_pilots(pilots, a, b) * _first_part(a, b, spare)
     pixels = float(sum_all(pilots.weight))
@@ -290,7 +290,7 @@ def _suspects(picture: Tensor) -> Tensor:
 
 def known_error(
     picture: Tensor, pilots: Pilots, a: Tensor, b: Tensor, spare: Tensor | None, counted: bool, again: Again | None
-) -> KnownError | None:
+) -> ErrorEstimate | None:
     """The error that a picture knows.
 
     Args:
@@ -380,7 +380,7 @@ def _really(values: Tensor, mean: Tensor, spare: Tensor) -> tuple[float, float]:
     return float(sum_all(share.mean(1))), float(sum_all((slope * spare.sqrt()).mean(1).square()))
 
 
-def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool, share: Tensor) -> KnownError:
+def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool, share: Tensor) -> ErrorEstimate:
     """The estimate with its interval.
 
     Args:
@@ -392,13 +392,13 @@ def _with_interval(mean: float, parts: Tensor, unsure: float, few: bool, share: 
     """
     count = len(parts)
     if not mean > 0.0 or not math.isfinite(mean):
-        return KnownError(mean, (0.0, 0.0) if mean == 0.0 and count >= FEWEST else None, not math.isfinite(mean))
+        return ErrorEstimate(mean, (0.0, 0.0) if mean == 0.0 and count >= FEWEST else None, not math.isfinite(mean))
     if count < FEWEST:
-        return KnownError(mean, None, True)
+        return ErrorEstimate(mean, None, True)
     deviation = math.sqrt(float(sum_all(parts.square())) + unsure)
     heavy = few or deviation > VAGUE * mean or (count >= FEWEST_OF_TAIL and heavy_tail(share))
     factor = math.exp(min(_quantile(count - 1) * deviation / mean, 300.0))
-    return KnownError(mean, (mean / factor, mean * factor), heavy)
+    return ErrorEstimate(mean, (mean / factor, mean * factor), heavy)
 
 
 def _quantile(freedom: int) -> float:

@@ -18,7 +18,7 @@ __all__ = ["BOTTOM", "TOP", "UPRIGHT", "Place", "Shape", "Size", "Surface", "Tri
 
 if TYPE_CHECKING:
     from torchpt.physics.shapes.quadrics import Quadric
-    from torchpt.spec.schema import Described
+    from torchpt.spec.schema import ParsedParams
 
 Matrix = NDArray[np.float64]
 
@@ -76,7 +76,7 @@ class Triangles:
     normals: Matrix | None = None
     uvs: Matrix | None = None
     flat: bool = False
-    displacement: Described | None = None
+    displacement: ParsedParams | None = None
     object: Any = None
 
 

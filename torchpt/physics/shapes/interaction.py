@@ -3,7 +3,7 @@
 The search is free of gradients. Here the point comes from the primitive's own corners, which is more accurate than
 ``o + t d`` and makes any search differentiable. Two parametrizations serve the derivative (the values are the same):
 
-- a camera ray stays fixed in its pixel and the point slides along it: ``slide``;
+- a camera ray stays fixed in its pixel and the point slides along it: ``follow_shape``;
 - at later vertices the point stays fixed on its surface and the direction follows: :func:`reattach` (the material form of
   Zhang, Miller, Yan, Gkioulekas, Zhao, *Path-Space Differentiable Rendering*, 2020; its interior term).
 """
@@ -43,7 +43,7 @@ def _round(world: World, prim: Tensor) -> list[tuple[type[Primitive], Tensor]]:
     return [(kind, world.geometry.of(kind, prim)) for kind in world.geometry.kinds if not kind.flat]
 
 
-def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) -> Interaction:
+def interact(world: World, o: Tensor, d: Tensor, hit: Hit, follow_shape: bool = False) -> Interaction:
     """Surface points of hits ``(N,)``, none of them a miss.
 
     Args:
@@ -51,12 +51,12 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
         o: ray origins ``(3, N)``.
         d: ray directions ``(3, N)``.
         hit: from the search.
-        slide: re-intersect the ray with the plane, so that the point follows ``o``, ``d`` and the geometry.
+        follow_shape: re-intersect the ray with the plane, so that the point follows ``o``, ``d`` and the geometry.
     """
     geometry, place = world.geometry, place_of(world, hit.prim)
     prim, p0, e1, e2, u, v = place.prim, place.p0, place.e1, place.e2, hit.u, hit.v
     round_ = _round(world, prim)
-    if slide:
+    if follow_shape:
         u, v = _slide(o, d, p0, e1, e2)
     for _, mine in round_:
         u, v = torch.where(mine, 0.0, u), torch.where(mine, 0.0, v)
@@ -66,7 +66,7 @@ def interact(world: World, o: Tensor, d: Tensor, hit: Hit, slide: bool = False) 
     if place.copied is not None and place.reach is not None:
         bound = torch.where(place.copied, dot(ng.detach().abs(), place.reach), take(geometry.bound, prim))
     for kind, mine in round_:
-        met = kind.meet(world, place, Rays(o, d, hit, slide), mine)
+        met = kind.meet(world, place, Rays(o, d, hit, follow_shape), mine)
         p, ng = torch.where(mine, met.p, p), torch.where(mine, met.ng, ng)
         if met.bound is not None:
             bound = torch.where(mine, met.bound, take(geometry.bound, prim) if bound is None else bound)

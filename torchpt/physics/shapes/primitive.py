@@ -95,13 +95,13 @@ class Rays:
         o: origins ``(3, N)``.
         d: directions ``(3, N)``.
         hit: from the search.
-        slide: whether points follow ``o``, ``d`` and the geometry.
+        follow_shape: whether points follow ``o``, ``d`` and the geometry.
     """
 
     o: Tensor
     d: Tensor
     hit: Hit
-    slide: bool = False
+    follow_shape: bool = False
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,24 @@ from torchpt.physics.shapes.geometry import Quadrics, QuadricTable
 from torchpt.physics.world import World
 
 __all__ = [
-    "Form", "Quadric", "areas", "bitangent", "direction", "normal", "octahedral", "outward", "place", "polar", "quadrics_of",
-    "ring", "rows", "sample", "slide", "surface_uv", "table_of", "tangent",
+    "Form",
+    "Quadric",
+    "areas",
+    "bitangent",
+    "direction",
+    "follow_shape",
+    "normal",
+    "octahedral",
+    "outward",
+    "place",
+    "polar",
+    "quadrics_of",
+    "ring",
+    "rows",
+    "sample",
+    "surface_uv",
+    "table_of",
+    "tangent",
 ]  # fmt: skip
 
 
@@ -228,7 +244,7 @@ def surface_uv(table: Quadrics, q: Tensor) -> Tensor:
     return torch.stack((turn, _each(table, (kind.v(q, across) for kind in table.kinds))))
 
 
-def slide(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t: Tensor, q: Tensor) -> Tensor:
+def follow_shape(table: Quadrics, p0: Tensor, e1: Tensor, o: Tensor, d: Tensor, t: Tensor, q: Tensor) -> Tensor:
     """The points ``q (3, N)`` with the derivative of where the ray ``o + t d`` meets the surface, in all arguments but ``t``.
 
     One Newton step on the surface's equation, whose slope is a constant of it. In float64 it is the value too, finer than the

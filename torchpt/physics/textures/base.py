@@ -19,7 +19,7 @@ from torchpt.core.errors import SceneError
 from torchpt.math.transforms import uv_matrix
 from torchpt.spec import Angle, Color, Moves, Other, Pair, Refused, Spec, parameters_of
 from torchpt.spec.reading import LARGEST, within
-from torchpt.spec.schema import Described, values_of
+from torchpt.spec.schema import ParsedParams, values_of
 
 if TYPE_CHECKING:
     from torchpt.physics.parts import Parameters
@@ -59,7 +59,7 @@ class TextureInput:
         moves: what changes place with the slot's values.
     """
 
-    texture: Described | Named
+    texture: ParsedParams | Named
     coloured: bool
     linear: bool
     low: float
@@ -276,7 +276,7 @@ class Texture:
         """
 
     @classmethod
-    def suits(cls, values: Mapping[str, Any], coloured: bool) -> None:
+    def film_space_applies(cls, values: Mapping[str, Any], coloured: bool) -> None:
         """Refuse what a slot of a colour, or of a number, cannot read of a texture that is written in it.
 
         Raises:

@@ -20,11 +20,11 @@ from torchpt.engines.kernels.threads import TASKS
 from torchpt.paths.wave import Wave
 from torchpt.rendering import Entry, Rendering, Run, render_many
 from torchpt.rendering.batches.inputs import Cameras, Seeds, cameras_of, named, params_of, scenes_of, seeds_of
-from torchpt.rendering.orders import Order, ordered, rendered
+from torchpt.rendering.requests import RenderRequest, ordered, rendered
 from torchpt.scene import Scene
-from torchpt.scene.editions import check_unchanged
 from torchpt.scene.entry import as_scene
-from torchpt.scene.settings import Common, RenderWishes
+from torchpt.scene.settings import Common, RenderOptions
+from torchpt.scene.versions import check_unchanged
 from torchpt.spec.arguments import check_names, spelled
 
 __all__ = ["Renderings", "render_batch"]
@@ -64,7 +64,7 @@ class _Picture:
     scene: int
     camera: int
     name: str
-    order: Order
+    order: RenderRequest
 
 
 Pictures = Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]] | None
@@ -117,7 +117,7 @@ def render_batch(
         RenderError: as :func:`torchpt.render`.
         TypeError: an argument that ``render`` does not know.
     """
-    check_names("render_batch", wishes, RenderWishes, ("cameras", "on_progress"))
+    check_names("render_batch", wishes, RenderOptions, ("cameras", "on_progress"))
     if on_progress is not None and not callable(on_progress):
         raise SceneError("on_progress", on_progress, "a function")
     scenes = scenes_of(scenes)
@@ -134,7 +134,7 @@ def render_batch(
     if first is None:
         raise SceneError("scenes", 0, "one scene at least")
     total = None if size is None else size * len(views)
-    found: dict[tuple[int, int], tuple[Order | None, Rendering]] = {}
+    found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]] = {}
     with limited_threads(first.order.settings.render.threads):
         tasks = 1 if total is None else -(-TASKS * torch.get_num_threads() // total)
         _check_memory(first.order, total)
@@ -158,7 +158,7 @@ def _stacked(rows: list[list[Tensor]]) -> Tensor:
         return torch.stack([torch.stack(row) for row in rows])
 
 
-def _taped(found: tuple[Order | None, Rendering]) -> Rendering:
+def _taped(found: tuple[RenderRequest | None, Rendering]) -> Rendering:
     """A rendering on the tape that its parameters are on; without an order there is none."""
     order, rendering = found
     return rendering if order is None else rendered(order, [rendering])
@@ -175,13 +175,13 @@ def _pictures(
 ) -> Iterator[_Picture]:
     """Return the orders, picture by picture, those of a scene together; ``several``: scenes are one under other parameters."""
     like: dict[str, Any] = {}
-    editions: WeakKeyDictionary[Scene, dict[str, int]] = WeakKeyDictionary()
+    versions: WeakKeyDictionary[Scene, dict[str, int]] = WeakKeyDictionary()
     for s, each in enumerate(scenes):
         scene = as_scene(each, f"scenes[{s}]")
         if not several:  # whether its pictures are rendered by now, nobody can tell
             with named(f"scenes[{s}]", None):
-                now = scene.editions()
-                check_unchanged(editions.setdefault(scene, now), now, "while the batch has it")
+                now = scene.versions()
+                check_unchanged(versions.setdefault(scene, now), now, "while the batch has it")
         if sets is not None and s >= len(sets):
             raise SceneError("params", len(sets), "as many as there are scenes")
         for c, camera in enumerate(cameras):
@@ -205,7 +205,7 @@ def _ordered(
     seed: int | None,
     full: bool,
     wishes: Common,
-) -> Order:
+) -> RenderRequest:
     """Return the order of one picture."""
     if isinstance(camera, Tensor):
         if "camera.to_world" in params:
@@ -224,7 +224,7 @@ def _ordered(
 
 def _entries(
     pictures: Iterable[_Picture],
-    found: dict[tuple[int, int], tuple[Order | None, Rendering]],
+    found: dict[tuple[int, int], tuple[RenderRequest | None, Rendering]],
     on_progress: Callable[[int, int | None], None] | None,
     total: int | None,
 ) -> Iterator[Entry]:
@@ -258,7 +258,7 @@ def _entries(
     return map(entry, pictures)
 
 
-def _check_memory(order: Order, total: int | None) -> None:
+def _check_memory(order: RenderRequest, total: int | None) -> None:
     """Refuse a bound that the pictures of a batch alone would break."""
     limit, film = order.settings.render.max_memory, order.settings.film
     _, _, width, height = film.crop or (0, 0, film.width, film.height)

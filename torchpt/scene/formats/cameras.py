@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from torchpt.physics.cameras import KINDS
-from torchpt.spec.schema import Described, described, refuse_foreign
+from torchpt.spec.schema import ParsedParams, described, refuse_foreign
 
 __all__ = ["read_camera"]
 
 
-def read_camera(raw: Any, film: Mapping[str, Any], file: str | None) -> Described:
+def read_camera(raw: Any, film: Mapping[str, Any], file: str | None) -> ParsedParams:
     """The camera of a scene file's block.
 
     Args:

@@ -21,7 +21,7 @@ from torchpt.scene.formats.textures import check_texture, texture_of
 from torchpt.scene.formats.yaml import parse_yaml, plain, read_open, read_yaml
 from torchpt.scene.settings import BLOCKS, Settings, having
 from torchpt.spec import Role
-from torchpt.spec.schema import Described, check_keys, described
+from torchpt.spec.schema import ParsedParams, check_keys, described
 
 __all__ = [
     "ASSETS",
@@ -66,16 +66,16 @@ class Description:
 
     file: str | None
     base: Path
-    camera: Described
+    camera: ParsedParams
     version: int | None = None
     film: dict[str, Any] = field(default_factory=dict)
     integrator: dict[str, Any] = field(default_factory=dict)
     sampler: dict[str, Any] = field(default_factory=dict)
     render: dict[str, Any] = field(default_factory=dict)
-    textures: dict[str, Described] = field(default_factory=dict)
-    materials: dict[str, Described] = field(default_factory=dict)
-    shapes: dict[str, Described] = field(default_factory=dict)
-    lights: dict[str, Described] = field(default_factory=dict)
+    textures: dict[str, ParsedParams] = field(default_factory=dict)
+    materials: dict[str, ParsedParams] = field(default_factory=dict)
+    shapes: dict[str, ParsedParams] = field(default_factory=dict)
+    lights: dict[str, ParsedParams] = field(default_factory=dict)
 
     def resolve(self, path: str | tuple[str, ...], key: str) -> Path:
         """The file that a scene names, or the first existing one of several.
@@ -251,11 +251,11 @@ def _named(raw: Mapping[str, Any], block: str, file: str | None, read: Callable[
 def _shape(
     item: Any,
     key: str,
-    materials: Mapping[str, Described],
-    textures: Mapping[str, Described],
+    materials: Mapping[str, ParsedParams],
+    textures: Mapping[str, ParsedParams],
     types: Mapping[str, Kind],
     file: str | None,
-) -> Described:
+) -> ParsedParams:
     if isinstance(item, dict) and isinstance(item.get("material"), dict):
         inline = read_material(item["material"], f"{key}.material", types, file)
         check_material(inline, f"{key}.material", materials, textures, file)

@@ -12,7 +12,7 @@ from torchpt.physics.bsdfs.base import made
 from torchpt.physics.bsdfs.specs import Inner
 from torchpt.scene.formats.textures import TextureInput, check_texture, texture_of
 from torchpt.spec import REQUIRED, Refused, Spec, parameters_of, spec_of
-from torchpt.spec.schema import Described, described, values_of
+from torchpt.spec.schema import ParsedParams, described, values_of
 
 __all__ = [
     "MAX_BLENDS", "POINTS", "Kind", "check_material", "inner_of", "material_types", "model_of", "plain_material",
@@ -74,7 +74,7 @@ def _check_own(model: Bsdf, key: str) -> None:
             raise SceneError(at, value.default if isinstance(value, Spec) else value, error.expected) from None
 
 
-def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | None, depth: int = 0) -> Described:
+def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | None, depth: int = 0) -> ParsedParams:
     """The material of a mapping, with those in place inside it.
 
     Args:
@@ -101,7 +101,7 @@ def read_material(raw: Any, key: str, types: Mapping[str, Kind], file: str | Non
     return described("material", types, raw, key, file, texture=texture_of)
 
 
-def plain_material() -> Described:
+def plain_material() -> ParsedParams:
     """That of shapes which are given none: grey, diffuse."""
     return values_of(KINDS["diffuse"], {}, "", None, texture=texture_of)
 
@@ -110,12 +110,12 @@ def _inner_keys(kind: Kind) -> tuple[str, ...]:
     return tuple(key for key, spec in parameters_of(kind).items() if isinstance(spec, Inner))
 
 
-def inner_of(material: Described) -> dict[str, str | Described]:
+def inner_of(material: ParsedParams) -> dict[str, str | ParsedParams]:
     """The materials that a blend is made of, by key: names, or materials in place. Of others none."""
     return {key: material[key] for key in _inner_keys(material.kind)}
 
 
-def model_of(material: Described, materials: Mapping[str, Described]) -> tuple[Bsdf, dict[str, Any]]:
+def model_of(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> tuple[Bsdf, dict[str, Any]]:
     """A material's model, in the variant that it needs, and what that is given.
 
     Args:
@@ -130,10 +130,10 @@ def model_of(material: Described, materials: Mapping[str, Described]) -> tuple[B
 
 
 def check_material(
-    material: Described,
+    material: ParsedParams,
     key: str,
-    materials: Mapping[str, Described],
-    textures: Mapping[str, Described],
+    materials: Mapping[str, ParsedParams],
+    textures: Mapping[str, ParsedParams],
     file: str | None,
 ) -> None:
     """What can be said of a material only once all are known.
@@ -158,7 +158,7 @@ def check_material(
         name = key.removeprefix("materials.")
         _check_blend(material, key, materials, file, (name,) if materials.get(name) is material else (), 1)
         for side, item in inner.items():
-            if isinstance(item, Described):
+            if isinstance(item, ParsedParams):
                 check_material(item, f"{key}.{side}", materials, textures, file)
     slots = {slot: value for slot, value in material.values.items() if isinstance(value, TextureInput)}
     for slot, value in slots.items():
@@ -180,7 +180,12 @@ def check_material(
 
 
 def _check_blend(
-    blend: Described, key: str, materials: Mapping[str, Described], file: str | None, trail: tuple[str, ...], depth: int
+    blend: ParsedParams,
+    key: str,
+    materials: Mapping[str, ParsedParams],
+    file: str | None,
+    trail: tuple[str, ...],
+    depth: int,
 ) -> None:
     if depth > MAX_BLENDS:
         raise SceneError(key, blend.name, f"blends nested at most {MAX_BLENDS} deep", file)
@@ -207,11 +212,11 @@ def _check_blend(
 
 
 def _check_maps(
-    blend: Described,
-    inner: Described,
-    item: str | Described,
+    blend: ParsedParams,
+    inner: ParsedParams,
+    item: str | ParsedParams,
     at: str,
-    materials: Mapping[str, Described],
+    materials: Mapping[str, ParsedParams],
     file: str | None,
 ) -> None:
     """Refuse textures that would have to be known before a blend can be: of normals and of how much is there at all."""
@@ -228,7 +233,7 @@ def _check_maps(
             raise NotBuiltError(at, "a blend by a texture with what light passes by chance", expected, file)
 
 
-def _sides(material: Described, materials: Mapping[str, Described]) -> Iterator[Described]:
+def _sides(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> Iterator[ParsedParams]:
     """The materials that a blend is made of, those that exist."""
     for item in inner_of(material).values():
         if not isinstance(item, str):
@@ -237,7 +242,7 @@ def _sides(material: Described, materials: Mapping[str, Described]) -> Iterator[
             yield materials[item]
 
 
-def _sheer(material: Described, materials: Mapping[str, Described]) -> bool:
+def _sheer(material: ParsedParams, materials: Mapping[str, ParsedParams]) -> bool:
     """Whether rays may pass a material as if it were not there."""
     if material.kind.sheer or material["opacity"] != 1.0:
         return True

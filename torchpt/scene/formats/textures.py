@@ -12,12 +12,12 @@ from torchpt.core.errors import SceneError
 from torchpt.physics.textures import CHANNELS, KINDS, Named, TextureInput
 from torchpt.spec import Moves, Refused, Spec, parameters_of
 from torchpt.spec.reading import within
-from torchpt.spec.schema import Described, check_keys, described, dotted
+from torchpt.spec.schema import ParsedParams, check_keys, described, dotted
 
 __all__ = ["Named", "TextureInput", "check_texture", "read_texture", "texture_of"]
 
 
-def read_texture(raw: Any, key: str, file: str | None) -> Described | Named:
+def read_texture(raw: Any, key: str, file: str | None) -> ParsedParams | Named:
     """The texture of a mapping: ``{texture: NAME}``, or one written out.
 
     Raises:
@@ -56,15 +56,15 @@ def _input(raw: Any, coloured: bool, low: float, high: float, linear: bool, move
     channel = texture.channel if isinstance(texture, Named) else texture.values.get("channel")
     if coloured and channel is not None:
         raise Refused("no channel where a colour is wanted", channel, ("channel",))
-    if isinstance(texture, Described):
-        texture.kind.suits(texture.values, coloured)
+    if isinstance(texture, ParsedParams):
+        texture.kind.film_space_applies(texture.values, coloured)
     return TextureInput(texture, coloured, linear, low, high, moves)
 
 
 def check_texture(
     slot: TextureInput,
     key: str,
-    textures: Mapping[str, Described],
+    textures: Mapping[str, ParsedParams],
     file: str | None,
     *,
     coordinates: bool = False,

@@ -40,8 +40,8 @@ class Quadric(Primitive):
         """See :class:`Primitive`."""
         table = quadrics.rows(world, place.prim)
         own = _told(table, rays, mine)
-        if rays.slide:
-            moved = quadrics.slide(table, place.p0, place.e1, rays.o, rays.d, rays.hit.t, own)
+        if rays.follow_shape:
+            moved = quadrics.follow_shape(table, place.p0, place.e1, rays.o, rays.d, rays.hit.t, own)
             own = torch.where(mine, moved, own)
         ng = quadrics.outward(table, own)
         # At the point itself: a needle is far thinner than it is long.

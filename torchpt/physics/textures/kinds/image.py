@@ -78,7 +78,7 @@ class Image(Mapped):
             raise Refused("no max_pixels beside data: it is of files", values["max_pixels"], ("max_pixels",))
 
     @classmethod
-    def suits(cls, values: Mapping[str, Any], coloured: bool) -> None:
+    def film_space_applies(cls, values: Mapping[str, Any], coloured: bool) -> None:
         """See :class:`Texture`."""
         if not coloured and len(set(values["scale"])) > 1:
             raise Refused("one number as scale where a number is wanted", list(values["scale"]), ("scale",))

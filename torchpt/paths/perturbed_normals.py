@@ -11,11 +11,11 @@ from torchpt.math.vectors import Frame, affine, cross, dot, normalize, take
 from torchpt.physics.shapes.geometry import Interaction
 from torchpt.physics.textures import MaterialTextures
 
-__all__ = ["Relief", "mapped"]
+__all__ = ["PerturbedNormal", "mapped"]
 
 
 @dataclass(frozen=True)
-class Relief:
+class PerturbedNormal:
     """What a normal or bump map did to the shading normal."""
 
     normal: Tensor  # (3, N) without the map, turned as the frame is
@@ -40,7 +40,7 @@ def mapped(
     d: Tensor,
     at: Interaction,
     side: Tensor | None,
-) -> tuple[Frame, Relief]:
+) -> tuple[Frame, PerturbedNormal]:
     """The frame about the normal of a normal or bump map, and what the map did.
 
     A normal map's vectors are relative to the shading normal, the tangent along u, and their cross product. A bump map's
@@ -81,4 +81,4 @@ def mapped(
     normal = torch.where(flat, n, normal)
     square = dot(normal, n).square().clamp_min(1e-12)
     alpha2 = (0.125 * (1.0 - square).clamp_min(0.0) / square).clamp_max(1.0)
-    return Frame.along(normal, at.tangent), Relief(n, alpha2)
+    return Frame.along(normal, at.tangent), PerturbedNormal(n, alpha2)

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
-from torchpt.scene.editions import changes
 from torchpt.scene.sources import check_sources
+from torchpt.scene.versions import changes
 
 if TYPE_CHECKING:
     from torchpt.scene.scene import Scene
 
-__all__ = ["check_tensor", "shared", "vet"]
+__all__ = ["check_tensor", "shared", "validate_changes"]
 
 
 def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], texels: bool = False) -> None:
@@ -35,8 +35,8 @@ def check_tensor(name: str, value: object, shape: torch.Size | tuple[int, ...], 
     raise SceneError(f"params.{name}", found, f"a {kind} of shape {tuple(shape)}{others}")
 
 
-def vet(scene: Scene, vetted: dict[str, int]) -> None:
-    """Check what was not yet; ``vetted`` is brought up to date: by name the edition that was checked.
+def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
+    """Check what was not yet; ``validated_versions`` is brought up to date: by name the edition that was checked.
 
     Raises:
         SceneError: see :meth:`Scene.check_own`.
@@ -46,7 +46,7 @@ def vet(scene: Scene, vetted: dict[str, int]) -> None:
         raise SceneError(
             f"params.{name}", "nothing" if name in own else name, "the names that the scene was loaded with"
         )
-    changed = changes(vetted, scene.editions())
+    changed = changes(validated_versions, scene.versions())
     if not changed:
         return
     for name in changed:
@@ -54,14 +54,14 @@ def vet(scene: Scene, vetted: dict[str, int]) -> None:
         check_tensor(name, value, own[name].shape)
         scene.check_number(name, value.detach())
     check_sources(scene.built.sources, changed, scene.merged(None))
-    vetted |= changed
+    validated_versions |= changed
 
 
-def shared(made: Scene, scene: Scene, vetted: dict[str, int]) -> dict[str, int]:
+def shared(made: Scene, scene: Scene, validated_versions: dict[str, int]) -> dict[str, int]:
     """Of what was checked of a scene, that which another one made of it has too: the same tensors, as they were checked."""
-    before, now = scene.editions(), made.editions()
+    before, now = scene.versions(), made.versions()
     return {
         name: edition
         for name, edition in now.items()
-        if 0 < before.get(name, 0) == vetted.get(name) and made.params[name] is scene.params[name]
+        if 0 < before.get(name, 0) == validated_versions.get(name) and made.params[name] is scene.params[name]
     }

@@ -10,7 +10,7 @@ from typing import Any, Unpack
 import torch
 from torch import Tensor
 
-from torchpt.core.autograd import in_batch, on_tape, wants_gradients
+from torchpt.core.autograd import custom_vjp, in_batch, wants_gradients
 from torchpt.core.errors import EdgeWarning, NoLightWarning, SceneError, warn_caller
 from torchpt.images.denoiser import check_denoiser
 from torchpt.paths.integrators import KINDS as INTEGRATORS
@@ -21,20 +21,20 @@ from torchpt.rendering import Rendering, render_scene
 from torchpt.rendering.graphs import known
 from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
-from torchpt.scene.editions import AFTER, check_unchanged
 from torchpt.scene.entry import as_scene
 from torchpt.scene.formats.description import settings as complete
-from torchpt.scene.settings import SAMPLERS, Call, Settings, Wishes, blocks_of
+from torchpt.scene.settings import SAMPLERS, Call, CommonOptions, Settings, blocks_of
 from torchpt.scene.textured import renew, with_texels
+from torchpt.scene.versions import AFTER, check_unchanged
 from torchpt.spec import Role
 
-__all__ = ["Order", "ordered", "ordered_along", "rendered"]
+__all__ = ["RenderRequest", "ordered", "ordered_along", "rendered"]
 
 _FLOATS = (torch.float32, torch.float64)
 
 
 @dataclass(frozen=True)
-class Order:
+class RenderRequest:
     """A picture that was asked for: checked, complete, and not begun.
 
     Attributes:
@@ -43,7 +43,7 @@ class Order:
         settings: how.
         call: what the arguments say beside settings.
         params: tensors in place of the scene's, those of its own that want gradients among them.
-        editions: of the scene's own parameters, but for those that ``params`` stand for, as they were.
+        versions: of the scene's own parameters, but for those that ``params`` stand for, as they were.
         rays: origins and directions ``(..., 3)`` in place of the camera's, pixels of a film of one row; None: the camera's.
     """
 
@@ -52,7 +52,7 @@ class Order:
     settings: Settings
     call: Call
     params: Mapping[str, Tensor]
-    editions: Mapping[str, int] = field(default_factory=dict)
+    versions: Mapping[str, int] = field(default_factory=dict)
     rays: tuple[Tensor, Tensor] | None = None
 
     @property
@@ -70,10 +70,10 @@ class Order:
         """Return True where the picture is to carry gradients."""
         return torch.is_grad_enabled() and bool(self.wanted or self.by_rays or self.scene.weights())
 
-    def noted(self) -> Order:
+    def noted(self) -> RenderRequest:
         """The same, with what :meth:`check_unchanged` compares."""
-        now = self.given.editions()
-        return replace(self, editions={name: edition for name, edition in now.items() if name not in self.params})
+        now = self.given.versions()
+        return replace(self, versions={name: edition for name, edition in now.items() if name not in self.params})
 
     def check_unchanged(self, since: str) -> None:
         """Refuse to go on with another scene than it was when it was noted; ``since`` is for the error.
@@ -81,11 +81,11 @@ class Order:
         Raises:
             RenderError: one of the scene's own parameters was replaced, or changed in place.
         """
-        check_unchanged(self.editions, self.given.editions(), since)
+        check_unchanged(self.versions, self.given.versions(), since)
         renew(self.scene, self.given, self.params)
 
 
-def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
+def ordered(scene: Scene, full: bool, **wishes: Unpack[CommonOptions]) -> RenderRequest:
     """Return what the arguments of ``render`` ask for.
 
     Raises:
@@ -103,11 +103,11 @@ def ordered(scene: Scene, full: bool, **wishes: Unpack[Wishes]) -> Order:
     params = _given(scene, call.params, full)
     textured = with_texels(scene, params)
     textured.check_own()
-    order = Order(scene, textured, settings, call, params)
+    order = RenderRequest(scene, textured, settings, call, params)
     return order.noted() if order.taped else order
 
 
-def ordered_along(scene: Scene, o: Tensor, d: Tensor, **wishes: Unpack[Wishes]) -> Order:
+def ordered_along(scene: Scene, o: Tensor, d: Tensor, **wishes: Unpack[CommonOptions]) -> RenderRequest:
     """Return what the arguments of ``trace`` ask for: a picture whose pixels are the rays.
 
     Raises:
@@ -182,7 +182,7 @@ def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dic
     return {name: value for name, value in scene.params.items() if getattr(value, "requires_grad", False)} | given
 
 
-def rendered(order: Order, made: list[Rendering] | None = None) -> Rendering:
+def rendered(order: RenderRequest, made: list[Rendering] | None = None) -> Rendering:
     """The rendering that was asked for, on a tape where one is wanted, and denoised where that is.
 
     ``made``: a list of the rendering alone, without gradients, where it is there already; it is taken out.
@@ -259,7 +259,7 @@ def _pair(rays: tuple[Tensor, ...]) -> tuple[Tensor, Tensor] | None:
 _Make = Callable[[Mapping[str, Tensor], tuple[Tensor, ...]], Rendering]
 
 
-def _differentiable(order: Order, render: _Make) -> Rendering:
+def _differentiable(order: RenderRequest, render: _Make) -> Rendering:
     """Return a rendering whose picture is on a tape from the parameters and rays wanted; ``render`` makes it without."""
     from torchpt import gradients as adjoint
     from torchpt.gradients import edges
@@ -301,7 +301,7 @@ def _differentiable(order: Order, render: _Make) -> Rendering:
         # One pass that is a derivative of the very estimator takes its own samples again.
         own = again().render
         exact = own.seed == settings.render.seed and own.spp == taken[0]
-        held = not exact and adjoint.suits(scene, settings, wanted)
+        held = not exact and adjoint.film_space_applies(scene, settings, wanted)
         rays = _pair(tensors[len(names) :])
         found = adjoint.gradients(
             scene, again(), given, wanted, dtype, attached, call.adjoint, cotangent, held, ranks, rays, by_rays
@@ -327,7 +327,7 @@ def _differentiable(order: Order, render: _Make) -> Rendering:
         return edges.Asked(scene, again(), wanted, dtype, edges_taken())
 
     tensors = (*(params[name] for name in names), *(order.rays or ()))
-    (image,) = on_tape(forward, backward_pass, tensors, scene.weights())
+    (image,) = custom_vjp(forward, backward_pass, tensors, scene.weights())
     rendering = made[-1]
     made.clear()  # the tape keeps the closures, which are not to keep pictures
     taken.append(max(rendering.spp, 1))
@@ -338,7 +338,7 @@ def _differentiable(order: Order, render: _Make) -> Rendering:
     return replace(rendering, image=image)
 
 
-def _constant(order: Order, render: _Make) -> Rendering:
+def _constant(order: RenderRequest, render: _Make) -> Rendering:
     """Return a rendering without gradients, of parameters and rays that may still be those of a transform of ``torch.func``."""
     params, made = order.params, list[Rendering]()
 
@@ -346,7 +346,7 @@ def _constant(order: Order, render: _Make) -> Rendering:
         made.append(render(dict(zip(params, tensors, strict=False)), tensors[len(params) :]))
         return (made[-1].image,)
 
-    (image,) = on_tape(forward, lambda *_: (), (*params.values(), *(order.rays or ())), ())
+    (image,) = custom_vjp(forward, lambda *_: (), (*params.values(), *(order.rays or ())), ())
     return replace(made[-1], image=image)
 
 

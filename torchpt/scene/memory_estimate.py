@@ -17,7 +17,7 @@ from torchpt.physics.film import Film
 from torchpt.scene.prepare import surface_layers
 from torchpt.scene.settings import Settings
 
-__all__ = ["BYTES_PER_LANE", "FEWEST_OF_LOOP", "LANES", "Need", "check_film", "loaded", "need_of"]
+__all__ = ["BYTES_PER_LANE", "FEWEST_OF_LOOP", "LANES", "MemoryEstimate", "check_film", "loaded", "memory_estimate"]
 
 #: Lanes of a wave where memory is not limited: large enough to hide the cost of dispatch, small enough for the caches.
 LANES = {"cpu": 1 << 18, "cuda": 1 << 22}
@@ -48,7 +48,7 @@ def loaded(how: str) -> None:
 
 
 @dataclass(frozen=True)
-class Need:
+class MemoryEstimate:
     """Bytes that a render is to take beside what is held when it begins.
 
     Attributes:
@@ -67,7 +67,7 @@ class Need:
         """The most that is held at once, beside ``held``; with some to spare."""
         return int(SLACK * (held + self.films + self.code + max(self.waves, self.picture))) + SPARE
 
-    def of_tape(self, held: int) -> int:
+    def backward_bytes(self, held: int) -> int:
         """The same of a backward pass, which has neither films nor a picture."""
         return int(SLACK * (held + self.code + self.waves)) + SPARE
 
@@ -76,7 +76,7 @@ class Need:
         return limit - held - self.films - self.code - self.picture
 
 
-def need_of(settings: Settings, device: torch.device, how: str, models: int, rows: int = 0) -> Need:
+def memory_estimate(settings: Settings, device: torch.device, how: str, models: int, rows: int = 0) -> MemoryEstimate:
     """What a render takes.
 
     Args:
@@ -102,7 +102,7 @@ def need_of(settings: Settings, device: torch.device, how: str, models: int, row
     if device.type != "cpu":
         code = 0
     waves = FEWEST_OF_LOOP * 4 * rows if how == "compiled" else FEWEST * 2 * BYTES_PER_LANE
-    return Need(pixels * films, code, waves, pixels * picture)
+    return MemoryEstimate(pixels * films, code, waves, pixels * picture)
 
 
 def check_film(

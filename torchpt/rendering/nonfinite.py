@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from torchpt.engines.tensors import brought
-from torchpt.paths.lost import Lost, Place
+from torchpt.paths.nonfinite import NonFinite, Place
 from torchpt.paths.state import PathState
 from torchpt.paths.wave import Wave
 from torchpt.scene.names import Names
 from torchpt.scene.scene import Scene
 
 if TYPE_CHECKING:  # what traces samples again is imported once there are such
-    from torchpt.paths.explain import Fault
+    from torchpt.paths.explain import NonFiniteCause
 
 __all__ = ["causes_of", "told"]
 
 
-def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str]:
+def causes_of(scene: Scene, wave: Wave, lost: NonFinite) -> tuple[dict[str, int], str]:
     """Samples by cause, most first, and a sentence about the first one; nothing where none was lost.
 
-    Only the first :data:`~torchpt.paths.lost.KEPT` are traced again. The others are counted as ``nan, not traced`` and
+    Only the first :data:`~torchpt.paths.nonfinite.KEPT` are traced again. The others are counted as ``nan, not traced`` and
     ``infinite, not traced``, so that all add up to ``lost.count``.
 
     Args:
@@ -33,9 +33,9 @@ def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str
     """
     if not lost.count:
         return {}, ""
-    from torchpt.paths.explain import faults_of
+    from torchpt.paths.explain import causes_of_samples
 
-    faults = faults_of(_trace, wave, lost.places)
+    faults = causes_of_samples(_trace, wave, lost.places)
     causes = Counter(fault.name for fault in faults)
     nans = sum(place.nan for place in lost.places)
     causes["nan, not traced"] = lost.nan - nans
@@ -46,9 +46,9 @@ def causes_of(scene: Scene, wave: Wave, lost: Lost) -> tuple[dict[str, int], str
 
 def told(scene: Scene, wave: Wave, place: Place) -> str:
     """Return a sentence about one sample that is not finite."""
-    from torchpt.paths.explain import faults_of
+    from torchpt.paths.explain import causes_of_samples
 
-    return f"{_named(wave, place)} is not finite: {_said(scene, wave, faults_of(_trace, wave, [place])[0])}"
+    return f"{_named(wave, place)} is not finite: {_said(scene, wave, causes_of_samples(_trace, wave, [place])[0])}"
 
 
 def _trace(wave: Wave, state: PathState, observer: Any) -> Tensor:
@@ -62,7 +62,7 @@ def _named(wave: Wave, place: Place) -> str:
     return str(place) + (" (its second value)" if place.first else "")
 
 
-def _said(scene: Scene, wave: Wave, fault: Fault) -> str:
+def _said(scene: Scene, wave: Wave, fault: NonFiniteCause) -> str:
     if fault.cause == "not repeated":
         return "traced again by tensor operations it is finite"
     depth = f" at depth {fault.depth}" if fault.depth else ""

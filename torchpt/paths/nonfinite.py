@@ -12,10 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.paths.wave import Plate
+from torchpt.paths.wave import PixelSet
 from torchpt.physics.samplers import Streams
 
-__all__ = ["KEPT", "Lost", "Place"]
+__all__ = ["KEPT", "NonFinite", "Place"]
 
 #: How many are kept, and traced again: the first ones of the picture, whichever thread took them.
 KEPT = 64
@@ -49,7 +49,7 @@ class Place:
 
 
 @dataclass
-class Lost:
+class NonFinite:
     """Samples that were not finite.
 
     Attributes:
@@ -67,7 +67,7 @@ class Lost:
         """Return how many there were."""
         return self.nan + self.infinite
 
-    def add(self, other: Lost) -> None:
+    def add(self, other: NonFinite) -> None:
         """Count those of ``other`` too."""
         if other.count:
             self.nan += other.nan
@@ -80,7 +80,7 @@ class Lost:
         return {"nan": self.nan, "infinite": self.infinite, "places": places}
 
     @staticmethod
-    def read(facts: dict[str, Any]) -> Lost:
+    def read(facts: dict[str, Any]) -> NonFinite:
         """Return what :meth:`plain` made.
 
         Raises:
@@ -93,7 +93,7 @@ class Lost:
                 raise ValueError("lost samples")
         except (KeyError, TypeError):
             raise ValueError("lost samples") from None
-        return Lost(facts["nan"], facts["infinite"], [Place(*place) for place in facts["places"]])
+        return NonFinite(facts["nan"], facts["infinite"], [Place(*place) for place in facts["places"]])
 
     @staticmethod
     def of(
@@ -101,8 +101,8 @@ class Lost:
         first_pixel: int,
         first_sample: int,
         crop: tuple[int, int, int, int],
-        plate: Plate | None = None,
-    ) -> Lost:
+        pixel_set: PixelSet | None = None,
+    ) -> NonFinite:
         """Those of a chunk. It looks at every value: to be asked only where some are known to be lost.
 
         Args:
@@ -110,17 +110,17 @@ class Lost:
             first_pixel: of the plate's.
             first_sample: of theirs.
             crop: ``(x, y, width, height)`` of the picture on the film.
-            plate: what is sampled; None: the picture, by one stream.
+            pixel_set: what is sampled; None: the picture, by one stream.
         """
         bad = ~torch.isfinite(radiance).all(0)
         nan = torch.isnan(radiance).any(0)
         count, nans = int(bad.sum()), int(nan.sum())
-        streams = Streams() if plate is None else plate.streams
+        streams = Streams() if pixel_set is None else pixel_set.streams
         places = []
         for s, p in bad.nonzero()[:KEPT].tolist():
             pixel = first_pixel + p
-            pixel = pixel if plate is None or plate.places is None else int(plate.places[pixel])
+            pixel = pixel if pixel_set is None or pixel_set.places is None else int(pixel_set.places[pixel])
             y, x = divmod(pixel, crop[2])
             of_nan = bool(nan[s, p])
             places.append(Place(first_sample + s, y + crop[1], x + crop[0], streams.first, streams.count, of_nan))
-        return Lost(nans, count - nans, places)
+        return NonFinite(nans, count - nans, places)

@@ -27,7 +27,7 @@ from torchpt.scene.scene import Scene
 from torchpt.search import Accel
 from torchpt.search.bounds import primitive_bounds
 
-__all__ = ["Unlit", "unlit"]
+__all__ = ["MissingLight", "unlit"]
 
 #: Share of the picture that may be dark for the rest to tell the error.
 DARK = 0.05
@@ -38,7 +38,7 @@ RAYS, SIGHTS = 512, 8
 
 
 @dataclass(frozen=True)
-class Unlit:
+class MissingLight:
     """Light that a picture lacks.
 
     Attributes:
@@ -51,7 +51,7 @@ class Unlit:
 
 
 @torch.no_grad()
-def unlit(scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: Tensor, relmse: float) -> Unlit:
+def unlit(scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: Tensor, relmse: float) -> MissingLight:
     """Look for light that a picture lacks.
 
     Args:
@@ -63,20 +63,20 @@ def unlit(scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: T
     """
     lights, names = wave.context.world.lights, Names(scene.built, wave.context.world)
     if wave.integrator.lit and (lights is None or (lights.environment is None and not bool(lights.radiance.any()))):
-        return Unlit("there is no light at all in the scene", 0.0)
+        return MissingLight("there is no light at all in the scene", 0.0)
     search = _Search(wave, geometry)
     if wave.integrator.lit and lights is not None:
         for row, kind in _deltas(lights):
             problem = _hidden(search, names, lights, row, kind)
             if problem:
-                return Unlit(f"lights.{names.light(row)}: {problem}", 0.0)
+                return MissingLight(f"lights.{names.light(row)}: {problem}", 0.0)
     black = (picture == 0.0).all(2).reshape(-1)
     if bool(black.all()):
-        return Unlit("no sample met any light", 1.0)
+        return MissingLight("no sample met any light", 1.0)
     dark = _dark(search, black)
     if dark > min(DARK, relmse):
-        return Unlit(f"no sample met any light in {100.0 * dark:.2g} % of the picture", dark)
-    return Unlit("", dark)
+        return MissingLight(f"no sample met any light in {100.0 * dark:.2g} % of the picture", dark)
+    return MissingLight("", dark)
 
 
 class _Search:
