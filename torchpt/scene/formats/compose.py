@@ -111,20 +111,23 @@ def _skeleton(raw: Any) -> Any:
 # ---- Files that a scene names in `defaults`
 
 
-def compose(raw: dict[str, Any], file: str | None, base: Path) -> tuple[dict[str, Any], Layers]:
+def compose(
+    raw: dict[str, Any], file: str | None, base: Path, places: Sequence[Path] = ()
+) -> tuple[dict[str, Any], Layers]:
     """Return a scene merged with the files that its ``defaults`` name, and where its keys come from.
 
     Args:
         raw: the scene as written, bounded by :func:`torchpt.scene.formats.yaml.plain`.
         file: the scene file, for errors.
         base: the folder that its relative paths start from.
+        places: folders where names are looked for too, before those that ship.
 
     Raises:
         SceneError: a file that is not there, that names itself, too many of them; a removal of what is not there.
     """
     if "defaults" not in raw:
         return raw, Layers()
-    reader = _Reader(base)
+    reader = _Reader(base, (*places, configs() / "scene"))
     merged = reader.merge(raw, file, base, () if file is None else (Path(file).resolve(),))
     return merged, Layers(tuple(reader.layers))
 
@@ -134,10 +137,11 @@ class _Reader:
 
     Args:
         base: the folder that relative paths start from once all are merged.
+        places: folders where names are looked for that are not beside the file that names them.
     """
 
-    def __init__(self, base: Path) -> None:
-        self.base = base.resolve()
+    def __init__(self, base: Path, places: Sequence[Path]) -> None:
+        self.base, self.places = base.resolve(), places
         self.layers: list[tuple[str | None, Any]] = []
 
     def merge(self, raw: dict[str, Any], file: str | None, folder: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
@@ -145,7 +149,7 @@ class _Reader:
         below: dict[str, Any] = {}
         for index, name in enumerate(_names(raw.get("defaults"), file)):
             key = f"defaults.{index}" if isinstance(raw["defaults"], list) else "defaults"
-            path = _found(name, folder, key, file, trail)
+            path = self.found(name, folder, key, file, trail)
             if path in trail:
                 circle = " -> ".join(_shown(step) for step in (*trail[trail.index(path) :], path))
                 raise SceneError(key, name, f"files that do not name themselves ({circle})", file)
@@ -161,9 +165,24 @@ class _Reader:
         self.layers.append((file, _skeleton(own)))
         return merged(below, own, file, strict="defaults" in raw)
 
+    def found(self, name: str, folder: Path, key: str, file: str | None, trail: tuple[Path, ...]) -> Path:
+        """Return the file that a default names: beside the file that names it, or in one of the places."""
+        exact = name.endswith((".yaml", ".yml"))
+        places = [folder / name] if exact else [place / f"{name}.yaml" for place in (folder, *self.places)]
+        for place in places:
+            path = place.resolve()
+            own = bool(trail) and path == trail[-1] and place is not places[-1]  # a file that extends its namesake
+            if is_regular(path) and not own:
+                return path
+        known = sorted({path.stem for place in (folder, *self.places) for path in place.glob("*.yaml")})
+        close = difflib.get_close_matches(name, known, 1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        where = str(places[0]) if exact else f"{places[0]} or a scene that ships"
+        raise SceneError(key, name, f"a file that is there: {where}{hint}", file)
+
 
 def _names(value: Any, file: str | None) -> list[str]:
-    names = [value] if isinstance(value, str) else value
+    names = [value] if isinstance(value, str) else [] if value is None else value
     expected = "a list of names of scenes or of files ending in .yaml, merged in this order under the scene's own keys"
     if not isinstance(names, list):
         raise SceneError("defaults", value, expected, file)
@@ -171,25 +190,6 @@ def _names(value: Any, file: str | None) -> list[str]:
         if not isinstance(name, str) or not name.strip() or not name.isprintable() or name == "_self_":
             raise SceneError(f"defaults.{index}", name, expected, file)
     return names
-
-
-def _found(name: str, folder: Path, key: str, file: str | None, trail: tuple[Path, ...]) -> Path:
-    """Return the file that a default names: beside the file that names it, or one that ships."""
-    shipped = configs() / "scene"
-    if name.endswith((".yaml", ".yml")):
-        places = [folder / name]
-    else:
-        places = [folder / f"{name}.yaml", shipped / f"{name}.yaml"]
-    for place in places:
-        path = place.resolve()
-        own = bool(trail) and path == trail[-1] and place is not places[-1]  # a file that extends its namesake
-        if is_regular(path) and not own:
-            return path
-    known = sorted({path.stem for place in (folder, shipped) for path in place.glob("*.yaml")})
-    close = difflib.get_close_matches(name, known, 1)
-    hint = f" (did you mean {close[0]}?)" if close else ""
-    where = str(places[0]) if len(places) == 1 else f"{places[0]} or a scene that ships"
-    raise SceneError(key, name, f"a file that is there: {where}{hint}", file)
 
 
 def _shown(path: Path) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -140,6 +141,7 @@ def read_description(
     bsdfs: Mapping[str, Bsdf] | None = None,
     change: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
     overrides: Mapping[str, Any] | None = None,
+    places: Sequence[Path] = (),
 ) -> Description:
     """A checked scene description.
 
@@ -150,6 +152,7 @@ def read_description(
         bsdfs: material types of the caller's own: type name to model instance.
         change: of what was written, merged with what it names in ``defaults``, before it is checked.
         overrides: values of its keys by dotted key, see :func:`torchpt.scene.formats.compose.overridden_by`.
+        places: folders where scenes are looked for by name, those that ``defaults`` name too, before those that ship.
 
     Raises:
         SceneError: what is wrong first, with file, dotted key, value and what is accepted.
@@ -161,7 +164,7 @@ def read_description(
     types = material_types(bsdfs)
 
     def made(raw: Any, file: str | None, base: Path) -> Description:
-        merged, layers = compose(plain(raw, file), file, base)
+        merged, layers = compose(plain(raw, file), file, base, places)
         if overrides:
             merged, layers = overridden_by(merged, overrides, layers, file, base)
         merged = change(merged) if change is not None else merged
@@ -185,12 +188,26 @@ def read_description(
         return made(parse_yaml(source), None, Path.cwd())
     if file.endswith((".yaml", ".yml")):
         path = Path(file)
-    elif file in scene_names():
-        path = configs() / "scene" / f"{file}.yaml"
-        file = str(path)
     else:
-        raise SceneError("scene", file, f"one of {', '.join(scene_names())}, or a path ending in .yaml")
+        path = _named_scene(file, places)
+        file = str(path)
     return made(read_yaml(path, file), file, path.resolve().parent)
+
+
+def _named_scene(name: str, places: Sequence[Path]) -> Path:
+    """Return the file of a scene in one of the places, or of one that ships.
+
+    Raises:
+        SceneError: there is none of this name.
+    """
+    files = {
+        path.stem: path for place in (configs() / "scene", *reversed(places)) for path in sorted(place.glob("*.yaml"))
+    }
+    if name not in files:
+        close = difflib.get_close_matches(name, files, 1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        raise SceneError("scene", name, f"one of {', '.join(sorted(files))}{hint}, or a path ending in .yaml")
+    return files[name]
 
 
 def settings(description: Description, overrides: Mapping[str, Any] | None = None) -> Settings:
