@@ -6,6 +6,7 @@ and the settings that are files (:func:`path_keys`) are taken out here, as they 
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field
 from functools import cache
@@ -46,6 +47,8 @@ _OPTIONS = {
     "--multirun": ("-m", False),
     "--cfg": ("-c", True),
     "--package": ("-p", True),
+    "--config-dir": ("-cd", True),
+    "--config-name": ("-cn", True),
     "--resolve": ("", False),
     "--json": ("", False),
     "--help": ("-h", False),  # which main knows
@@ -77,6 +80,7 @@ class Arguments:
         overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``, and for
             each of ``scene_keys`` ``+scene_key_K=0,1``, into its values.
         options: what Hydra gets besides, such as ``--multirun`` or ``--cfg job``.
+        config_dir: a folder with groups, scenes and configurations of the caller's own.
         multirun: whether this is a sweep.
         json: print `info`, or the path of `render debug.pixel=...`, as JSON.
     """
@@ -90,6 +94,7 @@ class Arguments:
     scene_keys: list[tuple[str, list[Any]]] = field(default_factory=list)
     overrides: list[str] = field(default_factory=list)
     options: list[str] = field(default_factory=list)
+    config_dir: str | None = None
     multirun: bool = False
     json: bool = False
 
@@ -196,16 +201,21 @@ def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
     return found
 
 
-def parse_study(words: list[str]) -> dict[str, str]:
-    """Return the words of `torchpt converge` by key, as written: its lists are axes, which Hydra has no part in.
+def parse_study(words: list[str]) -> tuple[dict[str, str], list[str]]:
+    """Return the words of `torchpt converge` by key, as written, and overrides of scene keys.
+
+    Its lists are axes, which Hydra has no part in.
 
     Raises:
         UsageError: an option, a word that is no ``key=value``, a key that is given twice.
     """
     study: dict[str, str] = {}
+    changes: list[str] = []
     for word in words:
         key, equals, value = word.partition("=")
-        if word in ("--multirun", "-m"):
+        if is_scene_word(word):
+            changes.append(word)
+        elif word in ("--multirun", "-m"):
             raise UsageError(f"{word}: `torchpt converge` takes lists without it, such as sampler=[independent,sobol]")
         elif word.startswith("-"):
             raise UsageError(f"{word}: unknown option; `torchpt converge` knows --help")
@@ -217,7 +227,7 @@ def parse_study(words: list[str]) -> dict[str, str]:
             raise UsageError(f"{key}: expected a value, got nothing")
         else:
             study[key] = value
-    return study
+    return study, changes
 
 
 def _option(arguments: Arguments, word: str, rest: object) -> None:
@@ -229,6 +239,14 @@ def _option(arguments: Arguments, word: str, rest: object) -> None:
         value = value or next(rest, "")  # type: ignore[call-overload]
         if long == "--cfg" and value not in _CONFIGS:
             raise UsageError(f"--cfg: expected one of {', '.join(_CONFIGS)}, got {value!r}")
+        if long == "--config-dir":
+            if not Path(value).is_dir():
+                raise UsageError(f"--config-dir: expected a folder that is there, got {value!r}")
+            arguments.config_dir = value = os.path.abspath(value)
+        if long == "--config-name" and not re.match(r"[\w-]+\Z", value):
+            raise UsageError(
+                f"--config-name: expected the name of a .yaml file in the folder of --config-dir, got {value!r}"
+            )
         arguments.options += [long, value]
     elif value:
         raise UsageError(f"{word}: {long} takes no value")
