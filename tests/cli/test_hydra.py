@@ -247,3 +247,51 @@ def test_keys_of_the_scene_reach_it(folder: Path, capsys: pytest.CaptureFixture[
         assert main(["info", "scene=s.yaml", *words]) == 2
         error = capsys.readouterr().err
         assert line in error and "Traceback" not in error
+
+
+@pytest.fixture
+def own(folder: Path) -> Path:
+    """A folder with a group's files, scenes and configurations of one's own."""
+    for name, text in {
+        "render/quick": "defaults: [default]\nspp: 2\n",
+        "render/bare": "spp: 3\n",
+        "scene/room": "defaults: [../../s, lights/studio]\n",
+        "scene/lights/studio": "lights: {sky: {type: constant}}\n",
+        "small": "defaults: [config, _self_]\nfilm: {width: 4}\n",
+        "calls": "defaults: [config, _self_]\nhydra: {callbacks: {a: {_target_: os.getcwd}}}\n",
+        "targets": "defaults: [config, _self_]\nfilm: {filter: {_target_: os.getcwd}}\n",
+    }.items():
+        file = folder / "own" / f"{name}.yaml"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    return folder / "own"
+
+
+def test_groups_scenes_and_configurations_of_ones_own(
+    own: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (own.parent / "t.yaml").write_text("defaults: [s, lights/studio]\n")  # what it names lies in own/scene
+    words = ["render", "--config-dir", "own"]
+    for more, spp, width in (
+        (["scene=room", "render=quick"], 2, 8), (["scene=room", "render=bare", "+render.threads=1"], 3, 8),
+        (["scene=t.yaml", "-cn", "small"], 4, 4), (["scene=room", "--config-name=small", "render=quick", "film.width=6"], 2, 6),
+    ):  # fmt: skip
+        assert main([*words, *more]) == 0, capsys.readouterr().err
+        assert (renderer.settings[-1].render.spp, renderer.settings[-1].film.width) == (spp, width)
+    assert main([*words, "-m", "-cn", "small", "scene=room", "render=quick,bare"]) == 0
+    assert [settings.render.spp for settings in renderer.settings[-2:]] == [2, 3]
+    assert not (own.parent / "outputs").exists() and not (own.parent / "multirun").exists()
+    for more, line in (
+        (["scene=room", "-cn", "calls"], "hydra.callbacks: no setting names a Python object"),
+        (["scene=room", "-cn", "targets"], "film.filter._target_: no setting names a Python object"),
+        (["scene=rom"], "scene: expected one of"), (["scene=rom"], "did you mean room?"),
+        (["scene=room", "render=qick"], "render: expected one of bare, default, quick, got 'qick'"),
+        (["scene=room", "render=bare", "render.threads=1"], "+render.threads= adds it"),
+        (["scene=room", "-cn", "none"], "--config-name: expected the name of a .yaml file"),
+        (["scene=room", "-cn", "../small"], "--config-name: expected the name of a .yaml file"),
+        (["scene=room", "-cd", "nowhere"], "--config-dir: expected a folder that is there, got 'nowhere'"),
+    ):  # fmt: skip
+        capsys.readouterr()
+        assert main([*words, *more]) == 2
+        error = capsys.readouterr().err
+        assert line in error and len(error.splitlines()) == 1

@@ -66,6 +66,9 @@ def unknown(key: str, words: Iterable[str] = ()) -> str:
                 own = ", ".join(known_keys(group, kind))
                 owners = ", ".join(other for other in types(group) if name in known_keys(group, other))
                 return f"{key}: expected only keys of {group}={kind} ({own}); {name} belongs to {owners}"
+        if name in known_keys(group):
+            how = f"+{key}= adds it, as does `defaults: [default]` there"
+            return f"{key}: expected a key of the file of {group} that is chosen; {how}"
         return f"{key}: unknown key; known: {', '.join(f'{group}.{known}' for known in known_keys(group))}"
     every = [f"{group}.{known}" for group in GROUPS for known in known_keys(group)]
     same = [known for known in every if known.endswith(f".{key}")]

@@ -224,7 +224,16 @@ class _Task:
         for key, path in self.arguments.paths.items():
             group, _, name = key.partition(".")
             overrides.setdefault(group, {})[name] = path
-        return Job(scene, overrides, tuple(self.arguments.outs), number, tuple(words), changes, self.folder)
+        return Job(
+            scene,
+            overrides,
+            tuple(self.arguments.outs),
+            number,
+            tuple(words),
+            changes,
+            self.folder,
+            self.arguments.config_dir,
+        )
 
 
 def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, Any]]:
@@ -274,13 +283,14 @@ def _compose_and_run(
     from hydra.core.global_hydra import GlobalHydra
 
     task = _Task(job, arguments)
-    words = [*arguments.options, *arguments.overrides]
+    own = arguments.config_dir is not None or "--config-name" in arguments.options
+    words = [*arguments.options, *(_QUIET if "--config-name" in arguments.options else ()), *arguments.overrides]
     single = not arguments.multirun and not any("hydra" in word for word in words)
     with sweep_folder() if arguments.multirun else nullcontext() as folder:
         if folder is not None:
             words.append(f"hydra.sweep.dir={_quoted(folder)}")
             task.folder = folder
-        with hydra_process(words), _composed_once() if single else nullcontext():
+        with hydra_process(words), _composed_once() if single else nullcontext(), _checked() if own else nullcontext():
             try:
                 hydra.main(version_base="1.3", config_path=str(_configs()), config_name="config")(task)()
             except SystemExit as end:
@@ -289,6 +299,8 @@ def _compose_and_run(
                 return end.code
             except Exception as error:
                 if _came_from_job(error):
+                    raise
+                if isinstance(error, TorchptError):
                     raise
                 _check_grammar(arguments.overrides)
                 raise UsageError(_one_line(error, arguments.overrides)) from error
@@ -312,6 +324,32 @@ def _composed_once() -> Iterator[None]:
         yield
     finally:
         Hydra.get_mode = before
+
+
+#: What configs/config.yaml says of Hydra itself: a configuration of the caller's own need not say it again.
+_QUIET = (
+    "hydra.run.dir=.", "hydra.output_subdir=null", "hydra.job.chdir=false",
+    "hydra/job_logging=none", "hydra/hydra_logging=none",
+)  # fmt: skip
+
+
+@contextmanager
+def _checked() -> Iterator[None]:
+    """Context in which Hydra calls nobody back: files of the caller's own name no Python objects either."""
+    from hydra._internal.callbacks import Callbacks
+
+    before: Any = Callbacks.__init__
+
+    def init(self: Callbacks, config: Any = None) -> None:
+        if config is not None and config.hydra.get("callbacks"):
+            raise UsageError("hydra.callbacks: no setting names a Python object to call: callbacks are refused")
+        before(self, config)
+
+    Callbacks.__init__ = init
+    try:
+        yield
+    finally:
+        Callbacks.__init__ = before
 
 
 def _check_grammar(words: list[str]) -> None:
@@ -358,6 +396,8 @@ def _one_line(error: Exception, words: list[str]) -> str:
         group, name = match[1], match[2]
         options = re.findall(r"^\t([\w-]+)$", text, re.MULTILINE) or keys.options(group)
         return f"{group}: expected one of {', '.join(options)}, got {name!r}"
+    if match := re.search(r"Cannot find primary config '(.+?)'", text):
+        return f"--config-name: expected the name of a .yaml file in the folder of --config-dir, got {match[1]!r}"
     if match := re.search(r"Ambiguous value for argument '(\w.*?)=(.*)'", text):
         return f"{match[1]}: expected one value or a list [..,..], got {match[2]!r} (--multirun sweeps over several)"
     cause = error.__cause__

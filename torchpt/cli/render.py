@@ -41,6 +41,9 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
   --multirun, -m      one render for every combination: sampler=sobol,independent render.spp=16,64 scene=a,b out=x.exr
                       writes x_0.exr, x_1.exr, ...; summaries say which job has which settings, and a table ends stderr;
                       keys of the scene sweep as well: materials.floor.roughness=.1,.2,.4 camera.fov=range(20,50,10)
+  --config-dir DIR, -cd
+                      groups, scenes and configurations of your own: render=quick is DIR/render/quick.yaml, scene=room is
+                      DIR/scene/room.yaml; --config-name NAME, -cn: DIR/NAME.yaml in place of configs/config.yaml
   --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
 
   torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/ranks.md)
@@ -62,6 +65,7 @@ class Job:
         number: of the job in a sweep, which enters the file names; None outside one.
         words: what the command line says of this job, ``key=value`` each.
         changes: overrides of scene keys, as :func:`torchpt.load` takes them.
+        config_dir: a folder of the caller's own, in whose folder ``scene`` defaults of scenes are looked for too.
         folder: where jobs of a sweep leave what came of them; None outside one.
     """
 
@@ -72,6 +76,7 @@ class Job:
     words: tuple[str, ...] = ()
     changes: dict[str, Any] = field(default_factory=dict)
     folder: str | None = None
+    config_dir: str | None = None
 
     def facts(self) -> dict[str, Any]:
         """Return what a summary says of the words of a job, and of one of a sweep its number."""
@@ -185,7 +190,8 @@ def described(job: Job) -> tuple[Any, Any]:
     """
     from torchpt.scene.formats.description import overridden, read_description
 
-    return overridden(read_description(job.scene, overrides=job.changes), job.overrides)
+    places = () if job.config_dir is None else (Path(job.config_dir, "scene"),)
+    return overridden(read_description(job.scene, overrides=job.changes, places=places), job.overrides)
 
 
 def knowing(wishes: Any) -> Any:
