@@ -1,7 +1,7 @@
 """Overrides of scene keys in Hydra's grammar. Its parser alone is used: scenes never enter Hydra or OmegaConf.
 
 ``camera.fov=20``, ``+shapes.ball='{type: sphere}'``, ``~lights.sky``; ``20,40``, ``choice(a,b)`` and ``range(1,4)`` sweep. What
-the words do is said in :mod:`torchpt.scene.formats.compose`.
+the words do is said in :mod:`torchpt.scene.formats.overrides`.
 """
 
 from __future__ import annotations

@@ -217,7 +217,7 @@ class _Task:
         overrides = _given(composed, words)
         told = {"scene_number": f"scene={scene}"} if len(self.arguments.scenes) > 1 else {}
         if changes:
-            from torchpt.scene.formats.compose import told as words_for
+            from torchpt.scene.formats.overrides import told as words_for
 
             told |= dict(zip(chosen, words_for(changes), strict=True))
         words = [told.get(word.lstrip("+").partition("=")[0], word) for word in words]

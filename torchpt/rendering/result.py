@@ -186,7 +186,7 @@ class Rendering:
         facts: dict[str, str | int | float | None] = {
             "version": __version__,
             "scene": self.scene if self.scene.isprintable() else None,
-            "overrides": " ".join(word for word in self.overrides if word.isprintable()),
+            "overrides": " ".join(_short(word) for word in self.overrides if word.isprintable()),
             "spp": self.spp,
             "relmse": self.relmse,
             "relmse_low": low,
@@ -272,6 +272,10 @@ class Rendering:
         if self.eager:
             facts["eager"] = list(self.eager)
         return facts
+
+
+def _short(word: str, most: int = 200) -> str:
+    return word if len(word) <= most else f"{word[: most - 3]}..."
 
 
 @dataclass

@@ -28,8 +28,8 @@ from torchpt.rendering.result import denoise_rendering
 from torchpt.reports.study import Study, Variant
 from torchpt.scene.devices import device_of
 from torchpt.scene.fingerprint import fingerprint as fingerprint_of
-from torchpt.scene.formats.compose import told
 from torchpt.scene.formats.description import Description, overridden, read_description
+from torchpt.scene.formats.overrides import told
 from torchpt.scene.prepare import Kept, kept
 from torchpt.scene.scene import Scene
 from torchpt.scene.settings import Settings, having

@@ -60,7 +60,7 @@ def build_parts(description: Description, traced: Collection[str] = ()) -> Built
     try:
         return _built(description, traced)
     except SceneError as error:
-        raise description.blame(error) from None
+        raise description.layers.blame(error) from None
 
 
 def _built(description: Description, traced: Collection[str]) -> Built:

@@ -17,8 +17,9 @@ from torchpt.physics.shapes import KINDS as SHAPES
 from torchpt.physics.textures import KINDS as TEXTURES
 from torchpt.scene import settings as run_settings
 from torchpt.scene.formats.cameras import read_camera
-from torchpt.scene.formats.compose import KEYS, Layers, compose, overridden_by, told
+from torchpt.scene.formats.compose import KEYS, Layers, compose
 from torchpt.scene.formats.materials import Kind, check_material, material_types, read_material
+from torchpt.scene.formats.overrides import overridden_by, told
 from torchpt.scene.formats.textures import check_texture, texture_of
 from torchpt.scene.formats.yaml import parse_yaml, plain, read_open, read_yaml
 from torchpt.scene.settings import BLOCKS, Settings, having
@@ -151,7 +152,7 @@ def read_description(
             the current one.
         bsdfs: material types of the caller's own: type name to model instance.
         change: of what was written, merged with what it names in ``defaults``, before it is checked.
-        overrides: values of its keys by dotted key, see :func:`torchpt.scene.formats.compose.overridden_by`.
+        overrides: values of its keys by dotted key, see :func:`torchpt.scene.formats.overrides.overridden_by`.
         places: folders where scenes are looked for by name, those that ``defaults`` name too, before those that ship.
 
     Raises:
