@@ -77,6 +77,7 @@ def rendering_of(run: Run) -> Rendering:
         lanes=run.waves.lanes if run.waves is not None and run.waves.short else None,
         eager=tuple(run.eager),
         scene=run.name,
+        overrides=run.scene.description.overrides,
         settings=run.settings,
     )
 
