@@ -207,3 +207,91 @@ def test_info(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     facts = json.loads(capsys.readouterr().out)
     assert isinstance(facts, dict) and all(f"{key}:" in plain.out for key in facts)
     assert os.listdir(folder) == ["s.yaml"]
+
+
+def test_keys_of_the_scene_sweep_with_settings(
+    folder: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["shapes.ball.radius=.5,2", "render.spp=1,2", "+shapes.b={type: cube}", "camera.fov=range(20,31,10)"]
+    assert main(["render", "-m", "scene=s.yaml", *words, "out=x.exr"]) == 0
+    captured = capsys.readouterr()
+    facts = [json.loads(line) for line in captured.out.splitlines()[1::2]]
+    expected = [
+        [f"shapes.ball.radius={radius}", f"render.spp={spp}", "+shapes.b={type:cube}", f"camera.fov={fov}"]
+        for radius in ("0.5", "2") for spp in (1, 2) for fov in (20, 30)
+    ]  # fmt: skip
+    assert [fact["overrides"] for fact in facts] == expected
+    assert [fact["job"] for fact in facts] == list(range(8)) == [int(fact["out"][2]) for fact in facts]
+    assert [settings.render.spp for settings in renderer.settings] == [1, 1, 2, 2, 1, 1, 2, 2]
+    table = captured.err.splitlines()[-9:]
+    assert table[0].split() == ["job", "overrides", "out", "error", "seconds"]
+    assert table[3].split() == ["2", "shapes.ball.radius=0.5", "render.spp=2", "camera.fov=20", "x_2.exr", "-", "1.5"]
+
+
+def test_keys_of_the_scene_reach_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["shapes.ball.radius=2", "~shapes.ball", "+shapes.b={type: cube}", "film.width=4"]
+    assert main(["info", "scene=s.yaml", "--json", *words[:1], words[3]]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["overrides"] == ["shapes.ball.radius=2", "film.width=4"]
+    assert facts["settings"]["film"]["width"] == 4 and facts["settings"]["film"]["height"] == 3
+    assert main(["info", "scene=s.yaml", "--json", *words[1:3]]) == 0
+    assert list(json.loads(capsys.readouterr().out)["shapes"]) == ["b"]
+    assert main(["render", "scene=s.yaml", "camera.fov=20", "--cfg", "job"]) == 0  # the scene is no part of it
+    assert "scene_key" not in capsys.readouterr().out
+    for words, line in (
+        (["camra.fov=20"], "did you mean camera.fov?"), (["material.m.alpha=1"], "did you mean materials.m.alpha?"),
+        (["shapes.bal.radius=1"], "torchpt: shapes.bal: expected the name of a shape that is there (did you mean ball?)"),
+        (["-m", "camera.fov=range(0,1e9)"], "expected at most 10000 values"), (["+scene_key_0=1"], "expected key=value"),
+        (["-m", "camera.fov=20,wide"], "torchpt: camera.fov: expected"),
+    ):  # fmt: skip
+        assert main(["info", "scene=s.yaml", *words]) == 2
+        error = capsys.readouterr().err
+        assert line in error and "Traceback" not in error
+
+
+@pytest.fixture
+def own(folder: Path) -> Path:
+    """A folder with a group's files, scenes and configurations of one's own."""
+    for name, text in {
+        "render/quick": "defaults: [default]\nspp: 2\n",
+        "render/bare": "spp: 3\n",
+        "scene/room": "defaults: [../../s, lights/studio]\n",
+        "scene/lights/studio": "lights: {sky: {type: constant}}\n",
+        "small": "defaults: [config, _self_]\nfilm: {width: 4}\n",
+        "calls": "defaults: [config, _self_]\nhydra: {callbacks: {a: {_target_: os.getcwd}}}\n",
+        "targets": "defaults: [config, _self_]\nfilm: {filter: {_target_: os.getcwd}}\n",
+    }.items():
+        file = folder / "own" / f"{name}.yaml"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    return folder / "own"
+
+
+def test_groups_scenes_and_configurations_of_ones_own(
+    own: Path, renderer: Renderer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (own.parent / "t.yaml").write_text("defaults: [s, lights/studio]\n")  # what it names lies in own/scene
+    words = ["render", "--config-dir", "own"]
+    for more, spp, width in (
+        (["scene=room", "render=quick"], 2, 8), (["scene=room", "render=bare", "+render.threads=1"], 3, 8),
+        (["scene=t.yaml", "-cn", "small"], 4, 4), (["scene=room", "--config-name=small", "render=quick", "film.width=6"], 2, 6),
+    ):  # fmt: skip
+        assert main([*words, *more]) == 0, capsys.readouterr().err
+        assert (renderer.settings[-1].render.spp, renderer.settings[-1].film.width) == (spp, width)
+    assert main([*words, "-m", "-cn", "small", "scene=room", "render=quick,bare"]) == 0
+    assert [settings.render.spp for settings in renderer.settings[-2:]] == [2, 3]
+    assert not (own.parent / "outputs").exists() and not (own.parent / "multirun").exists()
+    for more, line in (
+        (["scene=room", "-cn", "calls"], "hydra.callbacks: no setting names a Python object"),
+        (["scene=room", "-cn", "targets"], "film.filter._target_: no setting names a Python object"),
+        (["scene=rom"], "scene: expected one of"), (["scene=rom"], "did you mean room?"),
+        (["scene=room", "render=qick"], "render: expected one of bare, default, quick, got 'qick'"),
+        (["scene=room", "render=bare", "render.threads=1"], "+render.threads= adds it"),
+        (["scene=room", "-cn", "none"], "--config-name: expected the name of a .yaml file"),
+        (["scene=room", "-cn", "../small"], "--config-name: expected the name of a .yaml file"),
+        (["scene=room", "-cd", "nowhere"], "--config-dir: expected a folder that is there, got 'nowhere'"),
+    ):  # fmt: skip
+        capsys.readouterr()
+        assert main([*words, *more]) == 2
+        error = capsys.readouterr().err
+        assert line in error and len(error.splitlines()) == 1

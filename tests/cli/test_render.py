@@ -101,7 +101,7 @@ def test_settings_reach_the_renderer(folder: Path, renderer: Renderer) -> None:
     words = "film.width=16 film.filter=box integrator.max_depth=3 sampler=independent render.spp=2 render.compile=off"
     assert main(["render", "scene=s.yaml", *words.split(), "film.aovs=[albedo,depth]", "out=a.exr"]) == 0
     settings = renderer.settings[0]
-    assert (settings.film.width, settings.film.height) == (16, 6)  # given; the scene's wish
+    assert (settings.film.width, settings.film.height) == (16, 12)  # given; in the scene's shape, 8 x 6
     assert settings.film.filter.name == "box" and settings.film.aovs == ("albedo", "depth")
     assert settings.integrator.max_depth == 3 and settings.integrator.clamp == 10
     assert settings.sampler.name == "independent" and settings.render.spp == 2 and settings.render.compile == "off"
@@ -262,9 +262,11 @@ def test_multirun_numbers_the_pictures(folder: Path, renderer: Renderer, capsys:
     assert [line["out"][0] for line in lines] == [f"a b_{n}.exr" for n in range(4)]
     words = [[f"scene={scene}", f"render.spp={spp}"] for scene in ("s.yaml", "t, u.yaml") for spp in (1, 2)]
     assert [(line["job"], line["overrides"]) for line in lines] == list(enumerate(words))
-    assert captured.err.splitlines() == [
-        f"torchpt: job {n}: {' '.join(each)} -> a b_{n}.exr, c=1_{n}.png" for n, each in enumerate(words)
-    ]
+    told = captured.err.splitlines()
+    jobs, heading, rows = told[:4], told[4], told[5:]
+    assert jobs == [f"torchpt: job {n}: {' '.join(each)} -> a b_{n}.exr, c=1_{n}.png" for n, each in enumerate(words)]
+    assert heading.split() == ["job", "overrides", "out", "error", "seconds"] and len(rows) == 4
+    assert [row.split("  ")[0] for row in rows] == ["0", "1", "2", "3"] and "render.spp=2" in rows[1]
 
 
 def test_multirun_stops_at_a_signal(folder: Path, renderer: Renderer) -> None:

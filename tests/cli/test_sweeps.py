@@ -63,3 +63,25 @@ def test_a_job_that_is_wrong_leaves_the_others_pictures(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert [line for line in done.stderr.splitlines() if line.startswith("torchpt: render.spp: expected")]
     assert "Traceback" not in done.stderr and all((tmp_path / f"y_{k}.exr").exists() for k in (0, 2))
+
+
+def test_keys_of_the_scene_give_the_same_pictures_by_either_launcher(tmp_path: Path) -> None:
+    words = [
+        "materials.white.reflectance=.2,[.1,.5,.9]",
+        "render.spp=1",
+        "camera.fov=range(20,41,20)",
+        "~shapes.tall_box",
+    ]
+    done = sweep(tmp_path, *words, "out=x.exr")
+    assert done.returncode == 0, done.stderr
+    table = done.stderr.splitlines()[-5:]
+    assert table[0].split() == ["job", "overrides", "out", "error", "seconds"]
+    for number, (reflectance, fov) in enumerate((r, f) for r in (0.2, [0.1, 0.5, 0.9]) for f in (20, 40)):
+        overrides = {"materials.white.reflectance": reflectance, "camera.fov": fov, "~shapes.tall_box": None}
+        scene = torchpt.load("cornell_box", "cpu", overrides=overrides)
+        film = {"width": 24, "height": 16}
+        with warnings.catch_warnings(action="ignore", category=torchpt.NoLightWarning):
+            image = torchpt.render(scene, spp=1, film=film, pilots=True, threads=1)
+        assert torch.equal(torchpt.read_image(tmp_path / f"x_{number}.exr"), image)
+        assert torchpt.read_header(tmp_path / f"x_{number}.exr")["overrides"] == " ".join(scene.description.overrides)
+        assert f"camera.fov={fov}" in table[1 + number] and f"x_{number}.exr" in table[1 + number]

@@ -22,6 +22,7 @@ from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.samplers import KINDS as SAMPLERS
 from torchpt.physics.shapes import KINDS as SHAPES
 from torchpt.physics.textures import KINDS as TEXTURES
+from torchpt.scene.formats.compose import compose
 from torchpt.scene.formats.yaml import read_yaml
 from torchpt.scene.settings import RECORDS
 from torchpt.spec import REQUIRED, parameters_of
@@ -73,7 +74,7 @@ def whole_documents() -> list[dict[str, Any]]:
     """Sound documents: the scenes that ship, and a small one of each kind of everything."""
     found = []
     for file in sorted((configs() / "scene").glob("*.yaml")):
-        raw = read_yaml(file, str(file))
+        raw, _ = compose(read_yaml(file, str(file)), str(file), file.parent)
         names = list(raw.get("shapes", {}))
         kept = set(names[:MOST_SHAPES]) | {
             s["of"] for s in raw.get("shapes", {}).values() if s.get("type") == "instance"

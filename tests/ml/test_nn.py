@@ -113,7 +113,7 @@ def test_it_renders_what_render_does(scene, renderer):
     assert renderer.names == tuple(name for name in scene.params if name in (WALL, LAMP, "camera.to_world"))
     expected = torchpt.render(scene, params=renderer.values(), seed=5, **WISHES)
     assert torch.equal(renderer(seed=5), expected)
-    assert renderer(seed=5, film={"width": 4}).shape == (8, 4, 3)
+    assert renderer(seed=5, film={"width": 4}).shape == (3, 4, 3)
     assert renderer(seed=5, full=True, film={"aovs": ["depth"]})["depth"].shape == (8, 10, 1)
     dark = renderer({LAMP: torch.zeros(3)}, seed=5)
     assert float(dark.detach().abs().max()) == 0

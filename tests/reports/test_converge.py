@@ -260,7 +260,7 @@ def test_a_reference_from_a_file_is_exact(there: Path) -> None:
         (["scene=s.yaml", "film.wide=3"], "film.wide: expected a known key"),
         (["scene=s.yaml", "spp=[a"], "spp: expected a value, or a list"),
         (["scene=s.yaml", "reference=none.exr"], "none.exr: "),
-        (["scene=s.yaml", "film.width=8", "reference=theirs.exr"], "theirs.exr: expected a picture of 8 x 12 pixels"),
+        (["scene=s.yaml", "film.width=8", "reference=theirs.exr"], "theirs.exr: expected a picture of 8 x 6 pixels"),
         (["scene=s.yaml", "extra=[{name: a, seconds: 1, file: none.exr}]"], "none.exr: "),
         (["scene=s.yaml", "out=s.yaml"], "s.yaml: is a file; expected a folder"),
         (["scene=[s.yaml,nope]"], "scene: expected one of clutter"),
@@ -296,3 +296,25 @@ def test_a_browser_opens_it_without_a_word(folder: Path) -> None:
     )
     assert (folder / "page.png").stat().st_size > 20_000
     assert not re.search(r"CONSOLE|Refused|net::", done.stderr), done.stderr
+
+
+def test_keys_of_a_scene_make_curves_with_references_of_their_own(
+    no_plots: None, there: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "scene=s.yaml",
+        "camera.fov=30,60",
+        "spp=[1,2]",
+        "seeds=2",
+        "reference.spp=4",
+        "reference.seeds=2",
+        "metrics=mse",
+    ]
+    assert main(["converge", *words, "render.compile=off", "out=keys"]) == 0
+    facts = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert [curve["label"] for curve in facts["scenes"][0]["curves"]] == ["fov 30", "fov 60"]
+    runs_of = [json.loads(path.read_text()) for path in (there / "keys" / "runs").glob("*.json")]
+    scenes = {run["scene"] for run in runs_of}
+    assert len(scenes) == 2 and len(runs_of) == 2 * (2 * 2 + 2)
+    assert main(["converge", "scene=s.yaml", "camera.fo=30,60"]) == 2
+    assert "torchpt: camera.fo: expected a known key" in capfd.readouterr().err

@@ -40,6 +40,32 @@ def test_help_names_every_key_of_a_study(key: str) -> None:
     assert sum(line.startswith(f"  {key}=") for line in HELP.splitlines()) == 1
 
 
+def test_keys_of_the_scene_are_axes(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text(
+        "scene: cornell_box\nsampler: [sobol, independent]\n"
+        "overrides: {camera.fov: '20,40', materials.red.reflectance: [0, 0, 1], ~shapes.tall_box: ~}\n"
+    )
+    words, changes = parse_study(
+        [f"study={tmp_path}/s.yaml", "materials.red.reflectance=.2,[0,1,0]", "+lights.sky={type: constant}"]
+    )
+    raw, file = raw_study(words, changes)
+    variants = study_of(raw, file).variants
+    assert [variant.label for variant in variants[:5]] == [
+        "sobol, fov 20, reflectance 0.2", "sobol, fov 20, reflectance [0, 1, 0]", "sobol, fov 40, reflectance 0.2",
+        "sobol, fov 40, reflectance [0, 1, 0]", "independent, fov 20, reflectance 0.2",
+    ]  # fmt: skip
+    assert len(variants) == 8 and variants[1].settings == {"sampler": "sobol"} and variants[1].changes == {
+        "camera.fov": 20, "materials.red.reflectance": [0, 1, 0], "~shapes.tall_box": None, "+lights.sky": {"type": "constant"},
+    }  # fmt: skip
+    raw["reference"] = "r.exr"
+    with pytest.raises(SceneError, match=r"camera\.fov: expected one value where reference= is a file"):
+        study_of(raw, file)
+    for text, line in (("[1]", "overrides: expected a mapping"), ("{camera.fov: '1,1'}", "a list of different values")):
+        (tmp_path / "t.yaml").write_text(f"scene: cornell_box\noverrides: {text}\n")
+        with pytest.raises(SceneError, match=line):
+            study_of(*raw_study({"study": f"{tmp_path}/t.yaml"}))
+
+
 def test_settings_become_blocks() -> None:
     study = study_of(
         {
@@ -125,11 +151,13 @@ def test_files_of_a_study_file_start_at_its_folder(tmp_path: Path) -> None:
 
 def test_words_win_over_the_file_and_names_are_kept_as_written(tmp_path: Path) -> None:
     (tmp_path / "s.yaml").write_text("scene: cornell_box\nspp: [1, 2]\nreference: {spp: 8, seeds: 2}\n")
-    words = parse_study([f"study={tmp_path}/s.yaml", "spp=[2,4]", "reference.spp=16", "integrator.clamp=[null,1e-1]"])
+    words, _ = parse_study(
+        [f"study={tmp_path}/s.yaml", "spp=[2,4]", "reference.spp=16", "integrator.clamp=[null,1e-1]"]
+    )
     raw, _ = raw_study(words)
     assert raw["spp"] == [2, 4] and raw["reference"] == {"spp": 16, "seeds": 2}
     assert raw["integrator.clamp"] == [None, 0.1]
-    raw, _ = raw_study(parse_study(["scene=[a b.yaml,c]", "reference=a [1]: b.exr"]))
+    raw, _ = raw_study(*parse_study(["scene=[a b.yaml,c]", "reference=a [1]: b.exr"]))
     assert raw["scene"] == ["a b.yaml", "c"] and raw["reference"] == "a [1]: b.exr"
 
 

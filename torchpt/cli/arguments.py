@@ -6,17 +6,31 @@ and the settings that are files (:func:`path_keys`) are taken out here, as they 
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from torchpt.core.errors import TorchptError
 from torchpt.core.files import configs
 
-__all__ = ["DEBUG_KEYS", "GROUPS", "Arguments", "UsageError", "parse", "parse_study", "path_keys"]
+__all__ = [
+    "DEBUG_KEYS",
+    "GROUPS",
+    "SCENE_BLOCKS",
+    "Arguments",
+    "UsageError",
+    "is_scene_word",
+    "parse",
+    "parse_study",
+    "path_keys",
+]
 
 GROUPS = ("film", "integrator", "sampler", "render")
+#: Blocks of a scene that are no run settings: what their keys are is for the scene to say.
+SCENE_BLOCKS = ("version", "camera", "textures", "materials", "shapes", "lights")
 #: Keys of `torchpt orbit` alone.
 TURN_KEYS = ("frames", "degrees", "fps", "keep")
 _TURN = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)
@@ -24,6 +38,7 @@ _TURN = re.compile(rf"({'|'.join(TURN_KEYS)})=(.*)\Z", re.DOTALL)
 DEBUG_KEYS = ("debug.pixel", "debug.sample")
 _DEBUG = re.compile(r"\+{0,2}(debug\.[^=]*)=(.*)\Z", re.DOTALL)
 _TAKEN = re.compile(r"\+{0,2}([\w.]+)=(.*)\Z", re.DOTALL)
+_SCENE_WORD = re.compile(rf"(?:\+\+|\+|~|)(?:{'|'.join(SCENE_BLOCKS)})(?:[.=]|\Z)")
 #: A line of a group's file, as ``scripts/make_configs.py`` writes it of a setting that is a file.
 _PATH = re.compile(r"^(\w+): .*\(null or a file path\)$", re.MULTILINE)
 
@@ -32,6 +47,8 @@ _OPTIONS = {
     "--multirun": ("-m", False),
     "--cfg": ("-c", True),
     "--package": ("-p", True),
+    "--config-dir": ("-cd", True),
+    "--config-name": ("-cn", True),
     "--resolve": ("", False),
     "--json": ("", False),
     "--help": ("-h", False),  # which main knows
@@ -43,6 +60,9 @@ _CONFIGS = ("job", "hydra", "all")
 
 class UsageError(TorchptError):
     """A command line that cannot be understood."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__("".join(letter if letter.isprintable() else " " for letter in text))
 
 
 @dataclass
@@ -56,8 +76,11 @@ class Arguments:
         paths: values of the settings that are files.
         turn: values of the keys in `TURN_KEYS`, as written.
         debug: values of the keys in `DEBUG_KEYS`, as written.
-        overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``.
+        scene_keys: overrides of scene keys in the order given: key and its values, several only with ``multirun``.
+        overrides: what Hydra gets: ``key=value``; for a sweep over scenes also ``+scene_number=0,1``, into ``scenes``, and for
+            each of ``scene_keys`` ``+scene_key_K=0,1``, into its values.
         options: what Hydra gets besides, such as ``--multirun`` or ``--cfg job``.
+        config_dir: a folder with groups, scenes and configurations of the caller's own.
         multirun: whether this is a sweep.
         json: print `info`, or the path of `render debug.pixel=...`, as JSON.
     """
@@ -68,8 +91,10 @@ class Arguments:
     paths: dict[str, str | None] = field(default_factory=dict)
     turn: dict[str, str] = field(default_factory=dict)
     debug: dict[str, str] = field(default_factory=dict)
+    scene_keys: list[tuple[str, list[Any]]] = field(default_factory=list)
     overrides: list[str] = field(default_factory=list)
     options: list[str] = field(default_factory=list)
+    config_dir: str | None = None
     multirun: bool = False
     json: bool = False
 
@@ -94,10 +119,14 @@ def parse(command: str, words: list[str]) -> Arguments:
     """
     arguments = Arguments(command)
     taken: dict[str, str] = {}
+    swept: list[str] = []
     rest = iter(words)
     for word in rest:
         if word.startswith("-"):
             _option(arguments, word, rest)
+            continue
+        if is_scene_word(word):
+            swept += _scene_word(arguments, word)
             continue
         match = _TAKEN.match(word)
         if match is None or match[1] not in ("scene", "out", *path_keys()):
@@ -114,6 +143,8 @@ def parse(command: str, words: list[str]) -> Arguments:
         if key == "scene":
             arguments.overrides.append("scene")  # keeps its place among the sweeps
     arguments.multirun |= any(word.replace(" ", "") == "hydra.mode=MULTIRUN" for word in arguments.overrides)
+    if swept and not arguments.multirun:
+        raise UsageError(f"{swept[0]}: expected one value or a list [..,..] (--multirun sweeps over several)")
     if arguments.multirun and arguments.only_shows:
         raise UsageError("--multirun: cannot be combined with --cfg or --hydra-help")
     arguments.debug = _debug(arguments, taken)
@@ -130,9 +161,29 @@ def parse(command: str, words: list[str]) -> Arguments:
     arguments.turn = {key: taken[key] for key in TURN_KEYS if key in taken}
     sweep = f"+scene_number={','.join(map(str, range(len(arguments.scenes))))}"
     arguments.overrides = [sweep if word == "scene" else word for word in arguments.overrides]
+    if arguments.only_shows:  # no scene is a part of what is shown
+        arguments.overrides = [word for word in arguments.overrides if not word.startswith("+scene_key_")]
     if len(arguments.scenes) < 2:
         arguments.overrides = [word for word in arguments.overrides if word != sweep]
     return arguments
+
+
+def _scene_word(arguments: Arguments, word: str) -> list[str]:
+    """Take an override of a scene key; returns it where it sweeps."""
+    from torchpt.cli.grammar import read_word
+
+    key, values, sweeps = read_word(word)
+    if any(key == other for other, _ in arguments.scene_keys):
+        raise UsageError(f"{key}: given twice")
+    numbers = ",".join(map(str, range(len(values))))
+    arguments.overrides.append(f"+scene_key_{len(arguments.scene_keys)}={numbers}")
+    arguments.scene_keys.append((key, values))
+    return [word] if sweeps else []
+
+
+def is_scene_word(word: str) -> bool:
+    """Return True for an override of a scene's key that is no run setting."""
+    return _SCENE_WORD.match(word) is not None
 
 
 def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
@@ -150,16 +201,21 @@ def _debug(arguments: Arguments, taken: dict[str, str]) -> dict[str, str]:
     return found
 
 
-def parse_study(words: list[str]) -> dict[str, str]:
-    """Return the words of `torchpt converge` by key, as written: its lists are axes, which Hydra has no part in.
+def parse_study(words: list[str]) -> tuple[dict[str, str], list[str]]:
+    """Return the words of `torchpt converge` by key, as written, and overrides of scene keys.
+
+    Its lists are axes, which Hydra has no part in.
 
     Raises:
         UsageError: an option, a word that is no ``key=value``, a key that is given twice.
     """
     study: dict[str, str] = {}
+    changes: list[str] = []
     for word in words:
         key, equals, value = word.partition("=")
-        if word in ("--multirun", "-m"):
+        if is_scene_word(word):
+            changes.append(word)
+        elif word in ("--multirun", "-m"):
             raise UsageError(f"{word}: `torchpt converge` takes lists without it, such as sampler=[independent,sobol]")
         elif word.startswith("-"):
             raise UsageError(f"{word}: unknown option; `torchpt converge` knows --help")
@@ -171,7 +227,7 @@ def parse_study(words: list[str]) -> dict[str, str]:
             raise UsageError(f"{key}: expected a value, got nothing")
         else:
             study[key] = value
-    return study
+    return study, changes
 
 
 def _option(arguments: Arguments, word: str, rest: object) -> None:
@@ -183,6 +239,14 @@ def _option(arguments: Arguments, word: str, rest: object) -> None:
         value = value or next(rest, "")  # type: ignore[call-overload]
         if long == "--cfg" and value not in _CONFIGS:
             raise UsageError(f"--cfg: expected one of {', '.join(_CONFIGS)}, got {value!r}")
+        if long == "--config-dir":
+            if not Path(value).is_dir():
+                raise UsageError(f"--config-dir: expected a folder that is there, got {value!r}")
+            arguments.config_dir = value = os.path.abspath(value)
+        if long == "--config-name" and not re.match(r"[\w-]+\Z", value):
+            raise UsageError(
+                f"--config-name: expected the name of a .yaml file in the folder of --config-dir, got {value!r}"
+            )
         arguments.options += [long, value]
     elif value:
         raise UsageError(f"{word}: {long} takes no value")
@@ -201,7 +265,7 @@ def _override(arguments: Arguments, word: str) -> None:
     if "_target_" in word or word.lstrip("+").startswith("hydra.callbacks"):
         raise UsageError(f"{word}: no setting names a Python object to call: `_target_` and callbacks are refused")
     key, _, value = word.lstrip("+~").partition("=")
-    if not key.strip() or key in ("out", "scene_number") or re.match(r"scene\b", key):
+    if not key.strip() or key == "out" or re.match(r"scene(\b|_number|_key_)", key):
         raise UsageError(f"{word}: expected key=value")
     if key in GROUPS and (value == "null" or not _CHOICE.match(value)):  # nor a way out of the group's folder
         raise UsageError(f"{key}: expected the name of a file in configs/{key}, got {value!r}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,9 @@ torchpt converge study=NAME|FILE.yaml [key=value ...]
   denoise=    true: beside every curve a second one, of its runs' denoised pictures            false
   title=      of the page
   {keys}
+  {changes}
+              several values make an axis as well: camera.fov=20,40; a list is one value
+  overrides=  of a study file: keys of the scene, as above: overrides: {{camera.fov: '20,40'}}         none
 
 A study that was stopped resumes: the same command takes up the runs that are in FOLDER/runs. The last line on stdout is a
 summary in JSON. Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGTERM, with the finished runs kept.
@@ -55,15 +58,19 @@ summary in JSON. Exit codes: 0; 2 bad input; 130 after Ctrl-C and 143 after SIGT
 
 def run(words: list[str], interrupt: Interrupt) -> int:
     """Run a study of the words after ``converge``; returns the exit code."""
-    study = parse_study(words)
+    study, changes = parse_study(words)
     if not {"scene", "study"} & study.keys():
         ship = ", ".join(keys.options("scene"))
         raise UsageError(f"scene: expected scene=NAME, scene=FILE.yaml or study=FILE.yaml; scenes that ship: {ship}")
-    return converge(study, interrupt)
+    return converge(study, changes, interrupt)
 
 
-def raw_study(words: Mapping[str, str]) -> tuple[dict[str, Any], str | None]:
-    """The keys of a study and its file, from the words of the command line by key.
+def raw_study(words: Mapping[str, str], changes: Sequence[str] = ()) -> tuple[dict[str, Any], str | None]:
+    """Return the keys of a study and its file, from the words of the command line by key.
+
+    Args:
+        words: by key.
+        changes: overrides of scene keys, several values of which are axes.
 
     Raises:
         TorchptError: a file or value that cannot be read.
@@ -86,7 +93,34 @@ def raw_study(words: Mapping[str, str]) -> tuple[dict[str, Any], str | None]:
             raw["reference"] = {**(before if isinstance(before, Mapping) else {}), name: value}
         else:
             raw[key] = value
+    if changes or "overrides" in raw:
+        raw["overrides"] = _changes(raw.get("overrides") or {}, file) | _read(changes)
     return raw, file
+
+
+def _changes(written: Any, file: str | None) -> dict[str, list[Any]]:
+    """Return the overrides of a study file by key: text is read as on the command line, where ``a,b`` are several values."""
+    from torchpt.cli.grammar import read_value
+
+    if not isinstance(written, Mapping):
+        raise SceneError("overrides", written, "a mapping from keys of scenes such as camera.fov to values", file)
+    return {
+        str(key): read_value(str(key), value)[0] if isinstance(value, str) else [value]
+        for key, value in written.items()
+    }
+
+
+def _read(words: Sequence[str]) -> dict[str, list[Any]]:
+    """Return overrides of the command line by key."""
+    found: dict[str, list[Any]] = {}
+    for word in words:
+        from torchpt.cli.grammar import read_word
+
+        key, values, _ = read_word(word)
+        if key in found:
+            raise UsageError(f"{key}: given twice")
+        found[key] = values
+    return found
 
 
 def _value(key: str, text: str) -> Any:
@@ -106,8 +140,13 @@ def _names(text: str) -> list[str]:
     return [name.strip().strip("'\"") for name in text[1:-1].split(",")]
 
 
-def converge(words: Mapping[str, str], interrupt: Interrupt) -> int:
+def converge(words: Mapping[str, str], changes: Sequence[str], interrupt: Interrupt) -> int:
     """Run what is missing, write the report, print the summary; returns the exit code.
+
+    Args:
+        words: by key.
+        changes: overrides of scene keys.
+        interrupt: signals that came.
 
     Raises:
         TorchptError: bad input, found before anything is rendered.
@@ -120,7 +159,7 @@ def converge(words: Mapping[str, str], interrupt: Interrupt) -> int:
 
     collector.resume()
     start = time.perf_counter()
-    raw, file = raw_study({key: text for key, text in words.items() if key != "out"})
+    raw, file = raw_study({key: text for key, text in words.items() if key != "out"}, changes)
     with notices():
         study = study_of(raw, file)
         told = _told(raw, study.asked)

@@ -25,6 +25,7 @@ torchpt info scene=NAME|FILE.yaml [--json] [key=value ...]
   scene=   a file ending in .yaml, or a scene that ships:
 {scenes}
   {keys}
+  {changes}
 """
 
 

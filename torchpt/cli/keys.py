@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
-from torchpt.cli.arguments import GROUPS
+from torchpt.cli.arguments import GROUPS, SCENE_BLOCKS
 from torchpt.core.files import configs
 
 __all__ = ["known_keys", "listed", "options", "scenes", "types", "unknown"]
@@ -66,12 +66,19 @@ def unknown(key: str, words: Iterable[str] = ()) -> str:
                 own = ", ".join(known_keys(group, kind))
                 owners = ", ".join(other for other in types(group) if name in known_keys(group, other))
                 return f"{key}: expected only keys of {group}={kind} ({own}); {name} belongs to {owners}"
+        if name in known_keys(group):
+            how = f"+{key}= adds it, as does `defaults: [default]` there"
+            return f"{key}: expected a key of the file of {group} that is chosen; {how}"
         return f"{key}: unknown key; known: {', '.join(f'{group}.{known}' for known in known_keys(group))}"
     every = [f"{group}.{known}" for group in GROUPS for known in known_keys(group)]
     same = [known for known in every if known.endswith(f".{key}")]
     near = same or difflib.get_close_matches(key, [*every, *GROUPS, "scene", "out"], 1)
+    blocks = difflib.get_close_matches(group, SCENE_BLOCKS, 1)
+    if not near and blocks:
+        near = [f"{blocks[0]}.{name}" if name else blocks[0]]
     hint = f"; did you mean {near[0]}?" if near else ""
-    return f"{key}: unknown key; known: scene, out, {', '.join(f'{group}.*' for group in GROUPS)}{hint}"
+    ours = ", ".join(f"{group}.*" for group in GROUPS)
+    return f"{key}: unknown key; known: scene, out, {ours}, and the scene's own: {', '.join(SCENE_BLOCKS[1:])}{hint}"
 
 
 def scenes() -> str:

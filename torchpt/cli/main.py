@@ -1,4 +1,4 @@
-"""The command line: words to a Hydra composition, to jobs, to an exit code. The only file that imports Hydra.
+"""The command line: words to a Hydra composition, to jobs, to an exit code. With `torchpt.cli.grammar` all that imports Hydra.
 
 Hydra composes the *run* settings (groups ``film integrator sampler render``), sweeps over them (``--multirun``), shows
 them (``--cfg job``) and launches the jobs. Scenes and file names stay outside (`torchpt.cli.arguments`). Whatever is
@@ -24,6 +24,7 @@ from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.render import Job
 from torchpt.cli.streams import ready, speaking
 from torchpt.cli.sweep_folder import sweep_folder
+from torchpt.cli.sweep_table import tell_jobs
 from torchpt.core.errors import LostRankError, OtherRankError, TorchptError
 from torchpt.core.version import __version__
 
@@ -40,6 +41,10 @@ torchpt: a wavefront path tracer that is a PyTorch program
 torchpt COMMAND --help says more. Scenes that ship:
 {scenes}
 """
+#: What the help of commands says of a scene's own keys.
+CHANGES = """\
+camera.fov=20 materials.red.reflectance=[0,0,1] shapes.lamp.material=white
+                      any key of the scene; + adds, ~ removes: +shapes.ball='{type: sphere, radius: .2}' ~lights.sky"""
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,7 @@ class Command:
         name: the first word.
         example: words after it, for the list of commands.
         line: what it does, in a line.
-        help: what ``--help`` prints; ``{scenes}`` and ``{keys}`` stand for lists of them.
+        help: what ``--help`` prints; ``{scenes}``, ``{keys}`` and ``{changes}`` stand for what they are.
         run: called with the words after the name and the signals that came; returns the exit code.
     """
 
@@ -152,10 +157,18 @@ class JobFailedError(Exception):
 
 @dataclass
 class _Task:
-    """What Hydra calls with every composed configuration. Plain data, so that launchers may send it elsewhere."""
+    """What Hydra calls with every composed configuration. Plain data, so that launchers may send it elsewhere.
+
+    Attributes:
+        job: of the command, called with what the configuration came to.
+        arguments: the command line.
+        folder: where jobs of a sweep leave what came of them; None outside one.
+        process: that made this.
+    """
 
     job: Callable[[Job, Arguments, Interrupt], int]
     arguments: Arguments
+    folder: str | None = None
     process: int = field(default_factory=os.getpid)
 
     def __call__(self, cfg: DictConfig) -> int:
@@ -198,13 +211,29 @@ class _Task:
         assert isinstance(composed, dict)
         number = hydra.job.num if hydra.mode == RunMode.MULTIRUN else None
         scene = self.arguments.scenes[composed.pop("scene_number", 0)]
+        chosen = {f"scene_key_{k}": key for k, key in enumerate(self.arguments.scene_keys)}
+        changes = {key: values[composed.pop(name)] for name, (key, values) in chosen.items()}
         words = list(hydra.overrides.task)
         overrides = _given(composed, words)
-        words = [f"scene={scene}" if word.startswith("+scene_number=") else word for word in words]
+        told = {"scene_number": f"scene={scene}"} if len(self.arguments.scenes) > 1 else {}
+        if changes:
+            from torchpt.scene.formats.overrides import told as words_for
+
+            told |= dict(zip(chosen, words_for(changes), strict=True))
+        words = [told.get(word.lstrip("+").partition("=")[0], word) for word in words]
         for key, path in self.arguments.paths.items():
             group, _, name = key.partition(".")
             overrides.setdefault(group, {})[name] = path
-        return Job(scene, overrides, tuple(self.arguments.outs), number, () if number is None else tuple(words))
+        return Job(
+            scene,
+            overrides,
+            tuple(self.arguments.outs),
+            number,
+            tuple(words),
+            changes,
+            self.folder,
+            self.arguments.config_dir,
+        )
 
 
 def _given(composed: dict[Any, Any], words: list[str]) -> dict[str, dict[str, Any]]:
@@ -254,12 +283,14 @@ def _compose_and_run(
     from hydra.core.global_hydra import GlobalHydra
 
     task = _Task(job, arguments)
-    words = [*arguments.options, *arguments.overrides]
+    own = arguments.config_dir is not None or "--config-name" in arguments.options
+    words = [*arguments.options, *(_QUIET if "--config-name" in arguments.options else ()), *arguments.overrides]
     single = not arguments.multirun and not any("hydra" in word for word in words)
     with sweep_folder() if arguments.multirun else nullcontext() as folder:
         if folder is not None:
             words.append(f"hydra.sweep.dir={_quoted(folder)}")
-        with hydra_process(words), _composed_once() if single else nullcontext():
+            task.folder = folder
+        with hydra_process(words), _composed_once() if single else nullcontext(), _checked() if own else nullcontext():
             try:
                 hydra.main(version_base="1.3", config_path=str(_configs()), config_name="config")(task)()
             except SystemExit as end:
@@ -269,10 +300,14 @@ def _compose_and_run(
             except Exception as error:
                 if _came_from_job(error):
                     raise
+                if isinstance(error, TorchptError):
+                    raise
                 _check_grammar(arguments.overrides)
                 raise UsageError(_one_line(error, arguments.overrides)) from error
             finally:
                 GlobalHydra.instance().clear()
+                if folder is not None:
+                    tell_jobs(folder)
     interrupt.check()
     return 0
 
@@ -291,6 +326,32 @@ def _composed_once() -> Iterator[None]:
         Hydra.get_mode = before
 
 
+#: What configs/config.yaml says of Hydra itself: a configuration of the caller's own need not say it again.
+_QUIET = (
+    "hydra.run.dir=.", "hydra.output_subdir=null", "hydra.job.chdir=false",
+    "hydra/job_logging=none", "hydra/hydra_logging=none",
+)  # fmt: skip
+
+
+@contextmanager
+def _checked() -> Iterator[None]:
+    """Context in which Hydra calls nobody back: files of the caller's own name no Python objects either."""
+    from hydra._internal.callbacks import Callbacks
+
+    before: Any = Callbacks.__init__
+
+    def init(self: Callbacks, config: Any = None) -> None:
+        if config is not None and config.hydra.get("callbacks"):
+            raise UsageError("hydra.callbacks: no setting names a Python object to call: callbacks are refused")
+        before(self, config)
+
+    Callbacks.__init__ = init
+    try:
+        yield
+    finally:
+        Callbacks.__init__ = before
+
+
 def _check_grammar(words: list[str]) -> None:
     """Name the word that Hydra cannot read: its own message shows a fragment of it.
 
@@ -300,14 +361,14 @@ def _check_grammar(words: list[str]) -> None:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
+    from torchpt.cli.grammar import reason
+
     parser = OverridesParser.create()
     for word in words:
         try:
             parser.parse_override(word)
         except HydraException as error:
-            reason = next((line for line in str(error).splitlines() if "evaluating" in line), "")
-            reason = reason.partition(": ")[2] or "quote what holds blanks, brackets or commas, as in key='a b'"
-            raise UsageError(f"{word}: expected key=value ({reason})") from error
+            raise UsageError(f"{word}: expected key=value ({reason(error)})") from error
 
 
 def _quoted(text: str) -> str:
@@ -335,6 +396,8 @@ def _one_line(error: Exception, words: list[str]) -> str:
         group, name = match[1], match[2]
         options = re.findall(r"^\t([\w-]+)$", text, re.MULTILINE) or keys.options(group)
         return f"{group}: expected one of {', '.join(options)}, got {name!r}"
+    if match := re.search(r"Cannot find primary config '(.+?)'", text):
+        return f"--config-name: expected the name of a .yaml file in the folder of --config-dir, got {match[1]!r}"
     if match := re.search(r"Ambiguous value for argument '(\w.*?)=(.*)'", text):
         return f"{match[1]}: expected one value or a list [..,..], got {match[2]!r} (--multirun sweeps over several)"
     cause = error.__cause__
@@ -358,7 +421,9 @@ def _configs() -> Path:
 def _help(text: str) -> str:
     wide = max(len(f"{command.name} {command.example}") for command in COMMANDS)
     lines = [f"  torchpt {f'{command.name} {command.example}':{wide}}   {command.line}" for command in COMMANDS]
-    return text.format(scenes=keys.scenes(), keys=keys.listed().replace("\n", "\n  "), commands="\n".join(lines))
+    return text.format(
+        scenes=keys.scenes(), keys=keys.listed().replace("\n", "\n  "), commands="\n".join(lines), changes=CHANGES
+    )
 
 
 def _composed(name: str, job: Callable[[Job, Arguments, Interrupt], int]) -> Callable[[list[str], Interrupt], int]:

@@ -25,6 +25,7 @@ from torchpt.cli.notices import notices, which_job
 from torchpt.cli.progress import Bar
 from torchpt.cli.render import Job, check_distinct, described, knowing, numbered, plain
 from torchpt.cli.streams import speaking
+from torchpt.cli.sweep_table import note_job
 from torchpt.core.errors import OutputError, SceneError
 from torchpt.core.version import __version__
 
@@ -50,6 +51,7 @@ torchpt orbit scene=NAME|FILE.yaml [out=FILE.gif|FILE.mp4] [frames=48] [degrees=
   fps=      frames a second                                                                                 24
   keep=     true: leave the frames where they are, as pictures in OUT.frames                             false
   {keys}
+  {changes}
 
 Frame k is what `torchpt render` gives of its camera with render.seed + k. While the run goes on frames lie in OUT.frames;
 stopped, the same command takes up where it was. The last line on stdout is a summary in JSON.
@@ -194,6 +196,7 @@ def orbit(job: Job, turn: Turn, interrupt: Interrupt) -> int:
     facts["seconds"] = round(time.perf_counter() - start, 4)
     with speaking():
         print(json.dumps(plain(facts), allow_nan=False))
+    note_job(job, facts)
     if interrupt.signum is None:
         return 0
     kept = (

@@ -21,6 +21,7 @@ from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.notices import not_finite, notices, unknown_error, which_job
 from torchpt.cli.progress import Bar
 from torchpt.cli.streams import speaking
+from torchpt.cli.sweep_table import brief, error_of, note_job
 from torchpt.core.errors import OutputError, RenderError, SceneError, TorchptError
 
 __all__ = ["HELP", "Job", "check_distinct", "described", "knowing", "numbered", "plain", "render", "run", "sentence"]
@@ -32,12 +33,17 @@ torchpt render scene=NAME|FILE.yaml [out=FILE] [key=value ...]
 {scenes}
   out=     .exr .hdr .png .jpg .ppm; several as out=[a.exr,a.png]; NAME.png where nothing is said
   {keys}
+  {changes}
   debug.pixel=[x,y] debug.sample=k [--json]
                       print that path vertex by vertex, in place of a picture: [0,0] is at the upper left of the film
 
   integrator=NAME, sampler=NAME, ... take a group's file from configs/: integrator=direct sampler=independent
   --multirun, -m      one render for every combination: sampler=sobol,independent render.spp=16,64 scene=a,b out=x.exr
-                      writes x_0.exr, x_1.exr, ...; stderr and the summaries say which job has which settings
+                      writes x_0.exr, x_1.exr, ...; summaries say which job has which settings, and a table ends stderr;
+                      keys of the scene sweep as well: materials.floor.roughness=.1,.2,.4 camera.fov=range(20,50,10)
+  --config-dir DIR, -cd
+                      groups, scenes and configurations of your own: render=quick is DIR/render/quick.yaml, scene=room is
+                      DIR/scene/room.yaml; --config-name NAME, -cn: DIR/NAME.yaml in place of configs/config.yaml
   --cfg job           print the composed settings and stop (null: the scene's own wish, else the built-in default)
 
   torchrun --nproc-per-node N -m torchpt render ...   N processes share the picture, to the same bits (docs/guides/ranks.md)
@@ -57,7 +63,10 @@ class Job:
         overrides: block (``film integrator sampler render``) to the keys given on the command line.
         outs: pictures to write; ``<scene>.png`` in the current folder where empty.
         number: of the job in a sweep, which enters the file names; None outside one.
-        words: what the command line says of this job of a sweep, ``key=value`` each.
+        words: what the command line says of this job, ``key=value`` each.
+        changes: overrides of scene keys, as :func:`torchpt.load` takes them.
+        config_dir: a folder of the caller's own, in whose folder ``scene`` defaults of scenes are looked for too.
+        folder: where jobs of a sweep leave what came of them; None outside one.
     """
 
     scene: str
@@ -65,10 +74,14 @@ class Job:
     outs: tuple[str, ...] = ()
     number: int | None = None
     words: tuple[str, ...] = ()
+    changes: dict[str, Any] = field(default_factory=dict)
+    folder: str | None = None
+    config_dir: str | None = None
 
     def facts(self) -> dict[str, Any]:
-        """Return what a summary says of a job of a sweep; nothing outside one."""
-        return {} if self.number is None else {"job": self.number, "overrides": list(self.words)}
+        """Return what a summary says of the words of a job, and of one of a sweep its number."""
+        told = {"overrides": list(self.words)} if self.words or self.number is not None else {}
+        return told if self.number is None else {"job": self.number, **told}
 
 
 def numbered(path: str, number: int | None) -> str:
@@ -161,6 +174,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     height, width = rendering.image.shape[:2]
     with speaking():  # in one piece, as jobs of a sweep may share stdout; the last line is the summary
         print(f"{sentence(summary, width, height)}\n{json.dumps(summary, allow_nan=False)}")
+    note_job(job, summary)
     if interrupt.signum is None:
         return 0
     again = "" if wishes.render.checkpoint is None else "; render.resume=true goes on"
@@ -176,7 +190,8 @@ def described(job: Job) -> tuple[Any, Any]:
     """
     from torchpt.scene.formats.description import overridden, read_description
 
-    return overridden(read_description(job.scene), job.overrides)
+    places = () if job.config_dir is None else (Path(job.config_dir, "scene"),)
+    return overridden(read_description(job.scene, overrides=job.changes, places=places), job.overrides)
 
 
 def knowing(wishes: Any) -> Any:
@@ -320,29 +335,14 @@ def sentence(facts: Mapping[str, Any], width: int, height: int) -> str:
     """
     out, spp = facts["out"], facts["spp"]
     text = f"{out if isinstance(out, str) else ', '.join(out)}: {width} x {height} pixels, "
-    text += f"{spp} sample{'' if spp == 1 else 's'} a pixel, {_brief(facts['seconds'])} s"
-    if facts.get("relmse") is not None:
-        text += f"; relative error {_percent(facts['relmse'])} %"
-        if facts.get("relmse_interval") is not None:
-            low, high = map(_percent, facts["relmse_interval"])
-            text += f" ({low} to {high} %)"
-        if facts.get("heavy_tailed"):
-            text += ", most of it in few pixels"
+    text += f"{spp} sample{'' if spp == 1 else 's'} a pixel, {brief(facts['seconds'])} s"
+    if error := error_of(facts):
+        text += f"; relative error {error}"
     if not facts.get("complete", True):
         text += "; stopped early"
     elif "stopped_by" in facts:
         text += f"; ended by render.{facts['stopped_by']}"
     return text
-
-
-def _percent(relmse: float) -> str:
-    """Return the relative error in percent, the root of relMSE."""
-    return _brief(100.0 * math.sqrt(max(relmse, 0.0)))
-
-
-def _brief(value: float) -> str:
-    """Return two digits, or all before the point."""
-    return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"
 
 
 def plain(value: Any, digits: int = 17) -> Any:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchpt.cli import collector
-from torchpt.cli.arguments import GROUPS, UsageError
+from torchpt.cli.arguments import GROUPS, UsageError, is_scene_word
 from torchpt.cli.interrupt import Interrupt
 from torchpt.cli.streams import speaking
 from torchpt.core.errors import OutputError, SceneError
@@ -34,6 +34,7 @@ torchpt stress scene=NAME|FILE.yaml [key=value ...]
   accel=    auto, numba, torch, brute, or a list of them                        auto
   compile=  auto, on, off, or a list of them                                    auto
   dtype=    float32 or float64                                                  float32
+  camera.fov=20, +shapes.NAME=..., ~lights.NAME: any key of the scene, as in torchpt render
   out=      a folder for stress.json, stress.md and pictures of the sweeps      none
   --json    the figures as one JSON object in place of the table
 
@@ -54,6 +55,7 @@ class Wishes:
 
     given: dict[str, str] = field(default_factory=dict)
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    changes: dict[str, Any] = field(default_factory=dict)
     json: bool = False
 
     @classmethod
@@ -71,6 +73,8 @@ class Wishes:
             group, dot, name = key.partition(".")
             if word == "--json":
                 found.json = True
+            elif is_scene_word(word):
+                found.change(word)
             elif equals and key in _KEYS:
                 if key in found.given:
                     raise UsageError(f"{key}: given twice")
@@ -82,13 +86,23 @@ class Wishes:
                     raise UsageError(f"{word}: the value cannot be read") from None
             else:
                 raise UsageError(f"{word}: expected one of {', '.join(f'{k}=' for k in _KEYS)}, --json or --help")
-        if found.settings and "scene" not in found.given:
-            raise UsageError(f"{next(iter(found.settings))}: settings are of a scene: expected scene= beside them")
+        if (found.settings or found.changes) and "scene" not in found.given:
+            first = next(iter([*found.settings, *found.changes]))
+            raise UsageError(f"{first}: settings are of a scene: expected scene= beside them")
         for key, accepted in _CHOICES.items():
             wrong = [value for value in found.list(key, accepted[0]) if value not in accepted]
             if wrong or (key in ("dtype", "quick") and len(found.list(key, accepted[0])) > 1):
                 raise SceneError(key, found.given[key], f"one of {', '.join(accepted)}")
         return found
+
+    def change(self, word: str) -> None:
+        """Take an override of a scene key."""
+        from torchpt.cli.grammar import read_word
+
+        key, values, sweeps = read_word(word)
+        if sweeps or key in self.changes:
+            raise UsageError(f"{key}: expected one value, got {word!r}" if sweeps else f"{key}: given twice")
+        self.changes[key] = values[0]
 
     def list(self, key: str, default: str) -> list[str]:
         """A value, or the values of a list."""
@@ -169,7 +183,7 @@ def _topics(wishes: Wishes) -> dict[str, tuple[Case, ...]]:
     from torchpt.stress.own_scene import cases_of
 
     scene = wishes.given.get("scene")
-    every = all_cases() if scene is None else {"scene": cases_of(scene, wishes.settings)}
+    every = all_cases() if scene is None else {"scene": cases_of(scene, wishes.settings, wishes.changes)}
     pattern = wishes.given.get("case", "*")
     found = {
         topic: tuple(one for one in cases if fnmatch.fnmatch(one.name, pattern) or fnmatch.fnmatch(topic, pattern))

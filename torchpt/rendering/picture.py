@@ -77,6 +77,7 @@ def rendering_of(run: Run) -> Rendering:
         lanes=run.engine.budget.lanes if run.engine.budget.short and not run.engine.compiled else None,
         eager=tuple(run.eager),
         scene=run.name,
+        overrides=run.scene.description.overrides,
         settings=run.settings,
     )
 

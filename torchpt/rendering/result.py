@@ -79,6 +79,7 @@ class Rendering:
         lanes: of a wave at the end, where failed allocations made them fewer; None where memory sufficed.
         eager: stages that ran as tensor operations although kernels were wanted, and why.
         scene: name of the scene; "" where it came as a mapping.
+        overrides: of the scene's keys, as words of the command line.
         settings: what it was rendered with, complete.
     """
 
@@ -110,6 +111,7 @@ class Rendering:
     lanes: int | None = None
     eager: tuple[str, ...] = ()
     scene: str = ""
+    overrides: tuple[str, ...] = ()
     settings: Settings | None = None
 
     @property
@@ -184,6 +186,7 @@ class Rendering:
         facts: dict[str, str | int | float | None] = {
             "version": __version__,
             "scene": self.scene if self.scene.isprintable() else None,
+            "overrides": " ".join(_short(word) for word in self.overrides if word.isprintable()),
             "spp": self.spp,
             "relmse": self.relmse,
             "relmse_low": low,
@@ -269,6 +272,10 @@ class Rendering:
         if self.eager:
             facts["eager"] = list(self.eager)
         return facts
+
+
+def _short(word: str, most: int = 200) -> str:
+    return word if len(word) <= most else f"{word[: most - 3]}..."
 
 
 @dataclass

@@ -29,6 +29,7 @@ from torchpt.reports.study import Study, Variant
 from torchpt.scene.devices import device_of
 from torchpt.scene.fingerprint import fingerprint as fingerprint_of
 from torchpt.scene.formats.description import Description, overridden, read_description
+from torchpt.scene.formats.overrides import told
 from torchpt.scene.prepare import SceneCache, scene_cache
 from torchpt.scene.scene import Scene
 from torchpt.scene.settings import Settings, having
@@ -370,10 +371,13 @@ def prepare(study: Study) -> list[Measured]:
         check_denoiser()
     found = []
     for name in study.scenes:
-        description = read_description(name)
-        loaded: dict[str, tuple[Scene, str]] = {}
+        known: dict[tuple[str, ...], tuple[Description, dict[str, tuple[Scene, str]]]] = {}
         curves = []
         for variant in study.variants:
+            words = told(variant.changes)
+            if words not in known:
+                known[words] = read_description(name, overrides=variant.changes), {}
+            description, loaded = known[words]
             curve = Curve(variant, _job(description, study.overrides(variant), loaded, "run"))
             if study.asked["denoise"]:
                 curve.denoised = _denoised(curve.job)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from itertools import pairwise, product
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 from torchpt.core.errors import SceneError
@@ -64,11 +65,13 @@ class Variant:
         label: what differs from the other variants.
         settings: by dotted key or name of a group, as written.
         axes: of them, those that the grid gave a list of.
+        changes: overrides of the scene's keys, as :func:`torchpt.load` takes them.
     """
 
     label: str
     settings: dict[str, Any]
     axes: tuple[str, ...]
+    changes: dict[str, Any] = field(default_factory=dict)
 
 
 def denoised_label(label: str) -> str:
@@ -87,12 +90,15 @@ def flat(raw: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def variants_of(settings: Mapping[str, Any], file: str | None) -> list[Variant]:
+def variants_of(
+    settings: Mapping[str, Any], file: str | None, changes: Mapping[str, list[Any]] = MappingProxyType({})
+) -> list[Variant]:
     """Every combination of what the lists hold, the last list turning fastest.
 
     Args:
         settings: by dotted key (``integrator.max_depth``) or name of a group; a value or a list of values.
         file: the study file, for errors.
+        changes: values of the scene's keys, a list each.
 
     Raises:
         SceneError: an unknown key, an empty list, a value given twice, a setting that a study decides itself.
@@ -103,11 +109,19 @@ def variants_of(settings: Mapping[str, Any], file: str | None) -> list[Variant]:
             raise SceneError(key, settings[key], _TAKEN[key], file)
     axes = {key: _values(key, value, file) for key, value in settings.items() if _is_axis(key, value)}
     wide = tuple(key for key, values in axes.items() if len(values) > 1)
-    found = [{**settings, **dict(zip(axes, chosen, strict=True))} for chosen in product(*axes.values())]
-    labels = _labels([flat({key: item[key] for key in wide}) for item in found])
+    swept = [key for key, values in changes.items() if len(_values(key, values, file)) > 1]
+    found = [
+        ({**settings, **dict(zip(axes, chosen, strict=True))}, dict(zip(changes, scene, strict=True)))
+        for chosen in product(*axes.values())
+        for scene in product(*changes.values())
+    ]
+    labels = _labels(
+        [flat({key: one[key] for key in wide}) | {key: scene[key] for key in swept} for one, scene in found]
+    )
     if len(set(labels)) < len(labels):
-        raise SceneError(wide[0], settings[wide[0]], "settings that differ in more than how they are written", file)
-    return [Variant(label, item, wide) for label, item in zip(labels, found, strict=True)]
+        expected = "settings that differ in more than how they are written"
+        raise SceneError(wide[0], settings[wide[0]], expected, file)
+    return [Variant(label, one, wide, scene) for label, (one, scene) in zip(labels, found, strict=True)]
 
 
 def _is_axis(key: str, value: Any) -> bool:
@@ -289,7 +303,7 @@ class Reference(Valued):
     }
 
 
-OWN_KEYS = (*Asked.parameters, "scene", "reference")
+OWN_KEYS = (*Asked.parameters, "scene", "reference", "overrides")
 #: For the tables of the docs.
 RECORDS = {"study": Asked, "reference": Reference}
 
@@ -410,7 +424,8 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
     for key, value in raw.items():
         if key not in OWN_KEYS and not key.startswith("reference."):
             settings |= flat({key: value})
-    variants = tuple(variants_of(settings, file))
+    changes = raw.get("overrides") or {}
+    variants = tuple(variants_of(settings, file, changes))
     labels = {variant.label for variant in variants}
     labels |= {denoised_label(label) for label in labels if asked["denoise"]}
     extras = []
@@ -422,6 +437,8 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
             raise SceneError(f"extra.{index}.name", item["name"], "a name that no curve has", file)
         extras.append(Extra(item["name"], float(item["seconds"]), item["file"], scene, item.get("spp")))
     plan = _plan(raw.get("reference"), scenes, asked["spp"][-1], file)
+    if plan.files and (several := next((key for key, values in changes.items() if len(values) > 1), None)):
+        raise SceneError(several, changes[several], "one value where reference= is a file, which shows one scene", file)
     return Study(scenes, variants, asked.values, tuple(extras), plan, file)
 
 

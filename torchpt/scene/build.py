@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchpt.core.errors import SceneError
 from torchpt.physics.lights import order
 from torchpt.physics.parts import Copy, Parameters, Part, Source
 from torchpt.physics.shapes.geometry import KINDS
@@ -56,6 +57,13 @@ def build_parts(description: Description, traced: Collection[str] = ()) -> Built
     Warns:
         EnergyWarning: two refracting shapes touch.
     """
+    try:
+        return _built(description, traced)
+    except SceneError as error:
+        raise description.layers.blame(error) from None
+
+
+def _built(description: Description, traced: Collection[str]) -> Built:
     parameters = Parameters()
     opener = Opener(description.textures, description.resolve, parameters, description.file)
     builder = ShapeBuilder(description, parameters, opener)

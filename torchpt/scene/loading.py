@@ -24,6 +24,7 @@ def load(
     source: Source,
     device: str | torch.device | None = None,
     bsdfs: Mapping[str, Bsdf] | None = None,
+    overrides: Mapping[str, Any] | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -35,6 +36,9 @@ def load(
         device: ``auto`` (CUDA where there is one), ``cpu``, ``cuda`` or ``cuda:N``; by default the scene's own
             ``render.device``, which is ``auto`` where it does not say.
         bsdfs: models of your own by the ``type`` that materials name them by. Gradients flow to their weights too.
+        overrides: values of the scene's keys by dotted key: ``{"camera.fov": 20, "+shapes.ball": {"type": "sphere"},
+            "~lights.sky": None}`` sets one, adds a shape and removes a light (docs/scenes.md, *Overrides*). They may be
+            tensors as in a dict.
 
     Raises:
         SceneError: the description is wrong; says where and what is accepted.
@@ -43,15 +47,21 @@ def load(
     """
     if torch.compiler.is_compiling():  # not before: this imports the compiler
         outside: Any = torch.compiler.disable(_load)
-        return outside(source, device, bsdfs)
-    return _load(source, device, bsdfs)
+        return outside(source, device, bsdfs, overrides)
+    return _load(source, device, bsdfs, overrides)
 
 
-def _load(source: Source, device: str | torch.device | None, bsdfs: Mapping[str, Bsdf] | None) -> Scene:
+def _load(
+    source: Source,
+    device: str | torch.device | None,
+    bsdfs: Mapping[str, Bsdf] | None,
+    overrides: Mapping[str, Any] | None,
+) -> Scene:
     start = time.perf_counter()
     tensors = Tensors()
     with needing("the scene file"):
-        description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
+        may_hold_tensors = bool(overrides) or isinstance(source, Mapping)
+        description = read_description(source, bsdfs, tensors.taken_from if may_hold_tensors else None, overrides)
     chosen = device_of(settings(description).render.device if device is None else device)
     with lasting():
         scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))

@@ -40,6 +40,7 @@ __all__ = [
     "blocks_of",
     "having",
     "merge",
+    "shaped",
 ]
 
 BLOCKS = ("film", "integrator", "sampler", "render")
@@ -502,6 +503,26 @@ def _overlay(what: str, below: dict[str, Any], above: dict[str, Any]) -> dict[st
     return {**below, **above}
 
 
+def shaped(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a film over those of another: a width or a height alone keeps the other's shape.
+
+    Args:
+        below: whose shape is kept; what it does not say is the default.
+        above: that is set.
+    """
+    sides = [name for name in ("width", "height") if above.get(name) is not None]
+    if len(sides) != 1:
+        return dict(above)
+    side, other = sides[0], "height" if sides == ["width"] else "width"
+    old, along, new = (
+        Film.parameters[name].default if value is None else value
+        for name, value in ((side, below.get(side)), (other, below.get(other)), ("", above[side]))
+    )
+    if not all(type(value) is int and 1 <= value <= MAX_SIDE for value in (old, along, new)):
+        return dict(above)
+    return {**above, other: max(1, (2 * along * new + old) // (2 * old))}
+
+
 def merge(scene: Mapping[str, Any], overrides: Mapping[str, Any], file: str | None) -> Settings:
     """Complete settings from the blocks of a scene file and explicit overrides, both by block name.
 
@@ -531,6 +552,8 @@ def _merge(
     blocks: dict[str, Any] = {}
     for block in BLOCKS:
         below, above = _set(scene.get(block), block, file), _set(overrides.get(block), block, None)
+        if block == "film":
+            above = shaped(below, above)
         raw = _overlay(block, below, above) if block in TYPED else {**below, **above}
         if "filter" in raw:
             inner = [_set(part.get("filter"), "film.filter", name) for part, name in ((below, file), (above, None))]

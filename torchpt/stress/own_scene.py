@@ -36,17 +36,20 @@ FEW = 2_000
 Array = NDArray[np.float64]
 
 
-def cases_of(source: str, overrides: Mapping[str, Mapping[str, Any]]) -> tuple[Case, ...]:
+def cases_of(
+    source: str, overrides: Mapping[str, Mapping[str, Any]], changes: Mapping[str, Any] | None = None
+) -> tuple[Case, ...]:
     """The cases of a scene, rendered small.
 
     Args:
         source: its name or file.
         overrides: settings by block.
+        changes: overrides of its keys, as :func:`torchpt.load` takes them.
 
     Raises:
         TorchptError: a scene or setting that cannot be used.
     """
-    description, settings = overridden(read_description(source), overrides)
+    description, settings = overridden(read_description(source, overrides=changes), overrides)
     wishes = _small(settings)
     own = Scene(description, torch.device("cpu"))
     extent, pose = (
@@ -74,7 +77,7 @@ def cases_of(source: str, overrides: Mapping[str, Mapping[str, Any]]) -> tuple[C
         return beside(bench, lambda: picture(replace(bench, **other)))
 
     def elsewhere(bench: Bench, way: Array) -> float:
-        changed = read_description(source, change=lambda raw: moved(raw, way, pose))
+        changed = read_description(source, change=lambda raw: moved(raw, way, pose), overrides=changes)
         return beside(bench, lambda: picture(bench, changed))
 
     few = sum(len(part.faces) if part.faces is not None else 1 for part in own.built.parts) <= FEW

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, TypeVar
@@ -16,7 +17,9 @@ from torchpt.physics.shapes import KINDS as SHAPES
 from torchpt.physics.textures import KINDS as TEXTURES
 from torchpt.scene import settings as run_settings
 from torchpt.scene.formats.cameras import read_camera
+from torchpt.scene.formats.compose import KEYS, Layers, compose
 from torchpt.scene.formats.materials import Kind, check_material, material_types, read_material
+from torchpt.scene.formats.overrides import overridden_by, told
 from torchpt.scene.formats.textures import check_texture, texture_of
 from torchpt.scene.formats.yaml import parse_yaml, plain, read_open, read_yaml
 from torchpt.scene.settings import BLOCKS, Settings, having
@@ -37,7 +40,6 @@ __all__ = [
 ASSETS = "$TORCHPT_ASSETS"
 #: Textures, materials, shapes (instances are some) and lights that a scene may name, of each.
 MAX_ENTRIES = 100_000
-_KEYS = ("version", "camera", *BLOCKS, "textures", "materials", "shapes", "lights")
 
 T = TypeVar("T")
 #: What a scene is read from.
@@ -62,6 +64,8 @@ class Description:
         materials: by name.
         shapes: by name, in file order.
         lights: by name.
+        overrides: of its keys, as words of the command line.
+        layers: which file of several its keys come from.
     """
 
     file: str | None
@@ -76,6 +80,12 @@ class Description:
     materials: dict[str, ParsedParams] = field(default_factory=dict)
     shapes: dict[str, ParsedParams] = field(default_factory=dict)
     lights: dict[str, ParsedParams] = field(default_factory=dict)
+    overrides: tuple[str, ...] = ()
+    layers: Layers = field(default=Layers(), repr=False, compare=False)
+
+    def blame(self, error: SceneError) -> SceneError:
+        """Return an error of one of its keys with the file that the key comes from."""
+        return error if error.file is None else self.layers.blame(error)
 
     def resolve(self, path: str | tuple[str, ...], key: str) -> Path:
         """The file that a scene names, or the first existing one of several.
@@ -100,12 +110,13 @@ class Description:
         raise problems[-1]
 
     def _existing(self, path: str, key: str) -> Path:
+        file = self.layers.file_of(key, self.file)
         head, _, rest = path.partition("/")
         if head == ASSETS:
             folder = os.environ.get(ASSETS[1:], "")
             if not folder:
                 expected = f"a file that can be found (the environment variable {ASSETS[1:]} is not set)"
-                raise SceneError(key, path, expected, self.file)
+                raise SceneError(key, path, expected, file)
             found = Path(folder) / rest
         else:
             found = self.base / path
@@ -116,7 +127,7 @@ class Description:
                 "no such file" if isinstance(error, FileNotFoundError | NotADirectoryError) else str(error.strerror)
             )
             hint = f"; only {ASSETS} is expanded" if path.startswith(("$", "~")) and head != ASSETS else ""
-            where = f"{key} of {self.file}" if self.file else key
+            where = f"{key} of {file}" if file else key
             raise AssetError(found, f"{problem}, named by {where}{hint}") from None
         return found
 
@@ -130,6 +141,8 @@ def read_description(
     source: Source,
     bsdfs: Mapping[str, Bsdf] | None = None,
     change: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    places: Sequence[Path] = (),
 ) -> Description:
     """A checked scene description.
 
@@ -138,7 +151,9 @@ def read_description(
             one line, or a mapping of the same schema. Relative paths start at the file's folder; where there is no file, at
             the current one.
         bsdfs: material types of the caller's own: type name to model instance.
-        change: of what was written, before it is checked.
+        change: of what was written, merged with what it names in ``defaults``, before it is checked.
+        overrides: values of its keys by dotted key, see :func:`torchpt.scene.formats.overrides.overridden_by`.
+        places: folders where scenes are looked for by name, those that ``defaults`` name too, before those that ship.
 
     Raises:
         SceneError: what is wrong first, with file, dotted key, value and what is accepted.
@@ -147,27 +162,53 @@ def read_description(
     Warns:
         EnergyWarning: a material may reflect more light than it receives.
     """
-    types, change = material_types(bsdfs), change or (lambda raw: raw)
+    types = material_types(bsdfs)
+
+    def made(raw: Any, file: str | None, base: Path) -> Description:
+        merged, layers = compose(plain(raw, file), file, base, places)
+        if overrides:
+            merged, layers = overridden_by(merged, overrides, layers, file, base)
+        merged = change(merged) if change is not None else merged
+        try:
+            found = _describe(merged, types, file, base, layers)
+        except SceneError as error:
+            raise layers.blame(error) from None
+        return replace(found, overrides=told(overrides)) if overrides else found
+
     if isinstance(source, Mapping):
-        return _describe(change(plain(source)), types, None, Path.cwd())
+        return made(source, None, Path.cwd())
     if not isinstance(source, str | os.PathLike) and hasattr(source, "read"):
         named = getattr(source, "name", None)
         file = named if isinstance(named, str) and is_regular(named) else None
         base = Path.cwd() if file is None else Path(file).resolve().parent
-        return _describe(change(plain(read_open(source, file), file)), types, file, base)
+        return made(read_open(source, file), file, base)
     if not isinstance(source, str | os.PathLike):
         raise SceneError("scene", source, SOURCES)
     file = os.fspath(source)
     if isinstance(source, str) and "\n" in source:
-        return _describe(change(plain(parse_yaml(source))), types, None, Path.cwd())
+        return made(parse_yaml(source), None, Path.cwd())
     if file.endswith((".yaml", ".yml")):
         path = Path(file)
-    elif file in scene_names():
-        path = configs() / "scene" / f"{file}.yaml"
-        file = str(path)
     else:
-        raise SceneError("scene", file, f"one of {', '.join(scene_names())}, or a path ending in .yaml")
-    return _describe(change(plain(read_yaml(path, file), file)), types, file, path.resolve().parent)
+        path = _named_scene(file, places)
+        file = str(path)
+    return made(read_yaml(path, file), file, path.resolve().parent)
+
+
+def _named_scene(name: str, places: Sequence[Path]) -> Path:
+    """Return the file of a scene in one of the places, or of one that ships.
+
+    Raises:
+        SceneError: there is none of this name.
+    """
+    files = {
+        path.stem: path for place in (configs() / "scene", *reversed(places)) for path in sorted(place.glob("*.yaml"))
+    }
+    if name not in files:
+        close = difflib.get_close_matches(name, files, 1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        raise SceneError("scene", name, f"one of {', '.join(sorted(files))}{hint}, or a path ending in .yaml")
+    return files[name]
 
 
 def settings(description: Description, overrides: Mapping[str, Any] | None = None) -> Settings:
@@ -181,7 +222,10 @@ def settings(description: Description, overrides: Mapping[str, Any] | None = Non
         SceneError: key such as ``render.spp``.
     """
     blocks = {name: getattr(description, name) for name in BLOCKS}
-    return run_settings.merge(blocks, overrides or {}, description.file)
+    try:
+        return run_settings.merge(blocks, overrides or {}, description.file)
+    except SceneError as error:
+        raise description.blame(error) from None
 
 
 def overridden(description: Description, overrides: Mapping[str, Mapping[str, Any]]) -> tuple[Description, Settings]:
@@ -203,8 +247,10 @@ def overridden(description: Description, overrides: Mapping[str, Mapping[str, An
     return description, settings(description, overrides)
 
 
-def _describe(raw: dict[str, Any], types: Mapping[str, Kind], file: str | None, base: Path) -> Description:
-    check_keys(raw, _KEYS, "", "a scene", file)
+def _describe(
+    raw: dict[str, Any], types: Mapping[str, Kind], file: str | None, base: Path, layers: Layers
+) -> Description:
+    check_keys(raw, KEYS, "", "a scene", file)
     version = raw.get("version")
     if version is not None and (isinstance(version, bool) or version != 1):
         raise SceneError("version", version, "1", file)
@@ -216,11 +262,25 @@ def _describe(raw: dict[str, Any], types: Mapping[str, Kind], file: str | None, 
     textures = _named(raw, "textures", file, lambda item, key: described("texture", TEXTURES, item, key, file))
     materials = _named(raw, "materials", file, lambda item, key: read_material(item, key, types, file))
     for name, material in materials.items():
-        check_material(material, f"materials.{name}", materials, textures, file)
+        key = f"materials.{name}"
+        check_material(material, key, materials, textures, layers.file_of(key, file))
     shapes = _named(raw, "shapes", file, lambda item, key: _shape(item, key, materials, textures, types, file))
     lights = _named(raw, "lights", file, lambda item, key: described("light", LIGHTS, item, key, file))
+    film, integrator, sampler, render = (blocks[name] for name in BLOCKS)
     return Description(
-        file, base, camera, version, **blocks, textures=textures, materials=materials, shapes=shapes, lights=lights
+        file,
+        base,
+        camera,
+        version,
+        film,
+        integrator,
+        sampler,
+        render,
+        textures,
+        materials,
+        shapes,
+        lights,
+        layers=layers,
     )
 
 

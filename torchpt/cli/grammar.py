@@ -1,0 +1,90 @@
+"""Overrides of scene keys in Hydra's grammar. Its parser alone is used: scenes never enter Hydra or OmegaConf.
+
+``camera.fov=20``, ``+shapes.ball='{type: sphere}'``, ``~lights.sky``; ``20,40``, ``choice(a,b)`` and ``range(1,4)`` sweep. What
+the words do is said in :mod:`torchpt.scene.formats.overrides`.
+"""
+
+from __future__ import annotations
+
+import re
+from itertools import islice
+from typing import Any
+
+from torchpt.cli.arguments import UsageError
+
+__all__ = ["MAX_VALUES", "read_value", "read_word", "reason"]
+
+#: Values that one word may sweep over.
+MAX_VALUES = 10_000
+_WORD = re.compile(r"(\+\+|\+|~|)([^=]*)(?:=(.*))?\Z", re.DOTALL)
+
+
+def read_word(word: str) -> tuple[str, list[Any], bool]:
+    """Return the key of an override with its sign, its values, and whether it sweeps over them.
+
+    Raises:
+        UsageError: a word that the grammar does not know.
+    """
+    match = _WORD.match(word)
+    assert match is not None
+    sign, key, text = match.groups()
+    if text is None:
+        if sign != "~":
+            raise UsageError(f"{word}: expected key=value, for example {key}=...")
+        return word, [None], False
+    values, sweeps = read_value(sign + key, text)
+    return sign + key, values, sweeps
+
+
+def read_value(key: str, text: str) -> tuple[list[Any], bool]:
+    """Return the values of the text after ``=``, and whether it is a sweep.
+
+    Args:
+        key: for errors.
+        text: in Hydra's grammar.
+
+    Raises:
+        UsageError: the grammar does not know it, or it has no place in a scene.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.core.override_parser.types import ChoiceSweep, Override, RangeSweep
+    from hydra.errors import HydraException
+
+    try:
+        override = OverridesParser.create().parse_override(f"x={text}")
+        value = override.value()
+        if not override.is_sweep_override():
+            values, sweeps = [value], False
+        elif isinstance(value, ChoiceSweep | RangeSweep):
+            found = list(islice(override.sweep_iterator(), MAX_VALUES + 1))
+            values, sweeps = [Override._convert_value(item) for item in found], True
+        else:
+            kind = type(value).__name__.removesuffix("Sweep").lower()
+            raise UsageError(
+                f"{key}: expected values a,b or choice(a,b) or range(a,b), got {text!r} ({kind} is no list of values)"
+            )
+    except HydraException as error:
+        raise UsageError(f"{key}={text}: expected key=value ({reason(error)})") from error
+    if len(values) > MAX_VALUES:
+        raise UsageError(f"{key}: expected at most {MAX_VALUES} values, got {text!r}")
+    for item in values:
+        _check(key, item, text)
+    return values, sweeps
+
+
+def reason(error: Exception) -> str:
+    """Return why Hydra cannot read a word, in a line."""
+    found = next((line for line in str(error).splitlines() if "evaluating" in line), "")
+    return found.partition(": ")[2] or "quote what holds blanks, brackets or commas, as in key='a b'"
+
+
+def _check(key: str, value: Any, text: str) -> None:
+    """Refuse what a scene file cannot say either: interpolation, and keys that are no text."""
+    if isinstance(value, str) and "${" in value:
+        raise UsageError(f"{key}: expected a value, got {text!r} (scenes know no interpolation)")
+    if isinstance(value, dict):
+        for name in value:
+            if not isinstance(name, str):
+                raise UsageError(f"{key}: expected text as keys, got {name!r} in {text!r}")
+    for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _check(key, item, text)

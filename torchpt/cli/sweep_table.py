@@ -1,0 +1,78 @@
+"""What came of the jobs of a sweep, as a table: each job leaves a note in the sweep's folder, whichever process it runs in."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchpt.cli.render import Job
+
+__all__ = ["brief", "error_of", "note_job", "tell_jobs"]
+
+_HEADING = ("job", "overrides", "out", "error", "seconds")
+
+
+def note_job(job: Job, facts: Mapping[str, Any]) -> None:
+    """Leave a note of a job; outside a sweep, or where its folder cannot be reached, nothing.
+
+    Args:
+        job: of a sweep.
+        facts: its summary.
+    """
+    if job.folder is not None:
+        told = {
+            name: facts[name]
+            for name in ("out", "relmse", "relmse_interval", "heavy_tailed", "seconds")
+            if name in facts
+        }
+        told |= {"job": job.number, "overrides": list(job.words)}
+        with suppress(OSError):  # another machine, say
+            (Path(job.folder) / f"torchpt-job-{job.number}.json").write_text(json.dumps(told))
+
+
+def tell_jobs(folder: str) -> None:
+    """Print the table of a sweep on stderr; nothing where fewer than two jobs left a note."""
+    found = [json.loads(path.read_text()) for path in Path(folder).glob("torchpt-job-*.json")]
+    if len(found) > 1:
+        print("\n".join(table(found)), file=sys.stderr)
+
+
+def table(jobs: list[dict[str, Any]]) -> list[str]:
+    """Return the lines of a table of jobs; of their overrides those that not all have in common."""
+    jobs = sorted(jobs, key=lambda job: job["job"])
+    common = set.intersection(*(set(job["overrides"]) for job in jobs))
+    rows: list[tuple[str, ...]] = [_HEADING]
+    for job in jobs:
+        words = " ".join(word for word in job["overrides"] if word not in common)
+        out = job.get("out", "")
+        names = out if isinstance(out, str) else ", ".join(out)
+        rows.append((str(job["job"]), words, names, error_of(job) or "-", brief(job.get("seconds", math.nan))))
+    wide = [max(len(row[column]) for row in rows) for column in range(len(_HEADING))]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, wide, strict=True)).rstrip() for row in rows]
+
+
+def error_of(facts: Mapping[str, Any]) -> str:
+    """Return the relative error of a summary in words; nothing where it is not known."""
+    if facts.get("relmse") is None:
+        return ""
+    text = f"{_percent(facts['relmse'])} %"
+    if facts.get("relmse_interval") is not None:
+        low, high = map(_percent, facts["relmse_interval"])
+        text += f" ({low} to {high} %)"
+    return text + (", most of it in few pixels" if facts.get("heavy_tailed") else "")
+
+
+def _percent(relmse: float) -> str:
+    """Return the relative error in percent, the root of relMSE."""
+    return brief(100.0 * math.sqrt(max(relmse, 0.0)))
+
+
+def brief(value: float) -> str:
+    """Return two digits, or all before the point."""
+    return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"

@@ -1,0 +1,315 @@
+"""Scenes of several layers: files that a scene names in ``defaults``, its own keys; :mod:`.overrides` come on top.
+
+Layers are merged as they are written, before anything of them is read:
+
+- Mappings are merged key by key; lists, numbers and text of a later layer replace those of an earlier one.
+- A mapping that names another ``type`` than the one below it replaces it as a whole. The camera, ``integrator``, ``sampler``
+  and ``film.filter`` keep the keys that their new type reads too.
+- A null unsets: a texture, material, shape or light is removed by it, which has to be there.
+- Relative paths start at the folder of the file that they stand in; those of overrides at the current one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torchpt.core.errors import SceneError
+from torchpt.core.files import configs, is_regular
+from torchpt.physics.bsdfs import KINDS as MATERIALS
+from torchpt.physics.cameras import KINDS as CAMERAS
+from torchpt.physics.lights import KINDS as LIGHTS
+from torchpt.physics.shapes import KINDS as SHAPES
+from torchpt.physics.textures import KINDS as TEXTURES
+from torchpt.scene.formats.yaml import plain, read_yaml
+from torchpt.scene.settings import BLOCKS, TYPED, shaped
+from torchpt.spec.schema import parameters_of
+
+__all__ = [
+    "KEEPING", "KEYS", "MAX_FILES", "MAX_LEVELS", "NAMED", "PATHS", "TABLES", "Layers", "Parts", "compose", "kept", "one_of",
+    "over", "path_in", "placed", "prefixes", "skeleton", "things", "with_size",
+]  # fmt: skip
+
+#: Blocks that hold things by name.
+NAMED = {"textures": "texture", "materials": "material", "shapes": "shape", "lights": "light"}
+#: Keys of a scene.
+KEYS = ("version", "defaults", "camera", *BLOCKS, *NAMED)
+#: Keys whose values are paths.
+PATHS = ("path",)
+#: Files that a scene may consist of, and how deep they may name each other.
+MAX_FILES, MAX_LEVELS = 64, 8
+#: What has a type and keeps what another type reads too: its kinds, and its type where none is said.
+KEEPING: dict[tuple[str, ...], tuple[Mapping[str, Any], str]] = {
+    ("camera",): (CAMERAS, CAMERAS.names[0]),
+    ("integrator",): TYPED["integrator"],
+    ("sampler",): TYPED["sampler"],
+    ("film", "filter"): TYPED["filter"],
+}
+TABLES: dict[str, Mapping[str, Any]] = {
+    "textures": TEXTURES, "materials": MATERIALS, "shapes": SHAPES, "lights": LIGHTS,
+}  # fmt: skip
+
+Parts = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Which file of a scene each of its keys comes from.
+
+    Attributes:
+        layers: file, and its keys without values, the lowest first; the file of overrides is None.
+    """
+
+    layers: tuple[tuple[str | None, Any], ...] = field(default=())
+
+    def file_of(self, key: str, otherwise: str | None) -> str | None:
+        """Return the file that a key comes from: of those that know most of its parts the last one.
+
+        Args:
+            key: dotted.
+            otherwise: the file of a scene that has one layer only.
+        """
+        found, best = otherwise, -1
+        for file, tree in self.layers:
+            known = _known_parts(tree, key)
+            if known >= best:
+                found, best = file, known
+        return found
+
+    def blame(self, error: SceneError) -> SceneError:
+        """Return the error with the file that its key comes from."""
+        if not self.layers:
+            return error
+        return type(error)(error.key, error.value, error.expected, self.file_of(error.key, error.file))
+
+
+def _known_parts(tree: Any, key: str) -> int:
+    """Return how many letters of a dotted key a tree of keys has."""
+    known = 0
+    while isinstance(tree, dict) and key:
+        name = next((name for name in prefixes(key) if name in tree), None)
+        if name is None:
+            break
+        known, key, tree = known + len(name) + 1, key[len(name) + 1 :], tree[name]
+    return known
+
+
+def prefixes(key: str) -> Iterator[str]:
+    """Yield the beginnings of a dotted key that may be a name, the longest first: names may hold dots."""
+    parts = key.split(".")
+    for count in range(len(parts), 0, -1):
+        yield ".".join(parts[:count])
+
+
+def skeleton(raw: Any) -> Any:
+    """Return the keys of nested mappings, without values."""
+    return {key: skeleton(value) for key, value in raw.items()} if isinstance(raw, dict) else None
+
+
+# ---- Files that a scene names in `defaults`
+
+
+def compose(
+    raw: dict[str, Any], file: str | None, base: Path, places: Sequence[Path] = ()
+) -> tuple[dict[str, Any], Layers]:
+    """Return a scene merged with the files that its ``defaults`` name, and where its keys come from.
+
+    Args:
+        raw: the scene as written, bounded by :func:`torchpt.scene.formats.yaml.plain`.
+        file: the scene file, for errors.
+        base: the folder that its relative paths start from.
+        places: folders where names are looked for too, before those that ship.
+
+    Raises:
+        SceneError: a file that is not there, that names itself, too many of them; a removal of what is not there.
+    """
+    if "defaults" not in raw:
+        return raw, Layers()
+    reader = _Reader(base, (*places, configs() / "scene"))
+    merged = reader.merge(raw, file, base, () if file is None else (Path(file).resolve(),))
+    return merged, Layers(tuple(reader.layers))
+
+
+class _Reader:
+    """Reads the files of one scene.
+
+    Args:
+        base: the folder that relative paths start from once all are merged.
+        places: folders where names are looked for that are not beside the file that names them.
+    """
+
+    def __init__(self, base: Path, places: Sequence[Path]) -> None:
+        self.base, self.places = base.resolve(), places
+        self.layers: list[tuple[str | None, Any]] = []
+
+    def merge(self, raw: dict[str, Any], file: str | None, folder: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
+        own = {key: value for key, value in raw.items() if key != "defaults"}
+        below: dict[str, Any] = {}
+        for index, name in enumerate(_names(raw.get("defaults"), file)):
+            key = f"defaults.{index}" if isinstance(raw["defaults"], list) else "defaults"
+            path = self.found(name, folder, key, file, trail)
+            if path in trail:
+                circle = " -> ".join(_shown(step) for step in (*trail[trail.index(path) :], path))
+                raise SceneError(key, name, f"files that do not name themselves ({circle})", file)
+            if len(trail) > MAX_LEVELS:
+                raise SceneError(key, name, f"files that name each other at most {MAX_LEVELS} levels deep", file)
+            if len(self.layers) >= MAX_FILES:
+                raise SceneError(key, name, f"a scene of at most {MAX_FILES} files", file)
+            shown = _shown(path)
+            part = self.merge(plain(read_yaml(path, shown), shown), shown, path.parent, (*trail, path))
+            below = _merged(below, part, shown, strict=False) if below else part
+        if trail and folder.resolve() != self.base:
+            own = placed(own, folder.resolve())
+        self.layers.append((file, skeleton(own)))
+        return _merged(below, own, file, strict="defaults" in raw)
+
+    def found(self, name: str, folder: Path, key: str, file: str | None, trail: tuple[Path, ...]) -> Path:
+        """Return the file that a default names: beside the file that names it, or in one of the places."""
+        exact = name.endswith((".yaml", ".yml"))
+        places = [folder / name] if exact else [place / f"{name}.yaml" for place in (folder, *self.places)]
+        for place in places:
+            path = place.resolve()
+            own = bool(trail) and path == trail[-1] and place is not places[-1]  # a file that extends its namesake
+            if is_regular(path) and not own:
+                return path
+        known = sorted({path.stem for place in (folder, *self.places) for path in place.glob("*.yaml")})
+        close = difflib.get_close_matches(name, known, 1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        where = str(places[0]) if exact else f"{places[0]} or a scene that ships"
+        raise SceneError(key, name, f"a file that is there: {where}{hint}", file)
+
+
+def _names(value: Any, file: str | None) -> list[str]:
+    names = [value] if isinstance(value, str) else [] if value is None else value
+    expected = "a list of names of scenes or of files ending in .yaml, merged in this order under the scene's own keys"
+    if not isinstance(names, list):
+        raise SceneError("defaults", value, expected, file)
+    for index, name in enumerate(names):
+        if not isinstance(name, str) or not name.strip() or not name.isprintable() or name == "_self_":
+            raise SceneError(f"defaults.{index}", name, expected, file)
+    return names
+
+
+def _shown(path: Path) -> str:
+    """Return a path as errors show it: from the current folder where it lies below that."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except (ValueError, OSError):
+        return str(path)
+
+
+def placed(value: Any, folder: Path) -> Any:
+    """Return nested mappings whose relative paths start at a folder."""
+    if isinstance(value, dict):
+        return {key: path_in(item, folder) if key in PATHS else placed(item, folder) for key, item in value.items()}
+    if isinstance(value, list) and any(isinstance(item, dict | list) for item in value):
+        return [placed(item, folder) for item in value]
+    return value
+
+
+def path_in(value: Any, folder: Path) -> Any:
+    """Return a path, or each of several, from a folder; one that begins with a variable stays."""
+    if isinstance(value, list):
+        return [path_in(item, folder) for item in value]
+    if not isinstance(value, str) or value.startswith("$") or not value.strip():
+        return value
+    return os.path.normpath(folder / value)
+
+
+# ---- One layer over another
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any], file: str | None, *, strict: bool) -> dict[str, Any]:
+    """Return a layer over another; neither is changed.
+
+    Args:
+        below: the earlier layer, by block.
+        above: the later one.
+        file: of the later one, for errors.
+        strict: whether what a null removes has to be there; else the null stays, for a layer below.
+
+    Raises:
+        SceneError: a thing to remove that is not there.
+    """
+    below = with_size(below, above)
+    result = dict(below)
+    for block, value in above.items():
+        if block in NAMED and isinstance(value, Mapping):
+            result[block] = things(block, below.get(block), value, file, strict)
+        else:
+            result[block] = over(below.get(block), value, (block,))
+    return result
+
+
+def things(block: str, below: Any, above: Mapping[str, Any], file: str | None, strict: bool) -> dict[str, Any]:
+    """Return a block of things over another, see :func:`_merged`."""
+    result = dict(below) if isinstance(below, Mapping) else {}
+    for name, value in above.items():
+        if value is not None:
+            result[name] = over(result.get(name), value, (block, name))
+        elif result.pop(name, None) is None:
+            if strict:
+                raise SceneError(f"{block}.{name}", None, one_of(block, name, list(result)), file)
+            result[name] = None
+    return result
+
+
+def over(below: Any, above: Any, where: Parts) -> Any:
+    """Return a value of a later layer over that of an earlier one, ``where`` they stand."""
+    if where in KEEPING:
+        below, above = (({"type": item} if isinstance(item, str) else item) for item in (below, above))
+    if not isinstance(above, Mapping) or not isinstance(below, Mapping):
+        return above
+    if where == ("film",):
+        above = shaped(below, above)
+    if where in KEEPING:
+        table, default = KEEPING[where]
+        below = kept(below, above.get("type") or below.get("type") or default, table, default)
+    elif _identity(above) not in (None, _identity(below)):
+        return above
+    result = dict(below)
+    for key, value in above.items():
+        result[key] = over(below.get(key), value, (*where, key))
+    return result
+
+
+def _identity(thing: Mapping[str, Any]) -> Any:
+    """Return what says of a mapping what it is: its type, or that it names a texture."""
+    if "type" in thing:
+        return thing["type"] or "null"  # a material that YAML reads as nothing
+    return "texture" if "texture" in thing else None
+
+
+def kept(below: Mapping[str, Any], name: Any, table: Mapping[str, Any], default: str) -> dict[str, Any]:
+    """Return the keys of a mapping that another type reads too."""
+    if name == below.get("type", default) or not isinstance(name, str) or name not in table:
+        return dict(below)
+    own = parameters_of(table[name])
+    return {key: value for key, value in below.items() if key in own or key not in _all_keys(table)}
+
+
+def _all_keys(table: Mapping[str, Any]) -> set[str]:
+    return {key for kind in table for key in parameters_of(table[kind])}
+
+
+def with_size(below: Mapping[str, Any], above: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a layer whose camera says the size that its ``K`` in pixels is of, where a later layer has another film."""
+    camera, film = below.get("camera"), below.get("film")
+    if not isinstance(camera, Mapping) or camera.get("K") is None or camera.get("size") is not None:
+        return below
+    size = [film.get("width"), film.get("height")] if isinstance(film, Mapping) else [None]
+    if None in size or "film" not in above or "K" in (above.get("camera") or ()):
+        return below
+    return {**below, "camera": {**camera, "size": size}}
+
+
+def one_of(block: str, name: str, known: Sequence[str]) -> str:
+    """Return what is accepted in place of a name that is not there."""
+    close = difflib.get_close_matches(name, known, 1)
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    shown = [*known[:20], "..."] if len(known) > 20 else known
+    return f"the name of a {NAMED[block]} that is there{hint}: {', '.join(shown) or 'there is none'}"
