@@ -283,7 +283,7 @@ def check_keys(raw: Mapping[str, Any], known: Iterable[str], key: str, what: str
 def refused(error: Refused, key: str, value: Any, file: str | None) -> SceneError:
     """The refusal of a value as the error that names its key."""
     shown = value if error.value is ... else error.value
-    kind = NotBuiltError if error.unsupported else SceneError
+    kind = NotBuiltError if error.not_built else SceneError
     return kind(dotted(key, *error.at), shown, error.expected, file)
 
 
