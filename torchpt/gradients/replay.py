@@ -26,6 +26,7 @@ from torchpt.gradients.tape import sample_cotangents
 from torchpt.math.sums import ChunkSums, Sums
 from torchpt.paths.walk import KEPT, Counts, Observer, Population, walk
 from torchpt.scene import Scene
+from torchpt.scene.memory_estimate import BYTES_PER_LANE
 from torchpt.scene.prepare import own_models
 from torchpt.scene.settings import Settings
 
@@ -33,6 +34,8 @@ __all__ = ["replay_paths"]
 
 #: Lanes of a chunk of tensors. Always the same: sums of other chunks would be rounded otherwise.
 LANES = {"cpu": 1 << 16, "cuda": 1 << 20}
+#: Bytes of a vertex that is kept: state, hit and groups of a lane.
+BYTES_PER_VERTEX = 240
 #: Marks of a walk.
 MARKS = 8
 
@@ -152,8 +155,7 @@ def replay_paths(scene: Scene, assembly: SceneTape, settings: Settings, cotangen
     def whole(span: Span) -> None:
         sums.join(piece(assembly, settings, cotangent, share, span))
 
-    device = wave.centre.device
-    budget = Budget(device, LANES.get(device.type, LANES["cpu"]), what="the vertices of a single lane")
+    budget = _budget_of_tensors(wave.centre.device, settings)
     assembly.through(budget, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
@@ -203,6 +205,17 @@ def _over_threads(
         if budget.threads == 1:
             return "memory ran out"
         budget.shrink()
+
+
+def _budget_of_tensors(device: torch.device, settings: Settings) -> Budget:
+    """Return chunks of always the same size, or, where that is more than ``render.max_memory`` leaves, of what fits."""
+    depth = settings.integrator.limits.max_depth
+    # A vertex at a time is on a tape, which takes about as much as a wave does.
+    each = 2 * BYTES_PER_LANE + BYTES_PER_VERTEX * (min(depth, KEPT) if depth >= 0 else KEPT)
+    lanes, limit = LANES.get(device.type, LANES["cpu"]), settings.render.max_memory
+    budget = Budget(device, lanes, what="the vertices of a single lane", limit=limit, per_lane=each)
+    budget.steady()
+    return budget
 
 
 def _spans(blocks: Sequence[tuple[int, int]], samples: int) -> Iterator[Span]:
