@@ -15,6 +15,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchpt.cli import main as commands
+from torchpt.cli.interrupt import Interrupt, Interrupted
 from torchpt.cli.main import main
 from torchpt.images import read_image, read_layers
 
@@ -120,3 +122,27 @@ def test_a_signal_ends_a_process(tmp_path: Path, signum: int, code: int) -> None
             process.kill()
     assert process.returncode == code, err
     check_partial(tmp_path, out.decode(), err.decode())
+
+
+def test_a_signal_that_python_wraps_ends_as_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where it arrives in ``__set_name__`` while a module is imported."""
+
+    def wrapped(words: list[str], interrupt: Interrupt) -> int:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            raise AssertionError("no signal came")
+        except Interrupted as arrived:
+            raise RuntimeError("Error calling __set_name__") from arrived
+
+    command = commands.Command("wrapped", "", "", "", wrapped)
+    monkeypatch.setattr(commands, "COMMANDS", (*commands.COMMANDS, command))
+    assert main(["wrapped"]) == 143
+
+
+def test_an_error_of_no_signal_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(words: list[str], interrupt: Interrupt) -> int:
+        raise RuntimeError("a defect") from ValueError()
+
+    monkeypatch.setattr(commands, "COMMANDS", (commands.Command("broken", "", "", "", broken),))
+    with pytest.raises(RuntimeError, match="a defect"):
+        main(["broken"])

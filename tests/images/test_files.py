@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import struct
+import subprocess
 import sys
 import zlib
 from pathlib import Path
@@ -208,6 +209,33 @@ def test_the_systems_reason_is_told_where_a_file_may_not_grow(tmp_path: Path, en
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert str(caught.value) == f"{path}: cannot be written (File too large)"
     assert [file.name for file in tmp_path.iterdir()] == [path.name] and path.read_text() == "old"
+
+
+FORKED = """
+import faulthandler, os, sys, torch
+from torchpt.images import read_image, write_image
+
+first, second = sys.argv[1:]
+image = torch.rand(64, 48, 3)
+for _ in range(2):
+    write_image(first, image)
+    read_image(first)
+child = os.fork()
+if child == 0:
+    faulthandler.dump_traceback_later(20, exit=True)
+    write_image(second, image)
+    os._exit(0 if torch.equal(read_image(second), image) else 2)
+write_image(first, image)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing forks here")
+def test_a_forked_process_writes_where_its_parent_did(tmp_path: Path) -> None:
+    files = [str(tmp_path / name) for name in ("a.exr", "b.exr")]
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", FORKED, *files], capture_output=True, timeout=60)
+    assert done.returncode == 0, done.stderr
 
 
 def test_an_encoders_own_error_names_no_hidden_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -115,7 +115,9 @@ def test_the_bits_after_kills(box: torchpt.Scene, kills: int, tmp_path: Path) ->
             break
         assert time.monotonic() - killed < 15.0
         done += 1
-        assert codes[victim] == -signal.SIGKILL and all(code in (2, 143) for k, code in enumerate(codes) if k != victim)
+        told = started.errors.read_text()
+        assert codes[victim] == -signal.SIGKILL, (codes, told)
+        assert all(code in (2, 143) for k, code in enumerate(codes) if k != victim), (codes, told)
         (line,) = started.lines()
         assert line.startswith(("torchpt: ranks:", "torchpt: stopped by a signal")) and started.output.read_text() == ""
     assert done >= kills // 2

@@ -8,7 +8,7 @@ import threading
 from types import FrameType
 from typing import Any
 
-__all__ = ["Interrupt", "Interrupted"]
+__all__ = ["Interrupt", "Interrupted", "interruption"]
 
 
 class Interrupted(BaseException):
@@ -22,6 +22,20 @@ class Interrupted(BaseException):
     def exit_code(self) -> int:
         """130 for Ctrl-C, 143 for SIGTERM: the shell's convention."""
         return 128 + self.signum
+
+
+def interruption(error: BaseException) -> Interrupted | None:
+    """Return the signal that an error comes from; None where it comes from none.
+
+    Where a signal arrives while Python itself calls a method, it is wrapped in an error of Python's own: in 3.11 one in
+    ``__set_name__`` becomes a ``RuntimeError``, as where a module with dataclasses is imported.
+    """
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, Interrupted):
+            return seen
+        seen = seen.__cause__ or seen.__context__
+    return None
 
 
 class Interrupt:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from torchpt.cli import collector, compare, converge, info, keys, orbit, ranked, render, stress
 from torchpt.cli.arguments import GROUPS, Arguments, UsageError, parse
 from torchpt.cli.hydra_process import hydra_process
-from torchpt.cli.interrupt import Interrupt, Interrupted
+from torchpt.cli.interrupt import Interrupt, Interrupted, interruption
 from torchpt.cli.render import Job
 from torchpt.cli.streams import ready, speaking
 from torchpt.cli.sweep_folder import sweep_folder
@@ -87,12 +87,13 @@ def main(argv: list[str] | None = None) -> int:
             if _asks_for_help(argv[1:]):
                 return _say(_help(command.help))
             return command.run(argv[1:], interrupt)
-        except TorchptError as error:
-            return _refuse(str(error))
         except Interrupted as interrupted:
             return interrupted.exit_code
         except Exception as error:
-            return _out_of_memory(error)
+            wrapped = interruption(error)
+            if wrapped is not None:
+                return wrapped.exit_code
+            return _refuse(str(error)) if isinstance(error, TorchptError) else _out_of_memory(error)
 
 
 def _out_of_memory(error: Exception) -> int:
@@ -402,7 +403,7 @@ def _one_line(error: Exception, words: list[str]) -> str:
         return f"{match[1]}: expected one value or a list [..,..], got {match[2]!r} (--multirun sweeps over several)"
     cause = error.__cause__
     if cause is not None and str(cause) not in text:
-        text = f"{text.splitlines()[0]}: {cause}"
+        text = f"{(text.splitlines() or [type(error).__name__])[0]}: {cause}"
     return _first_line(text) if text.strip() else type(error).__name__
 
 

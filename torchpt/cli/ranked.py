@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from torchpt.cli.interrupt import Interrupt, Interrupted
+from torchpt.cli.interrupt import Interrupt, interruption
 from torchpt.core.errors import LostRankError, OtherRankError, TorchptError
 
 if TYPE_CHECKING:
@@ -74,7 +74,10 @@ def main_of_ranks(main: Callable[[list[str]], int], words: list[str]) -> int:
         if first:
             print(f"torchpt: {error}", file=sys.stderr)
         return 2
-    except Interrupted as interrupted:
+    except BaseException as error:
+        interrupted = interruption(error)
+        if interrupted is None:
+            raise
         say("torchpt: stopped by a signal, before all ranks were there", about="lost")
         _leave(interrupted.exit_code)
     _stderr = sys.stderr

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import partial
 from io import BytesIO
 from os import PathLike
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,28 @@ def _rgb(pixels: np.ndarray) -> np.ndarray:
     return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels[..., :3]
 
 
+#: Held while OpenEXR has threads.
+_encoding = Lock()
+
+
+@contextmanager
+def _threads_of_openexr() -> Iterator[None]:
+    """Let OpenEXR have its threads, and end them afterwards.
+
+    A process that is forked while they are there has none of them, and waits for them for ever as soon as it writes a file.
+    """
+    import OpenImageIO as oiio
+
+    with _encoding:
+        wanted = oiio.get_int_attribute("exr_threads")
+        try:
+            yield
+        finally:
+            oiio.attribute("exr_threads", -1)  # none
+            oiio.ImageOutput.create("picture.exr")  # which heeds it
+            oiio.attribute("exr_threads", wanted)
+
+
 def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str], facts: dict[str, Fact]) -> None:
     import OpenImageIO as oiio
 
@@ -175,12 +198,14 @@ def _encode_float(temporary: Path, pixels: np.ndarray, channels: list[str], fact
     if temporary.suffix == ".exr":
         spec.attribute("compression", "zip")
         put_header(spec, facts)
-    encoder = oiio.ImageOutput.create("picture" + temporary.suffix)
-    if encoder is None:
-        raise OSError(oiio.geterror())
-    opened = encoder.open(str(temporary), spec)
-    written = opened and encoder.write_image(np.ascontiguousarray(pixels))
-    if not (encoder.close() and written):
+    with _threads_of_openexr():
+        encoder = oiio.ImageOutput.create("picture" + temporary.suffix)
+        if encoder is None:
+            raise OSError(oiio.geterror())
+        opened = encoder.open(str(temporary), spec)
+        written = opened and encoder.write_image(np.ascontiguousarray(pixels))
+        done = encoder.close() and written
+    if not done:
         _try_bytes(temporary, pixels.nbytes + 64 * height + 2**16)
         said = encoder.geterror() or "the encoder failed"
         raise OSError(said.replace(str(temporary), "the file"))
