@@ -220,7 +220,7 @@ def test_a_new_stop_rule_is_one_declaration_and_its_use(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     *said, last = done.stdout.splitlines()
-    assert said[:2] == ["written: render/default.yaml", "written: guides/ml.md, reference/scenes.md"]
+    assert said[:2] == ["written: render/default.yaml", "written: guides/ml.md, reference/cli.md, reference/scenes.md"]
     row = "a whole number 1..2147483647"
     assert (
         f"\n| `enough` | samples that are enough | {row} | `None` |\n"
