@@ -1,4 +1,4 @@
-"""Hooks of mkdocs: the repository's CHANGELOG and CONTRIBUTING are pages of the site too, with their links turned around."""
+"""Hooks of mkdocs: CHANGELOG and CONTRIBUTING of the repository as pages, and roles of docstrings as plain code."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-__all__ = ["on_files"]
+__all__ = ["on_files", "on_page_content"]
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Page of the site -> file of the repository.
@@ -27,3 +27,8 @@ def on_files(files: Any, config: Any) -> Any:
     for page, name in PAGES.items():
         files.append(File.generated(config, page, content=as_page((ROOT / name).read_text(encoding="utf-8"))))
     return files
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
+    """Leave out the roles of docstrings (``:func:`` and others) before code: Markdown does not know them."""
+    return re.sub(r":(?:func|class|meth|mod|attr|data|exc|ref):(?=<code|`)", "", html)
