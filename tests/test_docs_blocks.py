@@ -181,11 +181,14 @@ def test_blocks_run(name: str, checkout: Path, capfd: pytest.CaptureFixture[str]
         if block.language == "python" and not is_file(name, block):
             exec(compile("\n" * block.line + block.text, name, "exec"), names)
         elif block.language == "yaml":
-            file = re.match(r"# ([\w.-]+\.yaml)\n", block.text)
+            file = re.match(r"# ([\w./-]+\.yaml)\n", block.text)
             if file:
+                (checkout / file[1]).parent.mkdir(exist_ok=True)
                 (checkout / file[1]).write_text(block.text, encoding="utf-8")
             elif "seeds" in block.text:
                 study_of(yaml.safe_load(block.text))
+            elif "defaults" in block.text:
+                torchpt.load(yaml.safe_load(block.text), device="cpu")
             else:
                 torchpt.load(completed(textwrap.dedent(block.text)), device="cpu")
         elif block.language == "sh" and shown is not None:

@@ -64,7 +64,7 @@ def test_help_says_what_each_argument_is() -> None:
     for name, argument in declared(CommonOptions).items():
         assert sum(line.startswith(f"{name}: {argument.spec.doc}") for line in lines) == 1
     assert (
-        "spp: samples a pixel, and the most that other limits let it take (a whole number 1..2147483647; None: 64)"
+        "spp: samples a pixel; a limit of time or error may end sooner (a whole number 1..2147483647; None: 64)"
         in lines
     )
 
