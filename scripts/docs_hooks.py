@@ -1,4 +1,4 @@
-"""Hooks of mkdocs: CHANGELOG and CONTRIBUTING of the repository as pages, and roles of docstrings as plain code."""
+"""Hooks of mkdocs: CHANGELOG and CONTRIBUTING of the repository as pages, and what GitHub writes otherwise than mkdocs."""
 
 from __future__ import annotations
 
@@ -30,5 +30,6 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
-    """Leave out the roles of docstrings (``:func:`` and others) before code: Markdown does not know them."""
-    return re.sub(r":(?:func|class|meth|mod|attr|data|exc|ref):(?=<code|`)", "", html)
+    """Leave out the roles of docstrings (``:func:`` and others) before code, and backslashes before bars in cells of tables."""
+    html = re.sub(r":(?:func|class|meth|mod|attr|data|exc|ref):(?=<code|`)", "", html)
+    return re.sub(r"<td.*?</td>", lambda cell: cell[0].replace("\\|", "|"), html, flags=re.DOTALL)

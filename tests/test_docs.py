@@ -13,6 +13,7 @@ from types import ModuleType
 
 import pytest
 import yaml
+from docs_hooks import as_page, on_page_content
 from make_tables import DOCS, MARKED, page, written
 
 import torchpt
@@ -116,3 +117,10 @@ def test_hosted_checks_run_what_is_run_here() -> None:
     assert steps == [".ci/run", "make docs"]
     script = (DOCS.parent / ".ci/run").read_text(encoding="utf-8")
     assert "make check" in script and "make test" in script
+
+
+def test_pages_from_the_root_and_docstrings_are_turned_for_the_site() -> None:
+    text = "[a](docs/guides/x.md#y) [b](tests/README.md) [c](https://d.e) [f](CITATION.cff)"
+    assert as_page(text) == "[a](guides/x.md#y) b [c](https://d.e) f"
+    html = "<td><code>\\|x\\|</code></td><p>:func:<code>a\\|b</code></p>"
+    assert on_page_content(html, None, None, None) == "<td><code>|x|</code></td><p><code>a\\|b</code></p>"
