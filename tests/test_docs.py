@@ -84,6 +84,9 @@ def test_every_page_is_in_the_site_and_says_what_it_is_for() -> None:
     for name in PAGES:
         lines = (DOCS / name).read_text(encoding="utf-8").split("\n## ", 1)[0]
         assert "After this page you" in lines, name
+        text = re.sub(r"^```.*?^```", "", (DOCS / name).read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+        headings = re.findall(r"^#+ .+$", text, re.MULTILINE)
+        assert len(headings) == len(set(headings)), name
 
 
 def test_every_scene_and_texture_that_ships_is_listed() -> None:
@@ -120,7 +123,7 @@ def test_hosted_checks_run_what_is_run_here() -> None:
 
 
 def test_pages_from_the_root_and_docstrings_are_turned_for_the_site() -> None:
-    text = "[a](docs/guides/x.md#y) [b](tests/README.md) [c](https://d.e) [f](CITATION.cff)"
-    assert as_page(text) == "[a](guides/x.md#y) b [c](https://d.e) f"
+    text = "[a](docs/glossary.md#y) [b](tests/README.md) [c](https://d.e) [f](CITATION.cff)"
+    assert as_page(text) == "[a](glossary.md#y) b [c](https://d.e) f"
     html = "<td><code>\\|x\\|</code></td><p>:func:<code>a\\|b</code></p>"
     assert on_page_content(html, None, None, None) == "<td><code>|x|</code></td><p><code>a\\|b</code></p>"
