@@ -16,7 +16,7 @@ SCENE ?= cornell_box
 OUT ?= $(notdir $(basename $(SCENE))).png
 ARGS ?=
 
-.PHONY: help render test test-quick test-all stress check format clean
+.PHONY: help render test test-quick test-all stress check format docs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo "make stress      stiff and extreme cases, whole sweeps by every backend, to stress/; a thousand million rays; damaged files"
 	@echo "make check       ruff, pyright, import layers"
 	@echo "make format      let ruff rewrite the files"
+	@echo "make docs        the docs as a site, to site/: open site/index.html"
 	@echo "make clean       remove the virtual environment and caches"
 
 render: $(VENV)/run.stamp
@@ -61,8 +62,12 @@ format: $(VENV)/dev.stamp
 	$(PY) -m ruff check --fix .
 	$(PY) -m ruff format .
 
+docs: $(VENV)/docs.stamp
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict --quiet
+	@echo "The site is $(abspath .)/site/index.html"
+
 clean:
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
 $(PY):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "torchpt needs Python >= 3.11; name one with PYTHON=...")'
@@ -77,6 +82,10 @@ $(VENV)/dev.stamp: $(VENV)/run.stamp
 	$(PIP) -e ".[dev,formats,video,compare,denoise,sweep]"
 	@touch $@
 
+$(VENV)/docs.stamp: $(VENV)/run.stamp
+	$(PIP) -e ".[docs]"
+	@touch $@
+
 $(VENV)/bench.stamp: $(VENV)/dev.stamp
-	$(PIP) -e ".[dev,formats,video,compare,denoise,sweep,bench]"
+	$(PIP) -e ".[dev,formats,video,compare,denoise,sweep,bench,docs]"
 	@touch $@

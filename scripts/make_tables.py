@@ -4,7 +4,8 @@
     python scripts/make_tables.py --check    # exit code 1 where a page is not what would be written
 
 A NAME is a table of kinds (``lights``, ``materials``, ...), one kind of it (``lights.spot``), ``common.lights``: what all kinds
-of it have, or ``summary.lights``: a row a kind. ``bounds`` is the table of :mod:`bounds`, ``arguments`` that of ``render``'s.
+of it have, or ``summary.lights``: a row a kind. ``bounds`` is the table of :mod:`bounds`, ``arguments`` that of ``render``'s,
+``help`` and ``help.render`` what the command line says of itself, ``public.cameras`` the names of ``torchpt.cameras``.
 """
 
 from __future__ import annotations
@@ -136,6 +137,26 @@ def _plain(spec: Spec) -> bool:
     return spec.default is not REQUIRED and spec.default is not None and not callable(spec.default)
 
 
+def said(command: str) -> str:
+    """The help of a command, or of ``torchpt`` itself, as a block."""
+    from torchpt.cli.main import help_of
+
+    return f"```text\n{help_of(command).rstrip()}\n```\n"
+
+
+def public(module: str) -> str:
+    """The names that a public module exports, with the first lines of their docstrings."""
+    room = import_module(f"torchpt.{module}")
+    lines = []
+    for name in room.__all__:
+        value = getattr(room, name)
+        own = value.__doc__ if getattr(value, "__module__", "").startswith("torchpt.") else None
+        text = " ".join((own or "").strip().split("\n\n")[0].split()).replace("``", "`").replace("|", "\\|")
+        text = re.sub(r":[a-z]+:`~?([^`]+)`", r"`\1`", text)
+        lines.append(f"| `{name}` | {text} |\n")
+    return "| name | what it is |\n|---|---|\n" + "".join(lines)
+
+
 def written(name: str) -> str:
     """What stands between the marks of NAME."""
     first, _, second = name.partition(".")
@@ -143,6 +164,10 @@ def written(name: str) -> str:
         return bounds.table()
     if name == "arguments":
         return arguments(RenderOptions)
+    if first == "help":
+        return said(second)
+    if first == "public":
+        return public(second)
     if first == "summary":
         return summary(kinds(second))
     if first == "common":

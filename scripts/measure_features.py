@@ -1,6 +1,6 @@
 """What a feature costs where a scene has it, and where it does not: nodes of its files in kernels, rows, tables, time.
 
-Print a table in Markdown for ``docs/explanations/lanes.md``: ``python scripts/measure_features.py``. A plain scene of three
+Print a table in Markdown for ``docs/benchmarks/performance.md``: ``python scripts/measure_features.py``. A plain scene of three
 rectangles (``tests/references/features.py``) gets one feature at a time. Times are of one thread, the least of several renders.
 """
 

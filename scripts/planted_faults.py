@@ -49,7 +49,7 @@ LEAST = 57
 #: In a copy its anchor is gone: that test says nothing of what users see.
 IGNORED = "test_planted_faults.py"
 #: What tests need of a tree that is no git checkout.
-COPIED = ("torchpt", "tests", "configs", "scenes", "scripts", "docs")
+COPIED = ("torchpt", "tests", "configs", "scenes", "scripts", "docs", ".ci", ".github")
 #: Notes the test that runs, and the first that fails, beside the copy.
 PLUGIN = """
 import json, os

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import sys
 import tomllib
 from collections.abc import Collection, Iterator
@@ -84,7 +85,7 @@ def test_every_extra_is_imported_by_a_feature_when_it_is_asked_for(extra: str) -
 
 
 def test_what_developers_install_is_used() -> None:
-    assert set(EXTRAS) == {*FEATURES, "sweep", "bench", "dev"}
+    assert set(EXTRAS) == {*FEATURES, "sweep", "bench", "docs", "dev"}
     dev = {Requirement(text).name for text in EXTRAS["dev"]}
     wanted = modules(EXTRAS["bench"]) | modules([name for name in dev if name not in TOOLS])
     found = {name for folder in ("scripts", "tests") for name, _ in imports(folder, wanted)}
@@ -99,6 +100,35 @@ def test_the_launcher_of_sweeps_is_tested() -> None:
     assert (
         name == "hydra-joblib-launcher" and "hydra/launcher=joblib" in (ROOT / "tests/cli/test_sweeps.py").read_text()
     )
+
+
+def test_the_makers_of_the_site_are_named_by_its_settings() -> None:
+    """They are run, not imported: mkdocs by make, its theme and plugin by name; ruff formats the signatures."""
+    assert {Requirement(text).name for text in EXTRAS["docs"]} == {"mkdocs", "mkdocs-material", "mkdocstrings", "ruff"}
+    settings = (ROOT / "mkdocs.yml").read_text()
+    assert "mkdocs build --strict" in (ROOT / "Makefile").read_text()
+    assert "name: material" in settings and "- mkdocstrings:" in settings
+
+
+def test_install_says_what_every_dependency_is_for() -> None:
+    text = (ROOT / "docs" / "getting-started" / "install.md").read_text()
+    rows = re.findall(r"^\| `([\w-]+)` \| .+ \| .+ \|$", text, re.MULTILINE)
+    assert sorted(name.lower() for name in rows) == sorted(
+        Requirement(text).name.lower() for text in PROJECT["dependencies"]
+    )
+    extras = re.findall(r"^\| `([\w-]+)` \| [^|]+ \|$", text, re.MULTILINE)
+    assert set(extras) == set(EXTRAS)
+
+
+def test_install_states_the_ranges_and_the_versions_that_are_tested() -> None:
+    text = (ROOT / "docs" / "getting-started" / "install.md").read_text()
+    asked = {Requirement(text).name: Requirement(text).specifier for text in PROJECT["dependencies"]}
+    pins = dict(re.findall(r"^([\w.-]+)==(.+)$", (ROOT / "constraints.txt").read_text(), re.MULTILINE))
+    for name in ("torch", "numba", "llvmlite", "numpy"):
+        low = next(bound.version for bound in asked[name] if bound.operator == ">=")
+        assert f"{low} up to {next(bound.version for bound in asked[name] if bound.operator == '<')}" in text, name
+        assert pins[name].rpartition(".")[0] in text, name
+    assert PROJECT["requires-python"] == ">=3.11" and "| Python | 3.11 and newer |" in text
 
 
 def test_everything_imported_is_asked_for() -> None:

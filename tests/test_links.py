@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+from docs_hooks import PAGES as SITE
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -42,6 +43,8 @@ def test_links_resolve(name: str) -> None:
             continue
         file, _, anchor = target.partition("#")
         at = (page.parent / file) if file else page
+        if not at.exists() and at.parent.resolve() == ROOT / "docs":
+            at = ROOT / SITE.get(at.name, at.name)
         assert at.exists(), f"{name}: {target}"
         if anchor:
             assert anchor in anchors(at.read_text(encoding="utf-8")), f"{name}: {target}"

@@ -171,7 +171,7 @@ def test_without_flip_one_line_says_what_to_install(
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     assert main(["compare", "a.exr", "b.exr"]) == 0
     lines = capfd.readouterr().out.splitlines()
-    assert "flip: needs the package flip-evaluator: pip install 'torchpt-renderer[compare]'" in lines
+    assert "flip: needs the package flip-evaluator: pip install '.[compare]' in the checkout of torchpt" in lines
     assert main(["compare", "a.exr", "b.exr", "map=f.png", "metric=flip"]) == 2
     captured = capfd.readouterr()
     assert captured.out == "" and "pip install" in captured.err and not (pair / "f.png").exists()

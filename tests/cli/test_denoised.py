@@ -102,7 +102,7 @@ def test_without_the_package_nothing_is_rendered(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     line = refused(capsys, "render", "scene=s.yaml", ON)
-    assert "needs the package pyoidn: pip install 'torchpt-renderer[denoise]'" in line
+    assert "needs the package pyoidn: pip install '.[denoise]' in the checkout of torchpt" in line
     assert files(folder) == set() and renderer.settings == []
 
 

@@ -88,7 +88,9 @@ def test_numbers_that_are_no_colours() -> None:
 def test_without_the_evaluator_all_others_are_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     found = compare(IMAGE, REFERENCE)
-    assert found.reasons == {"flip": "needs the package flip-evaluator: pip install 'torchpt-renderer[compare]'"}
+    assert found.reasons == {
+        "flip": "needs the package flip-evaluator: pip install '.[compare]' in the checkout of torchpt"
+    }
     assert all(math.isfinite(value) for name, value in found.metrics.items() if name != "flip")
 
 

@@ -166,7 +166,7 @@ def test_bad_arguments(given: dict[str, Tensor], says: str) -> None:
 
 def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(RenderError, match=r"needs the package pyoidn: pip install 'torchpt-renderer\[denoise\]'"):
+    with pytest.raises(RenderError, match=r"needs the package pyoidn: pip install '\.\[denoise\]' in the checkout"):
         torchpt.denoise(GREY)
 
 

@@ -77,7 +77,7 @@ def test_flip_refuses_a_black_reference_rather_than_end_the_process(capfd: Any) 
 
 def test_flip_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    with pytest.raises(ImportError, match=r"torchpt-renderer\[compare\]"):
+    with pytest.raises(ImportError, match=r"pip install .\.\[compare\]."):
         flip(REFERENCE, REFERENCE)
 
 

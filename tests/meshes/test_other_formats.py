@@ -99,7 +99,7 @@ def test_a_package_that_is_missing_is_named(tmp_path: Path, kind: str, monkeypat
     with pytest.raises(AssetError) as caught:
         loaded(tmp_path, kind, b"")
     line = str(caught.value)
-    assert "\n" not in line and f"reading {kind} needs the package" in line and "torchpt-renderer[formats]" in line
+    assert "\n" not in line and f"reading {kind} needs the package" in line and "pip install '.[formats]'" in line
     assert all(name in line for name in PARSERS[kind])
 
 

@@ -64,7 +64,7 @@ def test_help_says_what_each_argument_is() -> None:
     for name, argument in declared(CommonOptions).items():
         assert sum(line.startswith(f"{name}: {argument.spec.doc}") for line in lines) == 1
     assert (
-        "spp: samples a pixel, and the most that other limits let it take (a whole number 1..2147483647; None: 64)"
+        "spp: samples a pixel; a limit of time or error may end sooner (a whole number 1..2147483647; None: 64)"
         in lines
     )
 
@@ -220,7 +220,7 @@ def test_a_new_stop_rule_is_one_declaration_and_its_use(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     *said, last = done.stdout.splitlines()
-    assert said[:2] == ["written: render/default.yaml", "written: guides/ml.md, reference/scenes.md"]
+    assert said[:2] == ["written: render/default.yaml", "written: guides/ml.md, reference/cli.md, reference/scenes.md"]
     row = "a whole number 1..2147483647"
     assert (
         f"\n| `enough` | samples that are enough | {row} | `None` |\n"

@@ -175,7 +175,7 @@ def test_without_a_denoiser_nothing_is_rendered(scene: torchpt.Scene, monkeypatc
         raise AssertionError("rendered")
 
     def none() -> None:
-        raise RenderError("denoising needs the package pyoidn: pip install 'torchpt-renderer[denoise]'")
+        raise RenderError("denoising needs the package pyoidn: pip install '.[denoise]' in the checkout of torchpt")
 
     monkeypatch.setattr(torchpt.rendering.api, "render_scene", never)
     monkeypatch.setattr(denoiser, "_library", none)

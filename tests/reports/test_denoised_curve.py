@@ -202,7 +202,7 @@ def test_without_the_package_nothing_is_rendered(
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     assert main(["converge", *WORDS, "denoise=true"]) == 2
     captured = capfd.readouterr()
-    assert captured.err.count("\n") == 1 and "pip install 'torchpt-renderer[denoise]'" in captured.err
+    assert captured.err.count("\n") == 1 and "pip install '.[denoise]' in the checkout of torchpt" in captured.err
     assert not captured.out and not (tmp_path / "study").exists()
 
 

@@ -31,7 +31,7 @@ from torchpt.core.version import __version__
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-__all__ = ["COMMANDS", "HELP", "Command", "main", "run"]
+__all__ = ["COMMANDS", "HELP", "Command", "help_of", "main", "run"]
 
 HELP = """\
 torchpt: a wavefront path tracer that is a PyTorch program
@@ -417,6 +417,11 @@ def _configs() -> Path:
     from torchpt.core.files import configs
 
     return configs()
+
+
+def help_of(name: str) -> str:
+    """Return the help of a command, or of ``torchpt`` itself where the name is empty."""
+    return _help(next(command.help for command in COMMANDS if command.name == name) if name else HELP)
 
 
 def _help(text: str) -> str:

@@ -95,7 +95,9 @@ def _library() -> Any:
     try:
         import pyoidn
     except ImportError:
-        raise RenderError("denoising needs the package pyoidn: pip install 'torchpt-renderer[denoise]'") from None
+        raise RenderError(
+            "denoising needs the package pyoidn: pip install '.[denoise]' in the checkout of torchpt"
+        ) from None
     try:
         runs = pyoidn.Device.is_cpu_available()
     except OSError as problem:  # the library in the wheel is of another system

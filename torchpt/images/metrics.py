@@ -181,7 +181,7 @@ def _flip(image: Tensor, reference: Tensor) -> tuple[Tensor, float]:
         import flip_evaluator
     except ImportError:
         raise ImportError(
-            "torchpt.metrics.flip needs the package flip-evaluator: pip install 'torchpt-renderer[compare]'"
+            "torchpt.metrics.flip needs the package flip-evaluator: pip install '.[compare]' in the checkout of torchpt"
         ) from None
     arrays = [values.clamp(min=0).float().contiguous().numpy() for values in (ref, x)]
     if not float(arrays[0].max()) > 1e-5:  # below it the evaluator ends the process

@@ -42,7 +42,7 @@ def check_movie(path: str | PathLike[str], fps: float) -> None:
     if fps > _FASTEST[kind]:
         raise OutputError(path, f"{kind} shows at most {_FASTEST[kind]:g} frames a second, fps={fps:g} are asked for")
     if kind == ".mp4" and not (find_spec("imageio") and find_spec("imageio_ffmpeg")):
-        how = "pip install 'torchpt-renderer[video]' (.gif needs nothing)"
+        how = "pip install '.[video]' in the checkout of torchpt (.gif needs nothing)"
         raise OutputError(path, f"writing .mp4 needs the packages imageio and imageio-ffmpeg: {how}")
 
 

@@ -417,7 +417,7 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
     asked = values_of(Asked, {key: raw[key] for key in Asked.parameters if key in raw}, "", file, "a study")
     if "flip" in asked["metrics"] and find_spec("flip_evaluator") is None:
         if "metrics" in asked.given:
-            expected = "measures that are there (flip: pip install 'torchpt-renderer[compare]')"
+            expected = "measures that are there (flip: pip install '.[compare]' in the checkout of torchpt)"
             raise SceneError("metrics", list(asked["metrics"]), expected, file)
         asked.values["metrics"] = tuple(name for name in asked["metrics"] if name != "flip")
     settings: dict[str, Any] = {}

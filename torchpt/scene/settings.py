@@ -180,7 +180,7 @@ def _truth(default: bool, doc: str) -> Argument:
 class _Samples(TypedDict, total=False):
     """What lists begin with."""
 
-    spp: Annotated[int | None, Whole(64, low=1, doc="samples a pixel, and the most that other limits let it take")]
+    spp: Annotated[int | None, Whole(64, low=1, doc="samples a pixel; a limit of time or error may end sooner")]
 
 
 class TraceOptions(TypedDict, total=False):
@@ -273,7 +273,7 @@ class Common(_Samples, TraceOptions, total=False):
             "auto",
             reader=_pilots,
             words="auto, true or false",
-            doc="whether one pixel of 16 is sampled twice, by which the picture knows its error; auto: not in Python",
+            doc="whether one pixel of 16 is sampled twice, to estimate the picture's own error; auto: not in Python",
         ),
     ]
     time_limit: Annotated[

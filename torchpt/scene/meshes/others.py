@@ -52,7 +52,7 @@ def load_others(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     missing = [name for name in PARSERS[kind] if find_spec(name) is None]
     if missing:
         needs = "the package " if len(missing) == 1 else "the packages "
-        how = "pip install 'torchpt-renderer[formats]'"
+        how = "pip install '.[formats]' in the checkout of torchpt"
         raise AssetError(path, f"reading {kind} needs {needs}{' and '.join(missing)}: {how}")
     try:
         _screen(path, data)
