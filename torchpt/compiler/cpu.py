@@ -19,7 +19,7 @@ __all__ = [
     "counts",
     "host",
     "identity",
-    "kept",
+    "load_function",
 ]
 
 #: Enters every key: entries that are made otherwise are never read.
@@ -101,7 +101,7 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         return function
 
 
-def kept(key: str) -> Function | None:
+def load_function(key: str) -> Function | None:
     """A function of this machine by its key, from this process or from disk; None where there is none."""
     with _lock:
         function = _functions.get(key)
