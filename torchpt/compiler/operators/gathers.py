@@ -1,4 +1,4 @@
-"""How look-ups in tables, searches in sorted ones and products with small matrices are lowered."""
+"""Lowerings of table look-ups, binary searches and products with small matrices."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__: list[str] = []
 
 
 def _look_up(tracer: Tracer, table: Tensor, axis: int, index: int) -> np.ndarray:
-    """The nodes of entry ``index`` of a table along an axis: its shape without that axis."""
+    """Return the nodes of entry ``index`` of a table along an axis, in the table's shape without that axis."""
     graph, ty = tracer.graph, DTYPES[table.dtype]
     number = tracer.table(table, axis)
     lead = (*table.shape[:axis], *table.shape[axis + 1 :])
@@ -36,17 +36,17 @@ def _index_select(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: 
         return _from_lanes(tracer, out, table, axis, rows)
     if len(rows) == 1:
         nodes = np.expand_dims(_look_up(tracer, table, axis, rows[0]), axis)
-    else:  # several look-ups in every lane, side by side
+    else:  # several look-ups a lane
         nodes = np.stack([_look_up(tracer, table, axis, row) for row in rows], axis)
     tracer.put(out, nodes)
 
 
 def _from_lanes(tracer: Tracer, out: Tensor, table: Tensor, axis: int, rows: Any) -> None:
-    """What depends on lanes may be asked for by the lane's own number alone."""
+    """Lower a look-up in a tensor of lanes, which must be at the lane's own number."""
     value = tracer.get(table)
     if value.lane == axis and len(rows) == 1 and tracer.graph.nodes[rows[0]][0] == "iota":
         return tracer.alias(out, table)
-    if value.lane is not None and axis != value.lane:  # of a few numbers in every lane, one by its number
+    if value.lane is not None and axis != value.lane:  # selects one of a few values of each lane
         raise Unsupported("a look-up in what depends on lanes")
     raise Unsupported("a look-up in other lanes")
 
@@ -71,7 +71,7 @@ def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
         place = graph.binary("mul", "i", place, graph.constant("i", width))
         for k, inner in enumerate(
             np.ndindex(*rest)
-        ):  # entries of the table laid flat, where each is brought into range
+        ):  # elements of the flattened table, whose indices are clamped one by one
             one = graph.binary("add", "i", place, graph.constant("i", k))
             nodes[(*entry, *inner)] = graph.node("gather", ty, one, extra=(number, 1, 0))
     tracer.put(out, nodes)
@@ -100,7 +100,7 @@ def _take(tracer: Tracer, out: Tensor, table: Tensor, index: Tensor) -> None:
 
 @handles("gather")
 def _gather(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor, sparse_grad: bool = False) -> None:
-    """One of a few numbers that every lane has: a chain of selections."""
+    """Lower the selection of one of a few values of each lane, to a chain of selects."""
     value, rows, graph = tracer.get(table), tracer.get(index).nodes, tracer.graph
     axis %= table.dim()
     if value.lane == axis:

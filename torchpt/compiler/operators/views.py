@@ -1,4 +1,4 @@
-"""How operators that move numbers about without changing them are lowered: they cost nothing in a kernel."""
+"""Lowerings of views and other rearrangements, which cost nothing in a kernel."""
 
 from __future__ import annotations
 
@@ -112,14 +112,14 @@ def _expand(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any, implicit: bool =
 def _view(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any) -> None:
     value, lane = tracer.get(a), tracer.lane_axis(out.shape)
     if value.lane is not None and lane is not None:
-        # Lanes are next to each other along their axis: what follows it must stay what follows.
+        # Lanes are contiguous along their axis, so the axes behind it must hold the same number of elements.
         if math.prod(a.shape[value.lane + 1 :]) != math.prod(out.shape[lane + 1 :]):
             raise Unsupported(f"lanes of shape {tuple(a.shape)} mixed into shape {tuple(out.shape)}")
     tracer.put(out, value.nodes.reshape(tracer.inner(out.shape, lane)))
 
 
 def _cast(tracer: Tracer, tensor: Tensor, out: Tensor) -> np.ndarray:
-    """The nodes of a part in the type of the whole."""
+    """Return the nodes of a tensor, cast to the type of ``out``."""
     return cast_all(tracer, tracer.get(tensor).nodes, DTYPES[out.dtype])
 
 
