@@ -153,7 +153,7 @@ def test_what_the_lane_compiler_does_not_know():
     for _ in range(2):
         assert sorting(x) is NotImplemented and counting(x) is NotImplemented
     assert list(sorting.refused.values()) == ["the operator sort"]
-    assert list(counting.refused.values()) == ["lanes that ask for their own number"]
+    assert list(counting.refused.values()) == ["a use of the lane's own number"]
     with pytest.raises(ValueError, match="no parameters y"):
         Lanewise(lambda x: x, ("y",))
 

@@ -165,7 +165,7 @@ class Lanewise:
             results = self._function(*given)
         stores = _stores(tracer, [results] if isinstance(results, Tensor) else results)
         if any(op == "iota" for op, *_ in tracer.graph.nodes):
-            raise Unsupported("lanes that ask for their own number")
+            raise Unsupported("a use of the lane's own number")
         tables, steps, guards = pruned(tracer.tables, tracer.steps, tracer.guards)
         names = [str(k) for k in range(len(tracer.uniforms))]
         sinks = Sinks(store=stores)

@@ -81,7 +81,7 @@ class SinkLines(ABC):
         """Return type and name of a node's value in the 32 bits that the arena holds it in."""
         ty, name, block = self.graph.type(node), self.names[node], self.block
         if ty == "d":
-            raise Unsupported("a float64 in the state of a path")
+            raise Unsupported("a float64 in the path state")
         if ty == "b":
             return "i32", block.op(f"zext {block.each('i1')} {name} to {block.each('i32')}")
         return MEMORY[ty], block.convert("trunc", "L", "i", name) if ty == "L" else name
@@ -318,7 +318,7 @@ def _enter(body: Body, stage: TracedStage, needed: list[int]) -> None:
     found = [graph.nodes[node] for node in needed]
     for k in sorted({extra[0] for op, _, _, extra in found if op in ("gather", "element", "search")}):
         if k >= len(stage.tables):
-            raise Unsupported("a table that is not there")
+            raise Unsupported("a table that does not exist")
         body.do(f"%table{k} = load ptr, ptr {body.at('%tables', 'i64', 2 * k)}")
         body.do(f"%count{k} = load i64, ptr {body.at('%tables', 'i64', 2 * k + 1)}")
         last = body.op(f"sub i32 {body.op(f'trunc i64 %count{k} to i32')}, 1")

@@ -65,7 +65,7 @@ def lanes_for(tables: Iterable[Tensor]) -> int:
     for lanes in LANES:
         if all(size % lanes for size in sizes):
             return lanes
-    raise Unsupported("tables of so many lengths that none is left for the lanes to be traced on")
+    raise Unsupported("tables whose lengths leave no number of lanes to trace on")
 
 
 def tracing() -> bool:
@@ -256,7 +256,7 @@ class Tracer(TorchDispatchMode):
         traced = any(id(x) in self._values for x in given)
         if name == "_local_scalar_dense":
             if traced:
-                raise Unsupported("a number of a lane asked for by Python")
+                raise Unsupported("a lane's value read by Python")
             out = func(*args, **kwargs)
             self.guards.append(Guard(self.source(args[0]), out))
             return out
@@ -281,7 +281,7 @@ class Tracer(TorchDispatchMode):
         ty = DTYPES[out.dtype]
         if name == "arange":
             if out.shape[0] != self.lanes or out[0] != 0 or out[1] != 1:
-                raise Unsupported("numbers of lanes that do not count from 0 by 1")
+                raise Unsupported("an arange over lanes that does not start at 0 with step 1")
             self.put(out, np.array([self.graph.node("iota", ty)], object))
         elif name in ("full", "ones", "zeros", "scalar_tensor"):
             self.put(out, np.array(self.graph.constant(ty, out.reshape(-1)[0].item()), object))
@@ -316,7 +316,7 @@ class _Reads(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if getattr(func, "__name__", "") in ("tolist", "numpy", "__array__") and self.tracer.is_traced(args[0]):
-            raise Unsupported("numbers of lanes asked for by Python")
+            raise Unsupported("lanes' values read by Python")
         return func(*args, **(kwargs or {}))
 
 
@@ -340,7 +340,7 @@ def _safe(name: str, args: Any) -> Any:
     if name == "index":
         table, indices = args
         if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in indices):
-            raise Unsupported("a look-up by truth values")
+            raise Unsupported("a look-up by a boolean mask")
         sizes = table.shape
         return table, [None if i is None else i.clamp(0, max(sizes[k] - 1, 0)) for k, i in enumerate(indices)]
     return args

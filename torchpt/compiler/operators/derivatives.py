@@ -25,7 +25,7 @@ def _zeros(tracer: Tracer, out: Tensor) -> tuple[Any, int | None]:
 def _select_backward(tracer: Tracer, out: Tensor, given: Tensor, sizes: Any, axis: int, index: int) -> None:
     nodes, lane = _zeros(tracer, out)
     if axis % out.dim() == lane:
-        raise Unsupported("one lane taken out")
+        raise Unsupported("the selection of one lane")
     place: list[Any] = [slice(None)] * out.dim()
     place[axis] = index
     nodes[tuple(place)] = tracer.get(given).nodes
@@ -39,7 +39,7 @@ def _slice_backward(
     nodes, lane = _zeros(tracer, out)
     if axis % out.dim() == lane:
         if out.shape != given.shape:
-            raise Unsupported("a part of the lanes")
+            raise Unsupported("a slice of the lanes' axis")
         return tracer.alias(out, given)
     place: list[Any] = [slice(None)] * out.dim()
     place[axis] = slice(start, None if end > 1 << 40 else end, step)

@@ -47,7 +47,7 @@ def _from_lanes(tracer: Tracer, out: Tensor, table: Tensor, axis: int, rows: Any
     if value.lane == axis and len(rows) == 1 and tracer.graph.nodes[rows[0]][0] == "iota":
         return tracer.alias(out, table)
     if value.lane is not None and axis != value.lane:  # selects one of a few values of each lane
-        raise Unsupported("a look-up in what depends on lanes")
+        raise Unsupported("a look-up in a tensor that depends on lanes")
     raise Unsupported("a look-up in other lanes")
 
 
@@ -89,7 +89,7 @@ def _index_one(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Ten
 @handles("take")
 def _take(tracer: Tracer, out: Tensor, table: Tensor, index: Tensor) -> None:
     if tracer.is_traced(table):
-        raise Unsupported("a look-up in what depends on lanes")
+        raise Unsupported("a look-up in a tensor that depends on lanes")
     graph, ty, lanes = tracer.graph, DTYPES[table.dtype], tracer.get(index).nodes
     number = tracer.table(table, None)
     nodes = np.empty(lanes.shape, object)
@@ -136,14 +136,14 @@ def _searchsorted(
     sorter: Any = None,
 ) -> None:
     if tracer.is_traced(table) or table.dim() != 1 or sorter is not None:
-        raise Unsupported("a search in what is no single sorted table")
+        raise Unsupported("a search in a table with more than one axis, a sorter, or lanes")
     graph, ty = tracer.graph, DTYPES[table.dtype]
     right = right or side == "right"
     number, lanes = tracer.table(table, None), tracer.get(values).nodes
     nodes = np.empty(lanes.shape, object)
     for entry in np.ndindex(*lanes.shape):
         if graph.type(lanes[entry]) != ty and not (ty == "l" and graph.type(lanes[entry]) in "il"):
-            raise Unsupported("a search for numbers of another type than the table's")
+            raise Unsupported("a search for values of another type than the table's")
         nodes[entry] = graph.node("search", "l", lanes[entry], extra=(number, ty, right))
     tracer.put(out, nodes)
 
@@ -151,7 +151,7 @@ def _searchsorted(
 def _matrix(tracer: Tracer, tensor: Tensor) -> np.ndarray:
     nodes = tracer.get(tensor).nodes
     if nodes.ndim != 2:
-        raise Unsupported("a product of more than matrices")
+        raise Unsupported("a matrix product of tensors with more than two axes")
     return nodes
 
 
@@ -180,5 +180,5 @@ def _mm(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
 @handles("addmm")
 def _addmm(tracer: Tracer, out: Tensor, start: Tensor, a: Tensor, b: Tensor, beta: float = 1, alpha: float = 1) -> None:
     if beta != 1 or alpha != 1:
-        raise Unsupported("addmm with factors")
+        raise Unsupported("addmm with alpha or beta")
     _product(tracer, out, a, b, start)

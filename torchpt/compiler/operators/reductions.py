@@ -62,7 +62,7 @@ def _sums(op: str, out: Tensor) -> str:
 def _nothing(graph: Any, op: str, ty: str) -> int:
     """Return the result of a reduction of no elements."""
     if op not in ("add", "mul", "and", "or"):
-        raise Unsupported("the largest or smallest of no numbers")
+        raise Unsupported("the maximum or minimum of no elements")
     return graph.constant(ty, 1 if op in ("mul", "and") else 0)
 
 
