@@ -135,7 +135,7 @@ class Frame:
 
     @staticmethod
     def along(n: Tensor, tangent: Tensor) -> Frame:
-        """Return the frame about unit normals ``n (3, N)`` with ``s`` nearest to ``tangent (3, N)``; any frame if they align."""
+        """Return the frame about unit normals ``n (3, N)`` with ``s`` nearest to ``tangent (3, N)``; any frame if parallel."""
         s = torch.addcmul(tangent, n, dot(n, tangent), value=-1)
         square, whole = dot(s, s), dot(tangent, tangent)
         usable = square > 1e-12 * whole
