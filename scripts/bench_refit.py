@@ -22,7 +22,7 @@ from bench_accel import bumpy_sphere
 from bench_search import built, bunny, camera, contenders, extent, measure, ray_sets
 
 from torchpt.physics.shapes.geometry import Geometry
-from torchpt.search import tree as topology
+from torchpt.search import tree as wide
 from torchpt.search.tree import Wide
 
 
@@ -119,7 +119,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    topology.REBUILD = float("inf")
+    wide.REBUILD = float("inf")
     rows: list[dict[str, Any]] = []
     seconds(args.rounds, rows)
     slowdown(args.rounds, rows)

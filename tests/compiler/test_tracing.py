@@ -17,7 +17,7 @@ from torchpt.compiler import cpu, function
 from torchpt.compiler.form import VECTORS
 from torchpt.compiler.function import lanewise
 from torchpt.compiler.graph import Graph, Unsupported
-from torchpt.compiler.kernel import text
+from torchpt.compiler.kernel import kernel_ir
 from torchpt.compiler.program import Program, TracedStage, bound, holds, laid_out, replayed
 from torchpt.compiler.sinks import Sinks, Store
 from torchpt.compiler.tracing import LANES, Tracer, tracing
@@ -35,7 +35,7 @@ def trace(stage: Callable[..., Iterable[Tensor]], *given: Tensor, **tables: Tens
     with torch.no_grad(), tracer:
         results = list(stage(*lanes, **tables))
     stores = [Store(tuple(tracer.nodes(x)), tracer.graph.type(tracer.nodes(x)[0])) for x in results]
-    return tracer, text(TracedStage(tracer.graph, Sinks(store=stores), tracer.tables, tensors=len(given)), VECTORS)
+    return tracer, kernel_ir(TracedStage(tracer.graph, Sinks(store=stores), tracer.tables, tensors=len(given)), VECTORS)
 
 
 REFUSED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {

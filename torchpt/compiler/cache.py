@@ -44,10 +44,10 @@ class _NotKept(Exception):
 def key_of(structure: Any) -> str | None:
     """Return the cache key of a structure; None if it holds objects that exist in this process alone."""
     try:
-        text = "\n".join((code_of_folder(), torch.__version__, cpu.identity(), _canonical(structure)))
+        content = "\n".join((code_of_folder(), torch.__version__, cpu.identity(), _canonical(structure)))
     except _NotKept:
         return None
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _canonical(value: Any) -> str:

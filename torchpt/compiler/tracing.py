@@ -99,7 +99,7 @@ class Tracer(TorchDispatchMode):
         tables: tables that the graph reads, in order.
         steps: the prologue.
         guards: values that the trace depends on.
-        held: constants: tensors that are neither leaves nor results of steps.
+        held: tensors that are neither leaves nor results of steps.
     """
 
     @classmethod
