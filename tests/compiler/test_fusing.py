@@ -10,7 +10,7 @@ from forms import one_lane
 from torch import Tensor
 
 from torchpt.compiler.function import lanewise
-from torchpt.compiler.fusing import fused
+from torchpt.compiler.fusing import fused_products
 from torchpt.compiler.graph import Graph
 
 #: (1 + STEP)^2 is 1 + 2 STEP + STEP^2, of which float32 keeps no STEP^2.
@@ -47,8 +47,8 @@ def test_what_counts_as_asking():
     twice = graph.node("add", "f", product, product)
     whole = graph.node("tensor", "i", extra=(1, 0))
     count = graph.node("add", "i", graph.node("mul", "i", whole, whole), whole)
-    assert fused(graph, graph.needed([total]), [total]) == {total: product}
-    assert fused(graph, graph.needed([total]), [total, product]) == {}
-    assert fused(graph, graph.needed([total, less]), [total, less]) == {}
-    assert fused(graph, graph.needed([twice]), [twice]) == {}
-    assert fused(graph, graph.needed([count]), [count]) == {}
+    assert fused_products(graph, graph.needed([total]), [total]) == {total: product}
+    assert fused_products(graph, graph.needed([total]), [total, product]) == {}
+    assert fused_products(graph, graph.needed([total, less]), [total, less]) == {}
+    assert fused_products(graph, graph.needed([twice]), [twice]) == {}
+    assert fused_products(graph, graph.needed([count]), [count]) == {}

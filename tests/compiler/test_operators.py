@@ -23,7 +23,7 @@ from forms import differing, one_lane
 from torch import Tensor, nn
 
 from torchpt.compiler.function import lanewise
-from torchpt.compiler.tracing import HANDLERS
+from torchpt.compiler.tracing import LOWERINGS
 
 N = 1000
 LENGTHS = (N, 1, 15, 16, 17)
@@ -695,7 +695,7 @@ def test_operators(number, monkeypatch):
     case = CASES[number]
     called: set[str] = set()
     for name in case.operators.split():
-        monkeypatch.setitem(HANDLERS, name, _noted(name, called))
+        monkeypatch.setitem(LOWERINGS, name, _noted(name, called))
 
     def function(*arguments: Tensor) -> list[Tensor]:
         return [form(_namespace(arguments)) for form in case.forms]
@@ -731,7 +731,7 @@ def test_one_lane_at_a_time(number):
 
 
 def _noted(name: str, called: set[str]) -> Any:
-    handler = HANDLERS[name]
+    handler = LOWERINGS[name]
 
     def noted(*args: Any, **kwargs: Any) -> None:
         called.add(name)
@@ -750,4 +750,4 @@ def test_square_root_is_rounded_once():
 
 def test_every_operator_has_a_case():
     covered = {name for case in CASES for name in case.operators.split()}
-    assert covered == set(HANDLERS)
+    assert covered == set(LOWERINGS)

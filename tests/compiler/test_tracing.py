@@ -18,7 +18,7 @@ from torchpt.compiler.form import VECTORS
 from torchpt.compiler.function import lanewise
 from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.kernel import kernel_ir
-from torchpt.compiler.program import Program, TracedStage, bound, holds, laid_out, replayed
+from torchpt.compiler.program import Program, TracedStage, bind_tables, guards_hold, lay_out_table, run_prologue
 from torchpt.compiler.sinks import Sinks, Store
 from torchpt.compiler.tracing import LANES, Tracer, tracing
 from torchpt.math import vectors
@@ -106,12 +106,12 @@ def stage(x: Tensor, table: Tensor, gain: Tensor) -> list[Tensor]:
 
 def program(tracer: Tracer, ir: str) -> Program:
     made = cpu.compiled(ir)
-    parts = tuple(tracer.tables), tuple(tracer.steps), tuple(tracer.held), tuple(tracer.guards)
+    parts = tuple(tracer.tables), tuple(tracer.steps), tuple(tracer.constants), tuple(tracer.guards)
     return Program(made.call, made.key, *parts, (), 0, 0, 1, 2, 0, {})
 
 
 def call(made: Program, x: Tensor, results: int, leaves: dict[str, Tensor]) -> list[Tensor]:
-    tables = bound(made.tables, made.steps, made.held, leaves)
+    tables = bind_tables(made.tables, made.steps, made.constants, leaves)
     outputs = [torch.full((x.shape[1],), math.nan) for _ in range(results)]
     words = [0] * len(function.HEAD)
     words[function.HEAD.index("tables")] = tables.address
@@ -155,9 +155,9 @@ def test_guards():
     tracer, ir = trace(branching, X, table=torch.tensor([0.5, 2.0]))
     made = program(tracer, ir)
     assert len(made.guards) == 2
-    assert holds(made, {"table": torch.tensor([2.0, 0.1])})
-    assert not holds(made, {"table": torch.tensor([0.5, 3.0])})  # another number, on which the trace may rely
-    assert not holds(made, {"table": torch.tensor([2.0, math.nan])})
+    assert guards_hold(made, {"table": torch.tensor([2.0, 0.1])})
+    assert not guards_hold(made, {"table": torch.tensor([0.5, 3.0])})  # another number, on which the trace may rely
+    assert not guards_hold(made, {"table": torch.tensor([2.0, math.nan])})
 
 
 def test_numbers_of_the_program_are_read_not_frozen():
@@ -182,15 +182,15 @@ def test_steps_are_replayed_in_order():
     x = torch.rand(3, 50)
     found = call(program(tracer, ir), x, 1, {"table": torch.tensor([8.0])})[0]
     assert torch.equal(found, writing(x, torch.tensor([8.0]))[0]) and found.max() == 9
-    tensor = replayed(tracer.steps, tracer.held, {"table": torch.tensor([8.0])})
+    tensor = run_prologue(tracer.steps, tracer.constants, {"table": torch.tensor([8.0])})
     assert tensor(tracer.tables[0].source).tolist() == [1, 9, 1, 1]
 
 
 def test_tables_beyond_32_bits_are_refused():
     with pytest.raises(Unsupported, match="beyond 32 bits"):
-        laid_out(torch.tensor([1 << 40]), None)
+        lay_out_table(torch.tensor([1 << 40]), None)
     with pytest.raises(Unsupported, match="2147483648 numbers"):
-        laid_out(torch.zeros(1).expand(1 << 31), None)
+        lay_out_table(torch.zeros(1).expand(1 << 31), None)
 
 
 # -- safety of look-ups

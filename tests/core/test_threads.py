@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchpt.core.threads import PIECE, in_pieces, mean_all, sum_all
 from torchpt.images.colour import display, linear_to_srgb, srgb_to_linear
-from torchpt.math.sampling import Discrete
+from torchpt.math.sampling import Distribution1D
 from torchpt.physics.shapes.normals import smooth_normals
 
 THREADS = (2, 3)
@@ -49,8 +49,8 @@ def mesh() -> Tensor:
         lambda: srgb_to_linear(X[0]),
         lambda: linear_to_srgb(X[0]),
         lambda: display(X[:3].T, gamma=0.6),
-        lambda: Discrete.of(X[0], torch.float32).cdf,
-        lambda: Discrete.of(X[0].double() ** 8, torch.float64).pmf,
+        lambda: Distribution1D.of(X[0], torch.float32).cdf,
+        lambda: Distribution1D.of(X[0].double() ** 8, torch.float64).pmf,
         lambda: in_pieces(torch.atan2, X[0], X[1]),
         lambda: in_pieces(torch.pow, X[:2], X[2:]),
         lambda: in_pieces(torch.pow, X[0].double(), X[1].double()),

@@ -22,7 +22,7 @@ import torchpt
 from torchpt.compiler import cache, cpu
 from torchpt.compiler.cpu import Target
 from torchpt.compiler.form import CAPACITY, SCALAR, VECTORS
-from torchpt.compiler.kernel import text
+from torchpt.compiler.kernel import kernel_ir
 from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import Sinks
 from torchpt.engines.kernels import engine as calls
@@ -44,7 +44,7 @@ def stages(monkeypatch) -> Iterator[dict[str, TracedStage]]:
         return program
 
     monkeypatch.setattr(cache, "compiled", noted)
-    monkeypatch.setattr(cache, "key_of", lambda structure: None)
+    monkeypatch.setattr(cache, "cache_key", lambda structure: None)
     cache.forget()
     yield found
     cache.forget()
@@ -95,7 +95,7 @@ class ErrorProbes:
     def _single(self, kernel: Kernel, stage: TracedStage) -> Kernel:
         """The kernel on one lane at a time."""
         if id(kernel) not in self._singles:
-            made = cpu.compiled(text(stage, SCALAR), one_lane())
+            made = cpu.compiled(kernel_ir(stage, SCALAR), one_lane())
             single = replace(kernel, program=replace(kernel.program, call=made.call, code=made.key))
             self._singles[id(kernel)] = kernel, single  # both live, so that their ids stay their own
         return self._singles[id(kernel)][1]
@@ -106,11 +106,14 @@ def spans(sinks: Sinks, count: int, before: np.ndarray, after: np.ndarray) -> It
     shift = 0 if sinks.shift is None else int(before[sinks.shift])
     for row, _ in sinks.write:
         yield 0, row, shift, shift + count
-    for pack in sinks.pack:
-        for row, _ in pack.rows:
-            yield 0, row, int(before[pack.counter]), int(after[pack.counter])
-    for note in [*sinks.notes, *(note for pack in sinks.pack for note in pack.notes)]:
-        yield 3 + note.list, 0, int(before[note.counter]), int(after[note.counter])
+    for compact in sinks.compact:
+        for row, _ in compact.rows:
+            yield 0, row, int(before[compact.counter]), int(after[compact.counter])
+    for append in [
+        *sinks.appends,
+        *(append for compact in sinks.compact for append in compact.appends),
+    ]:
+        yield 3 + append.list, 0, int(before[append.counter]), int(after[append.counter])
     for scatter in sinks.scatter:
         for row, _ in () if scatter.slots else scatter.rows:
             yield 0, row, 0, CAPACITY - VECTORS.width

@@ -9,9 +9,9 @@ from torchpt.compiler.form import Form
 from torchpt.compiler.functions import FUNCTIONS
 from torchpt.compiler.graph import FLOATS, Graph, Unsupported
 
-__all__ = ["MEMORY", "Body", "emit"]
+__all__ = ["MEMORY", "LoopBody", "generate_node"]
 
-#: LLVM type of an element in tables and in the arena, by node type; see :func:`torchpt.compiler.program.bound`.
+#: LLVM type of an element in tables and in the arena, by node type; see :func:`torchpt.compiler.program.bind_tables`.
 MEMORY = {"f": "float", "d": "double", "i": "i32", "l": "i32", "L": "i32", "u": "i32", "b": "i32"}
 
 _COMPARISONS = {
@@ -24,12 +24,12 @@ _COMPARISONS = {
 }
 
 
-class Body(Block):
+class LoopBody(Block):
     """A builder for the body of a kernel's loop.
 
     Attributes:
         listed: lanes are read at the indices of a list; False: all lanes in order.
-        products: the product that is fused into each sum, both as nodes; see :func:`torchpt.compiler.fusing.fused`.
+        products: the product that is fused into each sum, both as nodes; see :func:`torchpt.compiler.fusing.fused_products`.
     """
 
     def __init__(self, form: Form, listed: bool, products: dict[int, int]) -> None:
@@ -37,7 +37,7 @@ class Body(Block):
         self.listed, self.products = listed, products
 
 
-def emit(block: Body, graph: Graph, node: int, names: dict[int, str]) -> str:
+def generate_node(block: LoopBody, graph: Graph, node: int, names: dict[int, str]) -> str:
     """Write the instructions of one node and return the name of its value; ``names`` maps its arguments to their values."""
     op, ty, arguments, extra = graph.nodes[node]
     if node in block.products:
@@ -63,7 +63,7 @@ def emit(block: Body, graph: Graph, node: int, names: dict[int, str]) -> str:
     return _byte(block, value) if ty == "u" and op in _CARRIES else value
 
 
-def _fused(block: Body, graph: Graph, node: int, names: dict[int, str]) -> str:
+def _fused(block: LoopBody, graph: Graph, node: int, names: dict[int, str]) -> str:
     """Compute ``a b + c``, ``a b - c`` or ``c - a b``, rounded once."""
     op, ty, terms, _ = graph.nodes[node]
     product = block.products[node]
@@ -308,12 +308,12 @@ def _iota(block: Block, ty: str) -> str:
     return block.convert("sext", "i", "L", places) if ty == "L" else _cast(block, "i", ty, places)
 
 
-def _place(block: Body, ty: str) -> str:
+def _place(block: LoopBody, ty: str) -> str:
     """Return the index of the lane in the arena."""
     return "%place" if block.listed else _iota(block, ty)
 
 
-def _arena(block: Body, ty: str, extra: int) -> str:
+def _arena(block: LoopBody, ty: str, extra: int) -> str:
     """Load a row of the arena at the lane's index."""
     element = MEMORY[ty]
     if block.listed:

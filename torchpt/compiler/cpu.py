@@ -19,7 +19,7 @@ __all__ = [
     "counts",
     "host",
     "identity",
-    "kept",
+    "load_function",
 ]
 
 #: Part of every key: raised when compilation changes, so that older entries are not read.
@@ -101,7 +101,7 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         return function
 
 
-def kept(key: str) -> Function | None:
+def load_function(key: str) -> Function | None:
     """Return a function of this machine by its key, from memory or from disk; None if it is in neither."""
     with _lock:
         function = _functions.get(key)

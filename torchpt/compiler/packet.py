@@ -14,13 +14,13 @@ from torchpt.compiler.codegen import MEMORY
 from torchpt.compiler.form import Form
 from torchpt.compiler.graph import Graph
 
-__all__ = ["KINDS", "packet_search", "packet_words", "search_functions"]
+__all__ = ["KINDS", "binary_searches", "packet_search", "scene_words"]
 
 
 # ---- Binary searches in sorted tables, as LLVM IR: functions that kernels call
 
 
-def search_functions(graph: Graph, needed: list[int], form: Form) -> Block:
+def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
     """Generate the binary searches that a graph uses; all lanes take the same number of steps, log2 of the table's length."""
     asked = {extra[1:] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op == "search"}
     whole = Block(form)
@@ -80,7 +80,7 @@ _RAY = ("ox", "oy", "oz", "dx", "dy", "dz")
 
 
 def packet_search(kinds: Sequence[str], form: Form) -> Block:
-    """Generate the functions ``nearest`` and ``occluded``, which take rays and the address of :func:`packet_words`.
+    """Generate the functions ``nearest`` and ``occluded``, which take rays and the address of :func:`scene_words`.
 
     Args:
         kinds: kinds of primitives in the scene, of :data:`KINDS`.
@@ -95,7 +95,7 @@ def packet_search(kinds: Sequence[str], form: Form) -> Block:
     return whole
 
 
-def packet_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: float) -> Any:
+def scene_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: float) -> Any:
     """Return the scene data that the functions read, as a ctypes array; the tensors must outlive it.
 
     Its words of 64 bits: address of the rows of planar primitives, address of the spheres, for each of :data:`KINDS` the id

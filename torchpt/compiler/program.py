@@ -13,10 +13,10 @@ from torch import Tensor
 
 from torchpt.compiler.cpu import Function
 from torchpt.compiler.graph import Graph, Unsupported
-from torchpt.compiler.prologue import Guard, Name, Source, Step, Table, names_of, replayed
+from torchpt.compiler.prologue import Guard, Source, Step, StepKey, Table, run_prologue, step_keys
 from torchpt.compiler.sinks import Sinks
 
-__all__ = ["Program", "Tables", "TracedStage", "bound", "holds", "laid_out"]
+__all__ = ["Program", "Tables", "TracedStage", "bind_tables", "guards_hold", "lay_out_table"]
 
 
 # ---- A traced stage
@@ -31,7 +31,7 @@ class TracedStage:
         sinks: where results are written.
         tables: tables that the graph reads.
         steps: the prologue, which computes some tables from leaves.
-        held: constant tensors.
+        constants: constant tensors.
         guards: values that the trace depends on.
         uniforms: names of the inputs that all lanes share.
         tensors: number of inputs that are tensors instead of rows of an arena.
@@ -44,7 +44,7 @@ class TracedStage:
     sinks: Sinks
     tables: Sequence[Table] = ()
     steps: Sequence[Step] = ()
-    held: Sequence[Tensor] = ()
+    constants: Sequence[Tensor] = ()
     guards: Sequence[Guard] = ()
     uniforms: Sequence[str] = ()
     tensors: int = 0
@@ -69,7 +69,7 @@ class Program:
         code: cache key of the machine code.
         tables: tables that the kernel reads.
         steps: the prologue, which computes some tables from leaves.
-        held: constant tensors.
+        constants: constant tensors.
         guards: values that the trace depended on.
         uniforms: names of the inputs that all lanes share.
         lists: number of index lists that the kernel writes.
@@ -85,7 +85,7 @@ class Program:
     code: str
     tables: tuple[Table, ...]
     steps: tuple[Step, ...]
-    held: tuple[Tensor, ...]
+    constants: tuple[Tensor, ...]
     guards: tuple[Guard, ...]
     uniforms: tuple[str, ...]
     lists: int
@@ -108,7 +108,7 @@ class Program:
             code=function.key,
             tables=tuple(stage.tables),
             steps=tuple(stage.steps),
-            held=tuple(stage.held),
+            constants=tuple(stage.constants),
             guards=tuple(stage.guards),
             uniforms=tuple(stage.uniforms),
             lists=stage.sinks.lists(),
@@ -125,9 +125,9 @@ class Program:
         return self._leaves
 
     @cached_property
-    def names(self) -> tuple[Name | None, ...]:
-        """Return the names of the steps, see :func:`torchpt.compiler.prologue.names_of`."""
-        return names_of(self.steps)
+    def names(self) -> tuple[StepKey | None, ...]:
+        """Return the names of the steps, see :func:`torchpt.compiler.prologue.step_keys`."""
+        return step_keys(self.steps)
 
     @cached_property
     def _leaves(self) -> frozenset[str]:
@@ -160,7 +160,7 @@ class Tables:
     keep: tuple[Any, ...]
 
 
-def laid_out(tensor: Tensor, axis: int | None) -> Tensor:
+def lay_out_table(tensor: Tensor, axis: int | None) -> Tensor:
     """Return a table in the layout of kernels: entries first, contiguous, integers and bools in 32 bits.
 
     Raises:
@@ -180,28 +180,28 @@ def laid_out(tensor: Tensor, axis: int | None) -> Tensor:
     return tensor.contiguous()
 
 
-def bound(
+def bind_tables(
     tables: Sequence[Table],
     steps: Sequence[Step],
-    held: Sequence[Tensor],
+    constants: Sequence[Tensor],
     leaves: Mapping[str, Tensor],
     known: dict[Any, Tensor] | None = None,
-    names: Sequence[Name | None] = (),
-    results: dict[Name, Tensor] | None = None,
+    names: Sequence[StepKey | None] = (),
+    results: dict[StepKey, Tensor] | None = None,
 ) -> Tables:
     """Compute and lay out the tables of a kernel for one scene.
 
     Args:
         tables: tables of the trace.
         steps: prologue of the trace.
-        held: constant tensors of the trace.
+        constants: constant tensors of the trace.
         leaves: the scene's tensors by path.
         known: leaves laid out before, by path and axis; filled.
         names: names of the steps.
-        results: results of steps of other kernels, see :func:`torchpt.compiler.prologue.replayed`; filled.
+        results: results of steps of other kernels, see :func:`torchpt.compiler.prologue.run_prologue`; filled.
     """
     known = {} if known is None else known
-    tensor = replayed(steps, held, leaves, names, results)
+    tensor = run_prologue(steps, constants, leaves, names, results)
     words: list[int] = []
     keep: list[Tensor] = []
     for table in tables:
@@ -209,7 +209,7 @@ def bound(
         numbers = known.get(key) if key is not None else None
         plain = tensor(table.source)
         if numbers is None:
-            numbers = laid_out(plain, table.axis)
+            numbers = lay_out_table(plain, table.axis)
             if key is not None:
                 known[key] = numbers
         keep.append(numbers)
@@ -218,11 +218,11 @@ def bound(
     return Tables(ctypes.addressof(block), (block, keep))
 
 
-def holds(program: Program, leaves: Mapping[str, Tensor]) -> bool:
+def guards_hold(program: Program, leaves: Mapping[str, Tensor]) -> bool:
     """Return True if the guards of a program hold for these leaves."""
     if not program.guards:
         return True
-    tensor = replayed(program.steps, program.held, leaves)
+    tensor = run_prologue(program.steps, program.constants, leaves)
 
     def number(value: Any) -> Any:
         return value.item() if isinstance(value, Tensor) else value

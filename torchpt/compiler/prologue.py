@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Guard", "Name", "Source", "Step", "Table", "names_of", "pruned", "replayed"]
+__all__ = ["Guard", "Source", "Step", "StepKey", "Table", "run_prologue", "step_keys", "without_unused_steps"]
 
 #: Largest tensor, in bytes, that is kept for other prologues.
 SMALL = 1 << 16
@@ -24,8 +24,8 @@ class Source:
     """The origin of a tensor without lanes.
 
     Attributes:
-        kind: ``leaf`` (of the stage's arguments), ``step`` (result of a prologue step) or ``held`` (a constant of the program,
-            such as the weights of a network).
+        kind: ``leaf`` (of the stage's arguments), ``step`` (result of a prologue step) or ``constants`` (a constant of the
+            program, such as the weights of a network).
         name: path of a leaf, else the number of the step or constant.
         item: index into the results of a step that returns several; -1 if it returns one.
     """
@@ -65,7 +65,7 @@ class Guard:
     value: Any
 
 
-def pruned(
+def without_unused_steps(
     tables: Sequence[Table], steps: Sequence[Step], guards: Sequence[Guard]
 ) -> tuple[tuple[Table, ...], tuple[Step, ...], tuple[Guard, ...]]:
     """Return tables, steps and guards without the unused steps."""
@@ -102,7 +102,7 @@ def pruned(
 
 
 @dataclass(frozen=True)
-class Name:
+class StepKey:
     """An identity of a step: equal in all prologues of the process for the same operators on leaves of the same paths.
 
     Attributes:
@@ -114,14 +114,14 @@ class Name:
     leaves: frozenset[str]
 
 
-def names_of(steps: Sequence[Step]) -> tuple[Name | None, ...]:
+def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
     """Return the names of steps; None for a step that depends on a constant tensor or has unhashable arguments."""
-    names: list[Name | None] = []
+    names: list[StepKey | None] = []
     leaves: set[str] = set()  # of the current step
 
-    def told(value: Any) -> Any:
+    def content_of(value: Any) -> Any:
         if isinstance(value, Source):
-            if value.kind == "held":
+            if value.kind == "constants":
                 raise TypeError("a tensor of the program's own")
             if value.kind == "leaf":
                 leaves.add(str(value.name))
@@ -132,7 +132,7 @@ def names_of(steps: Sequence[Step]) -> tuple[Name | None, ...]:
             leaves.update(name.leaves)
             return "step", name.number, value.item
         if isinstance(value, list | tuple):
-            return type(value), tuple(told(x) for x in value)
+            return type(value), tuple(content_of(x) for x in value)
         return type(value), repr(value) if isinstance(value, float) else value
 
     for step in steps:
@@ -141,8 +141,12 @@ def names_of(steps: Sequence[Step]) -> tuple[Name | None, ...]:
         try:
             if schema is None or schema.is_mutable:
                 raise TypeError("what writes into its arguments")
-            key = step.function, told(step.args), tuple((k, told(value)) for k, value in step.kwargs.items())
-            names.append(Name(_numbers.setdefault(key, next(_count)), frozenset(leaves)))
+            key = (
+                step.function,
+                content_of(step.args),
+                tuple((k, content_of(value)) for k, value in step.kwargs.items()),
+            )
+            names.append(StepKey(_numbers.setdefault(key, next(_count)), frozenset(leaves)))
         except TypeError:  # also raised by hash()
             names.append(None)
     return tuple(names)
@@ -157,20 +161,20 @@ def _small(result: Any) -> bool:
     return isinstance(result, Tensor) and result.untyped_storage().nbytes() <= SMALL
 
 
-def replayed(
+def run_prologue(
     steps: Sequence[Step],
-    held: Sequence[Tensor],
+    constants: Sequence[Tensor],
     leaves: Mapping[str, Tensor],
-    names: Sequence[Name | None] = (),
-    known: dict[Name, Tensor] | None = None,
+    names: Sequence[StepKey | None] = (),
+    known: dict[StepKey, Tensor] | None = None,
 ) -> Any:
     """Run a prologue and return the function ``tensor(source)``.
 
     Args:
         steps: the prologue.
-        held: the program's constant tensors.
+        constants: the program's constant tensors.
         leaves: the scene's tensors by path.
-        names: names of the steps, see :func:`names_of`.
+        names: names of the steps, see :func:`step_keys`.
         known: results of steps of other prologues on the same leaves, by name; small results are added.
     """
     results: list[Any] = []
@@ -178,8 +182,8 @@ def replayed(
     def tensor(source: Source) -> Tensor:
         if source.kind == "leaf":
             return leaves[str(source.name)]
-        if source.kind == "held":
-            return held[int(source.name)]
+        if source.kind == "constants":
+            return constants[int(source.name)]
         result = results[int(source.name)]
         return result if source.item < 0 else result[source.item]
 

@@ -6,7 +6,7 @@ import os
 import threading
 import time
 
-__all__ = ["begun", "ended", "seconds"]
+__all__ = ["begin", "end", "seconds"]
 
 _lock = threading.Lock()
 _state = {"total": 0.0, "since": 0.0, "depth": 0}
@@ -19,7 +19,7 @@ def seconds() -> float:
         return _state["total"] + under_way
 
 
-def begun() -> None:
+def begin() -> None:
     """Mark the start of a compilation in a thread, or of its wait for another thread's."""
     with _lock:
         if not _state["depth"]:
@@ -27,8 +27,8 @@ def begun() -> None:
         _state["depth"] += 1
 
 
-def ended() -> None:
-    """Mark the end of what :func:`begun` has marked."""
+def end() -> None:
+    """Mark the end of what :func:`begin` has marked."""
     with _lock:
         _state["depth"] -= 1
         if not _state["depth"]:

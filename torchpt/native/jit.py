@@ -31,7 +31,7 @@ from torchpt.native.content import code_of_function
 if getattr(numba_config, "DISABLE_JIT", 0):
     raise RenderError("NUMBA_DISABLE_JIT is set, and kernels are machine code that Python cannot run: unset it")
 
-__all__ = ["compiled", "jit", "launch", "parallel_allowed", "part"]
+__all__ = ["compiled", "jit", "jit_internal", "launch", "parallel_allowed"]
 
 _lock = threading.Lock()
 _state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "said": False}
@@ -58,10 +58,10 @@ class _Compiling(Listener):
     """A numba listener that reports each compilation to :mod:`torchpt.native.compile_time`."""
 
     def on_start(self, event: Event) -> None:
-        compile_time.begun()
+        compile_time.begin()
 
     def on_end(self, event: Event) -> None:
-        compile_time.ended()
+        compile_time.end()
 
 
 # Numba holds this lock while it compiles, and while it looks a kernel up on disk.
@@ -122,7 +122,7 @@ class _ByContent(NullCache):
         return hashlib.sha256(repr(facts).encode()).hexdigest()[:40] + ".nbc"
 
 
-def part(**options: Any) -> Callable[[Callable], Any]:
+def jit_internal(**options: Any) -> Callable[[Callable], Any]:
     """Decorate a function that only kernels call: as :func:`jit`, without the wrappers for Python and C."""
     return jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import thread_count
-from torchpt.native.jit import compiled, jit, launch, part
+from torchpt.native.jit import compiled, jit, jit_internal, launch
 from torchpt.native.simd import (
     bits,
     gather,
@@ -19,7 +19,7 @@ from torchpt.native.simd import (
     item,
     load,
     lowest,
-    population,
+    popcount,
     put,
     select,
     splat,
@@ -30,25 +30,25 @@ from torchpt.native.simd import (
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search import tree_packet as kernels
 from torchpt.search.base import Accel, Array, Hits
-from torchpt.search.bounds import chosen
+from torchpt.search.bounds import select_primitives
 from torchpt.search.tree_build import (
     Floats,
-    Others,
-    Tree,
-    aligned,
+    NonTriangles,
+    WideTree,
+    aligned_buffer,
     boxes_of,
     corners,
-    lines_of,
+    line_count,
     mesh_tree,
     planes_of,
-    room_of,
-    tables_of,
-    write,
+    primitive_tables,
+    stack_size,
+    write_tree,
 )
-from torchpt.search.tree_layout import CHILDREN, IDS, LEAF, LINE, MORE, NODE, PLANES, place
+from torchpt.search.tree_layout import CHILDREN, IDS, LEAF, LINE, MORE, NODE, PLANES, block_offset
 from torchpt.search.tree_leaf import RECTANGLES, RULED
 
-__all__ = ["REBUILD", "Topology", "Wide", "refit"]
+__all__ = ["REBUILD_THRESHOLD", "RefitState", "WideBvh", "refit"]
 
 
 # ---- Refit (numba): the same nodes, leaves and ids, with new boxes and triangles
@@ -57,7 +57,7 @@ __all__ = ["REBUILD", "Topology", "Wide", "refit"]
 _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _moved(tree, at, p, ids, here):
     """Copy a corner of a leaf's triangles to the tree, NaN where the mask is not set; return it in float64."""
     n, none = np.int32(p.shape[1]), splat(_NAN, 8)
@@ -70,7 +70,7 @@ def _moved(tree, at, p, ids, here):
     return widen(x), widen(y), widen(z)
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _half_area(tree, at):
     """Return half the area of the box whose six numbers begin at ``at``, eight apart; 0 for an empty box."""
     x = np.float64(item(tree, at + 24)) - np.float64(item(tree, at))
@@ -79,7 +79,7 @@ def _half_area(tree, at):
     return x * y + y * z + z * x if x >= 0.0 and y >= 0.0 and z >= 0.0 else 0.0
 
 
-@part(forceinline=True)
+@jit_internal(forceinline=True)
 def _union(boxes, first, out, at):
     """Write the bounding box of eight boxes to ``at``, in the layout of a node."""
     for j in range(0, 24, 8):
@@ -87,7 +87,7 @@ def _union(boxes, first, out, at):
         put(out, at + 24 + j, highest(load(boxes, first + 24 + j, 8)))
 
 
-@part()
+@jit_internal()
 def _leaf(at, old, tree, codes, p0, p1, p2, triangles, others, boxes):
     """Write the block of a leaf; ``boxes`` ``(48,)`` gets low x, y, z, high x, y, z of its primitives."""
     ids, none = load(old, at + IDS, 8), splat(_NAN, 8)
@@ -123,7 +123,7 @@ def _leaf(at, old, tree, codes, p0, p1, p2, triangles, others, boxes):
             boxes[j * 8 + k] = others[-2 - item(old, at + IDS + k) - triangles, j]
 
 
-@part()
+@jit_internal()
 def _rectangles(at, before, old, tree, corner, rows, triangles, disk):
     """Write the rectangles of a leaf; unused entries stay NaN."""
     for j in range(RECTANGLES, RECTANGLES + MORE * LINE):
@@ -169,7 +169,7 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, o
         children, none = load(old, line * LINE + CHILDREN, 8), splat(np.int32(0), 8)
         leaves = bits(children < none)
         ruled = leaves & bits((children & splat(np.int32(2), 8)) == none)
-        line += NODE + LEAF * population(leaves) + MORE * population(ruled)
+        line += NODE + LEAF * popcount(leaves) + MORE * popcount(ruled)
     work, work_before = 0.0, 0.0
     for node in range(nodes - 1, -1, -1):
         base = lines[node] * LINE
@@ -177,11 +177,11 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, o
         for k in range(8):
             code, at = np.int64(item(old, base + CHILDREN + k)), base + k
             if code > 0:
-                _union(tree, place(code), tree, at)
+                _union(tree, block_offset(code), tree, at)
             elif code < 0:
-                _leaf(place(code), old, tree, codes, p0, p1, p2, triangles, others, boxes)
+                _leaf(block_offset(code), old, tree, codes, p0, p1, p2, triangles, others, boxes)
                 if code & 2 == 0:
-                    _rectangles(place(code), before, old, tree, corner, rows, triangles, disk)
+                    _rectangles(block_offset(code), before, old, tree, corner, rows, triangles, disk)
                 _union(boxes, first, tree, at)
             else:  # an empty box, which no ray hits
                 for j in range(0, 24, 8):
@@ -201,10 +201,10 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, o
 #: A tree is rebuilt when refits have raised the expected cost of a random ray by more than this factor since the build. Up
 #: to it searches took at most a quarter longer than in a new tree, mostly less than a tenth (scripts/bench_refit.py): with
 #: 70,000 triangles a build pays off after about two million rays.
-REBUILD = 1.2
+REBUILD_THRESHOLD = 1.2
 
 
-class Topology:
+class RefitState:
     """The state of a tree that refits need.
 
     Args:
@@ -213,22 +213,22 @@ class Topology:
         line: line of the buffer at which the root begins.
 
     Attributes:
-        growth: expected cost of a random ray, relative to the tree as built.
+        sah_ratio: expected cost of a random ray, relative to the tree as built.
     """
 
-    def __init__(self, tree: Tree, geometry: Geometry, line: int = 0) -> None:
+    def __init__(self, tree: WideTree, geometry: Geometry, line: int = 0) -> None:
         self.nodes, self.line, self.counts = tree.nodes, line, geometry.counts
         self.left_out = np.zeros(0, np.int32)  # rising ids of the primitives without area
         if (tree.ids >= 0).sum() < geometry.size:
             self.left_out = np.setdiff1d(np.arange(geometry.size, dtype=np.int32), tree.ids)
         self.built: float | None = None  # expected cost as built, computed by the first refit
-        self.growth = 1.0
+        self.sah_ratio = 1.0
 
-    def refit(self, geometry: Geometry, others: Others, before: Floats, memory: Floats) -> Topology | None:
+    def refit(self, geometry: Geometry, others: NonTriangles, before: Floats, memory: Floats) -> RefitState | None:
         """Write this tree for primitives that have moved to ``memory``; ``before`` is the buffer of the present tree.
 
         Returns None, with undefined content of ``memory``, if the numbers of primitives differ, if a primitive without area in
-        the build has one now, if no primitive has an area, or if the cost has grown by more than :data:`REBUILD`.
+        the build has one now, if no primitive has an area, or if the cost has grown by more than :data:`REBUILD_THRESHOLD`.
         """
         if geometry.counts != self.counts or self._is_more(geometry):
             return None
@@ -239,14 +239,14 @@ class Topology:
         work, moved = refit(*args, memory, memory.view(np.int32))
         found = copy.copy(self)
         found.built = work if self.built is None else self.built
-        found.growth = moved / found.built
-        return found if found.growth <= REBUILD else None  # NaN if no primitive has an area
+        found.sah_ratio = moved / found.built
+        return found if found.sah_ratio <= REBUILD_THRESHOLD else None  # NaN if no primitive has an area
 
     def _is_more(self, geometry: Geometry) -> bool:
         if not len(self.left_out):
             return False
-        some = chosen(geometry, torch.from_numpy(self.left_out).long())
-        _, _, ids, others = tables_of(some)
+        some = select_primitives(geometry, torch.from_numpy(self.left_out).long())
+        _, _, ids, others = primitive_tables(some)
         return len(ids) > 0 or bool(others.area.any())
 
 
@@ -257,7 +257,7 @@ _GRAIN = 512  # rays that are worth another thread
 _ALL_OPAQUE = np.empty(0, np.uint8)
 
 
-class Wide(Accel):
+class WideBvh(Accel):
     """A search by a BVH with eight children a node, built by the surface area heuristic (numba, CPU).
 
     Args:
@@ -273,28 +273,28 @@ class Wide(Accel):
         tree, planes, others = mesh_tree(geometry)
         self.counts, self.depth, self.sah_cost = geometry.counts, tree.depth, tree.cost
         self.nodes, self.leaves = tree.nodes, tree.leaves
-        self.topology, self.copied = Topology(tree, geometry), geometry.copies is not None
-        memory = aligned(lines_of(tree, geometry.counts) * LINE)
-        write(tree, geometry, planes, others, 0, memory)
+        self.refit_state, self.copied = RefitState(tree, geometry), geometry.copies is not None
+        memory = aligned_buffer(line_count(tree, geometry.counts) * LINE)
+        write_tree(tree, geometry, planes, others, 0, memory)
         self._take(memory, others, start)
 
-    def _take(self, memory: np.ndarray, others: Others, start: float) -> None:
-        kinds = torch.tensor([*(sum(self.counts[:k]) for k in range(1, 5)), room_of(self.depth)], dtype=torch.int64)
+    def _take(self, memory: np.ndarray, others: NonTriangles, start: float) -> None:
+        kinds = torch.tensor([*(sum(self.counts[:k]) for k in range(1, 5)), stack_size(self.depth)], dtype=torch.int64)
         self.tensors = [torch.from_numpy(memory), *others.tensors, kinds]
         self.arrays = _arrays(self.tensors)
         self.build_seconds = time.perf_counter() - start
 
-    def refit(self, geometry: Geometry, threads: int | None = None) -> Wide | None:
-        """See :meth:`Accel.refit` and :meth:`Topology.refit`; the new tree has its own memory."""
+    def refit(self, geometry: Geometry, threads: int | None = None) -> WideBvh | None:
+        """See :meth:`Accel.refit` and :meth:`RefitState.refit`; the new tree has its own memory."""
         start = time.perf_counter()
         if (geometry.copies is not None) != self.copied:
             return None
-        others, memory = Others(geometry), aligned(len(self.arrays[0]))
-        topology = self.topology.refit(geometry, others, self.arrays[0], memory)
-        if topology is None:
+        others, memory = NonTriangles(geometry), aligned_buffer(len(self.arrays[0]))
+        refit_state = self.refit_state.refit(geometry, others, self.arrays[0], memory)
+        if refit_state is None:
             return None
         tree = copy.copy(self)
-        tree.threads, tree.topology = threads, topology
+        tree.threads, tree.refit_state = threads, refit_state
         tree._take(memory, others, start)
         return tree
 
@@ -335,7 +335,7 @@ class Wide(Accel):
             "primitives": sum(self.counts),
             "nodes": self.nodes,
             "leaves": self.leaves,
-            "sah_cost": self.sah_cost * self.topology.growth,
+            "sah_cost": self.sah_cost * self.refit_state.sah_ratio,
             "depth": self.depth,
             "bytes": sum(x.nbytes for x in self.tensors),
             "build_seconds": self.build_seconds,

@@ -22,7 +22,7 @@ from torchpt.native.simd.lanes import (
     lane_numbers,
     lowest,
     mask,
-    population,
+    popcount,
     sort_descending,
     trailing_zeros,
 )
@@ -47,7 +47,7 @@ __all__ = [
     "minimum",
     "narrow",
     "pointer",
-    "population",
+    "popcount",
     "prefetch",
     "put",
     "select",
