@@ -97,7 +97,7 @@ def slowdown(rounds: int, rows: list[dict[str, Any]]) -> None:
         for amount in amounts:
             g = moved(first, how, amount)
             old, new = refit(accel, g), WideBvh(g, 1)
-            work, least = (x.refit_state.sah_ratio * (x.refit_state.built or 1.0) for x in (old, refit(new, g)))
+            work, least = (x.refit_state.sah_ratio * (x.refit_state.built_cost or 1.0) for x in (old, refit(new, g)))
             sah_ratio = old.refit_state.sah_ratio
             row: dict[str, Any] = {"move": name, "amount": amount, "sah_ratio": sah_ratio, "beside": work / least}
             _, centre, size = extent(g)

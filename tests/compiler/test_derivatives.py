@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.graph import Graph, Unsupported
 from torchpt.compiler.operators.derivatives import summand_of
 from torchpt.math.vectors import cross, dot, normalize
@@ -26,7 +26,7 @@ def gradients(p: Tensor, q: Tensor) -> list[Tensor]:
 
 def test_a_tape_inside_of_a_kernel():
     p, q = torch.randn(3, 1000, generator=RNG), torch.randn(3, 1000, generator=RNG)
-    for found, wanted in zip(lanewise(gradients, (p, q))(p, q), gradients(p, q), strict=True):
+    for found, wanted in zip(compile_lanewise(gradients, (p, q))(p, q), gradients(p, q), strict=True):
         assert float(wanted.abs().max()) > 1
         assert torch.allclose(found, wanted, rtol=1e-3, atol=1e-3)
 

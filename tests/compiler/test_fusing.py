@@ -9,7 +9,7 @@ import torch
 from forms import one_lane
 from torch import Tensor
 
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.fusing import fused_products
 from torchpt.compiler.graph import Graph
 
@@ -33,7 +33,7 @@ CASES: dict[str, tuple[Callable[[Tensor], list[Tensor]], list[float]]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_rounded_once(name, form):
     function, wanted = CASES[name]
-    kernel = lanewise(function, [X], one_lane() if form == "one lane" else None)
+    kernel = compile_lanewise(function, [X], one_lane() if form == "one lane" else None)
     for found, value in zip(kernel(X), wanted, strict=True):
         assert (found == value).all(), (found[0].item(), value)
 

@@ -36,18 +36,18 @@ SMALL = {"film": {"width": 16, "height": 16}, "threads": 1, "compile": "on"}
 def stages(monkeypatch) -> Iterator[dict[str, TracedStage]]:
     """Stages by the names of their machine code; all that renders ask for is traced."""
     found: dict[str, TracedStage] = {}
-    compiled = cache.compiled
+    compiled = cache.compile_stage
 
     def noted(stage: TracedStage) -> Any:
         program = compiled(stage)
         found[program.code] = stage
         return program
 
-    monkeypatch.setattr(cache, "compiled", noted)
+    monkeypatch.setattr(cache, "compile_stage", noted)
     monkeypatch.setattr(cache, "cache_key", lambda structure: None)
-    cache.forget()
+    cache.clear_programs()
     yield found
-    cache.forget()
+    cache.clear_programs()
 
 
 class ErrorProbes:
@@ -95,7 +95,7 @@ class ErrorProbes:
     def _single(self, kernel: Kernel, stage: TracedStage) -> Kernel:
         """The kernel on one lane at a time."""
         if id(kernel) not in self._singles:
-            made = cpu.compiled(kernel_ir(stage, SCALAR), one_lane())
+            made = cpu.compile_ir(kernel_ir(stage, SCALAR), one_lane())
             single = replace(kernel, program=replace(kernel.program, call=made.call, code=made.key))
             self._singles[id(kernel)] = kernel, single  # both live, so that their ids stay their own
         return self._singles[id(kernel)][1]
@@ -153,7 +153,7 @@ def test_pictures_and_gradients(name, monkeypatch):
         pytest.skip("these are x86 machines that have what Haswell has")
 
     def made() -> list[Tensor]:
-        cache.forget()
+        cache.clear_programs()
         scene = torchpt.load(room(COLOURED), "cpu")
         picture = torchpt.render(scene, spp=4, **SMALL)
         return [picture, gradient_of(scene, "materials.plate.base_color", adjoint="replay")]
@@ -163,7 +163,7 @@ def test_pictures_and_gradients(name, monkeypatch):
     other = made()
     assert sum(cpu.counts()) > sum(before)  # kernels of their own
     monkeypatch.undo()
-    cache.forget()
+    cache.clear_programs()
     assert float(vectors[1].norm()) > 0
     for a, b in zip(vectors, other, strict=True):
         assert not differing(a, b).any()

@@ -21,7 +21,7 @@ from torchpt.compiler.prologue import Guard, Source, Step, Table
 from torchpt.native import cache
 from torchpt.native.content import code_of_folder
 
-__all__ = ["MOST_PROGRAMS", "cache_key", "compiled", "forget", "load", "program_of", "store"]
+__all__ = ["MOST_PROGRAMS", "cache_key", "clear_programs", "compile_stage", "load", "program_of", "store"]
 
 
 # ---- Programs on disk: the result of tracing, so that another process need not trace the stage again
@@ -184,7 +184,7 @@ def program_of(structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[
         if program is None and name is not None:
             program = load(name)
         if program is None or not guards_hold(program, tensors):
-            program = compiled(traced())
+            program = compile_stage(traced())
             if name is not None:
                 store(name, program)
         if _programs.get(structure) is not program:
@@ -195,12 +195,12 @@ def program_of(structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[
         return program
 
 
-def compiled(stage: TracedStage, target: cpu.Target | None = None) -> Program:
+def compile_stage(stage: TracedStage, target: cpu.Target | None = None) -> Program:
     """Compile a traced stage for a target; None is this machine."""
     target = target or cpu.host()
-    return Program.of(stage, cpu.compiled(kernel_ir(stage, target.form), target))
+    return Program.of(stage, cpu.compile_ir(kernel_ir(stage, target.form), target))
 
 
-def forget() -> None:
+def clear_programs() -> None:
     """Drop all programs in memory; entries on disk stay."""
     _programs.clear()

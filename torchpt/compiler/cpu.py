@@ -15,7 +15,7 @@ from torchpt.native import cache
 __all__ = [
     "Function",
     "Target",
-    "compiled",
+    "compile_ir",
     "counts",
     "host",
     "identity",
@@ -82,7 +82,7 @@ def counts() -> tuple[int, int]:
     return _state["compiled"], _state["loaded"]
 
 
-def compiled(ir: str, target: Target | None = None) -> Function:
+def compile_ir(ir: str, target: Target | None = None) -> Function:
     """Return the function ``kernel`` of an LLVM module from memory, from disk, or compiled now for the target."""
     with _lock:
         target = target or host()

@@ -1,6 +1,6 @@
 """Compile functions of tensors that work lane by lane, for calls outside of traced stages.
 
-:class:`Lanewise` compiles a function for the arguments of each call and caches the kernels; :func:`lanewise` compiles a
+:class:`Lanewise` compiles a function for the arguments of each call and caches the kernels; :func:`compile_lanewise` compiles a
 function at once.
 """
 
@@ -28,7 +28,7 @@ from torchpt.core.threads import share, thread_count
 from torchpt.core.tree import leaves, signature
 from torchpt.native import compile_time
 
-__all__ = ["Lanewise", "lanewise"]
+__all__ = ["Lanewise", "compile_lanewise"]
 
 #: Lanes of a block; threads share the work by blocks.
 BLOCK = 64
@@ -105,7 +105,7 @@ class Lanewise:
             return NotImplemented
         tables = leaves(records)
         made = self._made.get(key)
-        if made is None or not made.serves(tables):
+        if made is None or not made.is_current(tables):
             if any(map(self._unfit, tables)):
                 return NotImplemented
             compile_time.begin()
@@ -199,7 +199,7 @@ class _CompiledFunction:
         work = max(self.program.nodes.values(), default=1)
         self.grain = max(GRAIN // work // BLOCK, 1)
 
-    def serves(self, tables: list[Tensor]) -> bool:
+    def is_current(self, tables: list[Tensor]) -> bool:
         """Return True if the tables were made from these tensors in their present versions."""
         return all(
             table is known and _version(table) == version
@@ -228,7 +228,7 @@ class _CompiledFunction:
         return outputs[0] if isinstance(self.results, Tensor) else tuple(outputs)
 
 
-def lanewise(
+def compile_lanewise(
     function: Callable[..., Sequence[Tensor]], like: Sequence[Tensor], target: Target | None = None
 ) -> Callable[..., list[Tensor]]:
     """Compile a function of tensors ``(..., N)`` at once, for one thread.
@@ -249,7 +249,7 @@ def lanewise(
     sinks = Sinks(store=_stores(tracer, results))
     stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.constants, tensors=len(given))
     tables = bind_tables(stage.tables, stage.steps, stage.constants, {})
-    program = cache.compiled(stage, target)
+    program = cache.compile_stage(stage, target)
     made = _CompiledFunction(program, tables, [], tuple(x[..., :0] for x in results))
 
     def run(*arguments: Tensor) -> list[Tensor]:

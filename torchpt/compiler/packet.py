@@ -22,9 +22,9 @@ __all__ = ["KINDS", "binary_searches", "packet_search", "scene_words"]
 
 def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
     """Generate the binary searches that a graph uses; all lanes take the same number of steps, log2 of the table's length."""
-    asked = {extra[1:] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op == "search"}
+    searches = {extra[1:] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op == "search"}
     whole = Block(form)
-    for ty, right in sorted(asked):
+    for ty, right in sorted(searches):
         block, element = Block(form), MEMORY[ty]
         vector, places = block.vector(ty), block.each("i32")
         block.lines += [
@@ -184,8 +184,8 @@ class _Search(Block):
             f"  %{kind}_p = phi {self.i} [ {prim}, %{before} ], [ %{kind}_p1, %{last} ]",
         ]
         if kind == "sphere":
-            self._near_ball(kind)
-        distance, hit = self._ball(kind) if kind == "sphere" else self._planar(kind)
+            self._near_sphere(kind)
+        distance, hit = self._sphere(kind) if kind == "sphere" else self._planar(kind)
         tests = [
             self.compare("ogt", "f", distance, self.constant("f", 0.0)),
             self.compare("olt", "f", distance, f"%{kind}_t"),
@@ -253,7 +253,7 @@ class _Search(Block):
             value = self.fma("d", x, y, value)
         return value
 
-    def _near_ball(self, kind: str) -> None:
+    def _near_sphere(self, kind: str) -> None:
         """Branch to the exact test if any ray comes near the sphere, by float32 and a bound of its rounding error.
 
         The perpendicular from the centre ``c`` to the ray has an error below ``2^-20 (|f| + |c|)``, with ``f = o - c``: a
@@ -283,7 +283,7 @@ class _Search(Block):
         some = self.some(near)
         self.lines += [f"  br i1 {some}, label %{kind}_exact, label %{kind}_last", f"{kind}_exact:"]
 
-    def _ball(self, kind: str) -> tuple[str, str | None]:
+    def _sphere(self, kind: str) -> tuple[str, str | None]:
         """See :func:`torchpt.search.tree_leaf.sphere_distance`."""
         own = self.op(f"sub i64 %{kind}_id, %end_disk")
         base = self.op(f"getelementptr [4 x double], ptr %balls, i64 {own}")

@@ -71,18 +71,18 @@ def without_unused_steps(
     """Return tables, steps and guards without the unused steps."""
     needed: set[int] = set()
 
-    def asked(value: Any) -> None:
+    def mark_needed(value: Any) -> None:
         if isinstance(value, Source):
             if value.kind == "step" and int(value.name) not in needed:
                 needed.add(int(value.name))
                 step = steps[int(value.name)]
-                asked((step.args, tuple(step.kwargs.values())))
+                mark_needed((step.args, tuple(step.kwargs.values())))
         elif isinstance(value, list | tuple):
             for x in value:
-                asked(x)
+                mark_needed(x)
 
-    asked([table.source for table in tables])
-    asked([guard.source for guard in guards])
+    mark_needed([table.source for table in tables])
+    mark_needed([guard.source for guard in guards])
     numbers = {old: new for new, old in enumerate(sorted(needed))}
 
     def renamed(value: Any) -> Any:

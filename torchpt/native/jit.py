@@ -31,7 +31,7 @@ from torchpt.native.content import code_of_function
 if getattr(numba_config, "DISABLE_JIT", 0):
     raise RenderError("NUMBA_DISABLE_JIT is set, and kernels are machine code that Python cannot run: unset it")
 
-__all__ = ["compiled", "jit", "jit_internal", "launch", "parallel_allowed"]
+__all__ = ["ensure_compiled", "jit", "jit_internal", "launch", "parallel_allowed"]
 
 _lock = threading.Lock()
 _state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "said": False}
@@ -127,7 +127,7 @@ def jit_internal(**options: Any) -> Callable[[Callable], Any]:
     return jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
-def compiled(kernel: Any, *args: Any) -> Any:
+def ensure_compiled(kernel: Any, *args: Any) -> Any:
     """Compile a kernel by a call without work, and return it; a long compilation prints a message to stderr, once."""
     if not kernel.overloads:
         # LLVM aborts the process without memory, and so does the BLAS that numba loads with its first kernel.
@@ -193,15 +193,15 @@ def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, arg
     """
     threads = min(threads, max(1, items // grain))
     if threads == 1:
-        compiled(serial, 0, 0, *args)(0, items, *args)
+        ensure_compiled(serial, 0, 0, *args)(0, items, *args)
     elif parallel_allowed():
         threads = min(threads, _most_threads())
         before = numba.get_num_threads()
         numba.set_num_threads(threads)
         try:
-            compiled(parallel, 0, 0, *args)(threads, items, *args)
+            ensure_compiled(parallel, 0, 0, *args)(threads, items, *args)
         finally:
             numba.set_num_threads(before)
     else:
-        compiled(serial, 0, 0, *args)
+        ensure_compiled(serial, 0, 0, *args)
         share(lambda first, last: serial(first, last, *args), items, threads)

@@ -167,7 +167,7 @@ def _kernel(kinds: tuple[str, ...], any_hit: bool) -> Any:
         stores = [Store((graph.node("part", ty, hits, extra=k),), ty) for k, ty in enumerate("fiff")]
     compile_time.begin()
     try:
-        return cache.compiled(TracedStage(graph, Sinks(store=stores), tensors=3, searched=kinds)).call
+        return cache.compile_stage(TracedStage(graph, Sinks(store=stores), tensors=3, searched=kinds)).call
     finally:
         compile_time.end()
 

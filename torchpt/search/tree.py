@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import thread_count
-from torchpt.native.jit import compiled, jit, jit_internal, launch
+from torchpt.native.jit import ensure_compiled, jit, jit_internal, launch
 from torchpt.native.simd import (
     bits,
     gather,
@@ -88,7 +88,7 @@ def _union(boxes, first, out, at):
 
 
 @jit_internal()
-def _leaf(at, old, tree, codes, p0, p1, p2, triangles, others, boxes):
+def _leaf(at, old, tree, codes, p0, p1, p2, triangles, non_triangles, boxes):
     """Write the block of a leaf; ``boxes`` ``(48,)`` gets low x, y, z, high x, y, z of its primitives."""
     ids, none = load(old, at + IDS, 8), splat(_NAN, 8)
     store(codes, at + IDS, ids)
@@ -120,7 +120,7 @@ def _leaf(at, old, tree, codes, p0, p1, p2, triangles, others, boxes):
         k = trailing_zeros(mixed)
         mixed &= mixed - 1
         for j in range(6):
-            boxes[j * 8 + k] = others[-2 - item(old, at + IDS + k) - triangles, j]
+            boxes[j * 8 + k] = non_triangles[-2 - item(old, at + IDS + k) - triangles, j]
 
 
 @jit_internal()
@@ -138,7 +138,7 @@ def _rectangles(at, before, old, tree, corner, rows, triangles, disk):
 
 
 @jit()
-def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, others, tree, codes):
+def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, non_triangles, tree, codes):
     """Fill the blocks of a tree with the topology of another tree, which is not changed.
 
     In the buffer children must follow their parents, and the leaves of a node must follow it at once.
@@ -155,7 +155,7 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, o
         disk: id of the first primitive that is neither triangle nor rectangle.
         corner: ``(P - triangles, 12)`` corners of the other primitives.
         rows: ``(P - triangles, 12)`` affine rows of the other primitives.
-        others: ``(P - triangles, 6)`` float32 boxes of the other primitives: low x, y, z, high x, y, z.
+        non_triangles: ``(P - triangles, 6)`` float32 boxes of the other primitives: low x, y, z, high x, y, z.
         tree: float32, as long as ``before``, filled.
         codes: the same memory as int32.
 
@@ -179,7 +179,7 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, o
             if code > 0:
                 _union(tree, block_offset(code), tree, at)
             elif code < 0:
-                _leaf(block_offset(code), old, tree, codes, p0, p1, p2, triangles, others, boxes)
+                _leaf(block_offset(code), old, tree, codes, p0, p1, p2, triangles, non_triangles, boxes)
                 if code & 2 == 0:
                     _rectangles(block_offset(code), before, old, tree, corner, rows, triangles, disk)
                 _union(boxes, first, tree, at)
@@ -218,36 +218,38 @@ class RefitState:
 
     def __init__(self, tree: WideTree, geometry: Geometry, line: int = 0) -> None:
         self.nodes, self.line, self.counts = tree.nodes, line, geometry.counts
-        self.left_out = np.zeros(0, np.int32)  # rising ids of the primitives without area
+        self.without_area = np.zeros(0, np.int32)  # rising ids of the primitives without area
         if (tree.ids >= 0).sum() < geometry.size:
-            self.left_out = np.setdiff1d(np.arange(geometry.size, dtype=np.int32), tree.ids)
-        self.built: float | None = None  # expected cost as built, computed by the first refit
+            self.without_area = np.setdiff1d(np.arange(geometry.size, dtype=np.int32), tree.ids)
+        self.built_cost: float | None = None  # expected cost as built, computed by the first refit
         self.sah_ratio = 1.0
 
-    def refit(self, geometry: Geometry, others: NonTriangles, before: Floats, memory: Floats) -> RefitState | None:
+    def refit(
+        self, geometry: Geometry, non_triangles: NonTriangles, before: Floats, memory: Floats
+    ) -> RefitState | None:
         """Write this tree for primitives that have moved to ``memory``; ``before`` is the buffer of the present tree.
 
         Returns None, with undefined content of ``memory``, if the numbers of primitives differ, if a primitive without area in
         the build has one now, if no primitive has an area, or if the cost has grown by more than :data:`REBUILD_THRESHOLD`.
         """
-        if geometry.counts != self.counts or self._is_more(geometry):
+        if geometry.counts != self.counts or self._gains_area(geometry):
             return None
         codes, triangles = before.view(np.int32), self.counts[0]
-        corner, rows, _ = (x.numpy() for x in others.tensors)
-        tables = (triangles, triangles + self.counts[1], corner, rows, others.boxes)
+        corner, rows, _ = (x.numpy() for x in non_triangles.tensors)
+        tables = (triangles, triangles + self.counts[1], corner, rows, non_triangles.boxes)
         args = (before, codes, self.line, self.nodes, *corners(geometry), *tables)
         work, moved = refit(*args, memory, memory.view(np.int32))
         found = copy.copy(self)
-        found.built = work if self.built is None else self.built
-        found.sah_ratio = moved / found.built
+        found.built_cost = work if self.built_cost is None else self.built_cost
+        found.sah_ratio = moved / found.built_cost
         return found if found.sah_ratio <= REBUILD_THRESHOLD else None  # NaN if no primitive has an area
 
-    def _is_more(self, geometry: Geometry) -> bool:
-        if not len(self.left_out):
+    def _gains_area(self, geometry: Geometry) -> bool:
+        if not len(self.without_area):
             return False
-        some = select_primitives(geometry, torch.from_numpy(self.left_out).long())
-        _, _, ids, others = primitive_tables(some)
-        return len(ids) > 0 or bool(others.area.any())
+        some = select_primitives(geometry, torch.from_numpy(self.without_area).long())
+        _, _, ids, non_triangles = primitive_tables(some)
+        return len(ids) > 0 or bool(non_triangles.area.any())
 
 
 # ---- The search
@@ -270,17 +272,17 @@ class WideBvh(Accel):
     def __init__(self, geometry: Geometry, threads: int | None = None) -> None:
         start = time.perf_counter()
         self.threads = threads
-        tree, planes, others = mesh_tree(geometry)
+        tree, planes, non_triangles = mesh_tree(geometry)
         self.counts, self.depth, self.sah_cost = geometry.counts, tree.depth, tree.cost
         self.nodes, self.leaves = tree.nodes, tree.leaves
         self.refit_state, self.copied = RefitState(tree, geometry), geometry.copies is not None
         memory = aligned_buffer(line_count(tree, geometry.counts) * LINE)
-        write_tree(tree, geometry, planes, others, 0, memory)
-        self._take(memory, others, start)
+        write_tree(tree, geometry, planes, non_triangles, 0, memory)
+        self._take(memory, non_triangles, start)
 
-    def _take(self, memory: np.ndarray, others: NonTriangles, start: float) -> None:
+    def _take(self, memory: np.ndarray, non_triangles: NonTriangles, start: float) -> None:
         kinds = torch.tensor([*(sum(self.counts[:k]) for k in range(1, 5)), stack_size(self.depth)], dtype=torch.int64)
-        self.tensors = [torch.from_numpy(memory), *others.tensors, kinds]
+        self.tensors = [torch.from_numpy(memory), *non_triangles.tensors, kinds]
         self.arrays = _arrays(self.tensors)
         self.build_seconds = time.perf_counter() - start
 
@@ -289,13 +291,13 @@ class WideBvh(Accel):
         start = time.perf_counter()
         if (geometry.copies is not None) != self.copied:
             return None
-        others, memory = NonTriangles(geometry), aligned_buffer(len(self.arrays[0]))
-        refit_state = self.refit_state.refit(geometry, others, self.arrays[0], memory)
+        non_triangles, memory = NonTriangles(geometry), aligned_buffer(len(self.arrays[0]))
+        refit_state = self.refit_state.refit(geometry, non_triangles, self.arrays[0], memory)
         if refit_state is None:
             return None
         tree = copy.copy(self)
         tree.threads, tree.refit_state = threads, refit_state
-        tree._take(memory, others, start)
+        tree._take(memory, non_triangles, start)
         return tree
 
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
@@ -316,14 +318,14 @@ class WideBvh(Accel):
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
-        compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
+        ensure_compiled(kernels.nearest, 0, 0, *args)(0, count, *args)
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
     ) -> None:
         """See :meth:`Accel.blocked`."""
         args = (o, d, t_max, *self.arrays, _ALL_OPAQUE if non_opaque is None else non_opaque, out)
-        compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
+        ensure_compiled(kernels.blocked, 0, 0, *args)(0, count, *args)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`.

@@ -726,21 +726,21 @@ def primitive_tables(geometry: Geometry) -> tuple[Floats, Floats, Ints, NonTrian
 
 def mesh_tree(geometry: Geometry) -> tuple[WideTree, Floats, NonTriangles]:
     """Build the tree of a geometry; return it with the planes ``(T, 4)`` of its triangles and its other primitives."""
-    planes, boxes, ids, others = primitive_tables(geometry)
-    if others.area.size:
-        keep = np.flatnonzero(others.area)
-        boxes = np.concatenate([boxes, others.boxes[keep]])
+    planes, boxes, ids, non_triangles = primitive_tables(geometry)
+    if non_triangles.area.size:
+        keep = np.flatnonzero(non_triangles.area)
+        boxes = np.concatenate([boxes, non_triangles.boxes[keep]])
         ids = np.concatenate([ids, (keep + geometry.counts[0]).astype(np.int32)])
-    return wide_tree(boxes, ids, geometry.counts), planes, others
+    return wide_tree(boxes, ids, geometry.counts), planes, non_triangles
 
 
 def write_tree(
-    tree: WideTree, geometry: Geometry, planes: Floats, others: NonTriangles, line: int, memory: Floats
+    tree: WideTree, geometry: Geometry, planes: Floats, non_triangles: NonTriangles, line: int, memory: Floats
 ) -> None:
     """Write a tree to ``memory`` from a line on."""
     codes, triangles = memory.view(np.int32), geometry.counts[0]
     disk = triangles + geometry.counts[1]
-    tables = (planes, others.tensors[0].numpy(), others.tensors[1].numpy())
+    tables = (planes, non_triangles.tensors[0].numpy(), non_triangles.tensors[1].numpy())
     lay_out(tree.boxes, tree.child, tree.ids, *corners(geometry), *tables, triangles, disk, line, memory, codes)
 
 

@@ -12,7 +12,7 @@ from numba import prange
 from torch import Tensor
 
 from torchpt.core.threads import thread_count
-from torchpt.native.jit import compiled, jit, jit_internal, launch
+from torchpt.native.jit import ensure_compiled, jit, jit_internal, launch
 from torchpt.native.simd import item, pointer, put, splat
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Array, Hits, mark_non_opaque
@@ -106,9 +106,30 @@ def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
 
 @jit_internal(inline="always")
 def _search(
-    first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v, any_hit
+    first,
+    last,
+    o,
+    d,
+    t_max,
+    upper,
+    upper_codes,
+    lower,
+    lower_codes,
+    table,
+    shift,
+    roots,
+    stack_length,
+    t,
+    prim,
+    u,
+    v,
+    any_hit,
 ):
-    keys, parents, scratch = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(SCRATCH, np.float32)
+    keys, parents, scratch = (
+        np.empty(stack_length, np.int32),
+        np.empty(stack_length, np.int32),
+        np.empty(SCRATCH, np.float32),
+    )
     none = np.empty(1, np.uint8)
     work = (pointer(keys), pointer(parents), pointer(scratch))
     above, below = (
@@ -133,7 +154,9 @@ def _search(
 
 
 @jit()
-def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v):
+def nearest(
+    first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, t, prim, u, v
+):
     """Update the hits of rays ``first <= i < last`` by nearer hits with instances.
 
     Args:
@@ -149,7 +172,7 @@ def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, ta
         table: ``(I, 12)`` float64 transforms from the world to the meshes.
         shift: ``(I,)`` int32, added to a triangle's number in its mesh to get its id in the instance.
         roots: ``(I,)`` int64 codes of the meshes' roots.
-        room: size of the stack.
+        stack_length: size of the stack.
         t: nearest hits so far, inf for none; updated.
         prim: their primitives, -1 for none; updated.
         u: updated likewise.
@@ -168,7 +191,7 @@ def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, ta
         table,
         shift,
         roots,
-        room,
+        stack_length,
         t,
         prim,
         u,
@@ -179,35 +202,53 @@ def nearest(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, ta
 
 @jit(parallel=True)
 def nearest_parallel(
-    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v
+    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, t, prim, u, v
 ):
     """Run :func:`nearest` on several threads, over equal pieces of the rays."""
     pieces = chunks * PIECES
     for c in prange(chunks):
         for k in range(c, pieces, chunks):
             a, b = k * items // pieces, (k + 1) * items // pieces
-            nearest(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, t, prim, u, v)
+            nearest(
+                a,
+                b,
+                o,
+                d,
+                t_max,
+                upper,
+                upper_codes,
+                lower,
+                lower_codes,
+                table,
+                shift,
+                roots,
+                stack_length,
+                t,
+                prim,
+                u,
+                v,
+            )
 
 
 @jit()
-def blocked(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out):
+def blocked(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out):
     """Write 1 to ``out (N,)`` for rays that hit an instance; rays that have 1 already are skipped."""
     _search(
-        first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room,
+        first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length,
         t_max, out, t_max, t_max, True,
     )  # fmt: skip
 
 
 @jit(parallel=True)
 def blocked_parallel(
-    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out
+    chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out
 ):
     """Run :func:`blocked` on several threads, over equal pieces of the rays."""
     pieces = chunks * PIECES
     for c in prange(chunks):
         for k in range(c, pieces, chunks):
             a, b = k * items // pieces, (k + 1) * items // pieces
-            blocked(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, room, out)
+            blocked(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out)
 
 
 # ---- The search
@@ -293,7 +334,7 @@ class InstancedWideBvh(Accel):
         """See :meth:`Accel.nearest`."""
         self.base.nearest(o, d, t_max, count, t, prim, u, v)
         args = (o, d, t_max, *self.arrays, t, prim, u, v)
-        compiled(nearest, 0, 0, *args)(0, count, *args)
+        ensure_compiled(nearest, 0, 0, *args)(0, count, *args)
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
@@ -301,7 +342,7 @@ class InstancedWideBvh(Accel):
         """See :meth:`Accel.blocked`; with ``non_opaque`` every ray that hits anything gets 2."""
         self.base.blocked(o, d, t_max, count, out)
         args = (o, d, t_max, *self.arrays, out)
-        compiled(blocked, 0, 0, *args)(0, count, *args)
+        ensure_compiled(blocked, 0, 0, *args)(0, count, *args)
         mark_non_opaque(out[:count], non_opaque)
 
     def describe(self) -> dict[str, Any]:
@@ -331,7 +372,7 @@ def _meshes(meshes: list[Geometry]) -> tuple[list[WideTree], list[RefitState], n
     lines = [line_count(tree, mesh.counts) for (tree, _, _), mesh in zip(built, meshes, strict=True)]
     lines = np.cumsum([0, *lines]).tolist()
     memory = aligned_buffer(lines[-1] * LINE)
-    for (tree, planes, others), mesh, line in zip(built, meshes, lines[:-1], strict=True):
-        write_tree(tree, mesh, planes, others, line, memory)
+    for (tree, planes, non_triangles), mesh, line in zip(built, meshes, lines[:-1], strict=True):
+        write_tree(tree, mesh, planes, non_triangles, line, memory)
     trees = [tree for tree, _, _ in built]
     return trees, [RefitState(*args) for args in zip(trees, meshes, lines[:-1], strict=True)], memory

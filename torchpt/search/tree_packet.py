@@ -211,16 +211,17 @@ def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
 
 
 @jit_internal(forceinline=True)
-def trace_interleaved(count, scene, room, rows, ids, work, any_hit):
+def trace_interleaved(count, scene, stack_length, rows, ids, work, any_hit):
     """Find the nearest hits of the rays in the first ``count`` columns, or any hits.
 
     Args:
         count: number of columns.
         scene: the tree as float32 and as int32, tables of other primitives, first ids of their kinds.
-        room: stack size of a ray.
+        stack_length: stack size of a ray.
         rows: rows of float32, see the constants above.
         ids: rows of int32, likewise.
-        work: memory: keys and parents of the stacks (``RAYS_IN_FLIGHT * room`` int32), ``STATE`` int64, ``SCRATCH`` float32.
+        work: memory: keys and parents of the stacks (``RAYS_IN_FLIGHT * stack_length`` int32), ``STATE`` int64, ``SCRATCH``
+            float32.
         any_hit: stop at the first opaque hit.
     """
     tree, codes = scene[0], scene[1]
@@ -238,7 +239,7 @@ def trace_interleaved(count, scene, room, rows, ids, work, any_hit):
     flying = live
     while live > 0:
         for r in range(flying):
-            s, bottom = r * _ROW, r * room
+            s, bottom = r * _ROW, r * stack_length
             top = bottom + item(slots, s + _TOP)
             if top < bottom:
                 continue
@@ -547,7 +548,7 @@ PIECES = 8
 
 
 @jit_internal(inline="always")
-def _trace(first, last, rays, scene, room, groups, columns, work, spare, out, any_hit):
+def _trace(first, last, rays, scene, stack_length, groups, columns, work, spare, out, any_hit):
     """Trace rays ``first`` to ``last``; their number is a multiple of 16."""
     rows, ids = columns
     i, count = first, np.int64(0)
@@ -561,7 +562,7 @@ def _trace(first, last, rays, scene, room, groups, columns, work, spare, out, an
             count += 16
         i += 16
         if count == COLUMNS or (i >= last and count > 0):
-            trace_interleaved(count, scene, room, rows, ids, work, any_hit)
+            trace_interleaved(count, scene, stack_length, rows, ids, work, any_hit)
             for k in range(count >> 4):
                 best, u, v = load(rows, BEST + 16 * k, 16), load(rows, U + 16 * k, 16), load(rows, V + 16 * k, 16)
                 store_hits(item(groups, k), out, best, load(ids, RAY_IDS + 16 * k, 16), u, v, any_hit)
@@ -576,8 +577,8 @@ def _none():
 @jit_internal(inline="always")
 def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, t, prim, u, v, any_hit):
     """Allocate memory and run :func:`_trace`; a remainder of fewer than 16 rays is padded in separate memory."""
-    room = kinds[4]
-    keys, parents = np.empty(RAYS_IN_FLIGHT * room, np.int32), np.empty(RAYS_IN_FLIGHT * room, np.int32)
+    stack_length = kinds[4]
+    keys, parents = np.empty(RAYS_IN_FLIGHT * stack_length, np.int32), np.empty(RAYS_IN_FLIGHT * stack_length, np.int32)
     slots, scratch, groups = np.empty(STATE, np.int64), np.empty(SCRATCH, np.float32), np.empty(COLUMNS >> 4, np.int64)
     columns, numbers = np.empty(FLOATS, np.float32), np.empty(NUMBERS, np.int32)
     lanes, kept = np.empty(SPARE, np.float32), np.empty(RAYS, np.int32)
@@ -600,7 +601,7 @@ def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
     for k in range(2):  # a single call, which is inlined and compiled once
         rays, out = (given, found) if k == 0 else (given_edge, found_edge)
         start, stop = (first, end) if k == 0 else (0, RAYS if end < last else 0)
-        _trace(start, stop, rays, scene, room, pointer(groups), held, work, spare, out, any_hit)
+        _trace(start, stop, rays, scene, stack_length, pointer(groups), held, work, spare, out, any_hit)
     for j in range(last - end):
         prim[end + j] = number[j]
         if not any_hit:
