@@ -22,9 +22,10 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and
 _SCRIPT = """
 import torch
 from torchpt.compiler import cpu
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 x = torch.arange(4.0)
-found = [lanewise(lambda x: [x * 2 + 1], [x])(x)[0].tolist(), lanewise(lambda x: [x.exp() > 3], [x])(x)[0].tolist()]
+functions = (lambda x: [x * 2 + 1]), (lambda x: [x.exp() > 3])
+found = [compile_lanewise(function, [x])(x)[0].tolist() for function in functions]
 assert found == [[1, 3, 5, 7], [False, False, True, True]], found
 print(*cpu.counts())
 """
