@@ -261,10 +261,10 @@ def _gather(block: Block, ty: str, index: str, extra: tuple[int, int, int]) -> s
     return _from_memory(block, ty, block.gather(element, pointer, index, invariant=True))
 
 
-def _from_memory(block: Block, ty: str, held: str) -> str:
+def _from_memory(block: Block, ty: str, stored: str) -> str:
     if ty == "b":
-        return block.op(f"icmp ne {block.each('i32')} {held}, zeroinitializer")
-    return block.convert("sext", "i", "L", held) if ty == "L" else held
+        return block.op(f"icmp ne {block.each('i32')} {stored}, zeroinitializer")
+    return block.convert("sext", "i", "L", stored) if ty == "L" else stored
 
 
 def _scalar(block: Block, ty: str, pointer: str, place: int) -> str:
@@ -317,10 +317,10 @@ def _arena(block: LoopBody, ty: str, extra: int) -> str:
     """Load a row of the arena at the lane's index."""
     element = MEMORY[ty]
     if block.listed:
-        held = block.gather(element, f"%row{extra}", "%place")
+        stored = block.gather(element, f"%row{extra}", "%place")
     else:
-        held = block.op(f"load {block.each(element)}, ptr {block.at(f'%row{extra}', element, '%i')}, align 4")
-    return _from_memory(block, ty, held)
+        stored = block.op(f"load {block.each(element)}, ptr {block.at(f'%row{extra}', element, '%i')}, align 4")
+    return _from_memory(block, ty, stored)
 
 
 def _slot(block: Block, ty: str, place: str, extra: int) -> str:
@@ -336,12 +336,12 @@ def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
     element = {"l": "i64", "L": "i64", "b": "i8", "u": "i8"}.get(ty, ELEMENTS[ty])
     size = {"i64": 8, "double": 8, "i8": 1}.get(element, 4)
     row = block.at(f"%in{slot}", "i8", block.op(f"mul i64 %in{slot}s, {k * size}")) if k else f"%in{slot}"
-    held = block.masked_load(element, block.at(row, element, "%i"), "%mask")
+    stored = block.masked_load(element, block.at(row, element, "%i"), "%mask")
     if element == "i64":
-        return held if ty == "L" else block.op(f"trunc {block.each('i64')} {held} to {block.each('i32')}")
+        return stored if ty == "L" else block.op(f"trunc {block.each('i64')} {stored} to {block.each('i32')}")
     if ty == "b":
-        return block.op(f"icmp ne {block.each('i8')} {held}, zeroinitializer")
-    return block.op(f"zext {block.each('i8')} {held} to {block.each('i32')}") if ty == "u" else held
+        return block.op(f"icmp ne {block.each('i8')} {stored}, zeroinitializer")
+    return block.op(f"zext {block.each('i8')} {stored} to {block.each('i32')}") if ty == "u" else stored
 
 
 _HANDLERS: dict[str, Callable[..., str]] = {

@@ -77,7 +77,7 @@ class SinkWriter(ABC):
     def _masked(self, mask: int) -> str:
         return self.block.op(f"and {self.block.each('i1')} {self.names[mask]}, %mask")
 
-    def _held(self, node: int) -> tuple[str, str]:
+    def _stored_value(self, node: int) -> tuple[str, str]:
         """Return type and name of a node's value in the 32 bits that the arena holds it in."""
         ty, name, block = self.graph.type(node), self.names[node], self.block
         if ty == "d":
@@ -96,9 +96,9 @@ class SinkWriter(ABC):
     def _scatter(self, scatter: Scatter) -> None:
         block = self.block
         mask = "%mask" if scatter.mask < 0 else self._masked(scatter.mask)
-        place = self._held(scatter.place)[1]
+        place = self._stored_value(scatter.place)[1]
         for row, node in scatter.rows:
-            element, value = self._held(node)
+            element, value = self._stored_value(node)
             if scatter.slots:
                 start = block.at("%slots", element, block.op(f"mul i64 %stride, {row}")) if row else "%slots"
             else:
@@ -149,7 +149,7 @@ class _VectorSinks(SinkWriter):
 
     def _write(self, place: str) -> None:
         for row, node in self.sinks.write:
-            element, value = self._held(node)
+            element, value = self._stored_value(node)
             self._put(element, value, self._row(row, element, place))
 
     def _put(self, element: str, value: str, pointer: str) -> None:
@@ -159,7 +159,7 @@ class _VectorSinks(SinkWriter):
         block, mask = self.block, self._masked(compact.mask)
         start = self._counters[compact.counter]
         for row, node in compact.rows:
-            element, value = self._held(node)
+            element, value = self._stored_value(node)
             self._put(element, block.compress(element, value, mask), self._row(row, element, start))
         if compact.appends:
             places = self.block.places(start)
@@ -209,9 +209,9 @@ class _LaneSinks(SinkWriter):
         self._put(self.sinks.write, place, "%mask")
 
     def _put(self, rows: Sequence[tuple[int, int]], place: str, mask: str) -> None:
-        held = [(row, *self._held(node)) for row, node in rows]
+        stored = [(row, *self._stored_value(node)) for row, node in rows]
         with self.block.when(mask):
-            for row, element, value in held:
+            for row, element, value in stored:
                 self.block.do(f"store {element} {value}, ptr {self._row(row, element, place)}")
 
     def _compact(self, compact: Compact) -> None:

@@ -91,12 +91,12 @@ def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
                 if copy < 0:
                     continue
                 at, along = _moved(table, copy, o, d)
-                had = prim
+                previous = prim
                 best, prim, a, b = trace_single(
                     lower, item(roots, copy), at, along, best, prim, item(shift, copy),
                     keys, parents, top, scratch, any_hit,
                 )  # fmt: skip
-                if prim != had:
+                if prim != previous:
                     u, v = a, b
             if any_hit and prim != first:
                 break

@@ -181,20 +181,22 @@ def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
     met = crossed_triangles(tree, base, axes[0], axes[1], axes[2], splat(px, 8), splat(py, 8), splat(pz, 8), sx, sy)
     if bits(met[0]) == 0 and not mixed:
         return False
-    best, had = item(rows, BEST + c), item(ids, RAY_IDS + c)
+    best, previous = item(rows, BEST + c), item(ids, RAY_IDS + c)
     floor = as_float(key & -8) * FLOOR
     o, d, shear = _scalars(rows, ORIGIN + c), _scalars(rows, DIRECTION + c), _scalars(rows, SHEAR + c)
     if any_hit:
         q = (
-            occluding_triangle(scene, base, met, shear[2], o, d, floor, best, had, np.int32(0))
+            occluding_triangle(scene, base, met, shear[2], o, d, floor, best, previous, np.int32(0))
             if bits(met[0]) != 0
-            else had
+            else previous
         )
         if mixed and q < 0:
             _, q, _, _ = intersect_others(scene, code, base, o, d, axes, shear, floor, best, q, scratch, any_hit)
         put(ids, RAY_IDS + c, q)
         return q >= 0
-    best, q, lane = nearest_triangle(tree, codes, base, met, shear[2], o, d, floor, best, had, np.int32(0), scratch)
+    best, q, lane = nearest_triangle(
+        tree, codes, base, met, shear[2], o, d, floor, best, previous, np.int32(0), scratch
+    )
     if lane >= 0:
         put(rows, U + c, item(scratch, 8 + lane))
         put(rows, V + c, item(scratch, 16 + lane))
@@ -204,7 +206,7 @@ def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
         if q != before:
             put(rows, U + c, a)
             put(rows, V + c, b)
-    if q != had:
+    if q != previous:
         put(rows, BEST + c, best)
         put(ids, RAY_IDS + c, q)
     return False
@@ -431,18 +433,18 @@ def _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_h
     while left != 0:
         j = trailing_zeros(left)
         left &= left - 1
-        had = item(ids, j)
+        previous = item(ids, j)
         near, q, a, b = intersect_others(
             scene, code | 2, base,
             (item(spare, j), item(spare, 16 + j), item(spare, 32 + j)),
             (item(spare, 48 + j), item(spare, 64 + j), item(spare, 80 + j)),
-            (0, 1, 2), (_ZERO, _ZERO, _ZERO), item(spare, 96 + j), item(spare, 112 + j), had, scratch, any_hit,
+            (0, 1, 2), (_ZERO, _ZERO, _ZERO), item(spare, 96 + j), item(spare, 112 + j), previous, scratch, any_hit,
         )  # fmt: skip
         if any_hit:
             put(ids, j, q)
             if q >= 0:
                 put(spare, 112 + j, np.float32(-1.0))
-        elif q != had:
+        elif q != previous:
             put(ids, j, q)
             put(spare, 112 + j, near)
             put(spare, 128 + j, a)
@@ -585,7 +587,7 @@ def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
     tables = (pointer(corner), pointer(rows), pointer(quadrics))
     scene = (pointer(tree), pointer(codes), tables, pointer(kinds), pointer(non_opaque), len(non_opaque))
     work = (pointer(keys), pointer(parents), pointer(slots), pointer(scratch))
-    held = (pointer(columns), pointer(numbers))
+    ray_rows = (pointer(columns), pointer(numbers))
     spare = (pointer(lanes), pointer(kept), pointer(scratch))
     given = (pointer(o), pointer(d), pointer(t_max), d.shape[1])
     found = (pointer(t), pointer(prim), pointer(u), pointer(v))
@@ -601,7 +603,7 @@ def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
     for k in range(2):  # a single call, which is inlined and compiled once
         rays, out = (given, found) if k == 0 else (given_edge, found_edge)
         start, stop = (first, end) if k == 0 else (0, RAYS if end < last else 0)
-        _trace(start, stop, rays, scene, stack_length, pointer(groups), held, work, spare, out, any_hit)
+        _trace(start, stop, rays, scene, stack_length, pointer(groups), ray_rows, work, spare, out, any_hit)
     for j in range(last - end):
         prim[end + j] = number[j]
         if not any_hit:
