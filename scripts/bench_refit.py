@@ -2,8 +2,8 @@
 
 Run: ``python scripts/bench_refit.py [--rounds 5] [--json file]``; ``$TORCHPT_ASSETS/bunny.ply`` must be there. One thread, by
 its CPU time. Of each way of moving the bunny's vertices a line tells how often its tree's cost has multiplied since it was
-built (what ``torchpt.search.tree.REBUILD_THRESHOLD`` bounds), what it costs beside a tree built anew, and how much longer searches
-take than there.
+built (what ``torchpt.search.tree.REBUILD_THRESHOLD`` bounds), what it costs beside a tree built anew, and how much longer
+searches take than there.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bench_accel import bumpy_sphere
 from bench_search import built, bunny, camera, contenders, extent, measure, ray_sets
 
 from torchpt.physics.shapes.geometry import Geometry
-from torchpt.search import tree as refit_state
+from torchpt.search import tree as wide
 from torchpt.search.tree import WideBvh
 
 
@@ -97,7 +97,7 @@ def slowdown(rounds: int, rows: list[dict[str, Any]]) -> None:
         for amount in amounts:
             g = moved(first, how, amount)
             old, new = refit(accel, g), WideBvh(g, 1)
-            work, least = (x.refit_state.sah_ratio * (x.refit_state.built or 1.0) for x in (old, refit(new, g)))
+            work, least = (x.refit_state.sah_ratio * (x.refit_state.built_cost or 1.0) for x in (old, refit(new, g)))
             sah_ratio = old.refit_state.sah_ratio
             row: dict[str, Any] = {"move": name, "amount": amount, "sah_ratio": sah_ratio, "beside": work / least}
             _, centre, size = extent(g)
@@ -121,7 +121,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    refit_state.REBUILD_THRESHOLD = float("inf")
+    wide.REBUILD_THRESHOLD = float("inf")
     rows: list[dict[str, Any]] = []
     seconds(args.rounds, rows)
     slowdown(args.rounds, rows)

@@ -22,9 +22,10 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners and
 _SCRIPT = """
 import torch
 from torchpt.compiler import cpu
-from torchpt.compiler.function import lanewise
+from torchpt.compiler.function import compile_lanewise
 x = torch.arange(4.0)
-found = [lanewise(lambda x: [x * 2 + 1], [x])(x)[0].tolist(), lanewise(lambda x: [x.exp() > 3], [x])(x)[0].tolist()]
+functions = (lambda x: [x * 2 + 1]), (lambda x: [x.exp() > 3])
+found = [compile_lanewise(function, [x])(x)[0].tolist() for function in functions]
 assert found == [[1, 3, 5, 7], [False, False, True, True]], found
 print(*cpu.counts())
 """
@@ -91,18 +92,18 @@ def test_two_processes_at_once(tmp_path):
 
 
 def test_within_a_process_a_kernel_is_made_once(here):
-    first = cpu.compiled(ir())
-    assert cpu.compiled(ir()) is first and cpu.counts() == (1, 0)
+    first = cpu.compile_ir(ir())
+    assert cpu.compile_ir(ir()) is first and cpu.counts() == (1, 0)
     again()
-    assert cpu.compiled(ir()).code == first.code and cpu.counts() == (1, 1)
-    cpu.compiled(ir(1))
+    assert cpu.compile_ir(ir()).code == first.code and cpu.counts() == (1, 1)
+    cpu.compile_ir(ir(1))
     assert cpu.counts() == (2, 1)
 
 
 def test_targets_have_entries_of_their_own(here):
-    cpu.compiled(ir(), cpu.Target("generic", ""))
-    cpu.compiled(ir())
-    cpu.compiled(ir(), one_lane())  # another form
+    cpu.compile_ir(ir(), cpu.Target("generic", ""))
+    cpu.compile_ir(ir())
+    cpu.compile_ir(ir(), one_lane())  # another form
     assert cpu.counts() == (3, 0) and len(entries(here)) == 3
 
 
@@ -115,9 +116,9 @@ def test_forms_have_programs_of_their_own(monkeypatch):
 def test_switched_off(here, monkeypatch):
     monkeypatch.setenv("TORCHPT_CACHE", "")
     assert cache.cache_folder() is None
-    cpu.compiled(ir())
+    cpu.compile_ir(ir())
     again()
-    cpu.compiled(ir())
+    cpu.compile_ir(ir())
     assert cpu.counts() == (2, 0) and not here.exists()
 
 
@@ -126,7 +127,7 @@ def test_folder_that_others_may_enter(here, mode):
     here.mkdir()
     here.chmod(mode)
     assert cache.cache_folder() is None
-    cpu.compiled(ir())
+    cpu.compile_ir(ir())
     assert cpu.counts() == (1, 0) and not entries(here)
 
 
@@ -136,18 +137,18 @@ def test_no_folder_can_be_made(here, tmp_path, monkeypatch):
         monkeypatch.setenv("TORCHPT_CACHE", str(place))
         again()
         assert cache.cache_folder() is None
-        cpu.compiled(ir())
+        cpu.compile_ir(ir())
     assert cpu.counts() == (2, 0)
 
 
 def test_folder_that_cannot_be_written(here):
-    cpu.compiled(ir())
+    cpu.compile_ir(ir())
     again()
     here.chmod(0o500)
     try:
-        cpu.compiled(ir())
+        cpu.compile_ir(ir())
         assert cpu.counts() == (1, 1)  # what is there is used
-        cpu.compiled(ir(1))
+        cpu.compile_ir(ir(1))
         assert cpu.counts() == (2, 1)  # and what is not is compiled
     finally:
         here.chmod(0o700)
@@ -158,13 +159,13 @@ def test_disk_full(here, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
-    cpu.compiled(ir())
+    cpu.compile_ir(ir())
     assert cpu.counts() == (1, 0) and not list(here.iterdir())  # the temporary file is gone
 
 
 @pytest.mark.parametrize("what", ["flipped", "truncated", "empty", "another's", "folder", "writable", "link", "pipe"])
 def test_damaged_entries_are_made_again(here, what):
-    code = cpu.compiled(ir()).code
+    code = cpu.compile_ir(ir()).code
     (path,) = entries(here)
     content = path.read_bytes()
     if what == "flipped":
@@ -174,7 +175,7 @@ def test_damaged_entries_are_made_again(here, what):
     elif what == "empty":
         path.write_bytes(b"")
     elif what == "another's":  # a sound entry under another's name
-        cpu.compiled(ir(1))
+        cpu.compile_ir(ir(1))
         path.write_bytes(next(other for other in entries(here) if other != path).read_bytes())
     elif what == "folder":
         path.unlink()
@@ -189,7 +190,7 @@ def test_damaged_entries_are_made_again(here, what):
         path.symlink_to(here / "elsewhere")
     again()
     compiled, loaded = cpu.counts()
-    assert cpu.compiled(ir()).code == code
+    assert cpu.compile_ir(ir()).code == code
     assert cpu.counts() == (compiled + 1, loaded)
     if what != "folder":
         assert path.read_bytes() == content and not path.is_symlink() and stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -198,7 +199,7 @@ def test_damaged_entries_are_made_again(here, what):
 @pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can give files away")
 @pytest.mark.parametrize("what", ["folder", "entry", "link"])
 def test_owner(here, tmp_path, what):
-    cpu.compiled(ir())
+    cpu.compile_ir(ir())
     (path,) = entries(here)
     again()
     if what == "link":
@@ -209,7 +210,7 @@ def test_owner(here, tmp_path, what):
     else:
         os.chown(here if what == "folder" else path, 12345, 12345)
     assert (cache.cache_folder() is None) == (what != "entry")
-    cpu.compiled(ir())
+    cpu.compile_ir(ir())
     assert cpu.counts() == (2, 0)
 
 
@@ -228,7 +229,7 @@ def test_places(tmp_path, monkeypatch):
 
 def test_an_error_of_llvm_is_not_kept(here):
     with pytest.raises(RuntimeError, match="parsing"):
-        cpu.compiled("define void @kernel(")
+        cpu.compile_ir("define void @kernel(")
     assert cpu.counts() == (0, 0) and not entries(here)
 
 

@@ -45,13 +45,13 @@ def tables(rows: int = 5, degree: int = 2) -> Curve:
 @pytest.fixture
 def traced(monkeypatch) -> list[int]:
     """Count how often a stage was compiled."""
-    made, compiled = [0], cache.compiled
+    made, compiled = [0], cache.compile_stage
 
     def counting(*args: Any) -> Any:
         made[0] += 1
         return compiled(*args)
 
-    monkeypatch.setattr(cache, "compiled", counting)
+    monkeypatch.setattr(cache, "compile_stage", counting)
     return made
 
 
@@ -153,7 +153,7 @@ def test_what_the_lane_compiler_does_not_know():
     for _ in range(2):
         assert sorting(x) is NotImplemented and counting(x) is NotImplemented
     assert list(sorting.refused.values()) == ["the operator sort"]
-    assert list(counting.refused.values()) == ["lanes that ask for their own number"]
+    assert list(counting.refused.values()) == ["a use of the lane's own number"]
     with pytest.raises(ValueError, match="no parameters y"):
         Lanewise(lambda x: x, ("y",))
 
@@ -169,11 +169,11 @@ import torch
 from torchpt.compiler import cache, cpu
 from torchpt.compiler.function import Lanewise
 from torchpt.math.hashing import mix
-traced, kept = [0], cache.compiled
+traced, kept = [0], cache.compile_stage
 def counting(*args):
     traced[0] += 1
     return kept(*args)
-cache.compiled = counting
+cache.compile_stage = counting
 x = torch.arange(1000, dtype=torch.int32)
 assert torch.equal(Lanewise(mix, ("x",))(x), mix(x))
 own = Lanewise(lambda x: x + 1, ("x",))

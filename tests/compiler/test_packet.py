@@ -40,7 +40,7 @@ def searches(accel: Brute, kinds: Sequence[str] | None = None, form: Form = VECT
     stores.append(Store((graph.node("occluded", "b", *ray),), "b"))
     if kinds is None:
         kinds = [kind for kind, count in zip(KINDS, accel.counts, strict=False) if count]
-    made = cpu.compiled(kernel_ir(TracedStage(graph, Sinks(store=stores), tensors=3, searched=tuple(kinds)), form))
+    made = cpu.compile_ir(kernel_ir(TracedStage(graph, Sinks(store=stores), tensors=3, searched=tuple(kinds)), form))
 
     def run(o: Tensor, d: Tensor, t_max: Tensor) -> list[Tensor]:
         n = t_max.shape[0]

@@ -17,7 +17,7 @@ from torchpt.compiler import cpu, function
 from torchpt.compiler.form import VECTORS
 from torchpt.compiler.function import compile_lanewise
 from torchpt.compiler.graph import Graph, Unsupported
-from torchpt.compiler.kernel import text
+from torchpt.compiler.kernel import kernel_ir
 from torchpt.compiler.program import Program, TracedStage, bind_tables, guards_hold, lay_out_table, run_prologue
 from torchpt.compiler.sinks import Sinks, Store
 from torchpt.compiler.tracing import LANES, Tracer, tracing
@@ -35,7 +35,7 @@ def trace(stage: Callable[..., Iterable[Tensor]], *given: Tensor, **tables: Tens
     with torch.no_grad(), tracer:
         results = list(stage(*lanes, **tables))
     stores = [Store(tuple(tracer.nodes(x)), tracer.graph.type(tracer.nodes(x)[0])) for x in results]
-    return tracer, text(TracedStage(tracer.graph, Sinks(store=stores), tracer.tables, tensors=len(given)), VECTORS)
+    return tracer, kernel_ir(TracedStage(tracer.graph, Sinks(store=stores), tracer.tables, tensors=len(given)), VECTORS)
 
 
 REFUSED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
@@ -45,26 +45,26 @@ REFUSED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "product over lanes": ("a sum over lanes", lambda x: (x @ x.T) @ x),
     "other lanes": ("a look-up in other lanes", lambda x: x[:, torch.arange(x.shape[1]) + 1]),
     "gather from lanes": ("a look-up in other lanes", lambda x: torch.gather(x, 1, (x * 0).long())),
-    "rows by lanes": ("a look-up in what depends on lanes", lambda x: x[torch.tensor([0, 2])]),
-    "flip": ("lanes turned around", lambda x: x.flip(1)),
-    "roll": ("lanes rolled", lambda x: x.roll(1, 1)),
-    "one lane": ("one lane taken out", lambda x: x - x[:, 0][:, None]),
-    "part": ("a part of the lanes", lambda x: x[:, 1:]),
-    "joined": ("lanes joined", lambda x: torch.cat([x, x], 1)),
+    "rows by lanes": ("a look-up in a tensor that depends on lanes", lambda x: x[torch.tensor([0, 2])]),
+    "flip": ("a flip of the lanes' axis", lambda x: x.flip(1)),
+    "roll": ("a roll along the lanes' axis", lambda x: x.roll(1, 1)),
+    "one lane": ("the selection of one lane", lambda x: x - x[:, 0][:, None]),
+    "part": ("a slice of the lanes' axis", lambda x: x[:, 1:]),
+    "joined": ("a concatenation along the lanes' axis", lambda x: torch.cat([x, x], 1)),
     "two axes": ("lanes on two axes", lambda x: (x[0][:, None] * x[0]).sum(0)),
     "mixed": ("mixed into shape", lambda x: x.T.reshape(3, -1)),
     "flattened": ("along its lanes' axis", lambda x: x.reshape(-1)),
     "transposed": ("last axis is not the lanes'", lambda x: x.T),
-    "mask": ("a look-up by truth values", lambda x: x[:, x[0] > 0]),
-    "item": ("a number of a lane asked for", lambda x: x * torch.ops.aten._local_scalar_dense(x)),
-    "list": ("asked for by Python", lambda x: x * x.tolist()[0][0]),
-    "numpy": ("asked for by Python", lambda x: x * float(x.numpy()[0, 0])),
+    "mask": ("a look-up by a boolean mask", lambda x: x[:, x[0] > 0]),
+    "item": ("a lane's value read", lambda x: x * torch.ops.aten._local_scalar_dense(x)),
+    "list": ("read by Python", lambda x: x * x.tolist()[0][0]),
+    "numpy": ("read by Python", lambda x: x * float(x.numpy()[0, 0])),
     "sort": ("the operator sort", lambda x: x.sort(0)[0]),
     "in place": ("the operator add_", lambda x: x.clone().add_(1)),
     "written": ("the operator copy_", lambda x: torch.zeros_like(x).copy_(x)),
     "random": ("the operator rand_like", lambda x: torch.rand_like(x)),
     "random lanes": ("lanes made by rand", lambda x: x * torch.rand(x.shape[1])),
-    "spaced": ("do not count from 0 by 1", lambda x: x * torch.arange(1, x.shape[1] + 1)),
+    "spaced": ("does not start at 0 with step 1", lambda x: x * torch.arange(1, x.shape[1] + 1)),
     "half": ("torch.float16", lambda x: x.half().float()),
     "decimals": ("aten.round.decimals", lambda x: x.round(decimals=2)),
     "integer power": ("a power of integers", lambda x: x.long() ** x.long().abs()),
@@ -105,7 +105,7 @@ def stage(x: Tensor, table: Tensor, gain: Tensor) -> list[Tensor]:
 
 
 def program(tracer: Tracer, ir: str) -> Program:
-    made = cpu.compiled(ir)
+    made = cpu.compile_ir(ir)
     parts = tuple(tracer.tables), tuple(tracer.steps), tuple(tracer.constants), tuple(tracer.guards)
     return Program(made.call, made.key, *parts, (), 0, 0, 1, 2, 0, {})
 

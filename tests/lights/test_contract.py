@@ -291,7 +291,7 @@ def test_power_is_that_of_brute_force(name):
     rows = [*lights.SURFACES, *lights.KINDS]
     own = int(rows.index(name) > rows.index(known))
     assert len(choice.pmf) == 2
-    share = (float(choice.pmf[own]) - 0.005) / 0.99  # a hundredth is even, see Discrete
+    share = (float(choice.pmf[own]) - 0.005) / 0.99  # a hundredth is even, see Distribution1D
     power = 36 * math.pi * share / (1 - share)
     error = float(flux.std()) / math.sqrt(len(flux))
     assert abs(float(flux.mean()) - power) < 4 * error + 2e-3 * power

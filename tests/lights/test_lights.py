@@ -143,7 +143,7 @@ def test_lights_are_chosen_by_power():
     assert table is not None and isinstance(table.choice, Distribution1D)
     areas = table.area
     power = areas * table.radiance[0]
-    expected = 0.99 * power / power.sum() + 0.01 / 3  # a hundredth is even, see Discrete
+    expected = 0.99 * power / power.sum() + 0.01 / 3  # a hundredth is even, see Distribution1D
     torch.testing.assert_close(table.choice.pmf, expected)
     row = table.choice.draw(torch.rand(N, generator=G))[0]
     counts = torch.bincount(row, minlength=3).double()

@@ -20,12 +20,12 @@ KERNEL = '''"""A module."""
 import math
 import numpy as np
 from torchpt.native import simd
-from torchpt.native.jit import jit, part
+from torchpt.native.jit import jit, jit_internal
 
 STEP = 3
 TABLE = np.arange(4.0)
 
-@part()
+@jit_internal()
 def inner(x):
     """Add a step."""
     return x + STEP
@@ -80,7 +80,7 @@ KEYS = {
     "cell": "made(5)",
     "table": "np.arange(4.0)",
     "body": "math.sqrt(4.0)",
-    "options": "@part()",
+    "options": "@jit_internal()",
     "function": "math.sqrt(",
 }
 
@@ -96,7 +96,7 @@ KEYS = {
         ("cell", "made(6)", False),
         ("table", "np.arange(4.0) + 1", False),
         ("body", "math.sqrt(9.0)", False),
-        ("options", "@part(fastmath=True)", False),
+        ("options", "@jit_internal(fastmath=True)", False),
         ("function", "math.exp(", False),
     ],
 )

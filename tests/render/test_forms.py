@@ -36,14 +36,14 @@ SMALL = {"film": {"width": 16, "height": 16}, "threads": 1, "compile": "on"}
 def stages(monkeypatch) -> Iterator[dict[str, TracedStage]]:
     """Stages by the names of their machine code; all that renders ask for is traced."""
     found: dict[str, TracedStage] = {}
-    compiled = cache.compiled
+    compiled = cache.compile_stage
 
     def noted(stage: TracedStage) -> Any:
         program = compiled(stage)
         found[program.code] = stage
         return program
 
-    monkeypatch.setattr(cache, "compiled", noted)
+    monkeypatch.setattr(cache, "compile_stage", noted)
     monkeypatch.setattr(cache, "cache_key", lambda structure: None)
     cache.clear_programs()
     yield found
@@ -95,7 +95,7 @@ class ErrorProbes:
     def _single(self, kernel: Kernel, stage: TracedStage) -> Kernel:
         """The kernel on one lane at a time."""
         if id(kernel) not in self._singles:
-            made = cpu.compiled(kernel_ir(stage, SCALAR), one_lane())
+            made = cpu.compile_ir(kernel_ir(stage, SCALAR), one_lane())
             single = replace(kernel, program=replace(kernel.program, call=made.call, code=made.key))
             self._singles[id(kernel)] = kernel, single  # both live, so that their ids stay their own
         return self._singles[id(kernel)][1]
@@ -109,7 +109,10 @@ def spans(sinks: Sinks, count: int, before: np.ndarray, after: np.ndarray) -> It
     for compact in sinks.compact:
         for row, _ in compact.rows:
             yield 0, row, int(before[compact.counter]), int(after[compact.counter])
-    for append in [*sinks.appends, *(append for compact in sinks.compact for append in compact.appends)]:
+    for append in [
+        *sinks.appends,
+        *(append for compact in sinks.compact for append in compact.appends),
+    ]:
         yield 3 + append.list, 0, int(before[append.counter]), int(after[append.counter])
     for scatter in sinks.scatter:
         for row, _ in () if scatter.slots else scatter.rows:

@@ -96,9 +96,9 @@ def test_bits_do_not_depend_on_the_rays_beside():
 
 
 SCRIPT = """
-from test_bits import KINDS, Wide, check, sphere_mesh, triangles
+from test_bits import KINDS, WideBvh, check, sphere_mesh, triangles
 g = triangles(*sphere_mesh(12))
-accel = Wide(g, 1)
+accel = WideBvh(g, 1)
 for kind in KINDS:
     for sort in (False, True):
         check(g, accel, kind, 20_000, 5, sort)

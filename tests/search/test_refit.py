@@ -18,7 +18,6 @@ from torchpt.physics.shapes.geometry import Geometry
 from torchpt.physics.shapes.kinds.cylinder import Cylinder
 from torchpt.physics.shapes.kinds.sphere import Ellipsoid
 from torchpt.search import build
-from torchpt.search import tree as refit_state
 from torchpt.search import tree as wide
 from torchpt.search.bounds import primitive_bounds
 from torchpt.search.tables import affine_rows
@@ -33,7 +32,7 @@ EMPTY = np.array([np.inf] * 3 + [-np.inf] * 3, np.float32)
 @pytest.fixture
 def whatever_it_costs(monkeypatch):
     """Refits however far things have moved."""
-    monkeypatch.setattr(refit_state, "REBUILD_THRESHOLD", np.inf)
+    monkeypatch.setattr(wide, "REBUILD_THRESHOLD", np.inf)
 
 
 def refitted(before, g) -> WideBvh:

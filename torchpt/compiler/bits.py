@@ -1,4 +1,4 @@
-"""The order of a number's bits turned around: one instruction or a few, where tensor operations take twenty-five."""
+"""Bit reversal as one LLVM intrinsic; in tensor operations it takes twenty-five."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["reverse_bits"]
 
 
 def reverse_bits(x: Tensor) -> Any:
-    """Reverse the 32 bits of int32 lanes that are being traced; NotImplemented for other tensors."""
+    """Reverse the 32 bits of traced int32 lanes; return NotImplemented for tensors that are not traced."""
     tracer = tracer_of(x)
     if tracer is None:
         return NotImplemented
-    out = x.clone()  # a trace asks for what is done, not for what comes out
+    out = x.clone()  # only the graph counts in a trace, not the values
     apply(tracer, out, lambda node: tracer.graph.node("bitreverse", "i", node), x)
     return out

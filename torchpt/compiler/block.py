@@ -1,4 +1,4 @@
-"""Writing LLVM IR as text, in any form: one operation a line, on the numbers of all lanes that a value holds."""
+"""Build LLVM IR text, one instruction a line, for values of one lane or of a vector of lanes."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from torchpt.compiler.form import Form
 
 __all__ = ["ELEMENTS", "Block"]
 
-#: How a node's type is held in a register.
+#: LLVM type of a register, by node type.
 ELEMENTS = {"f": "float", "d": "double", "i": "i32", "l": "i32", "u": "i32", "L": "i64", "b": "i1"}
 _SUFFIX = {"float": "f32", "double": "f64", "i32": "i32", "i64": "i64", "i1": "i1", "i8": "i8"}
 
 
 class Block:
-    """Lines of IR in the body of a function, and the declarations that they need.
+    """A builder for the body of one LLVM function.
 
     Attributes:
-        form: how lanes are held.
-        width: lanes of a value.
-        lines: of the body.
-        declarations: of the functions that it calls.
-        label: of the basic block that lines are added to.
+        form: layout of lanes in registers.
+        width: number of lanes in a value.
+        lines: IR of the body.
+        declarations: ``declare`` lines of the functions that the body calls.
+        label: name of the basic block that lines are appended to.
     """
 
     def __init__(self, form: Form) -> None:
@@ -37,27 +37,27 @@ class Block:
         self._count = 0
 
     def name(self) -> str:
-        """A name for a new value."""
+        """Return a fresh name for a value."""
         self._count += 1
         return f"%v{self._count}"
 
     def op(self, text: str) -> str:
-        """A line that gives a value; returns its name."""
+        """Append an instruction and return the name of its result."""
         name = self.name()
         self.lines.append(f"  {name} = {text}")
         return name
 
     def do(self, text: str) -> None:
-        """A line that gives none."""
+        """Append an instruction without a result."""
         self.lines.append(f"  {text}")
 
     def let(self, name: str, type_: str, value: str) -> None:
-        """Give a value a name of its own."""
+        """Bind a value to a chosen name."""
         self.do(f"%{name} = bitcast {type_} {value} to {type_}")
 
     @contextmanager
     def when(self, condition: str) -> Iterator[None]:
-        """Write lines that run where a condition holds: a branch, so for values of one lane."""
+        """Put the lines written inside the ``with`` behind a branch on a condition (an i1); values must have one lane."""
         assert self.width == 1
         self._count += 1
         then, after = f"then{self._count}", f"after{self._count}"
@@ -72,32 +72,32 @@ class Block:
     # -- types and constants
 
     def each(self, element: str) -> str:
-        """Return LLVM's type of an element for each lane."""
+        """Return the LLVM type of a value with one ``element`` a lane."""
         return f"<{self.width} x {element}>" if self.width > 1 else element
 
     def vector(self, ty: str) -> str:
-        """Return the type of the numbers of a node of type ``ty``."""
+        """Return the LLVM type of a value of node type ``ty``."""
         return self.each(ELEMENTS[ty])
 
     def suffix(self, element: str) -> str:
-        """Return what LLVM's functions have behind their names for :meth:`each`."""
+        """Return the suffix of LLVM's overloaded intrinsics for the type :meth:`each` returns, such as ``v16f32``."""
         return (f"v{self.width}" if self.width > 1 else "") + _SUFFIX[element]
 
     def numbers(self) -> str:
-        """Return 0, 1, 2, ... for the lanes of a value: int32."""
+        """Return the int32 constant 0, 1, 2, ..., one number a lane."""
         return f"<{', '.join(f'i32 {k}' for k in range(self.width))}>" if self.width > 1 else "0"
 
     def places(self, first: str) -> str:
-        """Return consecutive places from an i64 on: int32."""
+        """Return the int32 indices ``first``, ``first + 1``, ..., one a lane; ``first`` is an i64."""
         start = self.splat("i", self.op(f"trunc i64 {first} to i32"))
         return self.op(f"add {self.each('i32')} {start}, {self.numbers()}")
 
     def constant(self, ty: str, value: float | int | bool) -> str:
-        """The same number in all lanes."""
+        """Return a constant that is the same in all lanes."""
         return f"splat ({ELEMENTS[ty]} {scalar(ty, value)})" if self.width > 1 else scalar(ty, value)
 
     def splat(self, ty: str, name: str) -> str:
-        """A scalar in all lanes."""
+        """Broadcast a scalar to all lanes."""
         if self.width == 1:
             return name
         vector = self.vector(ty)
@@ -105,7 +105,7 @@ class Block:
         return self.op(f"shufflevector {vector} {one}, {vector} poison, {self.each('i32')} zeroinitializer")
 
     def some(self, mask: str) -> str:
-        """Return whether a mask holds in any lane: an i1."""
+        """Return an i1: the mask is set in any lane."""
         if self.width == 1:
             return mask
         bits = self.op(f"bitcast {self.each('i1')} {mask} to i{self.width}")
@@ -114,7 +114,7 @@ class Block:
     # -- arithmetic
 
     def call(self, function: str, ty: str, *arguments: str, result: str | None = None) -> str:
-        """An intrinsic on vectors of one type, such as ``llvm.fabs``; the suffix is put behind it."""
+        """Call an intrinsic such as ``llvm.fabs`` on values of type ``ty``; the type suffix is appended to its name."""
         vector = self.vector(ty)
         name = f"{function}.{self.suffix(ELEMENTS[ty])}"
         self.declarations.add(f"declare {result or vector} @{name}({', '.join([vector] * len(arguments))})")
@@ -122,62 +122,62 @@ class Block:
         return self.op(f"call {result or vector} @{name}({given})")
 
     def binary(self, op: str, ty: str, a: str, b: str) -> str:
-        """An instruction of LLVM. No flag allows to fuse or to reorder those on floats."""
+        """Append an LLVM binary instruction, without fast-math flags: LLVM neither fuses nor reorders floats."""
         return self.op(f"{op} {self.vector(ty)} {a}, {b}")
 
     def add(self, ty: str, a: str, b: str) -> str:
-        """``a + b``."""
+        """Add: ``a + b``."""
         return self.binary("fadd" if ty in "fd" else "add", ty, a, b)
 
     def sub(self, ty: str, a: str, b: str) -> str:
-        """``a - b``."""
+        """Subtract: ``a - b``."""
         return self.binary("fsub" if ty in "fd" else "sub", ty, a, b)
 
     def mul(self, ty: str, a: str, b: str) -> str:
-        """``a b``."""
+        """Multiply: ``a b``."""
         return self.binary("fmul" if ty in "fd" else "mul", ty, a, b)
 
     def div(self, ty: str, a: str, b: str) -> str:
-        """``a / b`` of floats."""
+        """Divide floats: ``a / b``."""
         return self.binary("fdiv", ty, a, b)
 
     def fma(self, ty: str, a: str, b: str, c: str) -> str:
-        """``a b + c``, rounded once: an instruction, and on machines that have none a call of the C library."""
+        """Compute ``a b + c`` rounded once: an instruction, or a call of the C library on machines without one."""
         return self.call("llvm.fma", ty, a, b, c)
 
     def negative(self, ty: str, a: str) -> str:
-        """``-a``."""
+        """Negate: ``-a``."""
         if ty in "fd":
             return self.op(f"fneg {self.vector(ty)} {a}")
         return self.op(f"sub {self.vector(ty)} zeroinitializer, {a}")
 
     def compare(self, op: str, ty: str, a: str, b: str) -> str:
-        """``fcmp`` or ``icmp``."""
+        """Compare by ``fcmp`` or ``icmp``; ``op`` is LLVM's predicate."""
         return self.op(f"{'fcmp' if ty in 'fd' else 'icmp'} {op} {self.vector(ty)} {a}, {b}")
 
     def select(self, ty: str, condition: str, a: str, b: str) -> str:
-        """``a`` in lanes where the condition holds, else ``b``."""
+        """Select ``a`` in lanes where the condition holds, else ``b``."""
         vector = self.vector(ty)
         return self.op(f"select {self.each('i1')} {condition}, {vector} {a}, {vector} {b}")
 
     def convert(self, op: str, source: str, target: str, a: str) -> str:
-        """``sitofp``, ``bitcast``, ..."""
+        """Convert between node types by an LLVM cast ``op``: ``sitofp``, ``bitcast``, ..."""
         return self.op(f"{op} {self.vector(source)} {a} to {self.vector(target)}")
 
     def polynomial(self, ty: str, x: str, coefficients: tuple[float, ...]) -> str:
-        """Horner's scheme, the highest power first."""
+        """Evaluate a polynomial by Horner's scheme; coefficients of the highest power first."""
         value = self.constant(ty, coefficients[0])
         for c in coefficients[1:]:
             value = self.fma(ty, value, x, self.constant(ty, c))
         return value
 
     def extreme(self, op: str, ty: str, a: str, b: str) -> str:
-        """``max`` or ``min``; of floats NaN where either is, as torch has it."""
+        """Take the ``max`` or ``min``; for floats NaN if either is NaN, as in torch."""
         if ty not in "fd":
-            sign = "u" if ty == "b" else "s"  # a bit that is set is -1 to signed comparisons
+            sign = "u" if ty == "b" else "s"  # i1 true is -1 in signed comparisons
             return self.select(ty, self.compare(sign + ("gt" if op == "max" else "lt"), ty, a, b), a, b)
         better = "ogt" if op == "max" else "olt"
-        if not b.startswith("%"):  # a constant, no NaN: the other one is kept where it is
+        if not b.startswith("%"):  # a constant is not NaN: a NaN in ``a`` is kept
             return self.select(ty, self.compare(better, ty, b, a), b, a)
         chosen = self.select(ty, self.compare(better, ty, a, b), a, b)
         if not a.startswith("%"):
@@ -187,16 +187,16 @@ class Block:
     # -- memory
 
     def load(self, element: str, pointer: str, invariant: bool = True) -> str:
-        """A scalar; ``invariant``: nothing writes there while the kernel runs."""
+        """Load a scalar; ``invariant`` promises LLVM that nothing writes there while the kernel runs."""
         return self.op(f"load {element}, ptr {pointer}{', !invariant.load !0' if invariant else ''}")
 
     def at(self, pointer: str, element: str, index: str | int) -> str:
-        """The address of an element; ``index`` is a 64-bit number, or a vector's text with its type."""
+        """Return the address of an element; ``index`` is an i64, or a vector (or i32) with its type before it."""
         index = index if isinstance(index, str) and index.startswith(("<", "i32 ")) else f"i64 {index}"
         return self.op(f"getelementptr {element}, ptr {pointer}, {index}")
 
     def gather(self, element: str, pointer: str, index: str, invariant: bool = False) -> str:
-        """Elements at the lanes' indices; ``invariant`` as in :meth:`load`."""
+        """Load an element for each lane at int32 indices; ``invariant`` as in :meth:`load`."""
         if self.width == 1:
             return self.load(element, self.at(pointer, element, f"i32 {index}"), invariant)
         vector, suffix = self.each(element), self.suffix(element)
@@ -210,7 +210,7 @@ class Block:
         )
 
     def scatter(self, element: str, value: str, pointer: str, index: str, mask: str) -> None:
-        """Write elements at the lanes' indices where the mask holds."""
+        """Store an element for each lane at int32 indices where the mask is set."""
         if self.width == 1:
             with self.when(mask):
                 self.do(f"store {element} {value}, ptr {self.at(pointer, element, f'i32 {index}')}")
@@ -222,8 +222,8 @@ class Block:
         self.do(f"call void @{name}({vector} {value}, {self.each('ptr')} {places}, i32 4, {self.each('i1')} {mask})")
 
     def masked_load(self, element: str, pointer: str, mask: str) -> str:
-        """Consecutive elements; zero where the mask does not hold."""
-        if self.width == 1:  # lanes go one by one to the last: the mask holds
+        """Load consecutive elements; 0 where the mask is not set."""
+        if self.width == 1:  # a loop over single lanes ends at the last lane: the mask is set
             return self.load(element, pointer, False)
         vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.masked.load.{suffix}.p0"
@@ -233,7 +233,7 @@ class Block:
         )
 
     def masked_store(self, element: str, value: str, pointer: str, mask: str) -> None:
-        """Consecutive elements where the mask holds."""
+        """Store consecutive elements where the mask is set."""
         if self.width == 1:
             with self.when(mask):
                 self.do(f"store {element} {value}, ptr {pointer}")
@@ -244,14 +244,14 @@ class Block:
         self.do(f"call void @{name}({vector} {value}, ptr {pointer}, i32 1, {self.each('i1')} {mask})")
 
     def compress(self, element: str, value: str, mask: str, rest: str = "poison") -> str:
-        """Return the elements where the mask holds, moved together; ``rest``, of the same type, lies behind them."""
+        """Compress the elements where the mask is set to the front; elements of ``rest`` fill up the vector."""
         vector, suffix = self.each(element), self.suffix(element)
         name = f"llvm.experimental.vector.compress.{suffix}"
         self.declarations.add(f"declare {vector} @{name}({vector}, {self.each('i1')}, {vector})")
         return self.op(f"call {vector} @{name}({vector} {value}, {self.each('i1')} {mask}, {vector} {rest})")
 
     def count(self, mask: str) -> str:
-        """Count the lanes where a mask holds: an i64."""
+        """Count the lanes where a mask is set; return an i64."""
         word = f"i{self.width}"
         self.declarations.add(f"declare {word} @llvm.ctpop.{word}({word})")
         bits = self.op(f"bitcast {self.each('i1')} {mask} to {word}")
@@ -259,7 +259,7 @@ class Block:
 
 
 def scalar(ty: str, value: float | int | bool) -> str:
-    """A number in LLVM's notation."""
+    """Format a number as an LLVM constant."""
     if ty in "fd":
         value = float(value)
         if math.isnan(value):

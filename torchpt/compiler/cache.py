@@ -1,4 +1,4 @@
-"""Programs that are made once: those of this process by structure, and those on disk by content."""
+"""Caches of compiled programs: in memory by the structure of a stage's arguments, on disk by content."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from torchpt.compiler.prologue import Guard, Source, Step, Table
 from torchpt.native import cache
 from torchpt.native.content import code_of_folder
 
-__all__ = ["MOST_PROGRAMS", "cache_key", "clear_programs", "compiled", "load", "program_of", "store"]
+__all__ = ["MOST_PROGRAMS", "cache_key", "clear_programs", "compile_stage", "load", "program_of", "store"]
 
 
-# ---- Programs on disk: what a stage was traced to, so that another process need not trace it again
+# ---- Programs on disk: the result of tracing, so that another process need not trace the stage again
 #
-# An entry says which machine code it belongs to, which tables that reads and by which operators of torch they are made. It is
-# JSON; operators are looked up by name among torch's own, and nothing of it is code.
+# An entry names its machine code, the tables that the code reads and the torch operators that compute these tables. It is
+# JSON without code: operators are looked up by name in torch.ops.aten.
 
 
-#: Largest tensor of a program's own that is written.
+#: Elements of the largest constant of a program that is written to disk.
 _MOST = 1 << 16
-#: Whose classes are told by name: an entry belongs to a version of their code.
+#: Packages whose classes enter a key by name: the key already holds the versions of these packages.
 _LIBRARIES = ("torchpt", "torch", "builtins")
 _PLAIN = ("uniforms", "lists", "counters", "tensors", "results", "shadows", "nodes", "sums")
 
 
 class _NotKept(Exception):
-    """Something that no entry can hold."""
+    """A value that cannot be stored in an entry."""
 
 
 def cache_key(structure: Any) -> str | None:
-    """The name of an entry; None where the structure holds objects that only this process knows."""
+    """Return the cache key of a structure; None if it holds objects that exist in this process alone."""
     try:
-        kernel_ir = "\n".join((code_of_folder(), torch.__version__, cpu.identity(), _canonical(structure)))
+        content = "\n".join((code_of_folder(), torch.__version__, cpu.identity(), _canonical(structure)))
     except _NotKept:
         return None
-    return hashlib.sha256(kernel_ir.encode()).hexdigest()
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _canonical(value: Any) -> str:
@@ -56,14 +56,14 @@ def _canonical(value: Any) -> str:
     if value is None or isinstance(value, bool | int | float | str | torch.dtype):
         return repr(value)
     if isinstance(value, type) and value.__module__.partition(".")[0] in _LIBRARIES:
-        return f"{value.__module__}.{value.__qualname__}"  # the code of others may change without its name
+        return f"{value.__module__}.{value.__qualname__}"  # the code of other packages may change under the same name
     if isinstance(value, bytes):
         return value.hex()
     raise _NotKept
 
 
 def load(key: str) -> Program | None:
-    """A program from disk; None where there is none that can be used."""
+    """Load a program from disk; None if there is no usable entry."""
     content = cache.read(f"{key[:40]}.json")
     if content is None:
         return None
@@ -83,7 +83,7 @@ def load(key: str) -> Program | None:
 
 
 def store(key: str, program: Program) -> None:
-    """Write a program, where it can be written."""
+    """Write a program to disk, unless it holds values that cannot be stored."""
     try:
         facts = {
             "code": program.code,
@@ -157,26 +157,26 @@ def _step(value: list[Any]) -> Step:
     return Step(getattr(getattr(torch.ops.aten, operator), overload), tuple(_in(args)), _in(kwargs))
 
 
-# ---- Programs of a process: each is traced and compiled once for all tensors of one structure, or read from disk
+# ---- Programs in memory: each is loaded from disk, or traced and compiled, once for all tensors of one structure
 
 
-#: More programs than this are not kept.
+#: Most programs that are kept in memory.
 MOST_PROGRAMS = 512
-#: By what they were traced for, the latest last.
+#: Programs by structure, the newest last.
 _programs: dict[Any, Program] = {}
 _tracing = threading.Lock()
 
 
 def program_of(structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[], TracedStage]) -> Program:
-    """Return the program of a structure: of this process, from disk, or traced and compiled now.
+    """Return the program of a structure: from memory, from disk, or traced and compiled now.
 
     Args:
-        structure: all that the trace may ask, but for the numbers in its tensors; hashable.
-        tensors: the leaves by path, whose numbers a trace may rely on.
-        traced: traces it.
+        structure: all that a trace depends on, except for the values of tensors; hashable.
+        tensors: the leaves by path; a trace may depend on their values, and then has guards.
+        traced: traces the stage.
 
     Raises:
-        Unsupported: for what the lane compiler does not know.
+        Unsupported: the stage does something that the lane compiler cannot compile.
     """
     with _tracing:  # one at a time in a process: see torchpt.compiler.tracing.tracing
         program = _programs.get(structure)
@@ -184,7 +184,7 @@ def program_of(structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[
         if program is None and name is not None:
             program = load(name)
         if program is None or not guards_hold(program, tensors):
-            program = compiled(traced())
+            program = compile_stage(traced())
             if name is not None:
                 store(name, program)
         if _programs.get(structure) is not program:
@@ -195,12 +195,12 @@ def program_of(structure: Any, tensors: Mapping[str, Tensor], traced: Callable[[
         return program
 
 
-def compiled(stage: TracedStage, target: cpu.Target | None = None) -> Program:
-    """Return the program of a stage for a machine; for this one where None."""
+def compile_stage(stage: TracedStage, target: cpu.Target | None = None) -> Program:
+    """Compile a traced stage for a target; None is this machine."""
     target = target or cpu.host()
-    return Program.of(stage, cpu.compiled(kernel_ir(stage, target.form), target))
+    return Program.of(stage, cpu.compile_ir(kernel_ir(stage, target.form), target))
 
 
 def clear_programs() -> None:
-    """Drop the programs of this process; those on disk stay."""
+    """Drop all programs in memory; entries on disk stay."""
     _programs.clear()

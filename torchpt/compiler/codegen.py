@@ -1,4 +1,4 @@
-"""From nodes to instructions."""
+"""Generate LLVM instructions for the nodes of a graph."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchpt.compiler.graph import FLOATS, Graph, Unsupported
 
 __all__ = ["MEMORY", "LoopBody", "generate_node"]
 
-#: Types of elements as tables and the arena hold them; see :func:`torchpt.compiler.program.bind_tables`.
+#: LLVM type of an element in tables and in the arena, by node type; see :func:`torchpt.compiler.program.bind_tables`.
 MEMORY = {"f": "float", "d": "double", "i": "i32", "l": "i32", "L": "i32", "u": "i32", "b": "i32"}
 
 _COMPARISONS = {
@@ -25,11 +25,11 @@ _COMPARISONS = {
 
 
 class LoopBody(Block):
-    """The body of a kernel's loop.
+    """A builder for the body of a kernel's loop.
 
     Attributes:
-        listed: whether lanes are those that a list names, else all in order.
-        products: those that are rounded with a sum, by that; see :func:`torchpt.compiler.fusing.fused_products`.
+        listed: lanes are read at the indices of a list; False: all lanes in order.
+        products: the product that is fused into each sum, both as nodes; see :func:`torchpt.compiler.fusing.fused_products`.
     """
 
     def __init__(self, form: Form, listed: bool, products: dict[int, int]) -> None:
@@ -38,7 +38,7 @@ class LoopBody(Block):
 
 
 def generate_node(block: LoopBody, graph: Graph, node: int, names: dict[int, str]) -> str:
-    """Write the lines of one node, and return its name. ``names`` has those of its arguments."""
+    """Write the instructions of one node and return the name of its value; ``names`` maps its arguments to their values."""
     op, ty, arguments, extra = graph.nodes[node]
     if node in block.products:
         return _fused(block, graph, node, names)
@@ -64,7 +64,7 @@ def generate_node(block: LoopBody, graph: Graph, node: int, names: dict[int, str
 
 
 def _fused(block: LoopBody, graph: Graph, node: int, names: dict[int, str]) -> str:
-    """``a b + c``, ``a b - c`` or ``c - a b``, rounded once."""
+    """Compute ``a b + c``, ``a b - c`` or ``c - a b``, rounded once."""
     op, ty, terms, _ = graph.nodes[node]
     product = block.products[node]
     first = terms[0] == product
@@ -77,7 +77,7 @@ def _fused(block: LoopBody, graph: Graph, node: int, names: dict[int, str]) -> s
     return block.fma(ty, a, b, c)
 
 
-#: Operations on bytes, which are held in 32 bits, that may leave more than eight.
+#: Operations on uint8 (held in 32 bits) whose result may need more than eight bits.
 _CARRIES = ("add", "sub", "mul", "shl", "neg", "xor", "floordiv", "truncdiv", "remainder", "fmod")
 
 
@@ -87,7 +87,7 @@ def _byte(block: Block, a: str) -> str:
 
 def _comparison(block: Block, op: str, ty: str, a: str, b: str) -> str:
     if ty == "b":
-        return block.compare(_COMPARISONS[op][1].replace("s", "u"), ty, a, b)  # a bit that is set is -1 to signed ones
+        return block.compare(_COMPARISONS[op][1].replace("s", "u"), ty, a, b)  # i1 true is -1 in signed comparisons
     return block.compare(_COMPARISONS[op][ty not in FLOATS], ty, a, b)
 
 
@@ -99,7 +99,7 @@ def _cast(block: Block, source: str, target: str, a: str) -> str:
     if source in FLOATS and target in FLOATS:
         return block.convert("fpext" if target == "d" else "fptrunc", source, target, a)
     if source in FLOATS:
-        # Frozen: of NaN and of numbers out of range it is some number, which look-ups bring into range.
+        # fptosi of NaN and out of range is poison: frozen to any number, which look-ups clamp.
         number = block.op(f"freeze {block.vector(target)} {block.convert('fptosi', source, target, a)}")
         return _byte(block, number) if target == "u" else number
     if target in FLOATS:
@@ -128,7 +128,7 @@ def _bits(op: str) -> Callable[..., str]:
 
 
 def _shift(op: str) -> Callable[..., str]:
-    """Bits moved further than there are leave nothing, or the sign; by negative numbers likewise, as in torch."""
+    """Return a handler of shifts; shifts by more than the width, or negative ones, give 0 or the sign, as in torch."""
 
     def handler(block: Block, ty: str, a: str, b: str) -> str:
         most = block.constant(ty, 63 if ty == "L" else 31)
@@ -142,7 +142,7 @@ def _shift(op: str) -> Callable[..., str]:
 def _intrinsic(name: str) -> Callable[..., str]:
     def handler(block: Block, ty: str, *a: str) -> str:
         if ty not in FLOATS:
-            return a[0]  # a whole number is its own floor
+            return a[0]  # integers stay as they are
         return block.call(name, ty, *a)
 
     return handler
@@ -164,16 +164,16 @@ def _sign(block: Block, ty: str, a: str) -> str:
 
 
 def _quotient(block: Block, ty: str, a: str, b: str, rounding: str) -> str:
-    """Rounded quotients of 32-bit integers by way of doubles, which hold them exactly; no machine divides such vectors."""
+    """Divide 32-bit integers in float64, which is exact: CPUs have no integer division of vectors."""
     x, y = (block.convert("sitofp", ty, "d", v) for v in (a, b))
     q = block.call(f"llvm.{rounding}", "d", block.div("d", x, y))
     return block.op(f"freeze {block.vector(ty)} {block.convert('fptosi', 'd', ty, q)}")
 
 
 def _wide_quotient(block: Block, a: str, b: str) -> tuple[str, str]:
-    """Floored quotient and remainder of 64-bit integers, by doubles, which leave up to 2^10 of a quotient: once more for that.
+    """Return the floored quotient and the remainder of 64-bit integers.
 
-    Divisors of more than 62 bits are not meant.
+    A quotient in float64 is off by up to 2^10, so the remainder is divided once more. Divisors must fit in 62 bits.
     """
     x, y = (block.convert("sitofp", "L", "d", v) for v in (a, b))
 
@@ -199,7 +199,7 @@ def _wide_quotient(block: Block, a: str, b: str) -> tuple[str, str]:
 def _floordiv(block: Block, ty: str, a: str, b: str) -> str:
     if ty not in FLOATS:
         return _wide_quotient(block, a, b)[0] if ty == "L" else _quotient(block, ty, a, b, "floor")
-    # As Python and torch have it: the exact quotient rounded down, not the rounded quotient; 1 // 0.1 is 9.
+    # As in Python and torch: the exact quotient rounded down, not the rounded quotient; 1 // 0.1 is 9.
     zero, one = block.constant(ty, 0.0), block.constant(ty, 1.0)
     r = _fmod(block, ty, a, b)
     q = block.div(ty, block.sub(ty, a, r), b)
@@ -228,7 +228,7 @@ def _truncdiv(block: Block, ty: str, a: str, b: str) -> str:
 
 
 def _remainder(block: Block, ty: str, a: str, b: str) -> str:
-    """The remainder of the floored quotient, which has the divisor's sign."""
+    """Return the remainder of the floored quotient; it has the sign of the divisor."""
     if ty == "L":
         return _wide_quotient(block, a, b)[1]
     if ty not in FLOATS:
@@ -238,7 +238,7 @@ def _remainder(block: Block, ty: str, a: str, b: str) -> str:
 
 
 def _against(block: Block, ty: str, r: str, b: str) -> str:
-    """Return whether a remainder of floats has another sign than the divisor."""
+    """Return a mask: a float remainder is not 0 and differs in sign from the divisor."""
     zero = block.constant(ty, 0.0)
     other = block.op(f"xor {block.each('i1')} {block.compare('olt', ty, r, zero)}, {block.compare('olt', ty, b, zero)}")
     return block.op(f"and {block.each('i1')} {other}, {block.compare('une', ty, r, zero)}")
@@ -251,7 +251,7 @@ def _fmod(block: Block, ty: str, a: str, b: str) -> str:
 
 
 def _gather(block: Block, ty: str, index: str, extra: tuple[int, int, int]) -> str:
-    """Number ``k`` of the ``width`` in entry ``index`` of a table; entries that are not there are the last one."""
+    """Load component ``k`` of ``width`` of entry ``index`` of a table; indices out of range read the last entry."""
     table, width, k = extra
     index = block.call("llvm.umin", "i", index, f"%last{table}")
     if width != 1:
@@ -268,7 +268,7 @@ def _from_memory(block: Block, ty: str, stored: str) -> str:
 
 
 def _scalar(block: Block, ty: str, pointer: str, place: int) -> str:
-    """One number of memory in all lanes."""
+    """Load one element and broadcast it to all lanes."""
     value = block.load(MEMORY[ty], block.at(pointer, MEMORY[ty], place))
     if ty == "b":
         value = block.op(f"trunc i32 {value} to i1")
@@ -278,7 +278,7 @@ def _scalar(block: Block, ty: str, pointer: str, place: int) -> str:
 
 
 def _search(block: Block, ty: str, value: str, extra: tuple[int, str, bool]) -> str:
-    """Count the entries of a sorted table below a value (or not above it), by a function with a loop of its own."""
+    """Count the entries of a sorted table that are below a value (``right``: not above it), by a call of a binary search."""
     table, element, right = extra
     name = f"@sorted_{element}_{'right' if right else 'left'}"
     vector = block.vector(element)
@@ -309,12 +309,12 @@ def _iota(block: Block, ty: str) -> str:
 
 
 def _place(block: LoopBody, ty: str) -> str:
-    """Return where in the arena the lane is."""
+    """Return the index of the lane in the arena."""
     return "%place" if block.listed else _iota(block, ty)
 
 
 def _arena(block: LoopBody, ty: str, extra: int) -> str:
-    """A row of the arena, at the lane's own place or at that which the list names."""
+    """Load a row of the arena at the lane's index."""
     element = MEMORY[ty]
     if block.listed:
         stored = block.gather(element, f"%row{extra}", "%place")
@@ -324,14 +324,14 @@ def _arena(block: LoopBody, ty: str, extra: int) -> str:
 
 
 def _slot(block: Block, ty: str, place: str, extra: int) -> str:
-    """A row of the slots, at a place."""
+    """Load a row of the slots at an index."""
     element = MEMORY[ty]
     start = block.at("%slots", element, block.op(f"mul i64 %stride, {extra}")) if extra else "%slots"
     return _from_memory(block, ty, block.gather(element, start, place))
 
 
 def _tensor(block: Block, ty: str, extra: tuple[int, int]) -> str:
-    """Row ``k`` of an input tensor at the lane's own place."""
+    """Load row ``k`` of an input tensor at the lane's number."""
     slot, k = extra
     element = {"l": "i64", "L": "i64", "b": "i8", "u": "i8"}.get(ty, ELEMENTS[ty])
     size = {"i64": 8, "double": 8, "i8": 1}.get(element, 4)

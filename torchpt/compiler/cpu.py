@@ -1,4 +1,4 @@
-"""From IR to machine code: LLVM through llvmlite."""
+"""Compile LLVM IR to machine code, by llvmlite."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torchpt.native import cache
 __all__ = [
     "Function",
     "Target",
-    "compiled",
+    "compile_ir",
     "counts",
     "host",
     "identity",
     "load_function",
 ]
 
-#: Enters every key: entries that are made otherwise are never read.
+#: Part of every key: raised when compilation changes, so that older entries are not read.
 _VERSION = "5"
 _lock = threading.Lock()
 _state: dict[str, Any] = {"ready": False, "compiled": 0, "loaded": 0}
@@ -32,13 +32,13 @@ _machines: dict[Target, Any] = {}
 
 @dataclass(frozen=True)
 class Target:
-    """A machine that kernels are made for.
+    """A machine that kernels are compiled for.
 
     Attributes:
-        cpu: LLVM's name of it.
-        features: LLVM's names of its features.
-        triple: LLVM's name of the machine; None: this one.
-        form: how its kernels hold lanes.
+        cpu: LLVM's name of the CPU.
+        features: LLVM's list of CPU features.
+        triple: LLVM's target triple; None: this machine.
+        form: layout of lanes in registers.
     """
 
     cpu: str
@@ -49,16 +49,16 @@ class Target:
 
 @dataclass(frozen=True)
 class Function:
-    """A kernel's machine code: ``call(address of the arguments, lanes)`` runs it without the GIL."""
+    """A compiled kernel: ``call(address of the arguments, lanes)`` runs it without the GIL."""
 
     call: Any
     code: bytes
     engine: Any  # keeps the code in memory
-    key: str = ""  # its name on disk
+    key: str = ""  # cache key, its file name on disk
 
 
 def _llvm() -> Any:
-    """Llvmlite's binding, ready for this machine."""
+    """Return llvmlite's binding, initialized for this machine."""
     import llvmlite.binding as llvm
 
     if not _state["ready"]:
@@ -69,7 +69,7 @@ def _llvm() -> Any:
 
 
 def host() -> Target:
-    """This machine."""
+    """Return the target of this machine."""
     if "host" not in _state:
         check_room()
         llvm = _llvm()
@@ -78,12 +78,12 @@ def host() -> Target:
 
 
 def counts() -> tuple[int, int]:
-    """Return how many kernels this process compiled, and how many it loaded from disk."""
+    """Return the numbers of kernels that this process has compiled and has loaded from disk."""
     return _state["compiled"], _state["loaded"]
 
 
-def compiled(ir: str, target: Target | None = None) -> Function:
-    """The function ``kernel`` of a module, from this process, from disk, or made now."""
+def compile_ir(ir: str, target: Target | None = None) -> Function:
+    """Return the function ``kernel`` of an LLVM module from memory, from disk, or compiled now for the target."""
     with _lock:
         target = target or host()
         key = _key(ir, target)
@@ -102,7 +102,7 @@ def compiled(ir: str, target: Target | None = None) -> Function:
 
 
 def load_function(key: str) -> Function | None:
-    """A function of this machine by its key, from this process or from disk; None where there is none."""
+    """Return a function of this machine by its key, from memory or from disk; None if it is in neither."""
     with _lock:
         function = _functions.get(key)
         code = cache.read(f"{key[:40]}.o") if function is None else None
@@ -114,7 +114,7 @@ def load_function(key: str) -> Function | None:
 
 
 def identity() -> str:
-    """Return what this machine's code depends on beside a stage."""
+    """Return text that identifies compiler and machine, as part of cache keys."""
     return _named(host())
 
 
@@ -145,14 +145,14 @@ def _new_machine(target: Target) -> Any:
 
 
 def _object(ir: str, target: Target) -> bytes:
-    """Object code."""
+    """Compile IR to an object file."""
     llvm, machine = _llvm(), _machine(target)
     module = llvm.parse_assembly(ir)
     module.triple = target.triple or llvm.get_default_triple()
     module.data_layout = str(machine.target_data)
     module.verify()
-    # The IR is vectors already, its constants folded: what LLVM's own pipelines do beyond this takes three times as long, and
-    # the code is no faster for it.
+    # The IR is already vectorized and its constants are folded: LLVM's standard pipelines take three times as long as these
+    # passes, and the code is no faster.
     passes = llvm.create_new_module_pass_manager()
     passes.add_simplify_cfg_pass()
     passes.add_instruction_combine_pass()
@@ -164,9 +164,9 @@ def _object(ir: str, target: Target) -> bytes:
 
 def _loaded(code: bytes, target: Target, key: str) -> Function:
     if target.triple is not None:
-        return Function(None, code, None, key)  # for another machine: not to be run here
+        return Function(None, code, None, key)  # for another machine: cannot be called here
     llvm = _llvm()
-    machine = _new_machine(target)  # becomes the engine's own, and goes with it
+    machine = _new_machine(target)  # owned and freed by the engine
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()

@@ -1,4 +1,4 @@
-"""The form of a kernel, and the arenas that lanes live in between kernels."""
+"""The form of a kernel: lanes in a register, and elements in a row of the arena."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ from dataclasses import dataclass
 __all__ = ["CAPACITY", "SCALAR", "VECTORS", "Form"]
 
 
-# ---- Where lanes live between kernels: an *arena* has a row of 32-bit numbers for each number of a path's state
+# ---- Path states between kernels: an *arena* has a row of 32-bit elements for each component of the path state
 
 
-#: Numbers of a row: lanes, a multiple of a vector's, and a vector's to spare, for kernels write whole ones.
+#: Elements of a row: lanes (a multiple of 16) and one vector of padding, as kernels write whole vectors.
 CAPACITY = 16384 + 16
 
 
-# ---- The form of a kernel: how it holds lanes. Stages know nothing of it; what writes LLVM IR asks it
+# ---- The form of a kernel. Stages do not depend on it, only the generation of LLVM IR does
 
 
 @dataclass(frozen=True)
 class Form:
-    """A form in which kernels hold lanes.
+    """The layout of lanes in a kernel.
 
-    Results are the same bits in any form: whatever is rounded once is said in the graph (:mod:`torchpt.compiler.fusing`), and
-    each lane is computed by the same operations.
+    Results have the same bits in any form: the graph decides which products and sums are fused
+    (:mod:`torchpt.compiler.fusing`), and each lane is computed by the same operations.
 
     Attributes:
-        width: lanes of a value: a vector of them where more than one, else a plain number.
-        row: numbers from one row of an arena to the next.
+        width: lanes of a value; a value is an LLVM vector if there is more than one, else a scalar.
+        row: elements from one row of an arena to the next.
     """
 
     width: int
     row: int = CAPACITY
 
 
-#: Of this CPU's kernels. Where a machine's vectors are narrower, LLVM takes several of them for one.
+#: The form of CPU kernels. LLVM splits the vectors on machines with narrower registers.
 VECTORS = Form(16)
 #: One lane at a time.
 SCALAR = Form(1)

@@ -1,7 +1,7 @@
-"""Functions of whole tensors by lanes as kernels of their own, where no stage is traced.
+"""Compile functions of tensors that work lane by lane, for calls outside of traced stages.
 
-:class:`Lanewise` compiles a function for the arguments that it is called with, and keeps what was made; :func:`compile_lanewise`
-compiles one now.
+:class:`Lanewise` compiles a function for the arguments of each call and caches the kernels; :func:`compile_lanewise` compiles a
+function at once.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ from torchpt.native import compile_time
 
 __all__ = ["Lanewise", "compile_lanewise"]
 
-#: Lanes that a thread takes together.
+#: Lanes of a block; threads share the work by blocks.
 BLOCK = 64
-#: Operations times lanes that repay another thread: some 50 microseconds.
+#: Operations times lanes that are worth another thread: about 50 microseconds.
 GRAIN = 3_000_000
-#: Of one function more structures than this are not kept.
+#: Most structures of arguments that are kept for one function.
 _MOST = 32
 _TABLES = HEAD.index("tables")
 
 
 class Lanewise:
-    """A function of tensors ``(..., N)``, each result lane made of the arguments' lanes alone, as one loop over threads.
+    """A compiled function of tensors ``(..., N)``, each lane of whose results depends on the same lane of the arguments.
 
-    It is traced and compiled once for all arguments of one structure: dtypes and shapes but for N, and what else is no number
-    in a tensor. Calls return NotImplemented for what is better left to the function: tensors on other devices or under a
-    tape, no lanes at all, stages that are being traced, and what the lane compiler does not know.
+    The function is traced and compiled once for each structure of arguments: dtypes, shapes except for N, and all values that
+    are not in tensors. A call returns NotImplemented where the function itself has to be called: for tensors on other devices
+    or with gradients, for N = 0, while a stage is traced, and for code that the lane compiler cannot compile.
 
     Args:
-        function: gives a tensor ``(..., N)`` or a tuple of such.
+        function: returns a tensor ``(..., N)`` or a tuple of them.
         lanes: names of the parameters that are tensors ``(..., N)`` or None.
-        uniforms: names of those that are small tensors whose numbers change from call to call. Tensors in all others are
-            tables: laid out again where another takes their place.
-        detached: whether results have no derivatives, so that tensors under a tape are taken as well.
+        uniforms: names of the parameters that are small tensors whose values change from call to call. Tensors in all other
+            parameters are tables: they are copied to the layout of kernels again when they change.
+        detached: results have no derivatives, so tensors that require gradients are accepted.
 
     Attributes:
-        refused: why the lane compiler did not take arguments, by their structure.
+        refused: the message of :class:`Unsupported`, by the structure of arguments that could not be compiled.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Lanewise:
         if kinds:
             raise ValueError(f"no parameters {', '.join(kinds)}")
         name = f"{function.__module__}.{getattr(function, '__qualname__', '<')}"
-        # A name tells the package's own functions from others, on disk too: an entry there is of the package's code.
+        # Functions of this package are identified by name, on disk too, as keys hold a digest of its code; others by object.
         self._name = name if name.startswith("torchpt.") and "<" not in name else function
         self._made: dict[Any, _CompiledFunction] = {}
         self.refused: dict[Any, str] = {}
@@ -139,7 +139,7 @@ class Lanewise:
     def _changed(
         self, args: Sequence[Any], lane: Callable[[Tensor], Tensor], uniform: Callable[[Tensor], Tensor]
     ) -> Any:
-        """Return arguments with other lanes and uniforms."""
+        """Return the arguments with ``lane`` and ``uniform`` applied to their tensors."""
         change = {"lane": lane, "uniform": uniform}
         return [
             change[kind](value) if kind != "table" and isinstance(value, Tensor) else value
@@ -147,7 +147,7 @@ class Lanewise:
         ]
 
     def _results(self, args: Sequence[Any]) -> Tensor | tuple[Tensor, ...]:
-        """Return what the function makes of no lanes: as many tensors, of the same dtypes and shapes."""
+        """Return the results for no lanes, which have the number, dtypes and shapes of the real ones."""
         with torch.no_grad():
             return self._function(*self._changed(args, lambda x: x[..., :0], lambda x: x))
 
@@ -167,7 +167,7 @@ class Lanewise:
             results = self._function(*given)
         stores = _stores(tracer, [results] if isinstance(results, Tensor) else results)
         if any(op == "iota" for op, *_ in tracer.graph.nodes):
-            raise Unsupported("lanes that ask for their own number")
+            raise Unsupported("a use of the lane's own number")
         tables, steps, guards = without_unused_steps(tracer.tables, tracer.steps, tracer.guards)
         names = [str(k) for k in range(len(tracer.uniforms))]
         sinks = Sinks(store=stores)
@@ -176,13 +176,13 @@ class Lanewise:
 
 @dataclass
 class _CompiledFunction:
-    """A function compiled for arguments of one structure.
+    """A kernel for one structure of arguments, with its tables.
 
     Attributes:
-        program: its program.
-        tables: those of the last call.
-        states: the tensors that they are made of, and which of their contents.
-        results: without lanes; a tuple where the function gives one.
+        program: the compiled program.
+        tables: tables in the layout of kernels, as of the last call.
+        states: the tensors that the tables were made from, each with its version.
+        results: results for no lanes; a tuple if the function returns one.
     """
 
     program: Program
@@ -200,14 +200,14 @@ class _CompiledFunction:
         self.grain = max(GRAIN // work // BLOCK, 1)
 
     def is_current(self, tables: list[Tensor]) -> bool:
-        """Return True where its tables are those of these tensors, as they are now."""
+        """Return True if the tables were made from these tensors in their present versions."""
         return all(
             table is known and _version(table) == version
             for table, (known, version) in zip(tables, self.states, strict=True)
         )
 
     def run(self, inputs: Sequence[Tensor], uniforms: Sequence[Tensor], count: int, threads: int) -> Any:
-        """Return the results for ``count`` lanes, taken by as many threads as repay."""
+        """Return the results for ``count`` lanes, computed by at most ``threads`` threads."""
         inputs, uniforms = [x.detach().contiguous() for x in inputs], [x.detach().contiguous() for x in uniforms]
         outputs = [torch.empty((*shape, count), dtype=dtype) for shape, dtype in self.outputs]
         head = [0] * len(HEAD)
@@ -231,15 +231,15 @@ class _CompiledFunction:
 def compile_lanewise(
     function: Callable[..., Sequence[Tensor]], like: Sequence[Tensor], target: Target | None = None
 ) -> Callable[..., list[Tensor]]:
-    """Compile a function of tensors ``(..., N)`` now, for one thread.
+    """Compile a function of tensors ``(..., N)`` at once, for one thread.
 
     Args:
-        function: gives a sequence of tensors ``(..., N)``.
-        like: arguments of the shapes and dtypes to come; N may differ.
-        target: machine to compile for; this one where None.
+        function: returns a sequence of tensors ``(..., N)``.
+        like: example arguments with the shapes and dtypes of later calls; N may differ.
+        target: machine to compile for; None: this one.
 
     Raises:
-        Unsupported: for what the lane compiler does not know.
+        Unsupported: the function does something that the lane compiler cannot compile.
     """
     lanes = choose_lane_count([x[..., 0] for x in like if x.numel()])
     tracer = Tracer(lanes, {})
@@ -249,7 +249,7 @@ def compile_lanewise(
     sinks = Sinks(store=_stores(tracer, results))
     stage = TracedStage(tracer.graph, sinks, tracer.tables, tracer.steps, tracer.constants, tensors=len(given))
     tables = bind_tables(stage.tables, stage.steps, stage.constants, {})
-    program = cache.compiled(stage, target)
+    program = cache.compile_stage(stage, target)
     made = _CompiledFunction(program, tables, [], tuple(x[..., :0] for x in results))
 
     def run(*arguments: Tensor) -> list[Tensor]:
@@ -259,7 +259,7 @@ def compile_lanewise(
 
 
 def _input(tracer: Tracer, slot: int, x: Tensor) -> Tensor:
-    """Declare a tensor an input of the trace."""
+    """Declare a tensor as input number ``slot`` of a trace."""
     ty = DTYPES[x.dtype]
     return tracer.lane(x, lambda k: tracer.graph.node("tensor", ty, extra=(slot, k)))
 
@@ -269,12 +269,12 @@ def _stores(tracer: Tracer, results: Sequence[Tensor]) -> list[Store]:
 
 
 def _version(tensor: Tensor) -> object:
-    """Return which of its contents a tensor has; of inference tensors that cannot be known."""
+    """Return the version of a tensor's content; inference tensors have none, so theirs is never equal to another."""
     return object() if tensor.is_inference() else tensor._version
 
 
 def _sample(x: Tensor, lanes: int) -> Tensor:
-    """Return an argument's first lanes, repeated as often as it takes."""
+    """Return the first ``lanes`` lanes of an argument, repeated if it has fewer."""
     columns = torch.arange(lanes) % max(x.shape[-1], 1)
     if not x.numel():
         return torch.zeros(*x.shape[:-1], lanes, dtype=x.dtype)

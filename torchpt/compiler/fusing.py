@@ -1,6 +1,6 @@
-"""Fuse products with sums, rounded once: the graph decides which, so that no compiler does.
+"""Choose the products and sums that become fused multiply-adds, in the graph instead of in LLVM.
 
-A compiler that may fuse as it likes fuses otherwise at another width, in another version and on another machine.
+LLVM's own choice would depend on its version, on the vector width and on the machine.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ __all__ = ["fused_products"]
 
 
 def fused_products(graph: Graph, needed: list[int], roots: list[int]) -> dict[int, int]:
-    """Return the product that is rounded with each sum or difference: the first of its terms that nothing else asks for.
+    """Find for each sum or difference the product to fuse with it: the first term that is a product without other uses.
 
     Args:
-        graph: of a stage.
-        needed: the nodes that are computed.
-        roots: results among them; one that is named twice is asked for twice.
+        graph: the graph of a stage.
+        needed: nodes that are computed.
+        roots: nodes of the results; each mention counts as a use.
 
     Returns:
-        Products by the sums that they are a term of.
+        The fused product of each sum, both as nodes.
     """
     uses = Counter(roots)
     for node in needed:

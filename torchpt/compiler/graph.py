@@ -1,8 +1,8 @@
-"""A stage as a graph of scalar operations: each node stands for one number in every lane.
+"""The graph of a stage: its nodes are scalar operations, each with one value a lane.
 
-Types are one letter: ``f`` float32, ``d`` float64, ``i`` int32, ``b`` bool, ``u`` uint8 held in 32 bits. An int64 tensor has
-nodes of two types: ``l`` where it is an index and 32 bits hold it, ``L`` where it is a product, a power or shifted, or was made
-of int32 lanes, so that all 64 bits may be meant. (Of a product that is used as an index LLVM computes 32 bits alone.)
+Types are one letter: ``f`` float32, ``d`` float64, ``i`` int32, ``b`` bool, ``u`` uint8 held in 32 bits. Nodes of int64 tensors
+have one of two types: ``l`` for indices, which fit in 32 bits, and ``L`` for products, powers, shifts and conversions from
+int32 lanes, which may need all 64 bits. (LLVM narrows a product to 32 bits where it is used as an index.)
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["BYTES", "DTYPES", "FLOATS", "INTEGERS", "Graph", "Unsupported"]
 
 
 class Unsupported(Exception):
-    """A stage does something that the lane compiler does not know; the message names it."""
+    """An error: a stage uses an operation that the lane compiler cannot compile. The message names it."""
 
 
 class _Types(dict[torch.dtype, str]):
@@ -38,18 +38,18 @@ DTYPES = _Types(
     }
 )
 FLOATS, INTEGERS = "fd", "ilLu"
-#: Bytes of an element in memory outside of the arena.
+#: Bytes of an element in tensors.
 BYTES = {"f": 4, "d": 8, "i": 4, "l": 8, "L": 8, "b": 1, "u": 1}
 
 
 class Graph:
-    """Nodes ``(op, type, arguments, extra)``, each kept once.
+    """A list of unique nodes ``(op, type, arguments, extra)``.
 
     Attributes:
-        nodes: in an order in which arguments come before their users.
-        origins: for each node the files of the package that asked for it first, innermost first.
-        origin: those of the nodes made next.
-        derivatives: whether a backward pass is traced: sums over lanes are then named, and signs of zeros are of no account.
+        nodes: all nodes; arguments come before their users.
+        origins: for each node the files of the package that created it first, innermost first.
+        origin: the same for nodes that are added next.
+        derivatives: a backward pass is traced: sums over lanes become ``total`` nodes, and the sign of 0 is ignored.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class Graph:
         self._known: dict[tuple[str, str, tuple[int, ...], Any], int] = {}
 
     def node(self, op: str, ty: str, *arguments: int, extra: Any = None) -> int:
-        """The number of a node, made where it is new."""
+        """Return the index of a node, which is added if it is new."""
         key = op, ty, arguments, extra
         number = self._known.get(key)
         if number is None:
@@ -70,11 +70,11 @@ class Graph:
         return number
 
     def type(self, node: int) -> str:
-        """Its type."""
+        """Return the type of a node."""
         return self.nodes[node][1]
 
     def constant(self, ty: str, value: float | int | bool) -> int:
-        """A number that is the same in all lanes and scenes."""
+        """Return a node for a constant, the same in all lanes and scenes."""
         if ty in FLOATS:
             with np.errstate(over="ignore"):
                 value = float(np.float32(value) if ty == "f" else value)
@@ -87,14 +87,14 @@ class Graph:
         return self.node("const", ty, extra=value % 256 if ty == "u" else value)
 
     def value(self, node: int) -> Any:
-        """The number of a constant; None for other nodes."""
+        """Return the value of a constant; None for other nodes."""
         op, ty, _, extra = self.nodes[node]
         if op != "const":
             return None
         return struct.unpack("<d", extra)[0] if ty in FLOATS else extra
 
     def cast(self, node: int, ty: str) -> int:
-        """The number as another type, as torch converts it."""
+        """Convert a node to another type, as torch converts numbers."""
         own = self.type(node)
         if own == ty:
             return node
@@ -106,7 +106,7 @@ class Graph:
         return self.node("cast", ty, node)
 
     def select(self, condition: int, yes: int, no: int) -> int:
-        """``yes`` in lanes where the condition holds; both of one type."""
+        """Select ``yes`` in lanes where the condition holds, else ``no``; both have the same type."""
         if yes == no:
             return yes
         known = self.value(condition)
@@ -115,7 +115,7 @@ class Graph:
         return self.node("select", self.type(yes), condition, yes, no)
 
     def binary(self, op: str, ty: str, x: int, y: int) -> int:
-        """An operation on two nodes of type ``ty``, without what changes no bit of the result."""
+        """Return an operation on two nodes of type ``ty``, simplified where that changes no bit of the result."""
         a, b = self.value(x), self.value(y)
         if op in ("mul", "div") and b == 1:
             return x
@@ -143,7 +143,7 @@ class Graph:
         return self.node(op, ty, x, y)
 
     def needed(self, roots: list[int]) -> list[int]:
-        """All nodes that roots depend on, arguments first."""
+        """Return all nodes that the roots depend on, arguments first."""
         needed, stack = set(), list(roots)
         while stack:
             node = stack.pop()

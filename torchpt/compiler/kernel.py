@@ -1,7 +1,7 @@
-"""A kernel: the loop over lanes around the nodes of a stage, and what it writes at the end of each turn.
+"""Generate a kernel: a loop over lanes whose body computes the nodes of a stage and stores its results.
 
-A kernel reads lanes of one arena (:mod:`~torchpt.compiler.form`), all of them in order or those that a list of places names;
-its sinks (:mod:`~torchpt.compiler.sinks`) say where results go, and its form how many lanes a turn takes.
+A kernel reads lanes of one arena (:mod:`~torchpt.compiler.form`): all of them in order, or those at the indices of a list. Its
+sinks (:mod:`~torchpt.compiler.sinks`) say where results go, its form how many lanes an iteration takes.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 __all__ = ["HEAD", "SinkWriter", "kernel_ir", "sink_writer"]
 
 
-# ---- The end of a kernel's loop: LLVM IR that puts the results where the sinks say
+# ---- Stores: the LLVM IR at the end of the loop's body that writes the results to the sinks
 #
-# Vectors of lanes and single ones differ in how lanes find places behind each other: a vector is compressed and counters are
-# held in registers, a single lane takes the next place of a counter in memory and writes behind a branch.
+# Compaction differs by form: vectors are compressed, with counters in registers; a single lane takes the next index from a
+# counter in memory and stores behind a branch.
 
 
 class SinkWriter(ABC):
-    """The lines of a kernel's sinks.
+    """A writer of the stores to a kernel's sinks.
 
-    In the loop ``%i`` is the lane's number, or that of a vector's first, ``%mask`` says which lanes there are, and ``%first0``,
-    ``%first1``, ... are the counters as the kernel found them.
+    In the loop ``%i`` is the number of the (first) lane, ``%mask`` marks the lanes that exist, and ``%first0``, ``%first1``,
+    ... are the counters at the kernel's start.
 
     Attributes:
-        before: lines that begin a turn of the loop.
-        after: lines that follow the last turn.
-        functions: lines of functions that the loop calls.
+        before: lines at the head of the loop.
+        after: lines behind the loop.
+        functions: definitions of functions that the loop calls.
     """
 
     def __init__(self, block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
@@ -46,7 +46,7 @@ class SinkWriter(ABC):
         self.functions: list[str] = []
 
     def write(self) -> None:
-        """All of them."""
+        """Write the stores to all sinks."""
         block, sinks = self.block, self.sinks
         for compact in sinks.compact:
             self._compact(compact)
@@ -69,7 +69,7 @@ class SinkWriter(ABC):
 
     @abstractmethod
     def _write(self, place: str) -> None:
-        """Rows of the target arena from a place on: an i64."""
+        """Write rows of the target arena from index ``place`` (an i64) on."""
 
     @abstractmethod
     def _count(self, counter: int, mask: str) -> None: ...
@@ -78,16 +78,16 @@ class SinkWriter(ABC):
         return self.block.op(f"and {self.block.each('i1')} {self.names[mask]}, %mask")
 
     def _stored_value(self, node: int) -> tuple[str, str]:
-        """The 32 bits by which the arena holds a number: their type and name."""
+        """Return type and name of a node's value in the 32 bits that the arena holds it in."""
         ty, name, block = self.graph.type(node), self.names[node], self.block
         if ty == "d":
-            raise Unsupported("a float64 in the state of a path")
+            raise Unsupported("a float64 in the path state")
         if ty == "b":
             return "i32", block.op(f"zext {block.each('i1')} {name} to {block.each('i32')}")
         return MEMORY[ty], block.convert("trunc", "L", "i", name) if ty == "L" else name
 
     def _start(self, row: int) -> str:
-        """The first byte of a row of the target arena."""
+        """Return the address of a row of the target arena."""
         return self.block.at("%dst", "i8", 4 * self.block.form.row * row) if row else "%dst"
 
     def _row(self, row: int, element: str, place: str) -> str:
@@ -124,14 +124,14 @@ class SinkWriter(ABC):
 
 
 class _VectorSinks(SinkWriter):
-    """Lanes of a vector are moved together and stored whole; counters are values that go around the loop."""
+    """Stores of vectors: lanes are compressed and stored as whole vectors; counters are phi nodes of the loop."""
 
     def __init__(self, block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
         super().__init__(block, graph, names, sinks)
         self._counters = {k: f"%c{k}" for k in range(sinks.counters())}
 
     def write(self) -> None:
-        """All of them."""
+        """See :meth:`SinkWriter.write`; adds the phi nodes of the counters."""
         super().write()
         for k, last in self._counters.items():
             arriving = f"[ %first{k}, %entry ], [ {last}, %{self.block.label} ]"
@@ -141,7 +141,7 @@ class _VectorSinks(SinkWriter):
                 f"  %slot{k} = getelementptr i64, ptr %counters, i64 {k}",
                 f"  store i64 %end{k}, ptr %slot{k}",
             ]
-        self.after.sort(key=lambda line: " phi " not in line)  # which come first in their block
+        self.after.sort(key=lambda line: " phi " not in line)  # phi nodes come first in a basic block
 
     def _count(self, counter: int, mask: str) -> None:
         by = self.block.count(mask)
@@ -164,7 +164,7 @@ class _VectorSinks(SinkWriter):
         if compact.appends:
             places = self.block.places(start)
             for append in compact.appends:
-                # Which of the packed lanes are meant: their mask packed likewise, no further than there are any.
+                # The note's mask, compressed as the lanes are; 0 behind them.
                 both = block.op(f"and {block.each('i1')} {self.names[append.mask]}, {mask}")
                 wide = block.op(f"sext {block.each('i1')} {both} to {block.each('i32')}")
                 chosen = block.op(f"icmp ne {block.each('i32')} {self._compressed(wide, mask)}, zeroinitializer")
@@ -172,16 +172,17 @@ class _VectorSinks(SinkWriter):
         self._count(compact.counter, mask)
 
     def _compressed(self, value: str, mask: str) -> str:
-        """Return integers where the mask holds, moved together, with zeros behind."""
+        """Compress int32 lanes where the mask is set; zeros follow them."""
         return self.block.compress("i32", value, mask, "zeroinitializer")
 
     def _append_index(self, append: AppendIndex, mask: str, places: str) -> None:
-        together = self._compressed(places, mask)  # zeros behind: whatever reads on past the end reads a place
+        # Zeros follow: a vector load beyond the end of the list still reads valid indices.
+        together = self._compressed(places, mask)
         self._put("i32", together, self.block.at(f"%list{append.list}", "i32", self._counters[append.counter]))
         self._count(append.counter, mask)
 
 
-#: ``@take(counter, mask)``: the next place, and the counter goes on where the mask holds.
+#: ``@take(counter, mask)`` returns the counter, and increments it if the mask is set.
 _TAKE = """define internal i64 @take(ptr %counter, i1 %mask) alwaysinline {
   %place = load i64, ptr %counter
   %by = zext i1 %mask to i64
@@ -192,7 +193,7 @@ _TAKE = """define internal i64 @take(ptr %counter, i1 %mask) alwaysinline {
 
 
 class _LaneSinks(SinkWriter):
-    """One lane takes its places from counters in memory by the function ``take``, all that knows in which order lanes come."""
+    """Stores of single lanes: the function ``take`` returns the next index from a counter in memory."""
 
     def __init__(self, block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> None:
         super().__init__(block, graph, names, sinks)
@@ -228,14 +229,14 @@ class _LaneSinks(SinkWriter):
 
 
 def sink_writer(block: LoopBody, graph: Graph, names: dict[int, str], sinks: Sinks) -> SinkWriter:
-    """Return what writes the sinks of a stage whose nodes have names, in the block's form."""
+    """Return the writer of a stage's sinks for the form of ``block``; ``names`` maps nodes to their values."""
     return (_VectorSinks if block.width > 1 else _LaneSinks)(block, graph, names, sinks)
 
 
-# ---- A kernel: the loop over lanes around the nodes of a stage
+# ---- The whole kernel
 
 
-#: What every call is given, in this order; then uniforms, lists, and input and output tensors with their row lengths.
+#: First words of a kernel's arguments; uniforms, lists, and input and output tensors with their row lengths follow.
 HEAD = ("src", "dst", "list", "slots", "stride", "counters", "tables", "search")
 
 
@@ -243,7 +244,7 @@ def kernel_ir(stage: TracedStage, form: Form) -> str:
     """Return the IR of ``void kernel(ptr arguments, i64 lanes)``.
 
     Raises:
-        Unsupported: for an operation, or a table that is not there.
+        Unsupported: an unknown operation, or a table that does not exist.
     """
     graph, sinks, needed = stage.graph, stage.sinks, stage.needed()
     products = fused_products(graph, needed, sinks.roots())
@@ -293,7 +294,7 @@ _PREFERRED = ' "prefer-vector-width"="512" "min-legal-vector-width"="512"'
 
 
 def _begin(body: LoopBody) -> None:
-    """Begin a turn of the loop: its lanes (``%mask``), and their places in the arena (``%place``)."""
+    """Write the head of the loop's body: the mask of the lanes (``%mask``) and their indices in the arena (``%place``)."""
     body.declarations.add("declare i64 @llvm.smin.i64(i64, i64)")
     left = body.op("sub i64 %n, %i")
     few = body.op(f"call i64 @llvm.smin.i64(i64 {left}, i64 {body.width})")
@@ -305,7 +306,7 @@ def _begin(body: LoopBody) -> None:
 
 
 def _enter(body: LoopBody, stage: TracedStage, needed: list[int]) -> None:
-    """Read the arguments before the loop."""
+    """Load the kernel's arguments, before the loop."""
     graph, sinks = stage.graph, stage.sinks
     words = [(name, "i64" if name == "stride" else "ptr") for name in HEAD]
     words += [(f"uniform{k}", "ptr") for k in range(len(stage.uniforms))]
@@ -317,7 +318,7 @@ def _enter(body: LoopBody, stage: TracedStage, needed: list[int]) -> None:
     found = [graph.nodes[node] for node in needed]
     for k in sorted({extra[0] for op, _, _, extra in found if op in ("gather", "element", "search")}):
         if k >= len(stage.tables):
-            raise Unsupported("a table that is not there")
+            raise Unsupported("a table that does not exist")
         body.do(f"%table{k} = load ptr, ptr {body.at('%tables', 'i64', 2 * k)}")
         body.do(f"%count{k} = load i64, ptr {body.at('%tables', 'i64', 2 * k + 1)}")
         last = body.op(f"sub i32 {body.op(f'trunc i64 %count{k} to i32')}, 1")

@@ -1,4 +1,4 @@
-"""Searches inside a kernel: rays among few primitives, and values in a sorted table by bisection."""
+"""Searches inside a kernel: binary search in sorted tables, and brute-force ray intersection with few primitives."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["KINDS", "binary_searches", "packet_search", "scene_words"]
 
 
 def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
-    """Binary searches: all lanes take as many steps, which are as many as the table's length asks for."""
+    """Generate the binary searches that a graph uses; all lanes take the same number of steps, log2 of the table's length."""
     searches = {extra[1:] for op, _, _, extra in map(graph.nodes.__getitem__, needed) if op == "search"}
     whole = Block(form)
     for ty, right in sorted(searches):
@@ -66,25 +66,25 @@ def binary_searches(graph: Graph, needed: list[int], form: Form) -> Block:
     return whole
 
 
-# ---- A packet of rays against every primitive, as functions inside a kernel: the search for scenes of few primitives
+# ---- Brute-force intersection of a packet of rays with every primitive, as functions inside a kernel, for small scenes
 #
-# Planar primitives are affine rows with their own rounding error as tolerance (:func:`torchpt.search.tables.tolerances`);
-# spheres are met by perpendiculars in float64. Ascending ids and a strict comparison settle ties.
+# Planar primitives are affine rows, with their rounding error as tolerance (:func:`torchpt.search.tables.tolerances`);
+# spheres are intersected in float64. Primitives are tested by rising id with a strict comparison: ties go to the lowest id.
 
 
-#: Kinds of primitives that are searched here, in the order of their ids.
+#: Primitives that these functions know, in the order of their ids.
 KINDS = ("triangle", "rectangle", "disk", "sphere")
-#: Numbers of a planar primitive's row.
+#: Length of a planar primitive's row.
 _ROW = 13
 _RAY = ("ox", "oy", "oz", "dx", "dy", "dz")
 
 
 def packet_search(kinds: Sequence[str], form: Form) -> Block:
-    """Functions ``nearest`` and ``occluded`` of rays and the address of what is searched, see :func:`scene_words`.
+    """Generate the functions ``nearest`` and ``occluded``, which take rays and the address of :func:`scene_words`.
 
     Args:
-        kinds: those that the scene has.
-        form: a packet has as many rays as a value has lanes.
+        kinds: kinds of primitives in the scene, of :data:`KINDS`.
+        form: layout of lanes; a packet has ``form.width`` rays.
     """
     whole = Block(form)
     for any_hit in (False, True):
@@ -96,15 +96,15 @@ def packet_search(kinds: Sequence[str], form: Form) -> Block:
 
 
 def scene_words(rows: Tensor, balls: Tensor, counts: Sequence[int], extent: float) -> Any:
-    """Return what the functions read of a scene, as an array of ctypes; the tensors must live as long.
+    """Return the scene data that the functions read, as a ctypes array; the tensors must outlive it.
 
-    There lie, 64 bits each: the address of the rows of planar primitives, that of the spheres, for each of :data:`KINDS` the
-    id after its last primitive, and the scene's extent as a float64.
+    Its words of 64 bits: address of the rows of planar primitives, address of the spheres, for each of :data:`KINDS` the id
+    after its last primitive, and the scene's extent as a float64.
 
     Args:
         rows: ``(P, 13)`` float32: ``n c a ca b cb`` and the tolerance of each planar primitive.
         balls: ``(S, 4)`` float64: centres and radii.
-        counts: primitives of each kind; those of further kinds are not searched.
+        counts: number of primitives of each kind; kinds after :data:`KINDS` are not searched.
         extent: see :func:`torchpt.search.tables.extent`.
     """
     ends = [sum(counts[: k + 1]) for k in range(len(KINDS))]
@@ -121,7 +121,7 @@ class _Search(Block):
         self.kinds, self.any_hit = kinds, any_hit
 
     def write(self) -> None:
-        """The function."""
+        """Write the function."""
         given = ", ".join(f"{self.f} %{name}" for name in (*_RAY, "t_max"))
         name, result = ("occluded", self.b) if self.any_hit else ("nearest", self.hit)
         self.lines.append(f"define internal {result} @{name}({given}, ptr %search) noinline #0 {{\nentry:")
@@ -143,7 +143,7 @@ class _Search(Block):
         extent = self.load("double", self.at("%search", "i64", len(words)))
         extent = self.splat("f", self.op(f"fptrunc double {extent} to float"))
         zero = self.constant("f", 0.0)
-        # NaN unless all are finite.
+        # 0 if all components are finite, else NaN.
         nothing = None
         for name in _RAY:
             product = self.mul("f", f"%{name}", zero)
@@ -170,7 +170,7 @@ class _Search(Block):
         return self._larger(self._larger(a, b), c)
 
     def _loop(self, kind: str, t: str, prim: str, before: str) -> tuple[str, str, str]:
-        """All primitives of a kind; returns the names of distance and primitive after them, and the block that ends it."""
+        """Write a loop over all primitives of a kind; return distance, primitive and the name of the basic block after it."""
         number = KINDS.index(kind)
         first = "0" if number == 0 else f"%end_{KINDS[number - 1]}"
         last = f"{kind}_last" if kind == "sphere" else kind
@@ -192,7 +192,7 @@ class _Search(Block):
         ]
         for test in tests:
             hit = test if hit is None else self.op(f"and {self.b} {hit}, {test}")
-        # A ray that meets anything at all is done: no distance is below the one it has then.
+        # Any hit ends the ray: no later distance is below -1.
         better = self.constant("f", -1.0) if self.any_hit else distance
         number_ = self.splat("i", self.op(f"trunc i64 %{kind}_id to i32"))
         tail = "e" if kind == "sphere" else "1"
@@ -254,10 +254,10 @@ class _Search(Block):
         return value
 
     def _near_sphere(self, kind: str) -> None:
-        """Go on to the exact test where any ray comes near the sphere, by float32 and a bound of its rounding.
+        """Branch to the exact test if any ray comes near the sphere, by float32 and a bound of its rounding error.
 
-        The perpendicular from the centre to the ray errs by less than ``2^-20 (|f| + |c|)``, with ``f`` from the centre ``c``
-        to the origin: a few roundings of terms that large, the centre's own included.
+        The perpendicular from the centre ``c`` to the ray has an error below ``2^-20 (|f| + |c|)``, with ``f = o - c``: a
+        few roundings of terms of that size, including the centre's conversion to float32.
         """
         own = self.op(f"sub i64 %{kind}_id, %end_disk")
         base = self.op(f"getelementptr [4 x double], ptr %balls, i64 {own}")
@@ -277,7 +277,7 @@ class _Search(Block):
         for k in (1, 2):
             square = self.fma("f", off[k], off[k], square)
         reach = self.fma("f", size, self.constant("f", 2.0**-19), self.call("llvm.fabs", "f", c[3]))
-        # Not "farther away": what overflows or is no number takes the exact test.
+        # An unordered comparison, so that overflow and NaN take the exact test.
         near = self.compare("ule", "f", square, self.mul("f", reach, reach))
         near = self.op(f"and {self.b} {near}, {self.compare('ogt', 'f', f'%{kind}_t', self.constant('f', 0.0))}")
         some = self.some(near)
@@ -304,7 +304,7 @@ class _Search(Block):
         return self.convert("fptrunc", "d", "f", t), None
 
     def _finish(self, t: str, prim: str) -> None:
-        """Parameters of the planar hits; those in the slack beyond an edge are brought back to the edge."""
+        """Compute ``u, v`` of planar hits, clamped to the primitive, and return the hits."""
         hit = self.op(f"icmp sge {self.i} {prim}, zeroinitializer")
         zero, one = self.constant("f", 0.0), self.constant("f", 1.0)
         ends = {kind: self.splat("i", self.op(f"trunc i64 %end_{kind} to i32")) for kind in KINDS[:3]}

@@ -1,4 +1,4 @@
-"""A stage that was traced, and its machine code with the tables of a scene bound to it."""
+"""Traced stages, compiled programs, and the tables of a scene in the layout that kernels read."""
 
 from __future__ import annotations
 
@@ -19,26 +19,25 @@ from torchpt.compiler.sinks import Sinks
 __all__ = ["Program", "Tables", "TracedStage", "bind_tables", "guards_hold", "lay_out_table"]
 
 
-# ---- A stage as it was traced: a graph. What it is compiled to is another thing, see :mod:`torchpt.compiler.program`
+# ---- A traced stage
 
 
 @dataclass(frozen=True)
 class TracedStage:
-    """A stage as a graph, with nothing in it of the machine or the form that kernels are made for.
+    """A stage as a graph, independent of machine and form.
 
     Attributes:
-        graph: its operations.
-        sinks: what becomes of its results.
-        tables: what it reads.
-        steps: the prologue, which makes some of that from leaves.
-        constants: tensors of its own.
-        guards: numbers that must be what they were.
+        graph: operations of the stage.
+        sinks: where results are written.
+        tables: tables that the graph reads.
+        steps: the prologue, which computes some tables from leaves.
+        constants: constant tensors.
+        guards: values that the trace depends on.
         uniforms: names of the inputs that all lanes share.
-        tensors: how many inputs are tensors instead of rows of an arena.
-        listed: whether its lanes are those that a list names, else all in order.
-        searched: kinds of primitives that its rays are searched among, see :mod:`torchpt.compiler.packet`; None where it has
-            none.
-        sums: what rows of its results are derivatives by, see :mod:`torchpt.engines.kernels.backward`.
+        tensors: number of inputs that are tensors instead of rows of an arena.
+        listed: lanes are read at the indices of a list; False: all lanes in order.
+        searched: kinds of primitives that rays are intersected with, see :mod:`torchpt.compiler.packet`; None: no rays.
+        sums: parameters whose derivatives are rows of the results, see :mod:`torchpt.engines.kernels.backward`.
     """
 
     graph: Graph
@@ -54,11 +53,11 @@ class TracedStage:
     sums: Sequence[Sequence[Any]] = ()
 
     def needed(self) -> list[int]:
-        """Return the nodes that its results depend on, arguments first."""
+        """Return the nodes that the results depend on, arguments first."""
         return self.graph.needed(self.sinks.roots())
 
 
-# ---- What a stage was compiled to, and the tables of a scene as its machine code reads them
+# ---- A compiled stage, and the tables of a scene in the layout that kernels read
 
 
 @dataclass(frozen=True)
@@ -66,20 +65,20 @@ class Program:
     """A stage compiled for all records of one structure.
 
     Attributes:
-        call: its machine code, see :class:`torchpt.compiler.cpu.Function`.
-        code: the name of that on disk.
-        tables: what it reads.
-        steps: the prologue, which makes some of that from leaves.
-        constants: tensors of the program's own.
-        guards: numbers that must be what they were.
+        call: the machine code, see :class:`torchpt.compiler.cpu.Function`.
+        code: cache key of the machine code.
+        tables: tables that the kernel reads.
+        steps: the prologue, which computes some tables from leaves.
+        constants: constant tensors.
+        guards: values that the trace depended on.
         uniforms: names of the inputs that all lanes share.
-        lists: how many lists of places it writes.
-        counters: how many counters it has.
-        tensors: how many input tensors.
-        results: how many result tensors.
-        shadows: how many shadow rays each lane asks for.
-        nodes: how many of its nodes each file of the package asked for.
-        sums: what rows of its results are derivatives by, see :mod:`torchpt.engines.kernels.backward`.
+        lists: number of index lists that the kernel writes.
+        counters: number of counters.
+        tensors: number of input tensors.
+        results: number of result tensors.
+        shadows: number of shadow rays a lane.
+        nodes: number of nodes that each file of the package created.
+        sums: parameters whose derivatives are rows of the results, see :mod:`torchpt.engines.kernels.backward`.
     """
 
     call: Any
@@ -99,7 +98,7 @@ class Program:
 
     @classmethod
     def of(cls, stage: TracedStage, function: Function) -> Program:
-        """Return a stage's program with the machine code that was made of it."""
+        """Return the program of a stage whose machine code is ``function``."""
         nodes: dict[str, int] = {}
         for node in stage.needed():
             for file in stage.graph.origins[node]:
@@ -122,12 +121,12 @@ class Program:
         )
 
     def leaves(self) -> frozenset[str]:
-        """Paths of the leaves that enter its tables."""
+        """Return the paths of the leaves that the tables depend on."""
         return self._leaves
 
     @cached_property
     def names(self) -> tuple[StepKey | None, ...]:
-        """Of its steps, see :func:`torchpt.compiler.prologue.step_keys`."""
+        """Return the names of the steps, see :func:`torchpt.compiler.prologue.step_keys`."""
         return step_keys(self.steps)
 
     @cached_property
@@ -150,11 +149,11 @@ class Program:
 
 @dataclass(frozen=True)
 class Tables:
-    """Tables in memory.
+    """Tables in the layout that kernels read.
 
     Attributes:
-        address: of pairs of pointer and number of entries.
-        keep: what must live as long.
+        address: address of an array of pairs (pointer, number of entries).
+        keep: objects that own the memory.
     """
 
     address: int
@@ -162,10 +161,10 @@ class Tables:
 
 
 def lay_out_table(tensor: Tensor, axis: int | None) -> Tensor:
-    """A table as kernels read it: entries first, contiguous, integers and truth values in 32 bits.
+    """Return a table in the layout of kernels: entries first, contiguous, integers and bools in 32 bits.
 
     Raises:
-        Unsupported: numbers beyond 32 bits, or more of them than 32 bits count.
+        Unsupported: integers beyond 32 bits, or 2^31 elements or more.
     """
     tensor = tensor.detach()
     if tensor.numel() >= 1 << 31:
@@ -190,16 +189,16 @@ def bind_tables(
     names: Sequence[StepKey | None] = (),
     results: dict[StepKey, Tensor] | None = None,
 ) -> Tables:
-    """The tables of a kernel for one scene.
+    """Compute and lay out the tables of a kernel for one scene.
 
     Args:
-        tables: of the trace.
-        steps: its prologue.
-        constants: its own tensors.
+        tables: tables of the trace.
+        steps: prologue of the trace.
+        constants: constant tensors of the trace.
         leaves: the scene's tensors by path.
-        known: leaves that were laid out before, by path and axis; filled.
-        names: of the steps.
-        results: what steps of other kernels came to, see :func:`torchpt.compiler.prologue.run_prologue`; filled.
+        known: leaves laid out before, by path and axis; filled.
+        names: names of the steps.
+        results: results of steps of other kernels, see :func:`torchpt.compiler.prologue.run_prologue`; filled.
     """
     known = {} if known is None else known
     tensor = run_prologue(steps, constants, leaves, names, results)
@@ -220,7 +219,7 @@ def bind_tables(
 
 
 def guards_hold(program: Program, leaves: Mapping[str, Tensor]) -> bool:
-    """Return True where the numbers that a trace relied on are the same for other leaves."""
+    """Return True if the guards of a program hold for these leaves."""
     if not program.guards:
         return True
     tensor = run_prologue(program.steps, program.constants, leaves)

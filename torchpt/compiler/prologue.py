@@ -1,6 +1,6 @@
-"""The prologue of a kernel: arithmetic on tables alone, kept as steps, and run anew for each scene.
+"""The prologue of a kernel: torch operators on tables alone, recorded in the trace and run again for each scene.
 
-So other tables of the same shapes can take the place of those that a stage was traced with.
+Thus a kernel serves all tables of the same shapes.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from torch import Tensor
 
 __all__ = ["Guard", "Source", "Step", "StepKey", "Table", "run_prologue", "step_keys", "without_unused_steps"]
 
-#: Bytes of a tensor up to which it is kept for other prologues.
+#: Largest tensor, in bytes, that is kept for other prologues.
 SMALL = 1 << 16
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a tensor that holds no lanes comes from.
+    """The origin of a tensor without lanes.
 
     Attributes:
-        kind: ``leaf`` (of the records that the stage was given), ``step`` (of the prologue) or ``constants`` (an object of the
-            program's own, a network's weights among them).
-        name: of a leaf its path, else a number.
-        item: which result of a step that gives several; -1 where it gives one.
+        kind: ``leaf`` (of the stage's arguments), ``step`` (result of a prologue step) or ``constants`` (a constant of the
+            program, such as the weights of a network).
+        name: path of a leaf, else the number of the step or constant.
+        item: index into the results of a step that returns several; -1 if it returns one.
     """
 
     kind: str
@@ -37,7 +37,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Step:
-    """One operator on tables: ``function(*args, **kwargs)`` with a :class:`Source` in place of each tensor."""
+    """A call of a torch operator on tables: ``function(*args, **kwargs)``, with a :class:`Source` for each tensor."""
 
     function: Any
     args: tuple[Any, ...]
@@ -49,8 +49,8 @@ class Table:
     """A tensor as a kernel reads it.
 
     Attributes:
-        source: where it comes from.
-        axis: which axis is indexed: its entries come first in memory, the numbers of one entry side by side. None: as it is.
+        source: origin of the tensor.
+        axis: the indexed axis, which becomes the first one in memory; None: the layout stays.
     """
 
     source: Source
@@ -59,7 +59,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Guard:
-    """A number that was read from a table while tracing, and holds for this trace alone."""
+    """A value that the trace has read from a table: the trace holds only for this value."""
 
     source: Source
     value: Any
@@ -68,7 +68,7 @@ class Guard:
 def without_unused_steps(
     tables: Sequence[Table], steps: Sequence[Step], guards: Sequence[Guard]
 ) -> tuple[tuple[Table, ...], tuple[Step, ...], tuple[Guard, ...]]:
-    """The same without the steps that nothing asks for."""
+    """Return tables, steps and guards without the unused steps."""
     needed: set[int] = set()
 
     def mark_needed(value: Any) -> None:
@@ -103,11 +103,11 @@ def without_unused_steps(
 
 @dataclass(frozen=True)
 class StepKey:
-    """Of a step: the same in all prologues of the process for the same arithmetic on leaves of the same paths.
+    """An identity of a step: equal in all prologues of the process for the same operators on leaves of the same paths.
 
     Attributes:
-        number: tells it from others.
-        leaves: paths of those that enter it.
+        number: a unique number.
+        leaves: paths of the leaves that the step depends on.
     """
 
     number: int
@@ -115,9 +115,9 @@ class StepKey:
 
 
 def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
-    """Names of steps; None where a tensor of the program's own has part in one, or what its arguments are cannot be told."""
+    """Return the names of steps; None for a step that depends on a constant tensor or has unhashable arguments."""
     names: list[StepKey | None] = []
-    leaves: set[str] = set()  # of the step that is looked at
+    leaves: set[str] = set()  # of the current step
 
     def content_of(value: Any) -> Any:
         if isinstance(value, Source):
@@ -147,12 +147,12 @@ def step_keys(steps: Sequence[Step]) -> tuple[StepKey | None, ...]:
                 tuple((k, content_of(value)) for k, value in step.kwargs.items()),
             )
             names.append(StepKey(_numbers.setdefault(key, next(_count)), frozenset(leaves)))
-        except TypeError:  # of what cannot be hashed, too
+        except TypeError:  # also raised by hash()
             names.append(None)
     return tuple(names)
 
 
-#: Numbers of steps by what they do.
+#: Number of each step, by operator and arguments.
 _numbers: dict[Any, int] = {}
 _count = count()
 
@@ -168,14 +168,14 @@ def run_prologue(
     names: Sequence[StepKey | None] = (),
     known: dict[StepKey, Tensor] | None = None,
 ) -> Any:
-    """Runs a prologue; returns ``tensor(source)``.
+    """Run a prologue and return the function ``tensor(source)``.
 
     Args:
         steps: the prologue.
-        constants: the program's own tensors.
-        leaves: the scene's by path.
-        names: of the steps, see :func:`step_keys`.
-        known: what steps came to in other prologues on the same leaves, by name; filled with what is small.
+        constants: the program's constant tensors.
+        leaves: the scene's tensors by path.
+        names: names of the steps, see :func:`step_keys`.
+        known: results of steps of other prologues on the same leaves, by name; small results are added.
     """
     results: list[Any] = []
 

@@ -1,6 +1,6 @@
-"""What a kernel does with its results: written in place, packed together, scattered to places, noted in lists, stored.
+"""The outputs of a kernel: rows written in place, compacted rows, scattered rows, lists of indices, and result tensors.
 
-Numbers are named by their nodes in the :class:`~torchpt.compiler.graph.Graph` of the stage.
+Values are given by their nodes in the :class:`~torchpt.compiler.graph.Graph` of the stage.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ __all__ = ["AppendIndex", "Compact", "Scatter", "Sinks", "Store"]
 
 @dataclass(frozen=True)
 class AppendIndex:
-    """Places written one after the other into list ``list``, where ``mask`` holds; ``counter`` counts them."""
+    """An append of lane indices to list ``list`` where ``mask`` is set; ``counter`` is the length of the list."""
 
     mask: int
     list: int
@@ -21,9 +21,9 @@ class AppendIndex:
 
 @dataclass(frozen=True)
 class Compact:
-    """Lanes where ``mask`` holds, written together into rows of the target arena from ``counter`` on.
+    """A stream compaction: lanes where ``mask`` is set are appended to rows of the target arena at index ``counter``.
 
-    The notes name the places where they went.
+    The notes list the new indices of these lanes.
     """
 
     mask: int
@@ -34,7 +34,7 @@ class Compact:
 
 @dataclass(frozen=True)
 class Scatter:
-    """Numbers written to places of rows where ``mask`` holds (-1: everywhere): of the arena, or of the slots of samples."""
+    """A scatter to index ``place`` of rows of the arena or of the slots, where ``mask`` is set (-1: everywhere)."""
 
     mask: int
     place: int
@@ -44,7 +44,7 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Store:
-    """A result ``(rows, lanes)`` as a tensor: its nodes, and the type of its elements."""
+    """A result tensor ``(rows, lanes)``: one node a row, and the element type."""
 
     nodes: tuple[int, ...]
     ty: str
@@ -52,17 +52,17 @@ class Store:
 
 @dataclass
 class Sinks:
-    """What a kernel does with its results.
+    """The outputs of a kernel.
 
     Attributes:
-        write: rows of the target arena and their nodes, each at the lane's own place (of a list: its number in it).
+        write: rows of the target arena and their nodes, written at the number of the lane.
         compact: see :class:`Compact`.
-        appends: lists of the lanes' own places.
+        appends: lists of the lanes' indices in the source arena.
         scatter: see :class:`Scatter`.
-        count: masks whose lanes are counted, and by which counter.
+        count: pairs of a mask whose set lanes are counted and a counter.
         store: result tensors.
-        shift: counter whose first value is added to the places of ``write``.
-        shadows: how many shadow rays each lane asks for.
+        shift: counter whose value at the kernel's start is added to the indices of ``write``.
+        shadows: number of shadow rays a lane.
     """
 
     write: list[tuple[int, int]] = field(default_factory=list)
@@ -75,10 +75,14 @@ class Sinks:
     shadows: int = 0
 
     def roots(self) -> list[int]:
-        """The nodes that are asked for."""
+        """Return the nodes of all outputs."""
         roots = [node for _, node in self.write]
         for compact in self.compact:
-            roots += [compact.mask, *(node for _, node in compact.rows), *(append.mask for append in compact.appends)]
+            roots += [
+                compact.mask,
+                *(node for _, node in compact.rows),
+                *(append.mask for append in compact.appends),
+            ]
         roots += [append.mask for append in self.appends]
         for scatter in self.scatter:
             roots += [scatter.place, *(node for _, node in scatter.rows)]
@@ -87,7 +91,7 @@ class Sinks:
         return roots + [node for store in self.store for node in store.nodes]
 
     def counters(self) -> int:
-        """How many counters there are."""
+        """Return the number of counters."""
         numbers = [compact.counter for compact in self.compact] + [counter for _, counter in self.count]
         numbers += [append.counter for compact in self.compact for append in compact.appends] + [
             append.counter for append in self.appends
@@ -96,7 +100,7 @@ class Sinks:
         return max(numbers, default=-1) + 1
 
     def lists(self) -> int:
-        """How many lists there are."""
+        """Return the number of lists."""
         appends = [append.list for compact in self.compact for append in compact.appends] + [
             append.list for append in self.appends
         ]

@@ -1,8 +1,8 @@
-"""Running a stage once on a few lanes, and writing down what it does to each of them.
+"""Trace a stage: run it once on a few lanes and record its operations on one lane as a graph.
 
-Under :class:`Tracer` every tensor that depends on lanes carries a node for each of its numbers in one lane. Arithmetic on
-tables alone is run and kept as a list of steps (the *prologue*), so that other tables of the same shapes can take their
-place: what a kernel reads of a table is memory, whatever the numbers in it.
+Under :class:`Tracer` every tensor that depends on lanes has a graph node for each of its elements in one lane. Operators on
+tables alone are run and recorded as a list of steps (the *prologue*), which are run again for other tables of the same
+shapes: a kernel reads tables from memory and does not depend on their values.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ __all__ = [
     "tracing",
 ]
 
-#: Candidates for the number of lanes that a stage is traced on. An axis of a tensor that has this length is taken for the
-#: lanes', so it must divide no axis of a table.
+#: Candidates for the number of lanes that a stage is traced on. An axis whose length is a multiple of it is taken for the
+#: lanes' axis, so it must divide no axis of a table.
 LANES = (97, 89, 101, 83, 103, 79, 107, 109, 113, 127)
 
 Handler = Callable[..., None]
-#: What becomes of each operator of torch, by its name without overload.
+#: Lowering of each torch operator, by its name without overload.
 LOWERINGS: dict[str, Handler] = {}
 
 _PACKAGE = __file__.rpartition("compiler")[0]
@@ -45,7 +45,7 @@ _active: list[Tracer] = []
 
 
 def register_lowering(*names: str) -> Callable[[Handler], Handler]:
-    """Register ``handler(tracer, out, *args, **kwargs)``, which tells what ``out`` is made of."""
+    """Register ``handler(tracer, out, *args, **kwargs)``, which lowers an operator: it sets the nodes of ``out``."""
 
     def register(handler: Handler) -> Handler:
         for name in names:
@@ -56,55 +56,57 @@ def register_lowering(*names: str) -> Callable[[Handler], Handler]:
 
 
 def choose_lane_count(tables: Iterable[Tensor]) -> int:
-    """A number of :data:`LANES` that is the length of no axis of the tables, nor divides one.
+    """Return a number of :data:`LANES` that divides no axis of the tables.
 
     Raises:
-        Unsupported: where there is none.
+        Unsupported: each of them divides one.
     """
     sizes = {size for table in tables for size in table.shape if size}
     for lanes in LANES:
         if all(size % lanes for size in sizes):
             return lanes
-    raise Unsupported("tables of so many lengths that none is left for the lanes to be traced on")
+    raise Unsupported("tables whose lengths leave no number of lanes to trace on")
 
 
 def tracing() -> bool:
-    """Return True where a stage is being traced in this process: then tensor forms are wanted, not calls of kernels."""
+    """Return True while this process traces a stage: code must then call tensor operations, not kernels."""
     return bool(_active)
 
 
 def tracer_of(tensor: Tensor) -> Tracer | None:
-    """Return the tracer under which a tensor depends on lanes or inputs; None where none does."""
+    """Return the tracer that traces a tensor; None if no tracer does."""
     return next((tracer for tracer in _active if tracer.is_traced(tensor)), None)
 
 
 @dataclass(frozen=True)
 class Value:
-    """A traced tensor: an array of nodes in which the lanes' axis has length 1."""
+    """The nodes of a traced tensor: an array in which the lanes' axis has length 1."""
 
-    nodes: Any  # an array of objects, whose elements numpy's types do not tell from arrays
+    nodes: Any  # numpy array of objects; numpy's types cannot express that its elements are int
     lane: int | None
 
 
 class Tracer(TorchDispatchMode):
-    """Lowers what runs under it.
+    """A dispatch mode that records the torch operators run under it as a graph.
 
     Args:
-        lanes: of :data:`LANES`.
-        leaves: tables by id and their paths.
+        lanes: number of lanes, of :data:`LANES`.
+        leaves: path and tensor of each table, by the tensor's ``id``.
 
     Attributes:
-        graph: of all that was done.
-        uniforms: inputs that are the same for all lanes, in order: dtype and number of elements.
-        tables: what is read, in order.
+        graph: the recorded operations.
+        uniforms: inputs that are the same for all lanes, in order: type and number of elements.
+        tables: tables that the graph reads, in order.
         steps: the prologue.
-        guards: numbers that the trace relies on.
-        constants: tensors that are no leaves and no results of steps.
+        guards: values that the trace depends on.
+        constants: tensors that are neither leaves nor results of steps.
     """
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        return False  # else torch imports torch._dynamo at the first operator, which takes longer than most stages
+        return (
+            False  # else torch imports torch._dynamo at the first operator, which takes longer than tracing most stages
+        )
 
     def __init__(self, lanes: int, leaves: dict[int, tuple[str, Tensor]]) -> None:
         super().__init__()
@@ -135,7 +137,7 @@ class Tracer(TorchDispatchMode):
     # -- inputs and results
 
     def lane(self, like: Tensor, make: Callable[[int], int]) -> Tensor:
-        """Declare ``like (..., lanes)`` an input; ``make(k)`` gives the node of its k-th number."""
+        """Declare ``like (..., lanes)`` as an input; ``make(k)`` returns the node of its k-th element of a lane."""
         lead = like.shape[:-1]
         nodes = np.empty((*lead, 1), object)
         for k, entry in enumerate(np.ndindex(*lead)):
@@ -145,7 +147,7 @@ class Tracer(TorchDispatchMode):
         return like
 
     def uniform(self, like: Tensor) -> Tensor:
-        """Declare a small tensor an input that all lanes share, and that may differ from call to call."""
+        """Declare a small tensor as an input that all lanes share and that may differ from call to call."""
         ty = DTYPES[like.dtype]
         nodes = np.empty(tuple(like.shape), object)
         slot = len(self.uniforms)
@@ -157,7 +159,7 @@ class Tracer(TorchDispatchMode):
         return like
 
     def nodes(self, tensor: Tensor) -> list[int]:
-        """The nodes of a result ``(..., lanes)``, its leading axes flattened."""
+        """Return the nodes of a result ``(..., lanes)``, its leading axes flattened."""
         value = self.get(tensor)
         if value.lane is not None and value.nodes.shape[value.lane] != 1:
             raise Unsupported(
@@ -169,25 +171,25 @@ class Tracer(TorchDispatchMode):
             raise Unsupported(f"a result of shape {tuple(tensor.shape)} whose last axis is not the lanes'")
         return [int(node) for node in value.nodes.reshape(-1)]
 
-    # -- what handlers use
+    # -- for handlers
 
     def is_traced(self, tensor: Tensor) -> bool:
-        """Return True where a tensor depends on lanes or on inputs."""
+        """Return True if a tensor depends on lanes or on inputs."""
         return id(tensor) in self._values
 
     def lane_axis(self, shape: Iterable[int]) -> int | None:
-        """Return which axis holds the lanes; None where none does."""
+        """Return the lanes' axis of a shape; None if it has none."""
         axes = [axis for axis, size in enumerate(shape) if size and size % self.lanes == 0]
         if len(axes) > 1:
             raise Unsupported(f"a tensor of shape {tuple(shape)} with lanes on two axes")
         return axes[0] if axes else None
 
     def inner(self, shape: Iterable[int], lane: int | None) -> tuple[int, ...]:
-        """The shape of the nodes of a tensor: the lanes' axis divided by the number of lanes."""
+        """Return the shape of the nodes of a tensor: the lanes' axis divided by the number of lanes."""
         return tuple(size // self.lanes if axis == lane else size for axis, size in enumerate(shape))
 
     def put(self, out: Tensor, nodes: Any, lane: int | None = None) -> None:
-        """Say what ``out`` is."""
+        """Set the nodes of ``out``, broadcast to its shape."""
         nodes = np.asarray(nodes, dtype=object)
         lane = self.lane_axis(out.shape) if lane is None else lane
         shape = self.inner(out.shape, lane)
@@ -197,12 +199,12 @@ class Tracer(TorchDispatchMode):
         self._values[id(out)] = Value(nodes, lane)
 
     def alias(self, out: Tensor, tensor: Tensor) -> None:
-        """Say that ``out`` is ``tensor``."""
+        """Give ``out`` the nodes of ``tensor``."""
         self._keep.append(out)
         self._values[id(out)] = self.get(tensor)
 
     def get(self, tensor: Tensor) -> Value:
-        """The nodes of a tensor; those of a small table are read element by element."""
+        """Return the nodes of a tensor; a small table gets a node for each element."""
         value = self._values.get(id(tensor))
         if value is not None:
             return value
@@ -218,7 +220,7 @@ class Tracer(TorchDispatchMode):
         return Value(nodes, None)
 
     def _spread(self, tensor: Tensor, lane: int) -> Value:
-        """A table that was expanded to lanes: the same number in each."""
+        """Return the nodes of a table that was expanded along lanes, with the same value in each."""
         first = torch.ops.aten.narrow.default(tensor, lane, 0, 1)
         if not bool(((tensor == first) | ((tensor != tensor) & (first != first))).all()):
             raise Unsupported("a table as long as the lanes that the stage is traced on")
@@ -229,7 +231,7 @@ class Tracer(TorchDispatchMode):
         return value
 
     def source(self, tensor: Tensor) -> Source:
-        """Return where a tensor without lanes comes from."""
+        """Return the origin of a tensor without lanes; an unknown tensor becomes a constant."""
         source = self._sources.get(id(tensor))
         if source is None:
             source = self._sources[id(tensor)] = Source("constants", len(self.constants))
@@ -237,7 +239,7 @@ class Tracer(TorchDispatchMode):
         return source
 
     def table(self, tensor: Tensor, axis: int | None) -> int:
-        """The number of a table."""
+        """Return the number of a table, which is added if it is new."""
         table = Table(self.source(tensor), axis)
         if table not in self._numbers:
             self._numbers[table] = len(self.tables)
@@ -254,7 +256,7 @@ class Tracer(TorchDispatchMode):
         traced = any(id(x) in self._values for x in given)
         if name == "_local_scalar_dense":
             if traced:
-                raise Unsupported("a number of a lane asked for by Python")
+                raise Unsupported("a lane's value read by Python")
             out = func(*args, **kwargs)
             self.guards.append(Guard(self.source(args[0]), out))
             return out
@@ -265,7 +267,7 @@ class Tracer(TorchDispatchMode):
                 raise Unsupported(f"the operator {name}")
             try:
                 handler(self, out, *args, **kwargs)
-            except TypeError as error:  # arguments that the handler does not take
+            except TypeError as error:  # the handler does not accept these arguments
                 raise Unsupported(
                     f"the operator {func} with {', '.join(map(str, kwargs)) or 'these arguments'}"
                 ) from error
@@ -279,7 +281,7 @@ class Tracer(TorchDispatchMode):
         ty = DTYPES[out.dtype]
         if name == "arange":
             if out.shape[0] != self.lanes or out[0] != 0 or out[1] != 1:
-                raise Unsupported("numbers of lanes that do not count from 0 by 1")
+                raise Unsupported("an arange over lanes that does not start at 0 with step 1")
             self.put(out, np.array([self.graph.node("iota", ty)], object))
         elif name in ("full", "ones", "zeros", "scalar_tensor"):
             self.put(out, np.array(self.graph.constant(ty, out.reshape(-1)[0].item()), object))
@@ -287,7 +289,7 @@ class Tracer(TorchDispatchMode):
             raise Unsupported(f"lanes made by {name}")
 
     def _record(self, func: Any, args: Any, kwargs: dict[str, Any], out: Any) -> None:
-        """Keep an operator on tables for the prologue."""
+        """Record an operator on tables in the prologue."""
 
         def replaced(x: Any) -> Any:
             if isinstance(x, Tensor):
@@ -301,12 +303,12 @@ class Tracer(TorchDispatchMode):
             source = Source("step", number, item if isinstance(out, list | tuple) else -1)
             if isinstance(tensor, Tensor):
                 self._sources[id(tensor)] = source
-            else:  # a plain number: whether two tables are equal
+            else:  # a Python number, such as the result of torch.equal
                 self.guards.append(Guard(source, tensor))
 
 
 class _Reads(TorchFunctionMode):
-    """Notices lanes that leave torch for Python by ways that call no operator."""
+    """A function mode that refuses conversions of traced tensors to Python or numpy that call no operator."""
 
     def __init__(self, tracer: Tracer) -> None:
         super().__init__()
@@ -314,7 +316,7 @@ class _Reads(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if getattr(func, "__name__", "") in ("tolist", "numpy", "__array__") and self.tracer.is_traced(args[0]):
-            raise Unsupported("numbers of lanes asked for by Python")
+            raise Unsupported("lanes' values read by Python")
         return func(*args, **(kwargs or {}))
 
 
@@ -327,7 +329,7 @@ def _flat(values: Any) -> Iterable[Any]:
 
 
 def _safe(name: str, args: Any) -> Any:
-    """Arguments with indices brought into range: the numbers of a trace mean nothing, their shapes do."""
+    """Return arguments with indices clamped to the table: values are meaningless in a trace."""
     if name == "index_select":
         table, axis, index = args
         return table, axis, index.clamp(0, max(table.shape[axis] - 1, 0))
@@ -338,14 +340,14 @@ def _safe(name: str, args: Any) -> Any:
     if name == "index":
         table, indices = args
         if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in indices):
-            raise Unsupported("a look-up by truth values")
+            raise Unsupported("a look-up by a boolean mask")
         sizes = table.shape
         return table, [None if i is None else i.clamp(0, max(sizes[k] - 1, 0)) for k, i in enumerate(indices)]
     return args
 
 
 def _files() -> tuple[str, ...]:
-    """The package's files on the stack, innermost first; the lane compiler's own left out."""
+    """Return the package's files on the stack, innermost first, without those of the lane compiler."""
     files: list[str] = []
     frame: Any = sys._getframe(2)
     while frame is not None:

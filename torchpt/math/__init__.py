@@ -1,7 +1,7 @@
-"""Pure functions on tensors that know of no scene: vectors, frames, warps, distributions, MIS, microfacets, transforms.
+"""Mathematics on tensors, independent of scenes: vectors, frames, warps, distributions, MIS, microfacets, transforms, sums.
 
-Vectors are ``(3, N)``, lane scalars ``(N,)``. Start with ``vectors.py``. ``gathers.py`` is the one look-up in a table, which
-gradients may follow.
+Vectors are ``(3, N)``, scalars ``(N,)``. Start with ``vectors.py``. ``gathers.py`` lets a backward pass record look-ups in
+tables.
 
 May import: ``core``, ``native``.
 """

@@ -1,7 +1,8 @@
-"""Who is told of look-ups in tables under a tape.
+"""Record look-ups in tables that require gradients.
 
-Autograd's own derivative of a look-up is as large as the table, and made anew for each: of an atlas of many texels nearly all
-of a backward pass would be spent there. So whoever differentiates may take the look-ups of a thread over.
+Autograd's derivative of a look-up is a dense tensor as large as the table, for each look-up: with a large texture atlas a
+backward pass would spend nearly all its time there. A recorder replaces the look-ups of a thread by ones with sparse
+derivatives.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ _local = threading.local()
 
 
 class GatherRecorder(Protocol):
-    """Takes look-ups over."""
+    """A replacement of look-ups."""
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
-        """Columns ``index (N,)`` of a table ``(..., M)`` that requires gradients; None: not one of its own."""
+        """Return columns ``index (N,)`` of a table ``(..., M)`` that requires gradients; None if the table is unknown."""
         ...
 
 
 @contextmanager
 def recording_gathers(gathers: GatherRecorder | None) -> Iterator[None]:
-    """Look-ups of this thread go to ``gathers`` meanwhile."""
+    """Send look-ups of this thread to ``gathers`` inside the ``with``."""
     before = gather_recorder()
     _local.gathers = gathers
     try:
@@ -38,5 +39,5 @@ def recording_gathers(gathers: GatherRecorder | None) -> Iterator[None]:
 
 
 def gather_recorder() -> GatherRecorder | None:
-    """Who takes the look-ups of this thread over."""
+    """Return the recorder of this thread; None if there is none."""
     return getattr(_local, "gathers", None)

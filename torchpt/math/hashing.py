@@ -1,4 +1,4 @@
-"""Integer hashing on int32 lanes (wrap-around arithmetic), the same bits on every device and in every kernel.
+"""Integer hashing of int32 lanes (wrap-around arithmetic), with the same bits on every device and in every kernel.
 
 ``mix`` is Wellons' two-round multiply-xorshift of low bias ("Prospecting for hash functions", 2018): a bijection of 32 bits.
 """
@@ -11,24 +11,24 @@ from torchpt.core.dispatch import dispatched
 
 __all__ = ["HALVES", "M0", "M1", "as_int32", "logical_shift", "mix", "mix_int", "reverse_bits", "to_unit"]
 
-#: Steps that reverse 32 bits: a shift, and the bits of the lower halves of pairs that are so far apart.
+#: Steps of the reversal of 32 bits: a shift, and the mask of the bits that it swaps with higher ones.
 HALVES = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))
 M0, M1 = 0x7FEB352D, 0x846CA68B - (1 << 32)
 
 
 def as_int32(x: int) -> int:
-    """The low 32 bits of a Python integer, as a signed value that an int32 tensor accepts."""
+    """Return the low 32 bits of a Python integer as a signed value, which an int32 tensor accepts."""
     return ((x + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
 
 
 def logical_shift(x: Tensor, bits: int) -> Tensor:
-    """Right shift that feeds in zeros; torch's own is arithmetic on int32."""
+    """Shift int32 lanes to the right and fill with zeros; torch's own shift is arithmetic."""
     return (x >> bits) & ((1 << (32 - bits)) - 1)
 
 
 @dispatched
 def reverse_bits(x: Tensor) -> Tensor:
-    """Reverse the 32 bits of int32 lanes, or the low 32 bits of int64 that have no others."""
+    """Reverse the 32 bits of int32 lanes, or of int64 lanes whose high 32 bits are 0."""
     for shift, mask in HALVES:
         x = ((x >> shift) & mask) | ((x & mask) << shift)
     return x
@@ -42,7 +42,7 @@ def mix(x: Tensor) -> Tensor:
 
 
 def mix_int(x: int) -> int:
-    """The same hash of a Python integer, as a signed 32-bit value."""
+    """Hash a Python integer as :func:`mix` does; the result is a signed 32-bit value."""
     x &= 0xFFFFFFFF
     x = ((x ^ (x >> 16)) * 0x7FEB352D) & 0xFFFFFFFF
     x = ((x ^ (x >> 15)) * 0x846CA68B) & 0xFFFFFFFF
@@ -50,5 +50,5 @@ def mix_int(x: int) -> int:
 
 
 def to_unit(x: Tensor) -> Tensor:
-    """The top 24 bits as float32 in ``[0, 1 - 2^-24]``, every value of which is exact."""
+    """Convert the top 24 bits to float32 in ``[0, 1 - 2^-24]``, exactly."""
     return logical_shift(x, 8) * (1.0 / (1 << 24))

@@ -1,4 +1,4 @@
-"""Sampling: warps of the unit square, discrete distributions, weights of multiple importance sampling."""
+"""Sampling: warps of the unit square, discrete distributions, weights of multiple importance sampling (MIS)."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ __all__ = [
 
 
 def power_heuristic(a: Tensor, b: Tensor) -> Tensor:
-    """Weight ``a^2 / (a^2 + b^2)`` of the strategy with density ``a``, both ``(N,)``; 0 where ``a`` is 0, 1 where it is inf.
+    """Compute the MIS weight ``a^2 / (a^2 + b^2)`` of the strategy with density ``a (N,)``; 0 if ``a`` is 0, 1 if it is inf.
 
-    Written as ``1 / (1 + (b/a)^2)``: the densities' own squares would leave float32's range above 1.8e19. The ratio may
-    overflow to infinity, which gives the right limit 0.
+    Computed as ``1 / (1 + (b/a)^2)``: squares of densities above 1.8e19 overflow float32. The ratio may overflow to infinity,
+    which gives the right limit 0.
     """
     ratio = b * safe_reciprocal(a)
     return torch.sign(a) / (1.0 + ratio * ratio)
@@ -44,14 +44,14 @@ def power_heuristic(a: Tensor, b: Tensor) -> Tensor:
 
 
 def concentric_disk(u: Tensor) -> Tensor:
-    """Area-preserving map to the unit disk ``(2, N)`` (Shirley and Chiu, *A Low Distortion Map*, 1997)."""
+    """Map to the unit disk ``(2, N)``, preserving area (Shirley and Chiu, *A Low Distortion Map*, 1997)."""
     wide, r, phi = _concentric(u)
     c, s = torch.cos(phi), torch.sin(phi)
     return r * torch.stack((torch.where(wide, c, s), torch.where(wide, s, c)))
 
 
 def _concentric(u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The concentric map's signed radius and its angle, from the x axis where ``wide``, else from the y axis (mirrored)."""
+    """Return ``wide``, the concentric map's signed radius, and its angle: from +x if ``wide``, else from +y (mirrored)."""
     a, b = 2.0 * u[0] - 1.0, 2.0 * u[1] - 1.0
     wide = a.abs() > b.abs()
     r = torch.where(wide, a, b)
@@ -61,10 +61,10 @@ def _concentric(u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def uniform_polygon(u: Tensor, sides: int) -> Tensor:
-    """Points ``(2, N)`` uniform over the regular polygon in the unit circle, one of its corners at ``(0, 1)``.
+    """Map to points ``(2, N)`` uniform over the regular polygon in the unit circle with a corner at ``(0, 1)``.
 
-    The concentric map to the disk, then each sector of the disk onto its triangle: a share of the angle becomes the same
-    share of the edge. That preserves area as well and is continuous, so that strata of the square stay compact.
+    The concentric map to the disk, then each sector of the disk to its triangle: a fraction of the sector's angle becomes the
+    same fraction of the edge. The map preserves area and is continuous, so strata of the square stay compact.
     """
     wide, r, phi = _concentric(u)
     # Anticlockwise from the upper corner: half a turn on where the radius is negative, a quarter back from the x axis.
@@ -81,14 +81,14 @@ def uniform_polygon(u: Tensor, sides: int) -> Tensor:
 
 
 def cosine_hemisphere(u: Tensor) -> Tensor:
-    """Directions ``(3, N)`` about ``+z`` with density ``cos(theta) / pi`` (Malley's method)."""
+    """Map to directions ``(3, N)`` about ``+z`` with density ``cos(theta) / pi`` (Malley's method)."""
     d = concentric_disk(u)
     z = torch.addcmul(torch.addcmul(torch.ones_like(d[0]), d[0], d[0], value=-1), d[1], d[1], value=-1)
     return torch.stack((d[0], d[1], z.clamp_min(0.0).sqrt()))
 
 
 def uniform_hemisphere(u: Tensor) -> Tensor:
-    """Directions ``(3, N)`` with density ``1 / 2 pi``."""
+    """Map to directions ``(3, N)`` about ``+z`` with density ``1 / 2 pi``."""
     z = u[0]
     r = (1.0 - z * z).clamp_min(0.0).sqrt()
     phi = (2.0 * math.pi) * u[1]
@@ -96,7 +96,7 @@ def uniform_hemisphere(u: Tensor) -> Tensor:
 
 
 def uniform_sphere(u: Tensor) -> Tensor:
-    """Directions ``(3, N)`` with density ``1 / 4 pi``."""
+    """Map to directions ``(3, N)`` with density ``1 / 4 pi``."""
     z = 1.0 - 2.0 * u[0]
     r = 2.0 * (u[0] * (1.0 - u[0])).sqrt()
     phi = (2.0 * math.pi) * u[1]
@@ -104,13 +104,13 @@ def uniform_sphere(u: Tensor) -> Tensor:
 
 
 def one_minus_cos(sin2: Tensor) -> Tensor:
-    """``1 - sqrt(1 - sin2)`` without cancellation: a series below ``sin2 = 6.9e-4``, where a far light's cone vanishes."""
+    """Compute ``1 - sqrt(1 - sin2)`` without cancellation: by a series below ``sin2 = 6.9e-4``, for cones of distant lights."""
     series = sin2 * (0.5 + sin2 * (0.125 + sin2 * 0.0625))
     return torch.where(sin2 < 6.9e-4, series, 1.0 - (1.0 - sin2).clamp_min(0.0).sqrt())
 
 
 def uniform_cone(u: Tensor, width: Tensor) -> Tensor:
-    """Directions ``(3, N)`` about ``+z`` within a cone of ``width = 1 - cos(theta_max)``; density ``1 / (2 pi width)``."""
+    """Map to directions ``(3, N)`` about ``+z`` in a cone of ``width = 1 - cos(theta_max)``; density ``1 / (2 pi width)``."""
     drop = u[0] * width  # 1 - cos(theta)
     r = (drop * (2.0 - drop)).clamp_min(0.0).sqrt()
     phi = (2.0 * math.pi) * u[1]
@@ -118,21 +118,21 @@ def uniform_cone(u: Tensor, width: Tensor) -> Tensor:
 
 
 def uniform_triangle(u: Tensor) -> Tensor:
-    """Barycentrics ``(2, N)`` of points uniform by area (Heitz, *A Low-Distortion Map Between Triangle and Square*, 2019)."""
+    """Map to barycentrics ``(2, N)`` uniform by area (Heitz, *A Low-Distortion Map Between Triangle and Square*, 2019)."""
     a, b = u[0], u[1]
     low = torch.minimum(a, b) * 0.5
     return torch.stack((a, b)) - low
 
 
-# ---- Distributions by their cumulative sums, kept in float64: a float32 sum of many weights collapses
+# ---- Discrete distributions by cumulative sums in float64: a float32 sum of many weights loses small ones
 
 
 @dataclass(frozen=True)
 class Distribution1D:
-    """Choice among K outcomes.
+    """A discrete distribution over K outcomes.
 
     Attributes:
-        cdf: ``(K,)`` float64, the upper end of each outcome's interval; the last is 1.
+        cdf: ``(K,)`` float64, upper end of each outcome's interval; the last is 1.
         pmf: ``(K,)`` probabilities in the lanes' dtype.
     """
 
@@ -141,13 +141,13 @@ class Distribution1D:
 
     @staticmethod
     def of(weights: Tensor, dtype: torch.dtype, even: float = 0.01) -> Distribution1D:
-        """From non-negative weights ``(K,)``; all zero gives the uniform choice.
+        """Build the distribution of non-negative weights ``(K,)``; all zero gives the uniform one.
 
         Args:
             weights: ``(K,)``.
             dtype: of ``pmf``.
-            even: share of the draws that is even among the outcomes with any weight. A draw has 24 bits: an outcome rarer
-                than that would never come up, or too often.
+            even: probability that is spread evenly over the outcomes of positive weight. A random number has 24 bits: a rarer
+                outcome would be drawn never, or too often.
         """
         w = weights.detach().double()
         total = sum_all(w)
@@ -156,15 +156,15 @@ class Distribution1D:
         floor = possible / possible.sum().clamp_min(1.0)
         w = torch.where(total > 0, (1.0 - even) * w / torch.where(total > 0, total, 1.0) + even * floor, uniform)
         cdf = torch.cumsum(w, 0)
-        # From the last possible outcome on the sum is 1, so that rounding never lets a draw fall on an impossible one.
+        # 1 from the last possible outcome on, so that rounding never draws an impossible one.
         last = int((w > 0).nonzero().max())
         cdf[last:] = 1.0
         return Distribution1D(cdf, w.to(dtype))
 
     def draw(self, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return outcomes ``(N,)`` int64 for ``u (N,)`` in ``[0, 1]``, and what is left of ``u``, float64 in ``[0, 1]``.
+        """Draw outcomes ``(N,)`` int64 by ``u (N,)`` in ``[0, 1]``; return them and remapped ``u``, float64 in ``[0, 1]``.
 
-        One of probability 0 is never drawn. What is left is uniform whatever was chosen.
+        An outcome of probability 0 is never drawn. The remapped ``u`` is uniform and independent of the outcome.
         """
         outcome = torch.searchsorted(self.cdf, u.double().clamp_max(1.0 - 2.0**-53), right=True)
         low = torch.where(outcome > 0, take(self.cdf, (outcome - 1).clamp_min(0)), 0.0)
@@ -174,15 +174,15 @@ class Distribution1D:
 
 @dataclass(frozen=True)
 class Distribution2D:
-    """Choice of a cell of an R x C grid, rows first; what a draw leaves over is a fresh number within the cell.
+    """A discrete distribution over the cells of an R x C grid, by rows, then by columns.
 
-    The cells' preimages are rectangles of the unit square, so points that are stratified there stay so.
+    The preimage of a cell is a rectangle of the unit square, so stratified points stay stratified.
 
     Attributes:
         rows: ``(R + 1,)`` float64 cumulative sums over the rows, from 0 to 1.
-        columns: ``(R C + 1,)`` float64: row number plus the cumulative sums within that row. It never falls, so that one
+        columns: ``(R C + 1,)`` float64: row number plus the cumulative sums within that row. They never decrease, so one
             binary search finds a cell of any row.
-        width: ``()`` int64 C.
+        width: ``()`` int64, the number C of columns.
     """
 
     rows: Tensor
@@ -191,12 +191,12 @@ class Distribution2D:
 
     @staticmethod
     def of(weights: Tensor) -> Distribution2D:
-        """From non-negative weights ``(R, C)`` of which one is positive."""
+        """Build the distribution of non-negative weights ``(R, C)``, at least one of them positive."""
         w = weights.detach().double()
         number = w.shape[0]
         along = torch.cumsum(w, 1)
         total = along[:, -1:]
-        # A row without weight is never asked.
+        # A row without weight is never drawn.
         along = torch.where(total > 0, along / torch.where(total > 0, total, 1.0), 1.0)
         along += torch.arange(number, dtype=w.dtype, device=w.device)[:, None]
         down = torch.cumsum(total[:, 0], 0)
@@ -205,9 +205,9 @@ class Distribution2D:
         return Distribution2D(torch.cat((zero, down / down[-1])), torch.cat((zero, along.reshape(-1))), width)
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows and columns ``(N,)`` int64 for ``u (2, N)`` in ``[0, 1)``, and what is left ``(2, N)``: columns by ``u[0]``.
+        """Draw rows and columns ``(N,)`` int64 by ``u (2, N)`` in ``[0, 1)``; return them and remapped ``u``.
 
-        A cell without weight is never drawn.
+        ``u[0]`` draws columns, ``u[1]`` rows. A cell without weight is never drawn.
         """
         # Just below 1 a row number plus u would round to the next row.
         v = u.double().contiguous().clamp_max(1.0 - 2.0**-32)
@@ -219,15 +219,15 @@ class Distribution2D:
 
 
 def _within(cdf: Tensor, index: Tensor, v: Tensor) -> Tensor:
-    """Where ``v`` lies in the interval ``index``, in ``[0, 1)``."""
+    """Return the relative position of ``v`` in interval ``index`` of a CDF, in ``[0, 1)``."""
     low, high = take(cdf, index), take(cdf, index + 1)
     return (v - low) / (high - low)
 
 
 def invert_linear(u: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """``x`` in ``[0, 1]`` distributed as ``a (1 - x) + b x``, for ``u`` in ``[0, 1)``; ``a, b >= 0`` and not both 0.
+    """Map ``u`` in ``[0, 1)`` to ``x`` in ``[0, 1]`` with density proportional to ``a (1 - x) + b x``, ``a, b >= 0``.
 
-    The root of the quadratic in the form that does not cancel. Where rounding made both 0, x is 0.
+    Solves the quadratic without cancellation. If rounding has made ``a`` and ``b`` 0, x is 0.
     """
     largest = torch.maximum(a, b)
     scale = torch.where(largest > 0, largest, 1.0)

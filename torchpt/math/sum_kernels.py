@@ -1,4 +1,4 @@
-"""Adding values to places of a table in a fixed order, and samples in theirs."""
+"""Numba kernels that add values to entries of a table in a fixed order, and sort lanes by sample."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from torchpt.native.jit import jit
 
 __all__ = ["COLUMNS", "add_at", "add_by_columns", "sort_by_sample"]
 
-#: Columns that slots are dealt to: as many as threads of a GPU go together. A power of two.
+#: Number of columns, a power of two: the threads of a GPU's warp.
 COLUMNS = 32
 
 
 @jit()
 def sort_by_sample(places: Any, count: int, lanes: Any, slots: Any, found: Any, taken: Any) -> None:
-    """Sort places of an arena by the slots of the samples that are there.
+    """Sort indices of an arena by the slots of the samples in these lanes.
 
     Args:
-        places: int32 with one to spare, of which ``count`` are sorted in place.
-        count: how many.
-        lanes: the arena's row of slots, those of the places all different.
-        slots: int32 with one to spare, where the slots go in their order.
-        found: int32, one for each slot, to work in.
-        taken: uint8, eight or a multiple for all slots: 0 before and after.
+        places: int32 indices, ``count`` of them sorted in place; its length is at least ``count + 1``.
+        count: number of indices.
+        lanes: the arena's row of slots; the slots at the indices are distinct.
+        slots: int32, filled with the sorted slots; its length is at least ``count + 1``.
+        found: int32 scratch memory, one element a slot.
+        taken: uint8 scratch memory, one element a slot, its length a multiple of 8: 0 before and after.
     """
     for k in range(count):
         slots[k] = lanes[np.uint32(places[k])]
@@ -39,7 +39,7 @@ def sort_by_sample(places: Any, count: int, lanes: Any, slots: Any, found: Any, 
     k, eights = 0, taken.view(np.uint64)
     for eight in range(eights.shape[0]):
         if eights[eight]:
-            for slot in range(8 * eight, 8 * eight + 8):  # without branches: what is not taken is written over
+            for slot in range(8 * eight, 8 * eight + 8):  # without branches: an unused entry is overwritten
                 places[k], slots[k] = found[slot], slot
                 k += taken[slot]
             eights[eight] = 0
@@ -47,7 +47,7 @@ def sort_by_sample(places: Any, count: int, lanes: Any, slots: Any, found: Any, 
 
 @jit()
 def add_at(total: Any, index: Any, values: Any) -> None:
-    """``total[index[k], r] += values[r, k]`` for all k in their order; an index beyond the table adds nothing.
+    """Add ``total[index[k], r] += values[r, k]`` for all k in order; indices out of range are skipped.
 
     Args:
         total: ``(M, R)``.
@@ -56,7 +56,7 @@ def add_at(total: Any, index: Any, values: Any) -> None:
     """
     entries, width = total.shape
     first = 0
-    while first + 3 <= width:  # three at a time, written out: colours and vectors take half as long
+    while first + 3 <= width:  # unrolled by three: colours and vectors take half as long
         x, y, z = values[first], values[first + 1], values[first + 2]
         for k in range(index.shape[0]):
             row = index[k]
@@ -74,7 +74,7 @@ def add_at(total: Any, index: Any, values: Any) -> None:
 
 @jit()
 def add_by_columns(total: Any, index: Any, values: Any, slots: Any) -> None:
-    """As :func:`add_at`, what an entry is given summed by columns of slots first: see :mod:`torchpt.math.sums`.
+    """Add as :func:`add_at`, but sum the terms of an entry by columns of slots first, see :mod:`torchpt.math.sums`.
 
     Args:
         total: ``(M, R)`` float64.

@@ -1,24 +1,22 @@
-"""Sums of gradients with respect to tables, in an order that neither threads nor places of lanes decide.
+"""Sums of gradients of tables, in an order that depends neither on threads nor on the positions of lanes.
 
-A chunk's terms come vertex by vertex, from the last to the first, stage by stage and look-up by look-up. Within a look-up they
-come by sample: by the slot that a lane's sample has in its chunk, wherever in an arena the lane lies. What a look-up adds to an
-entry is,
+The terms of a chunk are ordered by vertex, from the last to the first, then by stage, look-up and sample: by the slot of a
+lane's sample in its chunk, wherever the lane is in an arena. The terms of a look-up are added to an entry
 
-- in tables of few numbers (:data:`FEW`), summed by columns: slot s is in column s modulo C
+- by columns, in tables of few numbers (:data:`FEW`): slot s is in column s modulo C
   (:data:`~torchpt.math.sum_kernels.COLUMNS`). An entry's terms of a column are added one after the other, from 0; then each
-  column of the second half is added to its fellow of the first, and so on with those that are left, until there is one, which
-  is added to the entry. A slot without a term may be left out or count 0. A derivative by all of a table is a term of each lane
-  for each of its numbers, and is summed alike;
-- in other tables its terms one after the other, each added to the entry itself.
+  column of the second half is added to its counterpart in the first half, and so on, until one column is left, which is added
+  to the entry. A slot without a term may be left out or count as 0. A derivative by a whole table has a term for each lane and
+  number of the table, and is summed in the same way;
+- one after the other, in all other tables.
 
-The first suits threads of a GPU that go together, one for each column; the other may be done by a stable sort by entry, and a
-thread for each: the bits are the same. Sums are float64, in tables of more than :data:`WIDE` numbers of the lanes' own
-precision. Chunks are added in their order: of tables of up to :data:`DENSE` numbers what a chunk comes to, of others its terms
-one by one.
+The first suits a GPU's warp, with one thread a column; the second can be done by a stable sort by entry and one thread an
+entry: the bits are the same. Sums are float64, in tables of more than :data:`WIDE` numbers of the lanes' precision. Chunks are
+added in their order: the chunk's sums in tables of up to :data:`DENSE` numbers, its terms one by one in larger ones.
 
-A stage that runs by tensor operations knows no slots: the number of a term takes the slot's place. Where chunks run by tensor
-operations altogether, the terms of a look-up are added one after the other on a CPU. On other devices they are sorted by entry,
-and an entry's terms are added pairwise (:func:`summed_by_entry`).
+A stage that runs by tensor operations has no slots: the number of a term is used instead. If all of a chunk runs by tensor
+operations, the terms of a look-up are added one after the other on a CPU; on other devices they are sorted by entry, and the
+terms of an entry are added pairwise (:func:`summed_by_entry`).
 """
 
 from __future__ import annotations
@@ -34,19 +32,19 @@ from torchpt.ranks import Group
 
 __all__ = ["ChunkGradientSums", "GradientSums", "summed_by_entry"]
 
-#: Tables of more numbers than this are summed in the lanes' own precision: few paths meet in one of so many places.
+#: Tables of more numbers are summed in the lanes' precision: each entry has few terms.
 WIDE = 1 << 20
-#: A chunk sums tables of no more numbers than this by itself.
+#: Tables of at most so many numbers are summed by chunk.
 DENSE = 1 << 15
-#: Tables of no more numbers than this are summed by columns of slots: many lanes meet in one of so few entries.
+#: Tables of at most so many numbers are summed by columns of slots: each entry has many terms.
 FEW = 1 << 7
 
 
 class GradientSums:
-    """What was added up of the gradients of some tables.
+    """Sums of the gradients of tables.
 
     Args:
-        tables: ``(..., M)`` each.
+        tables: the tables, each ``(..., M)``.
     """
 
     def __init__(self, tables: Sequence[Tensor]) -> None:
@@ -55,7 +53,7 @@ class GradientSums:
         self._totals: list[Tensor | None] = [None] * len(self.tables)
 
     def take(self, table: Tensor, index: Tensor) -> Tensor | None:
-        """See :class:`torchpt.math.gathers.GatherRecorder`: the derivative of the look-up goes straight to the sums."""
+        """See :class:`torchpt.math.gathers.GatherRecorder`: the derivative of the look-up is added to the sums."""
         number = self._numbers.get(id(table))
         return None if number is None else _Taken.apply(table, index, self, number)
 
@@ -80,7 +78,7 @@ class GradientSums:
             self.add_sorted(number, index, values)
 
     def add_sorted(self, number: int, index: Tensor, values: Tensor) -> None:
-        """As :meth:`add_at`, on any device: each entry is added to once, as adding at one place has no order there."""
+        """Add as :meth:`add_at`, on any device: terms are summed by entry first, as ``index_add_`` has no order on GPUs."""
         total = self.total(number)
         if len(index):
             entries, found = summed_by_entry(index, values.reshape(total.shape[1], -1).to(total.dtype))
@@ -92,13 +90,13 @@ class GradientSums:
         total += gradient.reshape(total.shape[1], total.shape[0]).T
 
     def add_each(self, gradients: Iterable[Tensor | None]) -> None:
-        """Add gradients as large as their tables, one a table in their order; None adds nothing."""
+        """Add gradients as large as their tables, one for each table in order; None adds nothing."""
         for number, gradient in enumerate(gradients):
             if gradient is not None:
                 self.add(number, gradient)
 
     def join(self, part: GradientSums) -> None:
-        """Add the sums of a piece: all of them, or nothing where there is no memory for that."""
+        """Add the sums of another part of the work: all of them, or none if memory runs out."""
         own = [
             total if more is None else more if total is None else total + more
             for total, more in zip(self._totals, part._totals, strict=True)
@@ -106,21 +104,21 @@ class GradientSums:
         self._totals = own
 
     def join_ranks(self, ranks: Group) -> None:
-        """Add the sums of all ranks, in their order: every one has the same bits then."""
+        """Add the sums of all ranks, in their order: afterwards all ranks have the same bits."""
         there = torch.tensor([total is not None for total in self._totals], dtype=torch.uint8)
         for number, count in enumerate(torch.stack(ranks.gather(there)).sum(0).tolist()):
             if count:
                 self._totals[number] = ranks.sum(self.total(number))
 
     def merge(self, part: ChunkGradientSums) -> None:
-        """Add the sums of a chunk: its terms of large tables first, as they come where they are added at once."""
+        """Add the sums of a chunk: first the terms of large tables, in the order in which they came."""
         for number, index, values in part.stream:
             self.add_rows(number, index, values)
         for number, total in part.dense.items():
             self.total(number).add_(total)
 
     def clear(self) -> None:
-        """Forget what was added."""
+        """Set all sums to 0."""
         self._totals = [None] * len(self.tables)
 
     def add_rows(self, number: int, index: np.ndarray, values: np.ndarray) -> None:
@@ -130,7 +128,7 @@ class GradientSums:
         add_at(self.total(number).numpy(), index, values)
 
     def gradients(self) -> list[Tensor | None]:
-        """Return the sums in the shapes of their tables; None where nothing was added."""
+        """Return the sums in the shapes of their tables; None for a table to which nothing was added."""
         return [
             None if total is None else total.T.reshape(table.shape).to(table.dtype)
             for total, table in zip(self._totals, self.tables, strict=True)
@@ -138,15 +136,15 @@ class GradientSums:
 
 
 class ChunkGradientSums:
-    """Sums of one chunk: dense ones of small tables, and of large ones the terms themselves.
+    """Sums of one chunk: dense sums of small tables, and the terms of large tables.
 
     Args:
-        tables: ``(..., M)`` each.
-        whole: where terms of large tables are added at once, as chunks come one after the other; None: they are kept.
+        tables: the tables, each ``(..., M)``.
+        whole: sums to which terms of large tables are added at once, if chunks run one after the other; None: terms are kept.
 
     Attributes:
-        dense: sums ``(M, R)`` float64 by the number of a table.
-        stream: numbers of tables, indices ``(n,)`` and values ``(R, n)``.
+        dense: sums ``(M, R)`` float64 by number of the table.
+        stream: kept terms: number of the table, indices ``(n,)`` and values ``(R, n)``.
     """
 
     def __init__(self, tables: Sequence[Tensor], whole: GradientSums | None = None) -> None:
@@ -169,7 +167,7 @@ class ChunkGradientSums:
     def add_rows(self, number: int, index: np.ndarray, values: np.ndarray, slots: np.ndarray) -> None:
         """Add ``values (R, n)`` to the entries ``index (n,)`` int32 of a table.
 
-        ``slots (n,)`` int32, rising: of the samples that the terms are of.
+        ``slots (n,)`` int32, rising: slots of the samples to which the terms belong.
         """
         numbers = self.tables[number].numel()
         if numbers > DENSE:
@@ -186,7 +184,7 @@ class ChunkGradientSums:
             add_at(self._total(number).numpy(), index, values)
 
     def add_all(self, number: int, values: np.ndarray, slots: np.ndarray) -> None:
-        """Add the sums over lanes of ``values (all numbers of a table, n)``; ``slots`` as of :meth:`add_rows`."""
+        """Add the sums over lanes of ``values (all numbers of a table, n)``; ``slots`` as in :meth:`add_rows`."""
         from torchpt.math.sum_kernels import add_by_columns
 
         total = torch.zeros(self.tables[number].shape, dtype=torch.float64)
@@ -211,15 +209,15 @@ class ChunkGradientSums:
 
 
 def _form(table: Tensor) -> tuple[int, int]:
-    """Return how many entries a table has, and numbers an entry: the last axis is the one that is looked up."""
+    """Return the numbers of entries of a table and of components of an entry; the last axis is indexed by look-ups."""
     return (table.shape[-1], math.prod(table.shape[:-1])) if table.dim() else (1, 1)
 
 
 def summed_by_entry(index: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Sum terms by entry to the same bits on any device: pairwise, in the order in which an entry's terms come.
+    """Sum terms by entry, with the same bits on any device: pairwise, in the order of the terms of an entry.
 
     Args:
-        index: ``(n,)`` the entries, n > 0.
+        index: ``(n,)`` entries of the terms, n > 0.
         values: ``(R, n)``.
 
     Returns:
@@ -231,7 +229,7 @@ def summed_by_entry(index: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
     first = counts.cumsum(0) - counts
     rank = torch.arange(len(keys), device=keys.device) - first.repeat_interleave(counts)
     step, longest = 1, int(counts.max())
-    while step < longest:  # terms 0 and 1 of an entry, 2 and 3, ..., then what came out at 0 and 2, ...
+    while step < longest:  # terms 0 and 1 of an entry, 2 and 3, ..., then the sums at 0 and 2, ...
         pairs = (rank[:-step] % (2 * step) == 0) & (keys[step:] == keys[:-step])
         sums[:, :-step] += torch.where(pairs, sums[:, step:], 0.0)
         step *= 2
@@ -239,7 +237,7 @@ def summed_by_entry(index: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _Taken(torch.autograd.Function):
-    """Columns of a table, whose derivative is added to sums instead of being handed on."""
+    """A look-up of columns of a table, whose derivative is added to sums instead of being returned."""
 
     @staticmethod
     def forward(ctx, table: Tensor, index: Tensor, sums: GradientSums | ChunkGradientSums, number: int) -> Tensor:

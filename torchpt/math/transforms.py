@@ -1,7 +1,7 @@
-"""Affine transforms as float64 ``(4, 4)`` matrices that act on column vectors, built from a scene file's lists.
+"""Affine transforms as float64 ``(4, 4)`` matrices that act on column vectors, from the lists of scene files.
 
-Each operation is one formula. Without a device it makes an array of numbers, which are checked; with one it makes a tensor
-there, on the tape of the tensors that stand among its arguments. Those are known to be right: they were read as numbers before.
+Each operation is one formula for numpy and torch. Without a device it checks its arguments and returns an array; with a device
+it returns a tensor there, differentiable by the tensors among its arguments, which must have been checked before.
 
 The camera convention is Mitsuba's: in its own frame a camera looks along +z with +y up and +x to the *left* of the
 picture, so that image right is ``(target - origin) x up`` in the right-handed world.
@@ -45,7 +45,7 @@ Matrix = NDArray[np.float64]
 Array = Any
 Device = torch.device | None
 
-#: What errors say of a matrix that is not usable.
+#: Text of errors about a matrix that is not usable.
 WITHIN = "it and its inverse finite in float32 (up to 3.4e38)"
 
 _SINGULAR = 1e-12  # smallest singular value over the largest; float64 products of a few matrices stay near 1e-15
@@ -54,7 +54,7 @@ _PARALLEL = 1e-6  # sine of the angle between up and the viewing direction
 
 
 def tensor_of(value: Any, device: torch.device) -> Tensor:
-    """Return numbers, and lists of them, with tensors anywhere among them, as one float64 tensor on a device."""
+    """Convert a number, or nested lists of numbers and tensors, to one float64 tensor on a device."""
     if isinstance(value, Tensor):
         return value.to(device, torch.float64)
     if isinstance(value, list | tuple):
@@ -63,24 +63,24 @@ def tensor_of(value: Any, device: torch.device) -> Tensor:
 
 
 def constant(values: Any, like: Array) -> Array:
-    """Return numbers as what ``like`` is: an array, or a tensor of its type on its device."""
+    """Return numbers as an array, or as a tensor of the dtype and device of ``like`` if that is a tensor."""
     return like.new_tensor(values) if isinstance(like, Tensor) else np.asarray(values, np.float64)
 
 
 def affine(linear: Array, origin: Array) -> Array:
-    """Return ``(4, 4)`` of a linear part ``(3, 3)`` and a translation ``(3,)``, both arrays or both tensors."""
+    """Return the ``(4, 4)`` matrix of a linear part ``(3, 3)`` and a translation ``(3,)``, both arrays or both tensors."""
     xp = _library(linear)
     rows = xp.concatenate((linear, origin[:, None]), 1)
     return xp.concatenate((rows, constant([[0.0, 0.0, 0.0, 1.0]], linear)), 0)
 
 
 def _library(value: Array) -> Any:
-    """Return the library of an array, numpy or torch: what is called of it here both call alike."""
+    """Return the module of an array, numpy or torch; the functions used here have the same names in both."""
     return torch if isinstance(value, Tensor) else np
 
 
 def _scaled(vector: Array) -> Array:
-    """Return a vector over its largest entry, which has no gradient; 0 as it is."""
+    """Divide a vector by its largest entry, taken without gradient; 0 stays 0."""
     largest = abs(vector).max()
     if isinstance(largest, Tensor):
         largest = largest.detach()
@@ -88,7 +88,7 @@ def _scaled(vector: Array) -> Array:
 
 
 def _unit(vector: Array) -> Array:
-    """Return a vector other than 0 at length 1."""
+    """Normalize a vector other than 0."""
     scaled = _scaled(vector)
     return scaled / _library(vector).linalg.norm(scaled)
 
@@ -100,7 +100,7 @@ def _number(value: Any) -> bool:
 def _vector(
     value: Any, key: str, device: Device, expected: str = "three finite numbers [x, y, z]", spread: bool = False
 ) -> Array:
-    """Return three numbers; with ``spread`` one may stand for all of them."""
+    """Return three numbers; with ``spread`` one number stands for all three."""
     if device is not None:
         return tensor_of(value, device).expand(3)
     items = [value] * 3 if spread and _number(value) else value
@@ -124,7 +124,7 @@ def _float(value: Any) -> float:
 def uv_matrix(
     scale: tuple[float, float], degrees: float, translate: tuple[float, float], repeats: tuple[float, float]
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Rows ``(2, 3)`` of an affine map of texture coordinates: scale, turn from u to v, move, multiply by ``repeats``."""
+    """Return the affine map ``(2, 3)`` of texture coordinates: scale, turn from u to v, translate, multiply by ``repeats``."""
     angle = math.radians(degrees)
     c, s = math.cos(angle), math.sin(angle)
     if degrees % 90.0 == 0.0:
@@ -134,7 +134,7 @@ def uv_matrix(
 
 
 def is_singular(matrix: Matrix) -> bool:
-    """Whether the linear part of a ``(4, 4)`` matrix has no usable inverse, whatever its scale, or is not finite."""
+    """Return True if a ``(4, 4)`` matrix is not finite or its linear part has no usable inverse, whatever its scale."""
     linear = np.asarray(matrix)[:3, :3]
     if not np.isfinite(matrix).all():
         return True
@@ -143,7 +143,7 @@ def is_singular(matrix: Matrix) -> bool:
 
 
 def is_usable(matrix: Matrix) -> bool:
-    """Whether a ``(4, 4)`` affine matrix can place things: it and its inverse exist and are finite in float32."""
+    """Return True if a ``(4, 4)`` affine matrix and its inverse exist and are finite in float32."""
     if not np.abs(matrix).max() <= _LARGEST:  # for NaN too
         return False
     values = np.linalg.svd(matrix[:3, :3], compute_uv=False)
@@ -159,19 +159,19 @@ def is_usable(matrix: Matrix) -> bool:
 
 
 def is_rigid(matrix: Matrix, tolerance: float = 1e-3) -> bool:
-    """Whether the linear part of a ``(4, 4)`` matrix keeps lengths: a rotation or a reflection, without scale or shear."""
+    """Return True if the linear part of a ``(4, 4)`` matrix keeps lengths: a rotation or reflection."""
     linear = matrix[:3, :3]
     return bool(np.abs(linear.T @ linear - np.eye(3)).max() <= tolerance)
 
 
 def similarity_scale(matrix: Matrix, tolerance: float = 1e-5) -> float | None:
-    """The uniform scale of a ``(4, 4)`` similarity (rotation or reflection, translation, uniform scale), else None."""
+    """Return the scale of a ``(4, 4)`` similarity (rotation or reflection, translation, uniform scale); None if it is none."""
     values = np.linalg.svd(np.asarray(matrix)[:3, :3], compute_uv=False)
     return float(values.mean()) if values[0] - values[2] <= tolerance * values[0] else None
 
 
 def apply_points(matrix: Matrix, points: Matrix) -> Matrix:
-    """Points ``(V, 3)`` moved by an affine ``(4, 4)`` matrix, in float64."""
+    """Transform points ``(V, 3)`` by an affine ``(4, 4)`` matrix, in float64."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
@@ -182,7 +182,7 @@ def translate(offset: Any, key: str = "translate", device: Device = None) -> Arr
 
 
 def scale(factor: Any, key: str = "scale", device: Device = None) -> Array:
-    """Return a scale by one number or by ``[x, y, z]``; a zero has no inverse and is an error."""
+    """Return a scale by one number or by ``[x, y, z]``; 0 is an error, as it has no inverse."""
     expected = "a non-zero number or three of them"
     factors = _vector(factor, key, device, expected, spread=True)
     if not factors.all():
@@ -217,7 +217,7 @@ def matrix4(rows: Any, key: str = "matrix", device: Device = None) -> Array:
     """Return an affine ``(4, 4)`` matrix from four rows of four numbers, the last one ``[0, 0, 0, 1]``."""
     if device is not None:
         matrix = tensor_of(rows, device)
-        return affine(matrix[:3, :3], matrix[:3, 3])  # the last row is no number of the scene
+        return affine(matrix[:3, :3], matrix[:3, 3])  # the last row is constant
     expected = "four rows of four finite numbers, the last one [0, 0, 0, 1]"
     try:
         entries = [list(row) for row in rows]
@@ -275,11 +275,11 @@ def compose(operations: Any, device: Device = None) -> Array:
 
     Args:
         operations: e.g. ``[{"scale": 2}, {"rotate": {"axis": [0, 1, 0], "angle": 30}}, {"translate": [0, 1, 0]}]``.
-        device: None: an array of numbers; else a float64 tensor there, of operations that were read before.
+        device: None: return an array; else a float64 tensor there, of operations that were checked before.
 
     Raises:
-        SceneError: an entry that is malformed or singular (its ``key`` is relative to the list, e.g. ``1.rotate.axis``), or
-            a product that float32 cannot hold together with its inverse (the ``key`` is empty).
+        SceneError: an entry is malformed or singular (its ``key`` is relative to the list, e.g. ``1.rotate.axis``), or the
+            product or its inverse overflows float32 (the ``key`` is empty).
     """
     names = ", ".join(OPERATIONS)
     if not isinstance(operations, list | tuple):

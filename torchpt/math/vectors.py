@@ -1,4 +1,4 @@
-"""Vectors ``(3, N)``, frames and angles between vectors; the lanes of records."""
+"""Vectors ``(3, N)``, orthonormal frames, angles; look-ups of lanes in tables and records."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ __all__ = [
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Dot product over the first axis: ``(3, N), (3, N) -> (N,)``."""
+    """Compute the dot product over the first axis: ``(3, N), (3, N) -> (N,)``."""
     return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross product over the first axis: ``(3, N), (3, N) -> (3, N)``."""
+    """Compute the cross product over the first axis: ``(3, N), (3, N) -> (3, N)``."""
     return torch.stack(
         (
             torch.addcmul(a[1] * b[2], a[2], b[1], value=-1),
@@ -51,9 +51,9 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def normalize(a: Tensor) -> Tensor:
-    """Unit vectors ``(3, N)``; a zero vector stays zero and passes a zero gradient.
+    """Normalize vectors ``(3, N)``; a zero vector stays zero and has gradient zero.
 
-    Scaled by the largest component first, so that neither 1e-30 nor 1e30 leaves the range of float32.
+    Vectors are scaled by their largest component first, so that squares of 1e-30 and 1e30 stay in the range of float32.
     """
     scale = a.detach().abs().amax(0)
     scale = torch.where(scale > 0, scale, 1.0)
@@ -64,29 +64,29 @@ def normalize(a: Tensor) -> Tensor:
 
 
 def affine(p: Tensor, a: Tensor, u: Tensor, b: Tensor, v: Tensor) -> Tensor:
-    """``p + a u + b v`` for vectors ``(3, N)`` and scalars ``(N,)``."""
+    """Compute ``p + a u + b v`` for vectors ``(3, N)`` and scalars ``(N,)``."""
     return torch.addcmul(torch.addcmul(p, a, u), b, v)
 
 
 def largest(a: Tensor) -> Tensor:
-    """The largest component: ``(3, N) -> (N,)``."""
+    """Return the largest component: ``(3, N) -> (N,)``."""
     return torch.maximum(torch.maximum(a[0], a[1]), a[2])
 
 
 def safe_reciprocal(a: Tensor) -> Tensor:
-    """``1 / a`` for ``a >= 0``; finite (and huge) at 0, where the caller's other factor is 0."""
+    """Compute ``1 / a`` for ``a >= 0``; finite (and huge) at 0, where the caller multiplies by 0."""
     return a.clamp_min(torch.finfo(a.dtype).tiny).reciprocal()
 
 
 def luminance(rgb: Tensor) -> Tensor:
-    """Luminance of linear RGB ``(3, ...) -> (...)``: Y of CIE XYZ by the primaries of Rec. 709, as in pbrt and Mitsuba."""
+    """Compute the luminance of linear RGB ``(3, ...) -> (...)``: CIE Y of Rec. 709 primaries, as in pbrt and Mitsuba."""
     return 0.212671 * rgb[0] + 0.715160 * rgb[1] + 0.072169 * rgb[2]
 
 
 def take(table: Tensor, index: Tensor | None) -> Tensor:
-    """Columns of a table: ``(C, M), (N,) -> (C, N)`` or ``(M,), (N,) -> (N,)``. Several times faster than ``[:, index]``.
+    """Return columns of a table: ``(C, M), (N,) -> (C, N)`` or ``(M,), (N,) -> (N,)``; ``index`` None: all of them.
 
-    ``index`` None: all of them.
+    Several times faster than ``table[:, index]``.
     """
     if index is None:
         return table
@@ -101,12 +101,12 @@ T = TypeVar("T")
 
 
 def rows(record: T, index: Tensor | None) -> T:
-    """Return the lanes ``index`` of all tensors in a record (None: all); what is static stays."""
+    """Return the lanes ``index`` of all tensors in a record (None: all); other fields stay."""
     return record if index is None else map_leaves(lambda table: take(table, index), record)
 
 
 def concatenate_lanes(records: list[T]) -> T:
-    """Records joined along the lane axis."""
+    """Concatenate records along the lanes' axis."""
     return records[0] if len(records) == 1 else map_leaves(lambda *parts: torch.cat(parts, -1), *records)
 
 
@@ -125,7 +125,7 @@ class Frame:
 
     @staticmethod
     def about(n: Tensor) -> Frame:
-        """The frame about unit normals ``(3, N)``; continuous but for ``n.z = 0``, and never degenerate."""
+        """Return a frame about unit normals ``(3, N)``; continuous except at ``n.z = 0``, and never degenerate."""
         sign = torch.copysign(torch.ones_like(n[2]), n[2])
         a = -1.0 / (sign + n[2])
         b = n[0] * n[1] * a
@@ -135,7 +135,7 @@ class Frame:
 
     @staticmethod
     def along(n: Tensor, tangent: Tensor) -> Frame:
-        """The frame about unit normals ``n (3, N)`` whose ``s`` is next to ``tangent (3, N)``; any where that is along n."""
+        """Return the frame about unit normals ``n (3, N)`` with ``s`` nearest to ``tangent (3, N)``; any frame if parallel."""
         s = torch.addcmul(tangent, n, dot(n, tangent), value=-1)
         square, whole = dot(s, s), dot(tangent, tangent)
         usable = square > 1e-12 * whole
@@ -143,11 +143,11 @@ class Frame:
         return Frame(s, cross(n, s), n)
 
     def to_local(self, w: Tensor) -> Tensor:
-        """World ``(3, N)`` to local."""
+        """Transform vectors ``(3, N)`` from the world to the frame."""
         return torch.stack((dot(self.s, w), dot(self.t, w), dot(self.n, w)))
 
     def to_world(self, w: Tensor) -> Tensor:
-        """Local ``(3, N)`` to world."""
+        """Transform vectors ``(3, N)`` from the frame to the world."""
         return affine(self.s * w[0], self.t, w[1], self.n, w[2])
 
 
@@ -169,17 +169,17 @@ _TURN = 2.0 * math.pi
 
 
 def azimuth(x: Tensor, y: Tensor) -> Tensor:
-    """Angles ``(N,)`` in ``[0, 2 pi)`` from +x to ``(x, y)``, counter-clockwise; 0, with finite derivatives, at the origin."""
-    # Signs as factors, and never 0: |x| would lose the derivative on an axis.
+    """Compute angles ``(N,)`` in ``[0, 2 pi)`` from +x to ``(x, y)``, counter-clockwise; 0 at the origin, gradients finite."""
+    # Absolute values by a sign that is never 0: torch.abs has gradient 0 at 0.
     sign_x, sign_y = (torch.copysign(torch.ones_like(a), a).detach() for a in (x, y))
     a, b = x * sign_x, y * sign_y
     steep = b > a
     low, high = torch.where(steep, a, b), torch.where(steep, b, a)
-    # Scaled by a constant, so that the sum below neither overflows nor vanishes.
+    # Scaled by a constant, so that the sum below neither overflows nor underflows.
     scale = high.detach()
     scale = torch.where(scale > 0, scale, 1.0)
     low, high = low / scale, torch.where(high > 0, high / scale, 1.0)
-    # atan(r) = pi / 4 + atan((r - 1) / (r + 1)) brings the upper half of the octant to the lower one.
+    # atan(r) = pi / 4 + atan((r - 1) / (r + 1)) maps the upper half of the octant to the lower half.
     upper = low > (math.sqrt(2.0) - 1.0) * high
     ratio = torch.where(upper, low - high, low) / torch.where(upper, low + high, high)
     square = ratio * ratio

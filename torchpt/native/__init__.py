@@ -1,8 +1,8 @@
-"""What torch alone does not run well: numba kernels, how they are compiled, kept on disk and timed; vectors as their values.
+"""Numba kernels: their compilation, cache on disk and compile time, and SIMD vectors as a numba type.
 
-``jit.py`` has the decorators: start there. ``content.py`` says what a kernel is made of, by which ``cache.py`` keeps it on
-disk; ``compile_time.py`` counts the seconds; ``simd/`` gives numba vectors of the CPU. Nothing here imports numba until a
-kernel is called.
+``jit.py`` has the decorators: start there. ``content.py`` computes digests of code, by which ``cache.py`` caches kernels;
+``compile_time.py`` measures the time of compilation; ``simd/`` has the vector type. ``jit.py`` and ``simd/`` import numba, so
+other rooms import them only when a kernel is needed.
 
 May import: ``core``.
 """

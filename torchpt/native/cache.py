@@ -1,8 +1,8 @@
-"""Keep kernels on disk: a folder of entries, never larger than it may be.
+"""The cache of kernels on disk: a folder of limited size.
 
-An entry is found by the content that it was made of, so that all checkouts and processes of a user share the folder. Entries
-are native code, so the folder is this user's alone (mode 0700, owner checked) and each carries a checksum. Where there can be
-no such folder, nothing is kept.
+The name of an entry is a digest of the code that it was compiled from, so all checkouts and processes of a user share the
+folder. Entries are native code, so only the user may access the folder (mode 0700, owner checked), and each entry has a
+checksum. Without such a folder nothing is cached.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from pathlib import Path
 
 __all__ = ["cache_folder", "read", "write"]
 
-#: Bytes of all entries from which on those go that were not used for the longest time, until half of that is left.
+#: Largest size of the folder in bytes; beyond it the least recently used entries are removed until half of it is left.
 MOST = 1 << 29
-#: Seconds after which a use is noted again, and what a killed process left of an entry is nobody's.
+#: Seconds after which the time of use of an entry is updated, and an unfinished entry counts as abandoned.
 DAY = 86_400.0
-#: Begins the names of entries that are being written.
+#: Prefix of the names of entries that are being written.
 _UNFINISHED = "unfinished-"
-#: What may be removed: the folder may hold files of others.
+#: Files that may be removed: the folder may hold other files.
 _OURS = re.compile(rf"[0-9a-f]{{40}}\.(o|json|nbc)|{_UNFINISHED}.*")
 
 
 def cache_folder() -> Path | None:
-    """Where kernels are kept: ``$TORCHPT_CACHE``, else the user's cache folder; None where that cannot be trusted."""
+    """Return the cache folder: ``$TORCHPT_CACHE``, else below the user's cache folder; None if it is missing or not private."""
     given = os.environ.get("TORCHPT_CACHE")
     if given == "":
         return None
     base = os.environ.get("XDG_CACHE_HOME", "")
-    if not os.path.isabs(base):  # as its specification says
+    if not os.path.isabs(base):  # relative paths are ignored, by the XDG specification
         base = os.path.join(os.path.expanduser("~"), ".cache")
     folder = Path(given).absolute() if given else Path(base) / "torchpt" / "kernels"
     if not folder.is_absolute():  # no home
         return None
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        facts = [folder.stat(), folder.lstat()]  # a link must be this user's as well
+        facts = [folder.stat(), folder.lstat()]  # a link must belong to the user, too
     except OSError:
         return None
     if not hasattr(os, "getuid"):  # no owners and modes to check
@@ -59,19 +59,19 @@ def _folder() -> Path | None:
 
 
 def read(name: str) -> bytes | None:
-    """An entry of the cache; None where there is none, or a damaged or a doubtful one, which is made again."""
+    """Read an entry; None if it is missing, damaged or not owned by the user."""
     folder = _folder()
     if folder is None:
         return None
     try:
-        # A pipe in the place of an entry would be waited for.
+        # Non-blocking, as a pipe in place of the entry would block.
         flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
         handle = os.open(folder / name, os.O_RDONLY | flags)
         with os.fdopen(handle, "rb") as file:
             facts = os.fstat(handle)
             if not stat.S_ISREG(facts.st_mode):
                 return None
-            # Whoever may rename the folder could have put another in its place since it was looked at.
+            # The folder may have been replaced since it was checked.
             if hasattr(os, "getuid") and (facts.st_uid != os.getuid() or facts.st_mode & 0o022):
                 return None
             content = file.read()
@@ -89,7 +89,7 @@ def _check(name: str, code: bytes) -> bytes:
 
 
 def write(entry: str, code: bytes) -> None:
-    """Put an entry in its place at once or not at all; a full disk is no reason to stop."""
+    """Write an entry atomically; errors such as a full disk are ignored."""
     folder = _folder()
     if folder is None:
         return
@@ -110,11 +110,11 @@ def write(entry: str, code: bytes) -> None:
 
 @cache
 def _tidied(folder: Path) -> None:
-    """Remove what was not used for the longest time, where the folder is too large; once a process, which has code to make."""
+    """Remove the least recently used entries if the folder is too large; once a process, before its first write."""
     found, now = [], time.time()
     with suppress(OSError), os.scandir(folder) as files:
         for file in files:
-            with suppress(OSError):  # another process is at it
+            with suppress(OSError):  # another process may remove it at the same time
                 facts = file.stat(follow_symlinks=False)
                 if stat.S_ISREG(facts.st_mode) and _OURS.fullmatch(file.name):
                     left = file.name.startswith(_UNFINISHED) and now - facts.st_mtime > DAY

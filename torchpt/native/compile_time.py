@@ -1,4 +1,4 @@
-"""Seconds that this process has spent on kernels that any render may call, compiling them or loading them from disk."""
+"""The time that this process has spent on compiling kernels or loading them from disk."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _state = {"total": 0.0, "since": 0.0, "depth": 0}
 
 
 def seconds() -> float:
-    """Return the seconds so far, those of a compilation that is under way included; nested or at once they count once."""
+    """Return the seconds so far, including a compilation in progress; nested or simultaneous ones count once."""
     with _lock:
         under_way = time.perf_counter() - _state["since"] if _state["depth"] else 0.0
         return _state["total"] + under_way
 
 
 def begin() -> None:
-    """Note that a thread compiles from now on, or waits for another one that does."""
+    """Mark the start of a compilation in a thread, or of its wait for another thread's."""
     with _lock:
         if not _state["depth"]:
             _state["since"] = time.perf_counter()
@@ -28,7 +28,7 @@ def begin() -> None:
 
 
 def end() -> None:
-    """Note that a thread that had :func:`begin` is done."""
+    """Mark the end of what :func:`begin` has marked."""
     with _lock:
         _state["depth"] -= 1
         if not _state["depth"]:
@@ -36,7 +36,7 @@ def end() -> None:
 
 
 def _after_fork() -> None:
-    """Begin anew in a child: threads that compiled are not there."""
+    """Reset the state in a forked child, which has none of the parent's compiling threads."""
     global _lock
     _lock = threading.Lock()
     _state["depth"] = 0

@@ -1,6 +1,6 @@
-"""Digest code: equal for equal code, whatever its file's time, its docstrings, its comments and its place.
+"""Digests of code, which ignore docstrings, comments, and path and time of the file.
 
-Entries of the kernel cache are found by them: see :mod:`torchpt.native.cache`.
+They are the keys of the kernel cache, see :mod:`torchpt.native.cache`.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def _digest(text: str) -> str:
 
 @functools.cache
 def code_of_folder(folder: Path = _PACKAGE) -> str:
-    """Return a digest of the code of all modules below a folder; the whole package without one.
+    """Return a digest of the code of all modules below a folder, by default of the whole package.
 
-    Files are compiled once a change: their digests are kept beside their size and time. ``assert`` does not count.
+    A file is read again only if its size or time has changed: digests are cached. ``assert`` statements are ignored.
     """
     name = _digest(str(folder))[:40] + ".json"
     kept: dict[str, list[Any]] = json.loads(cache.read(name) or b"{}")
@@ -59,12 +59,12 @@ def _modules(folder: str) -> Iterator[tuple[str, os.stat_result]]:
 
 
 def _code_of_file(path: str) -> str:
-    # optimize=2 leaves docstrings out
+    # optimize=2 removes docstrings and asserts
     return _digest(repr(_code(compile(Path(path).read_bytes(), "", "exec", dont_inherit=True, optimize=2))))
 
 
 def _code(code: CodeType, documented: bool = False) -> tuple[Any, ...]:
-    """Return what a code object says, without lines, file names and (where it has one) the docstring."""
+    """Return the content of a code object without line numbers and file name, and without the docstring if ``documented``."""
     consts = tuple(_constant(x) for x in code.co_consts[documented:])
     places = (code.co_argcount, code.co_kwonlyargcount, code.co_posonlyargcount, code.co_flags)
     names = (code.co_name, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
@@ -74,21 +74,21 @@ def _code(code: CodeType, documented: bool = False) -> tuple[Any, ...]:
 def _constant(value: Any) -> Any:
     if isinstance(value, CodeType):
         return _code(value)
-    if isinstance(value, frozenset):  # in an order that depends on the process
+    if isinstance(value, frozenset):  # its order depends on the process
         return "frozenset", sorted(map(repr, value))
     return type(value).__name__, repr(value)
 
 
-# -- a function of numba
+# -- a numba function
 
 
 def code_of_function(function: Callable[..., Any]) -> str:
-    """Return a digest of a numba function: its code, the values of the globals it reads and all that it calls.
+    """Return a digest of a numba function: its code, the values of the globals it reads, and the functions that it calls.
 
     Raises:
-        TypeError: it reads something whose content cannot be told.
+        TypeError: the function reads a global of a type without a digest.
     """
-    found: dict[int, tuple[int, Any]] = {}  # by id: its number, and the object, so that no other gets the id meanwhile
+    found: dict[int, tuple[int, Any]] = {}  # by id: number and object, which keeps the id in use
     return _digest(repr(_content(function, found)))
 
 
@@ -101,7 +101,7 @@ def _content(value: Any, found: dict[int, tuple[int, Any]]) -> Any:
         return value.dtype.str, value.shape, hashlib.sha256(value.tobytes()).hexdigest()
     if hasattr(value, "py_func"):  # a function that numba compiles
         return repr(sorted(value.targetoptions.items())), _content(value.py_func, found)
-    if hasattr(value, "_defn"):  # an intrinsic: it writes IR by means of the modules around it
+    if hasattr(value, "_defn"):  # an intrinsic: its IR depends on the modules of its folder
         return value._defn.__qualname__, _folder_of(value._defn)
     if isinstance(value, FunctionType):
         if _is_ours(value.__module__):
@@ -135,7 +135,7 @@ def _names(code: CodeType) -> set[str]:
 
 
 def _is_ours(module: str) -> bool:
-    """Return False for libraries: their versions are part of an entry's name."""
+    """Return False for modules of libraries, whose versions are part of the keys."""
     return module.split(".")[0] not in {"numba", "numpy", "torch", "llvmlite", *sys.stdlib_module_names} - {"__main__"}
 
 

@@ -1,6 +1,6 @@
-"""How numba kernels are compiled and how they are run on several threads.
+"""Compile numba kernels, and run them on several threads.
 
-Importing this module imports numba; only the numba backends do so.
+Importing this module imports numba; only the numba backends import it.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ __all__ = ["ensure_compiled", "jit", "jit_internal", "launch", "parallel_allowed
 
 _lock = threading.Lock()
 _state: dict[str, Any] = {"owner": None, "parallel": None, "forked": False, "said": False}
-#: Seconds of compiling after which the user is told.
+#: Seconds of compilation after which a message is printed.
 _PATIENCE = 1.0
 
 
 def _after_fork() -> None:
-    """A child starts without its parent's OpenMP team and lock.
+    """Reset the state in a forked child, which has none of the parent's OpenMP threads.
 
-    Torch's own parallel operations would wait for that team for ever: in the child they run serially.
+    torch's parallel operations would wait for these threads forever: in the child they run in one thread.
     """
     global _lock
     torch.set_num_threads(1)
@@ -55,7 +55,7 @@ if hasattr(os, "register_at_fork"):
 
 
 class _Compiling(Listener):
-    """Tells :mod:`torchpt.native.compile_time` of every kernel, also of those that compile at their first call."""
+    """A numba listener that reports each compilation to :mod:`torchpt.native.compile_time`."""
 
     def on_start(self, event: Event) -> None:
         compile_time.begin()
@@ -69,9 +69,9 @@ register("numba:compiler_lock", _Compiling())
 
 
 def jit(**options: Any) -> Callable[[Callable], Any]:
-    """``numba.njit`` with the house's options, cached on disk by content.
+    """Decorate a kernel: ``numba.njit`` without the GIL, cached on disk by content.
 
-    ``error_model="numpy"`` is not a choice: Python's check for division by zero keeps LLVM from using vectors.
+    ``error_model="numpy"`` is needed: Python's check for division by zero prevents vectorization.
     """
     settings: dict[str, Any] = {"error_model": "numpy", "nogil": True, **options}
 
@@ -84,9 +84,10 @@ def jit(**options: Any) -> Callable[[Callable], Any]:
 
 
 class _ByContent(NullCache):
-    """A kernel's machine code on disk, found by what it was made of; a cache that fails costs time and nothing else.
+    """A disk cache of a kernel's machine code, by the content of its source; errors are ignored, and the kernel is compiled.
 
-    Numba's own looks at the time of a kernel's file only: a checkout compiles all kernels, and an edit of what is inlined none.
+    numba's own cache checks only the time of the kernel's file: a checkout would recompile all kernels, and an edit of an
+    inlined function none.
     """
 
     def __init__(self, kernel: Any) -> None:
@@ -100,7 +101,7 @@ class _ByContent(NullCache):
             return None
         try:
             return CompileResult._rebuild(target_context, *pickle.loads(content))
-        except Exception:  # whatever an entry of another making raises: the kernel is compiled anew
+        except Exception:  # an entry in another format may raise anything: the kernel is compiled
             return None
 
     def save_overload(self, sig: Any, cres: Any) -> None:
@@ -122,14 +123,14 @@ class _ByContent(NullCache):
 
 
 def jit_internal(**options: Any) -> Callable[[Callable], Any]:
-    """:func:`jit` for what kernels alone call: without entries from Python and C, which would be compiled beside it."""
+    """Decorate a function that only kernels call: as :func:`jit`, without the wrappers for Python and C."""
     return jit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
 def ensure_compiled(kernel: Any, *args: Any) -> Any:
-    """The kernel, compiled for arguments with which it does nothing; says so on stderr, once, where that takes long."""
+    """Compile a kernel by a call without work, and return it; a long compilation prints a message to stderr, once."""
     if not kernel.overloads:
-        # LLVM ends the process where it finds no memory, and so does the BLAS that numba brings along with its first kernel.
+        # LLVM aborts the process without memory, and so does the BLAS that numba loads with its first kernel.
         check_room(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN)
         timer = threading.Timer(_PATIENCE, _say)
         timer.daemon = True
@@ -148,12 +149,12 @@ def _say() -> None:
 
 
 def _most_threads() -> int:
-    """Threads that numba was started with."""
+    """Return the number of threads that numba was started with."""
     return int(getattr(numba_config, "NUMBA_NUM_THREADS", 1))
 
 
 def _probe() -> bool:
-    """Return True where numba's threading layer lets several Python threads call parallel kernels (starts the layer)."""
+    """Return True if numba's threading layer allows parallel kernels in several Python threads; starts the layer."""
     if _most_threads() < 2 or getattr(numba_config, "THREADING_LAYER", "") == "workqueue":
         return False
     try:
@@ -166,10 +167,10 @@ def _probe() -> bool:
 
 
 def parallel_allowed() -> bool:
-    """Return True where ``prange`` kernels may run here.
+    """Return True if ``prange`` kernels may run in this process.
 
-    Only in the process that first asked, never after a fork (GNU OpenMP kills forked children that use it), and never
-    under numba's ``workqueue`` layer, which aborts when two Python threads enter it.
+    They may run only in the process of the first call, never after a fork (GNU OpenMP kills forked children that use it), and
+    never with numba's ``workqueue`` layer, which aborts when two Python threads enter it.
     """
     if _state["forked"]:
         return False
@@ -185,10 +186,10 @@ def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, arg
     Args:
         serial: compiled ``(first, last, *args)``, releases the GIL.
         parallel: compiled ``(chunks, items, *args)``: the same body under ``prange``.
-        items: how many blocks of lanes there are.
-        threads: 1 runs strictly in the calling thread.
-        grain: fewest items that repay another thread.
-        args: what both take; results are written into it, each item its own part, so the split does not matter.
+        items: number of items.
+        threads: most threads; 1 runs in the calling thread.
+        grain: fewest items that are worth another thread.
+        args: arguments of both; each item writes its own results into them, so results do not depend on the split.
     """
     threads = min(threads, max(1, items // grain))
     if threads == 1:

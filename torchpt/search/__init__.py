@@ -1,16 +1,16 @@
-"""Search structures: which primitive does a ray hit first, and does it hit anything.
+"""Ray intersection: acceleration structures that find the nearest hit of a ray, or whether it hits anything.
 
-One contract (:class:`~torchpt.search.base.Accel`: start there), three backends:
+One interface (:class:`~torchpt.search.base.Accel`: start there), three backends:
 
-- ``brute`` (CPU): every ray against every primitive in packets, by kernels of the lane compiler; for a few dozen primitives.
-- ``numba`` (CPU): a wide tree built by the surface area heuristic (``tree_build.py``, ``tree_layout.py``, ``tree_leaf.py``);
-  packets and single rays go through it (``tree_packet.py``, ``tree_single.py``, ``tree.py``).
+- ``brute`` (CPU): brute force in packets of rays, by kernels of the lane compiler; for a few dozen primitives.
+- ``numba`` (CPU): an eight-wide BVH built by the surface area heuristic (``tree_build.py``, ``tree_layout.py``,
+  ``tree_leaf.py``), traversed by packets and single rays (``tree_packet.py``, ``tree_single.py``, ``tree.py``).
 - ``torch`` (any device, the reference): a linear BVH built and traversed by tensor operations (``lbvh.py``).
 
-Instances of meshes are a second level above the last two (``instances.py``, ``tree_instances.py``). Nothing here imports numba
-until a numba backend is built.
+Instances of meshes are a second level above the last two (``instances.py``, ``tree_instances.py``). numba is imported only when
+a numba backend is built.
 
-May import: ``compiler`` and what lies below it; of physics the geometry.
+May import: ``compiler`` and the rooms below it; of ``physics`` only ``shapes.geometry``.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from torchpt.search.base import Accel, Hits
 
 __all__ = ["BRUTE_LIMIT", "KINDS", "Accel", "Hits", "build"]
 
-#: What ``kind`` accepts.
+#: Values of ``kind`` in :func:`build`.
 KINDS = ("auto", "torch", "numba", "brute")
-#: Up to this many primitives ``auto`` takes the packet search on a CPU (measured crossover, scripts/bench_accel.py).
+#: Most primitives for which ``auto`` chooses ``brute`` on a CPU (measured crossover, scripts/bench_accel.py).
 BRUTE_LIMIT = 128
 
 
 def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, before: Accel | None = None) -> Accel:
-    """Builds a search structure, or makes it from one of the same primitives in other places.
+    """Build an acceleration structure, or refit one of the same primitives at other positions.
 
     Args:
-        geometry: the primitives, on the device where rays will live.
+        geometry: the primitives, on the device of the rays.
         kind: ``auto``, ``torch``, ``numba`` or ``brute``.
-        threads: CPU threads of ``numba`` and ``brute``; ``None`` is torch's own number. Results do not depend on it.
-        before: a structure that may be refitted where it is of the kind that is wanted; it stays as it is.
+        threads: CPU threads of ``numba`` and ``brute``; None: torch's number. Results do not depend on it.
+        before: a structure to refit if it is of the chosen kind; it is not changed.
 
     Returns:
-        The structure. ``auto`` gives ``torch`` on an accelerator; on a CPU ``brute`` for few primitives of like scale and
-        no quadrics, else ``numba``.
+        The structure. ``auto`` chooses ``torch`` on an accelerator; on a CPU ``brute`` for few primitives of similar scale
+        without quadrics, else ``numba``.
 
     Raises:
-        SceneError: an unknown kind, or one that cannot serve this geometry.
+        SceneError: the kind is unknown, or does not support this geometry.
     """
     if kind not in KINDS:
         raise SceneError("render.accel", kind, " | ".join(KINDS))
@@ -78,8 +78,8 @@ def build(geometry: Geometry, kind: str = "auto", threads: int | None = None, be
 
 
 def _packets(geometry: Geometry, threads: int | None) -> Accel | None:
-    """Return the packet search; None where a tree is quicker, or float32 rows are too coarse for these primitives."""
-    # Packets know no quadrics: from three on the tree is as fast or faster.
+    """Return the brute-force search; None if a tree is faster, or if float32 rows are too coarse for these primitives."""
+    # Quadrics are tested outside of packets: from three on the tree is as fast or faster.
     if geometry.size > BRUTE_LIMIT or geometry.copies is not None or geometry.counts[4]:
         return None
     from torchpt.search.brute import Brute, rows_of

@@ -1,4 +1,4 @@
-"""The contract of a search structure."""
+"""The interface of acceleration structures."""
 
 from __future__ import annotations
 
@@ -21,39 +21,38 @@ Hits = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 class Accel(ABC):
-    """Finds what rays hit first, and whether they hit anything.
+    """An acceleration structure: finds the nearest hits of rays, and whether rays hit anything.
 
-    Rays are ``o, d`` ``(3, N)`` and ``t_max`` ``(N,)``; ``d`` need not be unit, ``t`` counts in units of ``|d|``. A hit
-    has ``0 < t < t_max``, from either side; equal ``t`` goes to the lowest primitive id. A miss is ``prim = -1``,
-    ``t = inf``, ``u = v = 0``. Rays with ``t_max <= 0`` or with a component that is not finite miss. Nothing is
-    differentiable here.
+    Rays are ``o, d`` ``(3, N)`` and ``t_max`` ``(N,)``; ``d`` need not have length 1, ``t`` is in units of ``|d|``. A hit has
+    ``0 < t < t_max``, from either side; of hits with equal ``t`` the lowest primitive id wins. A miss has ``prim = -1``,
+    ``t = inf``, ``u = v = 0``. Rays with ``t_max <= 0`` or a non-finite component miss. Results have no gradients.
     """
 
     name: str = ""
-    #: Whether :meth:`refit` ever gives a structure.
+    #: True if :meth:`refit` is supported.
     refits: bool = False
 
     @torch.no_grad()
     def intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits:
-        """The nearest hit of each ray: ``t, prim, u, v``, each ``(N,)``."""
+        """Return the nearest hit of each ray: ``t, prim, u, v``, each ``(N,)``."""
         return self._intersect(*_rays(o, d, t_max))
 
     @torch.no_grad()
     def occluded(self, o: Tensor, d: Tensor, t_max: Tensor) -> Tensor:
-        """Whether anything lies in the open interval ``(0, t_max)``: ``(N,)`` bool."""
+        """Return True for rays with a hit in the open interval ``(0, t_max)``: ``(N,)`` bool."""
         return self._occluded(*_rays(o, d, t_max))
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
-        """The nearest hits of the first ``count`` rays of arrays, for loops outside of torch.
+        """Find the nearest hits of the first ``count`` rays of numpy arrays, for loops outside of torch.
 
-        Serial, and in the numba backends without the GIL, so that several Python threads may search at once. Only lanes
-        below ``count`` are read and written. Misses are those of :meth:`intersect`.
+        Runs in the calling thread; the numba backends release the GIL, so several Python threads may search at once. Only
+        lanes below ``count`` are read and written. Misses are as in :meth:`intersect`.
 
         Args:
             o: origins ``(3, C)`` float32, C-contiguous, ``C >= count``.
             d: directions, likewise.
             t_max: ``(C,)`` float32.
-            count: how many rays.
+            count: number of rays.
             t: ``(C,)`` float32, filled.
             prim: ``(C,)`` int32, filled.
             u: ``(C,)`` float32, filled.
@@ -64,31 +63,31 @@ class Accel(ABC):
             out[:count] = found.numpy()
 
     def refit(self, geometry: Geometry, threads: int | None = None) -> Accel | None:
-        """A structure for primitives that have moved, made from this one, which stays as it is and may be in use.
+        """Return a structure for primitives that have moved, refitted from this one, which is not changed and may be in use.
 
         Args:
-            geometry: the primitives where they are now, on the same device.
-            threads: as where a structure is built.
+            geometry: the primitives at their new positions, on the same device.
+            threads: CPU threads, as for :func:`torchpt.search.build`.
 
         Returns:
-            The structure, or None where one has to be built: this kind has no refit, the primitives are others, or they have
-            moved too far for a search to be quick.
+            The structure, or None if it has to be built anew: this backend does not refit, the primitives are others, or they
+            have moved so far that the refitted tree would be slow.
         """
         return None
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
     ) -> None:
-        """Whether anything lies in ``(0, t_max)``: 1 or 0 in ``out (C,)`` int32; else as :meth:`nearest`.
+        """Write 1 to ``out`` for rays with a hit in ``(0, t_max)``, else 0; otherwise as :meth:`nearest`.
 
         Args:
             o: as in :meth:`nearest`.
             d: likewise.
             t_max: likewise.
-            count: how many rays.
+            count: number of rays.
             out: ``(C,)`` int32, filled.
-            non_opaque: a uint8 for each primitive, not 0 where light may pass it. A ray gets 2 where it
-                may be that all it meets lets light pass, so that it has to be looked at closer.
+            non_opaque: uint8 a primitive, nonzero if light may pass it. A ray gets 2 if all that it hits may be such
+                primitives: the caller has to compute its transmittance.
         """
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         out[:count] = self.occluded(*rays).numpy()
@@ -102,11 +101,11 @@ class Accel(ABC):
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """What was built: name, primitives, nodes, leaves, sah_cost, depth, bytes, build_seconds."""
+        """Return statistics: name, primitives, nodes, leaves, sah_cost, depth, bytes, build_seconds."""
 
 
 def mark_non_opaque(out: Array, non_opaque: Array | None) -> None:
-    """What was found without a look at ``non_opaque`` as :meth:`Accel.blocked` tells it: 2 for 1 where there are any."""
+    """Replace 1 by 2 in ``out`` if there are non-opaque primitives, for a search that does not test for them."""
     if non_opaque is not None:
         np.left_shift(out, 1, out=out)
 

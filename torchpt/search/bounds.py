@@ -11,18 +11,18 @@ __all__ = ["half_areas", "primitive_bounds", "select_primitives"]
 
 
 def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
-    """Boxes of all primitives, a few ulps larger than they are: ``low, high``, each ``(3, P)`` float32.
+    """Return the boxes of all primitives, enlarged by a few ulps: ``low, high``, each ``(3, P)`` float32.
 
-    The margin (relative to coordinates and size) keeps rays that run exactly within a face of a box, and hits that a
-    leaf test accepts by rounding, inside it.
+    The margin (relative to coordinates and size) keeps inside the box rays that run exactly in one of its faces, and hits that
+    a leaf test accepts by rounding.
 
-    A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse reaches ``sqrt(e1^2 + e2^2)`` from its centre on each axis.
+    A rectangle's fourth corner is ``p1 + p2 - p0``; an ellipse extends ``sqrt(e1^2 + e2^2)`` from its centre on each axis.
     """
     p0, p1, p2 = geometry.p0.double(), geometry.p1.double(), geometry.p2.double()
     n_tri, n_rect, n_disk, n_ball, _ = geometry.counts
     low, high = torch.minimum(torch.minimum(p0, p1), p2), torch.maximum(torch.maximum(p0, p1), p2)
     a, b, c, q = n_tri, n_tri + n_rect, n_tri + n_rect + n_disk, n_tri + n_rect + n_disk + n_ball
-    # the float32 sum is the corner that the searches see
+    # the searches use the float32 sum as the corner
     fourth = ((geometry.p1 + geometry.p2) - geometry.p0)[:, a:b].double()
     low[:, a:b], high[:, a:b] = torch.minimum(low[:, a:b], fourth), torch.maximum(high[:, a:b], fourth)
     reach = ((p1 - p0)[:, b:c].square() + (p2 - p0)[:, b:c].square()).sqrt()
@@ -39,7 +39,7 @@ def primitive_bounds(geometry: Geometry) -> tuple[Tensor, Tensor]:
 
 
 def select_primitives(geometry: Geometry, prim: Tensor) -> Geometry:
-    """Some of the primitives, given by rising ids ``(K,)`` int64."""
+    """Return the primitives with ids ``prim`` ``(K,)`` int64, which must rise."""
     starts = torch.tensor([sum(geometry.counts[:k]) for k in range(6)], device=prim.device)
     a, b, c, d, e = torch.diff(torch.searchsorted(prim, starts)).tolist()
     p0, p1, p2 = (p.index_select(1, prim) for p in (geometry.p0, geometry.p1, geometry.p2))
@@ -52,6 +52,6 @@ def select_primitives(geometry: Geometry, prim: Tensor) -> Geometry:
 
 
 def half_areas(low: Tensor, high: Tensor) -> Tensor:
-    """Half the surface area of boxes ``(3, N)``."""
+    """Compute half the surface area of boxes ``(3, N)``."""
     x, y, z = (high - low).unbind(0)
     return x * y + y * z + z * x

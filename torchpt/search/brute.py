@@ -1,9 +1,9 @@
-"""Every ray against every primitive, in packets: the fastest search for a few dozen primitives on a CPU.
+"""Brute-force intersection in packets of rays: the fastest search for a few dozen primitives on a CPU.
 
-The code is that of compiled renders (:mod:`torchpt.compiler.packet`), as kernels of whole tensors: in a render by tensor
-operations a ray meets what it meets inside of a stage, wherever in the batch it stands. Packets know planar
-primitives and spheres; quadrics come afterwards, one by one (:func:`merge_quadric_hits`).
-Edges are watertight because primitives accept their own rounding error (:func:`torchpt.search.tables.tolerances`).
+The kernels have the code that compiled stages contain (:mod:`torchpt.compiler.packet`), so the hits have the same bits in a
+render by tensor operations. They know planar primitives and spheres; quadrics are tested afterwards, one by one
+(:func:`merge_quadric_hits`). Edges are watertight because primitives accept hits within their own rounding error
+(:func:`torchpt.search.tables.tolerances`).
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from torchpt.search.tables import Tables, affine_rows, extent, quadric_rows, tol
 
 __all__ = ["MAX_TOLERANCE", "Brute", "Rows", "merge_quadric_hits", "rows_of"]
 
-#: Largest share of its own size by which a primitive may be enlarged (rays across it, from within the scene).
+#: Largest enlargement of a primitive, relative to its size (for rays at right angles to it, from within the scene).
 MAX_TOLERANCE = 1e-3
-#: Rays that a thread takes together: a multiple of a packet's.
+#: Rays of a block, a multiple of a packet; threads share the work by blocks.
 _BLOCK = 64
-#: Rays times primitives that repay another thread: some 50 microseconds.
+#: Rays times primitives that are worth another thread: about 50 microseconds.
 _GRAIN = 100_000
 _SEARCH = HEAD.index("search")
 
 
 class Rows(NamedTuple):
-    """Primitives as packets read them.
+    """Affine rows of primitives and their tolerances.
 
     Attributes:
-        tables: of them.
+        tables: affine rows of the primitives.
         size: largest coordinate of the scene.
-        tolerance: ``(P,)`` float64 by which each is enlarged, see :func:`torchpt.search.tables.tolerances`.
+        tolerance: ``(P,)`` float64 enlargement of each primitive, see :func:`torchpt.search.tables.tolerances`.
     """
 
     tables: Tables
@@ -59,26 +59,26 @@ class Rows(NamedTuple):
 
     @property
     def fine(self) -> bool:
-        """Return True where float32 is fine enough for these primitives: no mixed scales, no slivers."""
+        """Return True if float32 is precise enough for these primitives: no mixed scales, no slivers."""
         return bool((self.tolerance * self.size <= MAX_TOLERANCE).all())
 
 
 def rows_of(geometry: Geometry) -> Rows:
-    """Return the rows of primitives; whether they are fine enough is for the caller to ask."""
+    """Return the rows of primitives; the caller checks :attr:`Rows.fine`."""
     size, tables = extent(geometry), affine_rows(geometry)
     return Rows(tables, size, tolerances(tables.rows64, size))
 
 
 class Brute(Accel):
-    """Brute force over packets of rays (kernels of the lane compiler, CPU).
+    """Brute-force search in packets of rays (kernels of the lane compiler, CPU).
 
     Args:
         geometry: the primitives, on the CPU.
-        threads: CPU threads; ``None`` is torch's number, as it is when rays are searched.
-        rows: of the primitives, where they are known already.
+        threads: CPU threads; None: torch's number at the time of a search.
+        rows: rows of the primitives, if they are known already.
 
     Attributes:
-        words: what kernels read of the primitives, see :func:`torchpt.compiler.packet.scene_words`.
+        words: scene data that kernels read, see :func:`torchpt.compiler.packet.scene_words`.
 
     Raises:
         SceneError: the geometry is not on the CPU, or float32 rows are too coarse for it.
@@ -122,7 +122,7 @@ class Brute(Accel):
         return blocked
 
     def _search(self, any_hit: bool, rays: Sequence[Tensor], results: Sequence[Tensor]) -> None:
-        """Search planar primitives and spheres, over as many threads as repay."""
+        """Intersect rays with planar primitives and spheres; the number of threads depends on the work."""
         call, count = _kernel(self.kinds, any_hit), results[0].shape[0]
         rows = [(x.data_ptr(), x.element_size()) for x in (*rays, *results)]
 
@@ -136,12 +136,12 @@ class Brute(Accel):
             call(ctypes.addressof(block), end - start)
 
         most = max(count * sum(self.counts) // _GRAIN, 1)
-        # In threads of the pool torch has but one: loops that search there share the work already.
+        # torch has one thread inside a worker thread, where callers share the work already.
         threads = min(thread_count(self.threads), torch.get_num_threads(), most)
         share(part, -(-count // _BLOCK), threads)
 
     def describe(self) -> dict[str, Any]:
-        """See :meth:`Accel.describe`; there are no nodes, and the cost is one test a primitive."""
+        """See :meth:`Accel.describe`; there are no nodes, and the cost is 1 a primitive."""
         primitives = sum(self.counts)
         return {
             "name": self.name,
@@ -157,7 +157,7 @@ class Brute(Accel):
 
 @functools.cache
 def _kernel(kinds: tuple[str, ...], any_hit: bool) -> Any:
-    """Return the search among kinds of primitives as a kernel of rays ``o, d, t_max`` and of results."""
+    """Compile the search among kinds of primitives; the kernel's tensors are rays ``o, d, t_max`` and the results."""
     graph = Graph()
     ray = [graph.node("tensor", "f", extra=(slot, k)) for slot, rows in enumerate((3, 3, 1)) for k in range(rows)]
     if any_hit:
@@ -167,7 +167,7 @@ def _kernel(kinds: tuple[str, ...], any_hit: bool) -> Any:
         stores = [Store((graph.node("part", ty, hits, extra=k),), ty) for k, ty in enumerate("fiff")]
     compile_time.begin()
     try:
-        return cache.compiled(TracedStage(graph, Sinks(store=stores), tensors=3, searched=kinds)).call
+        return cache.compile_stage(TracedStage(graph, Sinks(store=stores), tensors=3, searched=kinds)).call
     finally:
         compile_time.end()
 
@@ -176,7 +176,7 @@ def _kernel(kinds: tuple[str, ...], any_hit: bool) -> Any:
 def merge_quadric_hits(
     o: Tensor, d: Tensor, t_max: Tensor, t: Tensor, prim: Tensor, u: Tensor, v: Tensor, row: Tensor, number: Tensor
 ) -> Hits:
-    """Return hits, those on one quadric where it is nearer: its ``row (19,)`` and its id."""
+    """Return the hits, replaced by those on a quadric where it is nearer; ``row (19,)`` is the quadric, ``number`` its id."""
     sound = torch.isfinite(o).all(0) & torch.isfinite(d).all(0)
     at, a, b = quadric(o, d, row[:, None])
     hit = sound & (at > 0) & (at < torch.minimum(t, t_max))

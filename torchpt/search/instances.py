@@ -1,4 +1,4 @@
-"""Copies of meshes as a second level, by tensor operations: their triangles stay where the mesh has them."""
+"""Instances of meshes as a second level of search, by tensor operations."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from torchpt.search.bounds import primitive_bounds
 __all__ = ["CopyTables", "Instanced"]
 
 
-# ---- Two levels: the primitives as ever, then the copies of meshes, whose triangles stay where the mesh has them
+# ---- Two levels: first the primitives, then the instances
 #
-# A ray is moved into the mesh's own place by the inverse of the copy's map, in float64; its direction is not made unit, so
-# ``t`` is the same there and here. Each mesh has one tree, however many copies there are.
+# A ray is transformed to the mesh's own space by the inverse of the instance's transform, in float64; its direction is not
+# normalized, so ``t`` is the same in both spaces. All instances of a mesh share one tree.
 
 
-#: Pairs of a ray and a copy that the tensor form looks at together.
+#: Most pairs of a ray and an instance that are tested together.
 PAIRS = 1 << 22
-#: Boxes of copies are enlarged by this share of their coordinates: rays are rounded in another place than they are.
+#: Relative enlargement of the boxes of instances, for the rounding of rays that are transformed to the mesh's space.
 MARGIN = 2.0**-20
 
 
 class CopyTables:
-    """What both forms need of the copies.
+    """Tables of the instances, for the searches of torch and of numba.
 
     Attributes:
         meshes: the geometry of each distinct mesh.
-        mesh: ``(I,)`` int64, which one a copy is of.
-        shift: ``(I,)`` int64, added to a triangle's number in its mesh to get the copy's id.
-        inverse: ``(I, 12)`` float64 rows of the map from the world to the mesh's own place.
+        mesh: ``(I,)`` int64, the mesh of each instance.
+        shift: ``(I,)`` int64, added to a triangle's number in its mesh to get its id in the instance.
+        inverse: ``(I, 12)`` float64 rows of the transform from the world to the mesh's own space.
         low: ``(3, I)`` float32 boxes in the world.
         high: ``(3, I)`` float32.
     """
@@ -67,11 +67,11 @@ def _span(geometry: Geometry, first: int, count: int) -> Geometry:
 
 
 class Instanced(Accel):
-    """Any search over the primitives, and tensor operations over the copies: the reference.
+    """A search over the primitives, extended to instances by tensor operations: the reference.
 
     Args:
-        geometry: with copies.
-        base: finds the primitives that are no copies.
+        geometry: the primitives, with instances.
+        base: the search over the primitives that belong to no instance.
     """
 
     def __init__(self, geometry: Geometry, base: Accel) -> None:
@@ -99,7 +99,7 @@ class Instanced(Accel):
         return blocked
 
     def _pairs(self, o: Tensor, d: Tensor, reach: Tensor) -> list[tuple[Tensor, int, Tensor]]:
-        """Rays that meet the boxes of copies before ``reach``, grouped by mesh: places, mesh, copies."""
+        """Return pairs of a ray and an instance whose box it hits before ``reach``, by mesh: lanes, mesh, instances."""
         from torchpt.search.leaf import prepare_rays
 
         good = (reach > 0) & torch.isfinite(o).all(0) & torch.isfinite(d).all(0) & (d != 0).any(0)
@@ -134,7 +134,7 @@ class Instanced(Accel):
         return torch.stack(at).float(), torch.stack(along).float()
 
     def describe(self) -> dict[str, Any]:
-        """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost is that of what is no copy."""
+        """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost leaves instances out."""
         parts = [self.base.describe(), *(tree.describe() for tree in self.trees)]
         return parts[0] | {
             "primitives": self.ids,
@@ -146,14 +146,14 @@ class Instanced(Accel):
 
 
 def _nearer(best: Hits, lanes: Tensor, found: Hits, shift: Tensor) -> Hits:
-    """The hits with those of pairs taken in; equal ``t`` goes to the lowest id."""
+    """Merge hits of pairs into the nearest hits of the rays; of equal ``t`` the lowest id wins."""
     t, prim, u, v = best
     hit = found[1] >= 0
     lanes, near, id_ = lanes[hit], found[0][hit], found[1][hit].long() + shift[hit]
     least = t.scatter_reduce(0, lanes, near, "amin")
     first = near == least[lanes]
     lanes, near, id_, a, b = lanes[first], near[first], id_[first], found[2][hit][first], found[3][hit][first]
-    # What was there before stays where it is as near: its id is lower.
+    # An earlier hit at the same distance stays: its id is lower.
     none = torch.iinfo(torch.int64).max
     before = torch.where((prim >= 0) & (t == least), prim.long(), none)
     lowest = before.scatter_reduce(0, lanes, id_, "amin")

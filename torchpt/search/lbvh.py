@@ -1,4 +1,4 @@
-"""A linear BVH by tensor operations, on any device: built by Morton codes, traversed lane by lane."""
+"""A linear BVH by tensor operations on any device: built from Morton codes, traversed by all rays in lockstep."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchpt.search.tables import affine_rows, quadric_rows
 __all__ = ["Lbvh", "RadixTree", "build_tree", "intersect", "morton_codes", "occluded"]
 
 
-# ---- The radix tree over Morton codes, by tensor operations without a loop over primitives
+# ---- Build: a radix tree over Morton codes, by tensor operations without a loop over primitives
 #
 # Karras, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees", HPG 2012.
 
@@ -33,7 +33,7 @@ class RadixTree(NamedTuple):
         children: ``(2, M)`` int32; a negative value ``~k`` is the leaf that holds sorted primitive ``k``.
         boxes: ``(12, M)`` float32: low and high corner of the first child, then of the second.
         order: ``(L,)`` int32: primitive ids in Morton order.
-        depth: nodes on the longest way from the root to a leaf.
+        depth: nodes on the longest path from the root to a leaf.
     """
 
     children: Tensor
@@ -43,7 +43,7 @@ class RadixTree(NamedTuple):
 
 
 def morton_codes(centre: Tensor) -> Tensor:
-    """63-bit Morton codes of points ``(3, N)`` within their own bounds, int64; a flat axis gives zeros."""
+    """Compute 63-bit Morton codes of points ``(3, N)`` within their bounds, int64; an axis without extent gives zeros."""
     low = centre.amin(1, keepdim=True)
     size = (centre.amax(1, keepdim=True) - low).clamp(min=torch.finfo(torch.float64).tiny)
     cell = ((centre - low) / size * 2**_BITS).long().clamp(0, 2**_BITS - 1)
@@ -59,10 +59,10 @@ def morton_codes(centre: Tensor) -> Tensor:
 
 
 def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> RadixTree:
-    """Builds the tree of primitives with boxes ``low, high`` ``(3, L)`` and primitive ids ``ids`` ``(L,)``.
+    """Build the tree of primitives with boxes ``low, high`` ``(3, L)`` and primitive ids ``ids`` ``(L,)``.
 
-    Equal codes are told apart by their place in the stable order, so that a million coincident centroids give a
-    balanced tree. Boxes come from range minima over the sorted leaves: log L steps, whatever the depth.
+    Equal codes are distinguished by their index in the stable order, so that a million coincident centroids give a balanced
+    tree. Boxes are range minima and maxima over the sorted leaves: log L steps, whatever the depth.
     """
     n, device = ids.shape[0], ids.device
     if n < 2:
@@ -73,7 +73,8 @@ def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> RadixTree:
         return RadixTree(torch.full((2, min(n, 1)), -1, dtype=torch.int32, device=device), boxes, ids.int(), min(n, 1))
     codes, perm = torch.sort(morton_codes(low.double() / 2 + high.double() / 2), stable=True)
     low, high, order = low[:, perm], high[:, perm], ids[perm].int().contiguous()
-    left, right, split = _ranges(codes >> 1)  # room above for "outside"; the lost bit is settled by place
+    # Shifted, as the largest int64 stands for "outside"; codes that differ in the lost bit alone count as equal.
+    left, right, split = _ranges(codes >> 1)
     node = torch.arange(n - 1, device=device)
     first = torch.where(split == left, ~split, split)
     second = torch.where(split + 1 == right, ~(split + 1), split + 1)
@@ -87,7 +88,7 @@ def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> RadixTree:
 
 
 def _below(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
-    """Whether the highest set bit of a is below b's; a and b are (xor of codes, xor of places)."""
+    """Return True where the highest set bit of a is below that of b; a and b are (xor of codes, xor of indices)."""
     (ca, ia), (cb, ib) = a, b
     codes = (ca < cb) & (ca < (ca ^ cb))
     places = (ia < ib) & (ia < (ia ^ ib))
@@ -95,7 +96,7 @@ def _below(a: tuple[Tensor, Tensor], b: tuple[Tensor, Tensor]) -> Tensor:
 
 
 def _ranges(codes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """For each of the n - 1 nodes: first leaf, last leaf, and the last leaf of the first child (Karras, fig. 4)."""
+    """Return for each of the n - 1 nodes: first leaf, last leaf, and the last leaf of the first child (Karras, fig. 4)."""
     n = codes.shape[0]
     i = torch.arange(n - 1, device=codes.device)
     big = torch.full_like(i, torch.iinfo(torch.int64).max)
@@ -123,7 +124,7 @@ def _ranges(codes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _range_boxes(low: Tensor, high: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-    """Boxes of the leaves ``first..last``: two overlapping powers of two cover any range (a sparse table)."""
+    """Return the boxes of the leaves ``first..last``, by a sparse table: two overlapping powers of two cover any range."""
     count = last - first + 1
     out_low, out_high = torch.empty_like(low[:, : len(first)]), torch.empty_like(high[:, : len(first)])
     width = 1
@@ -140,7 +141,7 @@ def _range_boxes(low: Tensor, high: Tensor, first: Tensor, last: Tensor) -> tupl
 
 
 def _depth(parent: Tensor) -> int:
-    """Length of the longest chain of parents, by pointer jumping."""
+    """Return the length of the longest chain of parents, by pointer jumping."""
     steps = (parent != torch.arange(len(parent), device=parent.device)).long()
     steps[0] = 0
     while bool((parent != 0).any()):
@@ -148,20 +149,20 @@ def _depth(parent: Tensor) -> int:
     return int(steps.max()) + 1
 
 
-# ---- Traversal of the radix tree by a whole wave: each step moves every live lane by one node
+# ---- Traversal by all lanes in lockstep: each step moves every active lane by one node
 
 
-#: Lanes that travel together; bounds memory to some 100 MB.
+#: Lanes that are traversed together; bounds memory to about 100 MB.
 CHUNK = 1 << 18
 _DONE = 1 << 30
-#: Boxes are enlarged by 16 ulps of the distance: the slabs' own error is 3 (Ize, "Robust BVH Ray Traversal", 2013).
+#: Boxes are enlarged by 16 ulps of the distance; the slab test errs by 3 (Ize, "Robust BVH Ray Traversal", 2013).
 _SLACK = 1.0 + 2.0**-20
 
 
 def intersect(
     o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts: list[int], depth: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Nearest hits; arguments as :class:`torchpt.search.lbvh.Lbvh` holds them."""
+    """Return the nearest hits; ``tensors``, ``counts`` and ``depth`` are those of :class:`Lbvh`."""
     t, prim = torch.full_like(t_max, torch.inf), torch.full_like(t_max, -1, dtype=torch.int32)
     u, v = torch.zeros_like(t_max), torch.zeros_like(t_max)
     for lanes in _live(o, d, t_max):
@@ -180,13 +181,13 @@ def occluded(o: Tensor, d: Tensor, t_max: Tensor, tensors: list[Tensor], counts:
 
 
 def _live(o: Tensor, d: Tensor, t_max: Tensor) -> list[Tensor]:
-    """Places of the rays that can hit anything, in chunks."""
+    """Return the indices of the rays that can hit anything, in chunks."""
     good = (t_max > 0) & torch.isfinite(o).all(0) & torch.isfinite(d).all(0) & (d != 0).any(0)
     return [c for c in torch.nonzero(good)[:, 0].split(CHUNK) if c.numel()]
 
 
 class _Wave:
-    """The state of the lanes that still travel, and the hits of those that do not."""
+    """The traversal of a chunk: state of the active lanes, and hits of the finished ones."""
 
     def __init__(
         self, o: Tensor, d: Tensor, t_max: Tensor, lanes: Tensor, tensors: list[Tensor], counts: list[int], depth: int
@@ -204,7 +205,7 @@ class _Wave:
         self.finished: list[tuple[Tensor, ...]] = []
 
     def run(self, any_hit: bool) -> tuple[Tensor, list[Tensor]]:
-        """Travels to the end: places of the rays that hit, and their ``t, prim, u, v``."""
+        """Traverse to the end; return the indices of the rays that hit, and ``t, prim, u, v``."""
         step = 0
         while True:
             inner = torch.nonzero((self.node >= 0) & (self.node < _DONE))[:, 0]
@@ -229,7 +230,7 @@ class _Wave:
         self.finished.append(tuple(x[which] for x in (self.lanes, self.t, self.prim, self.u, self.v)))
 
     def _compact(self) -> None:
-        """Puts finished lanes aside."""
+        """Move finished lanes out of the state."""
         done = self.node == _DONE
         self._retire(done)
         keep = torch.nonzero(~done)[:, 0]
@@ -239,7 +240,7 @@ class _Wave:
         self.stack = self.stack[:, keep]
 
     def _pop(self, lanes: Tensor) -> Tensor:
-        """The next node of these lanes; row 0 of the stack says that nothing is left."""
+        """Pop the next node of lanes; row 0 of the stack holds ``_DONE``."""
         top = self.top[lanes]
         self.top[lanes] = (top - 1).clamp(min=0)
         return self.stack[top, lanes].long()
@@ -274,18 +275,18 @@ class _Wave:
 
 
 def _slabs(ray: Rays, box: Tensor, t_max: Tensor) -> tuple[Tensor, Tensor]:
-    """Entry distances into boxes ``(6, N)``, and whether they are met before ``t_max`` (conservative)."""
+    """Return entry distances into boxes ``(6, N)``, and True where they are hit before ``t_max`` (conservative)."""
     a, b = (box[0:3] - ray.o) * ray.inverse, (box[3:6] - ray.o) * ray.inverse
     near = torch.minimum(a, b).amax(0).clamp(min=0.0)
     far = torch.minimum(torch.maximum(a, b).amin(0), t_max) * _SLACK
     return near, near <= far
 
 
-# ---- Linear BVH: built and traversed by tensor operations on any device. The reference for the other backends
+# ---- The search: the reference for the other backends
 
 
 class Lbvh(Accel):
-    """Morton order, a radix tree over it (Karras 2012), traversal by whole waves of lanes.
+    """A linear BVH (Karras 2012) built and traversed by tensor operations.
 
     Args:
         geometry: the primitives, on any device.
@@ -330,7 +331,7 @@ class Lbvh(Accel):
 
 
 def sah_cost(tree: RadixTree) -> float:
-    """Expected cost of a random ray through the root's box: 1 a node, 1 a primitive (MacDonald & Booth 1990)."""
+    """Return the SAH cost: 1 a node and 1 a primitive, for a random ray through the root's box (MacDonald and Booth 1990)."""
     if tree.children.shape[1] == 0:
         return float(tree.order.shape[0])
     boxes = tree.boxes.double()

@@ -1,11 +1,11 @@
-"""Rays against one primitive each, by tensor operations.
+"""Intersect N rays with one primitive each, by tensor operations.
 
 Triangles and parallelograms are watertight after Woop, Benthin, Wald, "Watertight Ray/Triangle Intersection", JCGT
 2013: corners are sheared into the ray's frame, where an edge function's sign depends on the edge alone, not on the
-primitive. Products round monotonically, so a computed edge function is of the right sign or zero; zero counts as
-inside. That holds without fused operations only. The distance comes from the plane, within the corners' depths: of a
-primitive that is seen edge-on the plane may lie anywhere, behind the ray too, and must not make a hole.
-The numba kernels (kernels_leaf.py) do the same operations in the same order.
+primitive. Products round monotonically, so a computed edge function has the right sign or is zero; zero counts as
+inside. This holds only without fused operations. The distance comes from the plane, clamped to the depths of the corners:
+rounding may move the plane of a primitive seen edge-on anywhere, even behind the ray, which would open a hole.
+The numba kernels (tree_leaf.py) do the same operations in the same order.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ __all__ = ["Rays", "distances", "prepare_rays", "quadric"]
 
 
 class Rays(NamedTuple):
-    """Rays and what follows from them alone.
+    """Rays with values precomputed from each ray alone.
 
     Attributes:
         o: ``(3, N)`` origins.
         d: ``(3, N)`` directions.
-        inverse: ``(3, N)`` reciprocals for box tests, never infinite: no 0 * inf on axis-parallel rays.
-        axes: ``(3, N)`` int64: the axis of the largest ``|d|`` last, the two that follow it cyclically first.
+        inverse: ``(3, N)`` reciprocal directions for box tests, never infinite: no 0 * inf on axis-parallel rays.
+        axes: ``(3, N)`` int64: the axis of the largest ``|d|`` last, before it the two that follow it cyclically.
         shear: ``(3, N)``: d[x] / d[z], d[y] / d[z], 1 / d[z] in that order of axes.
     """
 
@@ -36,12 +36,12 @@ class Rays(NamedTuple):
     shear: Tensor
 
     def take(self, index: Tensor) -> Rays:
-        """The rays at these places."""
+        """Return the rays at ``index``."""
         return Rays(*(x[:, index] for x in self))
 
 
 def prepare_rays(o: Tensor, d: Tensor) -> Rays:
-    """Computes the fields of :class:`Rays`."""
+    """Compute the fields of :class:`Rays`."""
     size = d.abs()
     z = torch.where((size[0] >= size[1]) & (size[0] >= size[2]), 0, torch.where(size[1] >= size[2], 1, 2))
     axes = torch.stack([(z + 1) % 3, (z + 2) % 3, z])
@@ -54,18 +54,18 @@ def prepare_rays(o: Tensor, d: Tensor) -> Rays:
 def distances(
     rays: Rays, prim: Tensor, corners: Tensor, rows: Tensor, quadrics: Tensor, counts: list[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Where ray k meets primitive ``prim[k]``.
+    """Intersect ray k with primitive ``prim[k]``.
 
     Args:
         rays: N rays.
         prim: ``(N,)`` int64 primitive ids.
         corners: ``(9, P)`` float32: p0, p1, p2.
         rows: ``(12, P)`` float32, see :mod:`torchpt.search.tables`.
-        quadrics: ``(19, Q)`` float64, or 18 rows where no form has a ``half``, see :func:`torchpt.search.tables.quadric_rows`.
+        quadrics: ``(19, Q)`` float64, or 18 rows if all linear terms are 0, see :func:`torchpt.search.tables.quadric_rows`.
         counts: primitives of each kind.
 
     Returns:
-        ``t, u, v``; ``t`` is NaN (or not positive) where there is no hit.
+        ``t, u, v``; ``t`` is NaN or not positive for a miss.
     """
     disks, balls = counts[0] + counts[1], counts[0] + counts[1] + counts[2]
     row, corner = rows[:, prim], corners[:, prim]
@@ -95,7 +95,7 @@ def distances(
 
 
 def _polygon(rays: Rays, corner: Tensor, plane: Tensor, four: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Triangles, and parallelograms where ``four`` is set."""
+    """Intersect triangles, or parallelograms where ``four`` is set."""
 
     def sheared(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         x, y, z = (p - rays.o).gather(0, rays.axes).unbind(0)
@@ -126,7 +126,7 @@ def _polygon(rays: Rays, corner: Tensor, plane: Tensor, four: Tensor | None) -> 
 
 
 def _sphere(o: Tensor, d: Tensor, corner: Tensor) -> Tensor:
-    """See :func:`torchpt.search.tree_leaf.sphere_distance`: Haines et al., Ray Tracing Gems ch. 7, in float64."""
+    """Intersect spheres as :func:`torchpt.search.tree_leaf.sphere_distance`: Haines et al., Ray Tracing Gems ch. 7, float64."""
     f, e, radius = o.double() - corner[0:3], d.double(), corner[3].double()
     a = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
     b = -(f[0] * e[0] + f[1] * e[1] + f[2] * e[2])
@@ -141,23 +141,23 @@ def _sphere(o: Tensor, d: Tensor, corner: Tensor) -> Tensor:
 
 
 def quadric(o: Tensor, d: Tensor, row: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Nearest positive ``t`` on quadrics, and ``u, v`` that tell the point: float32, NaN and whatever for misses.
+    """Return the nearest positive ``t`` on quadrics, and the point's ``u, v``: float32; ``t`` is NaN for a miss.
 
-    In its own space a surface is ``x^2 + y^2 + k w^2 + 2 h w = r`` with ``w = z - s``, between two heights
+    In its own space a quadric is ``x^2 + y^2 + k w^2 + 2 h w = r`` with ``w = z - s``, between two heights
     (:class:`torchpt.physics.shapes.quadrics.Form`). Half the discriminant of a ray ``f + t e`` is, by Lagrange's identity for
-    that form, ``r a - (k (m_x^2 + m_y^2) + m_z^2) + h (h e_z^2 + 2 (e_y m_x - e_x m_y))`` with ``m = f x e``: no difference of
+    this form, ``r a - (k (m_x^2 + m_y^2) + m_z^2) + h (h e_z^2 + 2 (e_y m_x - e_x m_y))`` with ``m = f x e``: no difference of
     large squares where h is 0. The roots come from ``q = b + sign(b) sqrt`` (Haines et al., Ray Tracing Gems ch. 7), all in
     float64.
 
-    ``v`` is z, and ``u`` the way along the square ``|x| + |y| = 1`` from +x, in [-2, 2]; of a surface that is told by the
-    direction to its points they are octahedral (Cigolle et al., "A Survey of Efficient Representations for Independent Unit
-    Vectors", JCGT 2014). Both are algebraic, so that backends agree, and are read by
+    ``v`` is z, and ``u`` the distance along the square ``|x| + |y| = 1`` from +x, in [-2, 2]. For surfaces parametrized by
+    the direction to their points ``u, v`` are octahedral (Cigolle et al., "A Survey of Efficient Representations for
+    Independent Unit Vectors", JCGT 2014). Both are algebraic, so that backends agree; the inverse is
     :func:`torchpt.physics.shapes.quadrics.place`.
 
     Args:
         o: origins ``(3, N)``.
         d: directions ``(3, N)``.
-        row: ``(19, N)`` float64 world to own space, and the form; without its last row h is 0.
+        row: ``(19, N)`` float64: transform from the world to own space, and the quadric's coefficients; with 18 rows h is 0.
     """
     px, py, pz = o.double().unbind(0)
     rx, ry, rz = d.double().unbind(0)

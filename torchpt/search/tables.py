@@ -1,9 +1,9 @@
-"""What every search needs of a primitive, computed once in float64 and stored in float32.
+"""Affine rows of primitives for the searches, computed once in float64 and stored in float32.
 
 A planar primitive becomes three affine rows ``(n, c)``, ``(a, ca)``, ``(b, cb)``: ``n . x + c`` is the signed distance
-to its plane (``n`` unit), ``u(x) = a . x + ca`` and ``v(x) = b . x + cb`` its parameters. Every backend takes the
-distance of a planar hit from the first row, so that it is as exact as the plane is: a ray that leaves a surface,
-however large the primitive, knows the surface's own plane to a few ulps.
+to its plane (``n`` unit), ``u(x) = a . x + ca`` and ``v(x) = b . x + cb`` its parameters. Every backend computes the
+distance of a planar hit from the first row, which is as exact as the plane: a ray that leaves a surface is within a few
+ulps of the surface's plane, however large the primitive.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from torchpt.physics.shapes.geometry import Geometry
 
 __all__ = ["QUADRIC", "ROUNDING", "Tables", "affine_rows", "extent", "quadric_rows", "tolerances"]
 
-#: 32 units of float32 rounding. The affine test of a primitive errs by at most 16 of them times the magnitudes that
-#: enter (see :func:`tolerances`); the other half covers grazing rays, where ``n . d`` itself is uncertain.
+#: 32 units of float32 rounding. The affine test of a primitive errs by at most 16 of them times the magnitudes of the terms
+#: (see :func:`tolerances`); the other half covers grazing rays, where ``n . d`` itself is uncertain.
 ROUNDING = 2.0**-19
-#: Numbers of a quadric: its map to its own space, and its form there (:class:`torchpt.physics.shapes.quadrics.Form`).
+#: Length of a quadric's row: transform to its own space, and coefficients (:class:`torchpt.physics.shapes.quadrics.Form`).
 QUADRIC = 19
 
 
 class Tables(NamedTuple):
-    """Per-primitive numbers.
+    """Affine rows of primitives.
 
     Attributes:
         rows: ``(P, 12)`` float32: ``n c a ca b cb``; zeros for spheres, quadrics and primitives without area.
         rows64: the same in float64, not rounded.
-        area: ``(P,)`` bool: the primitive can be hit.
+        area: ``(P,)`` bool: True if the primitive can be hit.
     """
 
     rows: Tensor
@@ -39,14 +39,14 @@ class Tables(NamedTuple):
 
 
 def affine_rows(geometry: Geometry) -> Tables:
-    """The affine rows of all primitives.
+    """Compute the affine rows of all primitives.
 
     Args:
         geometry: the primitives.
 
     Returns:
         Rows in both precisions, on the geometry's device. A primitive with zero area, a non-finite corner or a row that
-        overflows float32 gets zero rows: its plane equation reads 0 = 0, which is never hit.
+        overflows float32 gets zero rows: its plane equation is 0 = 0, so it is never hit.
     """
     p0, p1, p2 = (p.double() for p in (geometry.p0, geometry.p1, geometry.p2))
     e1, e2 = p1 - p0, p2 - p0
@@ -68,10 +68,10 @@ def affine_rows(geometry: Geometry) -> Tables:
 
 
 def quadric_rows(geometry: Geometry) -> Tensor:
-    """World to own space of the quadrics ``(19, Q)`` float64: three affine rows, NaN where there are none, and the form.
+    """Return quadrics ``(19, Q)`` float64: three affine rows from the world to own space, NaN if singular, and coefficients.
 
-    Searches intersect quadrics in their own space and in float64: however thin, sheared or distant one is, a ray that
-    leaves it knows its side.
+    Searches intersect quadrics in their own space in float64, so that a ray leaving one is on the right side of it, however
+    thin, sheared or distant the quadric is.
     """
     table = geometry.quadrics
     if table is None:
@@ -84,7 +84,7 @@ def quadric_rows(geometry: Geometry) -> Tensor:
 
 
 def extent(geometry: Geometry) -> float:
-    """Largest absolute coordinate of the scene (at least the smallest normal float32)."""
+    """Return the largest absolute coordinate of the scene, at least the smallest normal float32."""
     if geometry.size == 0:
         return 1.0
     planar, round_ = sum(geometry.counts[:3]), sum(geometry.counts[:4])
@@ -99,12 +99,12 @@ def extent(geometry: Geometry) -> float:
 
 
 def tolerances(rows: Tensor, scene_extent: float) -> Tensor:
-    """Rounding error of the affine test, per unit of ``|d| max(|o|, extent) / |n . d|`` (maximum norms).
+    """Bound the rounding error of the affine test, per unit of ``|d| max(|o|, extent) / |n . d|`` (maximum norms).
 
     With ``U(x) = sum |a_i x_i| + |ca|`` and ``W`` likewise for the plane, the parameter ``u = u(o) - w(o) u(d) / w(d)``
     of a hit is computed with an error below ``16 eps (U(o) W(d) + W(o) U(d) + W(d)) / |w(d)|`` (standard model,
     eps = 2^-24; five roundings in each of the rows' sums, rounded rows included). A primitive that accepts this much
-    beyond its edges accepts everything that is inside in exact arithmetic: edges that two primitives share cannot leak.
+    beyond its edges accepts every hit that is inside in exact arithmetic, so shared edges do not leak.
 
     Args:
         rows: ``(P, 12)`` float64 rows.

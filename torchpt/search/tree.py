@@ -1,4 +1,4 @@
-"""The search by the wide SAH tree: its topology, refitted where only vertices moved, and the search that takes rays."""
+"""The search by an eight-wide BVH (numba), and its refit when primitives move."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from torchpt.search.tree_leaf import RECTANGLES, RULED
 __all__ = ["REBUILD_THRESHOLD", "RefitState", "WideBvh", "refit"]
 
 
-# ---- A tree's blocks for primitives that have moved (numba): the same nodes, leaves and ids, with new boxes and triangles
+# ---- Refit (numba): the same nodes, leaves and ids, with new boxes and triangles
 
 
 _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
@@ -59,7 +59,7 @@ _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
 
 @jit_internal(forceinline=True)
 def _moved(tree, at, p, ids, here):
-    """Corners of a leaf's triangles where the mask is set, NaN elsewhere: as they are written, in float64."""
+    """Copy a corner of a leaf's triangles to the tree, NaN where the mask is not set; return it in float64."""
     n, none = np.int32(p.shape[1]), splat(_NAN, 8)
     x = gather(p, ids, here, none)
     y = gather(p, ids + splat(n, 8), here, none)
@@ -72,7 +72,7 @@ def _moved(tree, at, p, ids, here):
 
 @jit_internal(forceinline=True)
 def _half_area(tree, at):
-    """Half the area of a box whose six numbers begin at ``at``, eight apart; 0 where it ends before it begins."""
+    """Return half the area of the box whose six numbers begin at ``at``, eight apart; 0 for an empty box."""
     x = np.float64(item(tree, at + 24)) - np.float64(item(tree, at))
     y = np.float64(item(tree, at + 32)) - np.float64(item(tree, at + 8))
     z = np.float64(item(tree, at + 40)) - np.float64(item(tree, at + 16))
@@ -81,7 +81,7 @@ def _half_area(tree, at):
 
 @jit_internal(forceinline=True)
 def _union(boxes, first, out, at):
-    """Writes the box about eight to ``at``; the numbers lie as in a node."""
+    """Write the bounding box of eight boxes to ``at``, in the layout of a node."""
     for j in range(0, 24, 8):
         put(out, at + j, lowest(load(boxes, first + j, 8)))
         put(out, at + 24 + j, highest(load(boxes, first + 24 + j, 8)))
@@ -89,7 +89,7 @@ def _union(boxes, first, out, at):
 
 @jit_internal()
 def _leaf(at, old, tree, codes, p0, p1, p2, triangles, non_triangles, boxes):
-    """Writes the block of a leaf; ``boxes`` ``(48,)`` gets low x, y, z, high x, y, z of what it holds."""
+    """Write the block of a leaf; ``boxes`` ``(48,)`` gets low x, y, z, high x, y, z of its primitives."""
     ids, none = load(old, at + IDS, 8), splat(_NAN, 8)
     store(codes, at + IDS, ids)
     here = ids >= splat(np.int32(0), 8)
@@ -99,7 +99,7 @@ def _leaf(at, old, tree, codes, p0, p1, p2, triangles, non_triangles, boxes):
         _moved(tree, at + 48, p2, ids, here),
     )
     n0, n1, n2, d, good = planes_of(a, b, c)
-    # A triangle that has no area is met by no ray; its id stays, as it may have one again.
+    # A triangle without area gets NaN, which no ray hits; its id stays for the next refit.
     store(tree, at + PLANES, select(good, n0, none))
     store(tree, at + PLANES + 8, select(good, n1, none))
     store(tree, at + PLANES + 16, select(good, n2, none))
@@ -125,7 +125,7 @@ def _leaf(at, old, tree, codes, p0, p1, p2, triangles, non_triangles, boxes):
 
 @jit_internal()
 def _rectangles(at, before, old, tree, corner, rows, triangles, disk):
-    """Writes the rectangles of a leaf; the other places hold NaN, as before."""
+    """Write the rectangles of a leaf; unused entries stay NaN."""
     for j in range(RECTANGLES, RECTANGLES + MORE * LINE):
         put(tree, at + j, item(before, at + j))
     for k in range(8):
@@ -139,28 +139,28 @@ def _rectangles(at, before, old, tree, corner, rows, triangles, disk):
 
 @jit()
 def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, non_triangles, tree, codes):
-    """Fills the blocks of a tree by the topology of another, which stays as it is.
+    """Fill the blocks of a tree with the topology of another tree, which is not changed.
 
-    Children must lie behind their parents, and the leaves of a node right behind it.
+    In the buffer children must follow their parents, and the leaves of a node must follow it at once.
 
     Args:
         before: the other tree's buffer, float32.
         old: the same memory as int32.
-        line: the line of either buffer at which the root lies.
-        nodes: how many nodes there are.
+        line: line of both buffers at which the root begins.
+        nodes: number of nodes.
         p0: ``(3, P)`` float32 corners.
         p1: ``(3, P)``.
         p2: ``(3, P)``.
-        triangles: how many of the P are triangles; these come first.
+        triangles: number of triangles among the P primitives; they come first.
         disk: id of the first primitive that is neither triangle nor rectangle.
-        corner: ``(P - triangles, 12)`` corners of the others.
-        rows: ``(P - triangles, 12)`` their affine rows.
-        non_triangles: ``(P - triangles, 6)`` float32 boxes of the others: low x, y, z, high x, y, z.
+        corner: ``(P - triangles, 12)`` corners of the other primitives.
+        rows: ``(P - triangles, 12)`` affine rows of the other primitives.
+        non_triangles: ``(P - triangles, 6)`` float32 boxes of the other primitives: low x, y, z, high x, y, z.
         tree: float32, as long as ``before``, filled.
         codes: the same memory as int32.
 
     Returns:
-        Expected work of a random ray that meets the root's box, 1 a node and 1 a leaf: of the other tree, and of this one.
+        Expected cost of a random ray through the root's box, 1 a node and 1 a leaf: of the other tree, and of this one.
     """
     lines, boxes = np.empty(nodes, np.int64), np.empty(48, np.float32)
     first, root = np.int64(0), np.int64(line) * LINE
@@ -183,7 +183,7 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, n
                 if code & 2 == 0:
                     _rectangles(block_offset(code), before, old, tree, corner, rows, triangles, disk)
                 _union(boxes, first, tree, at)
-            else:  # a box that ends before it begins is met by no ray
+            else:  # an empty box, which no ray hits
                 for j in range(0, 24, 8):
                     put(tree, at + j, _INF)
                     put(tree, at + 24 + j, -_INF)
@@ -195,43 +195,42 @@ def refit(before, old, line, nodes, p0, p1, p2, triangles, disk, corner, rows, n
     return 1.0 + work_before / _half_area(boxes, first), 1.0 + work
 
 
-# ---- What a tree in blocks keeps of how it was built, and the same tree for primitives that have moved
+# ---- When to refit
 
 
-#: A tree is built anew where moves have made the expected work of a random ray more than this many times what it was when
-#: the tree was built. Up to there searches took up to a quarter longer than in a tree built anew, mostly less than a tenth
-#: (scripts/bench_refit.py): with 70,000 triangles, a build repays itself after some two million rays then.
+#: A tree is rebuilt when refits have raised the expected cost of a random ray by more than this factor since the build. Up
+#: to it searches took at most a quarter longer than in a new tree, mostly less than a tenth (scripts/bench_refit.py): with
+#: 70,000 triangles a build pays off after about two million rays.
 REBUILD_THRESHOLD = 1.2
 
 
 class RefitState:
-    """Where a tree lies in its buffer, and what decides whether it can be refitted.
+    """The state of a tree that refits need.
 
     Args:
-        tree: as it was built.
-        geometry: over which.
-        line: the line of the buffer where its root lies.
+        tree: the tree as built.
+        geometry: the primitives of the tree.
+        line: line of the buffer at which the root begins.
 
     Attributes:
-        sah_ratio: expected work of a random ray, as a multiple of what it was when the tree was built.
+        sah_ratio: expected cost of a random ray, relative to the tree as built.
     """
 
     def __init__(self, tree: WideTree, geometry: Geometry, line: int = 0) -> None:
         self.nodes, self.line, self.counts = tree.nodes, line, geometry.counts
-        self.without_area = np.zeros(0, np.int32)  # rising ids of what had no area
+        self.without_area = np.zeros(0, np.int32)  # rising ids of the primitives without area
         if (tree.ids >= 0).sum() < geometry.size:
             self.without_area = np.setdiff1d(np.arange(geometry.size, dtype=np.int32), tree.ids)
-        self.built_cost: float | None = None  # the work, which the first refit finds out
+        self.built_cost: float | None = None  # expected cost as built, computed by the first refit
         self.sah_ratio = 1.0
 
     def refit(
         self, geometry: Geometry, non_triangles: NonTriangles, before: Floats, memory: Floats
     ) -> RefitState | None:
-        """Fills this tree's part of ``memory`` by that of ``before``, for primitives that have moved.
+        """Write this tree for primitives that have moved to ``memory``; ``before`` is the buffer of the present tree.
 
-        None where the counts are others, where a primitive that had no area when the tree was built has one now, where
-        nothing has an area, and where the tree has become :data:`REBUILD_THRESHOLD` times as costly as it was; what ``memory`` holds
-        then means nothing.
+        Returns None, with undefined content of ``memory``, if the numbers of primitives differ, if a primitive without area in
+        the build has one now, if no primitive has an area, or if the cost has grown by more than :data:`REBUILD_THRESHOLD`.
         """
         if geometry.counts != self.counts or self._gains_area(geometry):
             return None
@@ -243,7 +242,7 @@ class RefitState:
         found = copy.copy(self)
         found.built_cost = work if self.built_cost is None else self.built_cost
         found.sah_ratio = moved / found.built_cost
-        return found if found.sah_ratio <= REBUILD_THRESHOLD else None  # NaN where nothing has an area
+        return found if found.sah_ratio <= REBUILD_THRESHOLD else None  # NaN if no primitive has an area
 
     def _gains_area(self, geometry: Geometry) -> bool:
         if not len(self.without_area):
@@ -253,19 +252,19 @@ class RefitState:
         return len(ids) > 0 or bool(non_triangles.area.any())
 
 
-# ---- The CPU's tree: binned SAH, eight children a node, searched by vector kernels
+# ---- The search
 
 
-_GRAIN = 512  # rays that repay another thread
+_GRAIN = 512  # rays that are worth another thread
 _ALL_OPAQUE = np.empty(0, np.uint8)
 
 
 class WideBvh(Accel):
-    """SAH tree with eight children a node (numba, CPU).
+    """A search by a BVH with eight children a node, built by the surface area heuristic (numba, CPU).
 
     Args:
         geometry: the primitives, on the CPU.
-        threads: CPU threads; ``None`` is torch's number, as it is when rays are searched.
+        threads: CPU threads; None: torch's number at the time of a search.
     """
 
     name, refits = "numba", True
@@ -288,7 +287,7 @@ class WideBvh(Accel):
         self.build_seconds = time.perf_counter() - start
 
     def refit(self, geometry: Geometry, threads: int | None = None) -> WideBvh | None:
-        """See :meth:`Accel.refit` and :meth:`RefitState.refit`; the new tree has memory of its own."""
+        """See :meth:`Accel.refit` and :meth:`RefitState.refit`; the new tree has its own memory."""
         start = time.perf_counter()
         if (geometry.copies is not None) != self.copied:
             return None
@@ -331,7 +330,7 @@ class WideBvh(Accel):
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`.
 
-        The cost is what it was when the tree was built, times what the areas of its boxes have grown by since.
+        ``sah_cost`` is that of the tree as built, times the growth of the boxes' areas since then.
         """
         return {
             "name": self.name,
@@ -346,6 +345,6 @@ class WideBvh(Accel):
 
 
 def _arrays(tensors: list[Tensor]) -> tuple[np.ndarray, ...]:
-    """The kernels' arguments: the tree as float32 and as int32, then the others."""
+    """Return the kernels' arguments: the tree as float32 and as int32, then the other tables."""
     tree, *rest = (x.numpy() for x in tensors)
     return tree, tree.view(np.int32), *rest

@@ -1,4 +1,4 @@
-"""The wide SAH tree: built as a binary one, collapsed to eight children a node, laid out in memory (numba)."""
+"""Build an eight-wide BVH: a binary tree by the surface area heuristic, collapsed, then laid out in memory (numba)."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ __all__ = [
 ]
 
 
-# ---- Binary trees by the surface area heuristic (numba): binned (Wald 2007), and exact over the last few primitives
+# ---- Binary trees by the surface area heuristic (numba): binned (Wald 2007); the last few primitives by a full sweep
 
 
 #: Children a node, and primitives a leaf: one vector of boxes or triangles.
@@ -66,7 +66,7 @@ _ZERO = np.float32(0.0)
 
 @jit(forceinline=True)
 def half_area(b, k):
-    """Half the surface of a box."""
+    """Compute half the surface area of a box."""
     x, y, z = b[k, 3] - b[k, 0], b[k, 4] - b[k, 1], b[k, 5] - b[k, 2]
     return x * y + y * z + z * x
 
@@ -93,7 +93,7 @@ def _bin(box, i, axis, low, scale):
 
 @jit()
 def _best_split(box, start, stop, low, scale, bins, counts, suffix):
-    """Cheapest plane by the surface area heuristic (Wald 2007): axis (-1: none), first bin of the upper side."""
+    """Find the split of least SAH cost (Wald 2007): axis (-1: none), first bin of the upper side."""
     counts[:] = 0
     for k in range(3 * _BINS):
         _clear(bins, k)
@@ -127,7 +127,7 @@ def _best_split(box, start, stop, low, scale, bins, counts, suffix):
 
 @jit()
 def _partition(box, ids, start, stop, axis, cut, low, scale):
-    """Moves the primitives of the lower bins to the front; returns where the upper side starts."""
+    """Move the primitives of the lower bins to the front; return the start of the upper side."""
     i, j = start, stop - 1
     while i <= j:
         if _bin(box, i, axis, low, scale) < cut:
@@ -142,7 +142,7 @@ def _partition(box, ids, start, stop, axis, cut, low, scale):
 
 @jit()
 def _sorted(box, ids, start, stop, axis):
-    """Sorts a few primitives by their centres along an axis, and equal ones by their ids."""
+    """Sort a few primitives by their centres along an axis, equal ones by id."""
     for i in range(start + 1, stop):
         j = i
         while j > start:
@@ -157,7 +157,7 @@ def _sorted(box, ids, start, stop, axis):
 
 @jit()
 def _exact_split(box, ids, start, stop, bins, suffix):
-    """Sorts a few primitives along the axis that splits them at the least cost; returns where the upper side starts."""
+    """Sort a few primitives along the axis of the split of least SAH cost; return the start of the upper side."""
     best, best_axis, best_cut = np.float64(np.inf), 2, (start + stop) // 2
     for axis in range(3):
         _sorted(box, ids, start, stop, axis)
@@ -177,10 +177,10 @@ def _exact_split(box, ids, start, stop, bins, suffix):
 
 @jit()
 def build_binary(box, ids, nodes, spans, common):
-    """Binary tree over primitives.
+    """Build a binary tree over primitives.
 
-    Its leaves hold at most :data:`WIDTH` primitives, and one alone where these are far from each other: where their areas
-    sum to less than that of the box about them, or where they are not of the common kind, which are tested together.
+    A leaf holds at most :data:`WIDTH` primitives. Primitives are split down to one a leaf if they are not of the common kind
+    (only those are tested together), or if their areas sum to less than the area of their bounding box.
 
     Args:
         box: ``(L, 6)`` float32 boxes; permuted in place.
@@ -188,10 +188,10 @@ def build_binary(box, ids, nodes, spans, common):
         nodes: ``(2 L, 6)`` float32, filled with boxes.
         spans: ``(2 L, 3)`` int32, filled: first primitive, one past the last, first child (0 for a leaf; the second
             child follows it).
-        common: ids below are of the common kind.
+        common: primitives with smaller ids are of the common kind.
 
     Returns:
-        How many nodes there are; node 0 is the root.
+        The number of nodes; node 0 is the root.
     """
     bins = np.empty((3 * _BINS + 1, 6), np.float32)
     counts = np.empty(3 * _BINS, np.int64)
@@ -238,15 +238,15 @@ def build_binary(box, ids, nodes, spans, common):
     return used
 
 
-# ---- From a binary tree to the wide one that rays are expected to search at the least cost (numba)
+# ---- Collapse of a binary tree to the wide tree of least SAH cost (numba)
 #
 # By dynamic programming over the binary tree, as in section 3.1 of Ylitie, Karras and Laine, "Efficient Incoherent Ray
-# Traversal on GPUs Through Compressed Wide BVHs" (2017): what is below a node becomes a leaf, a wide node, or up to seven of
-# its parent's children, whichever costs least by the surface area heuristic.
+# Traversal on GPUs Through Compressed Wide BVHs" (2017): each subtree becomes a leaf, a wide node, or up to seven of its
+# parent's children, whichever costs least by the surface area heuristic.
 
 
 _INF, _ZERO = np.float32(np.inf), np.float32(0.0)
-#: Cost of a leaf's test of eight triangles, of its rectangles beside, and of each other primitive; a wide node costs 1.
+#: Cost of testing a leaf's eight triangles, its rectangles, and each other primitive; a wide node costs 1.
 _TRIANGLES, _RECTANGLES, _OTHER = np.float32(1.0), np.float32(1.3), np.float32(2.0)
 
 
@@ -261,17 +261,17 @@ def _leaf_cost(ids, start, stop, rectangle, other):
 
 @jit()
 def choose_collapse(nodes, spans, ids, rectangle, other, cost, share):
-    """Finds what is best done with each node of a binary tree.
+    """Find the cheapest use of each node of a binary tree.
 
     Args:
         nodes: boxes ``(M, 6)`` float32.
         spans: ``(M, 3)`` int32: first primitive, one past the last, first child (0 for none).
         ids: ``(L,)`` primitives in the tree's order.
         rectangle: id of the first primitive that is no triangle.
-        other: id of the first one that is no rectangle either.
-        cost: ``(M, WIDTH)`` float32, filled: of what is below a node as at most 1, 2, ... children.
-        share: ``(M, WIDTH)`` int8, filled: how many of as many children go to the node's first child; 0 where fewer do as well.
-            As one child it is a leaf (0), or a wide node that hands so many of its eight to its first child.
+        other: id of the first primitive that is neither triangle nor rectangle.
+        cost: ``(M, WIDTH)`` float32, filled: cost of the subtree as at most 1, 2, ... children of a wide node.
+        share: ``(M, WIDTH)`` int8, filled: how many of these children come from the node's first child; 0 if fewer children
+            cost no more. In column 0: 0 for a leaf, else a wide node with so many of its eight children from the first child.
     """
     for node in range(len(nodes) - 1, -1, -1):  # children come after their parents
         start, stop, left = spans[node, 0], spans[node, 1], spans[node, 2]
@@ -298,7 +298,7 @@ def choose_collapse(nodes, spans, ids, rectangle, other, cost, share):
 
 @jit()
 def _children(root, spans, share, slots, nodes, room):
-    """Fills ``slots`` with what the children of a wide node are in the binary tree; returns how many there are."""
+    """Fill ``slots`` with the binary nodes that are the children of a wide node; return their number."""
     count, top, first = 0, 2, share[root, 0]
     left = spans[root, 2]
     nodes[0], room[0], nodes[1], room[1] = left + 1, WIDTH - first, left, first
@@ -319,18 +319,18 @@ def _children(root, spans, share, slots, nodes, room):
 
 @jit()
 def collapse(nodes, spans, share, boxes, child, first):
-    """Writes down the wide tree that :func:`choose_collapse` found.
+    """Build the wide tree that :func:`choose_collapse` found.
 
     Args:
         nodes: boxes of the binary tree.
-        spans: its topology.
-        share: what is done with its nodes.
+        spans: topology of the binary tree.
+        share: result of :func:`choose_collapse`.
         boxes: ``(M * 48,)`` float32, filled: per node low x, y, z, high x, y, z of 8 children; empty ones at infinity.
         child: ``(M * 8,)`` int32, filled: a node, or ``~leaf``.
         first: ``(K, 2)`` int32, filled: the primitives of each leaf.
 
     Returns:
-        Nodes, leaves and depth.
+        Numbers of nodes and leaves, and the depth.
     """
     pending = np.empty((len(child) // WIDTH + 1, 2), np.int32)  # binary node and depth of each wide node
     pending[0, 0], pending[0, 1] = 0, 1
@@ -360,7 +360,7 @@ def collapse(nodes, spans, share, boxes, child, first):
     return used, leaves, depth
 
 
-# ---- From a tree of boxes to blocks of cache lines (numba)
+# ---- Memory layout: blocks of cache lines (numba)
 
 
 _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
@@ -368,7 +368,7 @@ _INF, _NAN = np.float32(np.inf), np.float32(np.nan)
 
 @jit_internal()
 def _kinds(ids, first, triangles, disk):
-    """2 for a leaf that holds rectangles, plus 1 for one that holds other primitives beside triangles."""
+    """Return 2 if a leaf holds rectangles, plus 1 if it holds primitives that are neither triangles nor rectangles."""
     found = 0
     for k in range(8):
         q = ids[first + k]
@@ -381,7 +381,7 @@ def _kinds(ids, first, triangles, disk):
 
 @jit_internal()
 def _leaf(base, tree, codes, ids, first, p0, p1, p2, planes, triangles):
-    """Writes a leaf's triangles and ids."""
+    """Write the triangles and ids of a leaf."""
     for k in range(8):
         q = ids[first + k]
         codes[base + IDS + k] = -2 - q if q >= triangles else q
@@ -396,7 +396,7 @@ def _leaf(base, tree, codes, ids, first, p0, p1, p2, planes, triangles):
 
 @jit_internal()
 def _rectangles(base, tree, ids, first, corner, rows, triangles, disk):
-    """Writes a leaf's rectangles."""
+    """Write the rectangles of a leaf."""
     for k in range(8):
         q = ids[first + k]
         here = triangles <= q < disk
@@ -408,21 +408,21 @@ def _rectangles(base, tree, ids, first, corner, rows, triangles, disk):
 
 @jit()
 def lay_out(boxes, child, ids, p0, p1, p2, planes, corner, rows, triangles, disk, line, tree, codes):
-    """Fills the blocks of a tree, parents before children, each node's leaves right behind it.
+    """Fill the blocks of a tree: parents before children, each node followed by its leaves.
 
     Args:
-        boxes: ``(M * 48,)`` float32: low x, y, z, high x, y, z of eight children a node; infinite where there is none.
+        boxes: ``(M * 48,)`` float32: low x, y, z, high x, y, z of eight children a node; infinite for none.
         child: ``(M * 8,)`` int32: a node, or ``~leaf``, or 0 for none.
-        ids: ``(L * 8,)`` int32 primitives of the leaves in rising order, -1 where there is none.
+        ids: ``(L * 8,)`` int32 primitives of the leaves in rising order, -1 for none.
         p0: ``(3, P)`` corners.
         p1: ``(3, P)``.
         p2: ``(3, P)``.
-        planes: ``(T, 4)`` of the triangles.
+        planes: ``(T, 4)`` planes of the triangles.
         corner: ``(K, 12)`` corners of the other primitives.
-        rows: ``(K, 12)`` their affine rows.
-        triangles: how many of the P are triangles; these come first.
+        rows: ``(K, 12)`` affine rows of the other primitives.
+        triangles: number of triangles among the P primitives; they come first.
         disk: id of the first primitive that is neither triangle nor rectangle.
-        line: the line of ``tree`` at which the root goes.
+        line: line of ``tree`` at which the root begins.
         tree: float32, filled: ``4 M + 7 L`` lines, and 8 for each leaf that holds rectangles.
         codes: the same memory as int32.
     """
@@ -447,7 +447,7 @@ def lay_out(boxes, child, ids, p0, p1, p2, planes, corner, rows, triangles, disk
             code = child[node * 8 + k]
             for c in range(6):
                 x = boxes[node * 48 + c * 8 + k]
-                # a box that ends before it begins is met by no ray
+                # an empty box, which no ray hits
                 tree[base + c * 8 + k] = -_INF if code == 0 and c >= 3 else x
             codes[base + CHILDREN + k] = 4 * lines[code] if code > 0 else 0
             if code < 0:
@@ -462,9 +462,9 @@ def lay_out(boxes, child, ids, p0, p1, p2, planes, corner, rows, triangles, disk
             codes[base + CHILDREN + 8 + k] = 0
 
 
-# ---- What the tree needs of triangles (numba): the float64 operations of ``tables.affine_rows`` and ``bounds`` in one pass
+# ---- Planes and boxes of triangles (numba): the float64 operations of ``tables.affine_rows`` and ``bounds`` in one pass
 #
-# Eight triangles go together, as vectors of float64.
+# Eight triangles are processed together, as vectors of float64.
 
 
 _MARGIN = 2.0**-22
@@ -482,16 +482,16 @@ def _dot(a, b):
 
 @jit_internal(forceinline=True)
 def _finite(row, p):
-    """Whether affine rows about points are finite in float32."""
+    """Return a mask: affine rows through points are finite in float32."""
     total, zero = narrow(row[0]) + narrow(row[1]) + narrow(row[2]) + narrow(-_dot(row, p)), splat(_ZERO, 8)
     return total * zero == zero
 
 
 @jit_internal(forceinline=True)
 def planes_of(a, b, c):
-    """Unit normals and distances of eight triangles by float64 corners, and which can be hit.
+    """Compute the planes (unit normal, distance) of eight triangles from float64 corners, and the mask of those with an area.
 
-    See :func:`torchpt.search.tables.affine_rows`. The numbers of those that cannot mean nothing.
+    See :func:`torchpt.search.tables.affine_rows`. The planes of triangles outside of the mask are undefined.
     """
     e1 = (b[0] - a[0], b[1] - a[1], b[2] - a[2])
     e2 = (c[0] - a[0], c[1] - a[1], c[2] - a[2])
@@ -506,10 +506,10 @@ def planes_of(a, b, c):
 
 @jit_internal(forceinline=True)
 def _down(x):
-    """The float32 below float64 lanes, or their own."""
+    """Round float64 lanes down to float32."""
     near, one = narrow(x), splat(np.int32(1), 8)
     whole, zero = as_int(near), splat(np.int32(0), 8)
-    # the next float32: one less in its bits, one more where they are those of a negative number
+    # The next float32 below: its bits less 1, plus 1 for a negative number.
     below = select(whole < zero, whole + one, whole - one)
     below = select(near == splat(_ZERO, 8), splat(np.int32(-(2**31) + 1), 8), below)
     return select(widen(near) > x, as_float(below), near)
@@ -522,7 +522,7 @@ def _span(a, b, c):
 
 @jit_internal(forceinline=True)
 def boxes_of(a, b, c):
-    """Boxes of eight triangles with their margin: low x, y, z, high x, y, z.
+    """Compute the boxes of eight triangles with a margin: low x, y, z, high x, y, z.
 
     See :func:`torchpt.search.bounds.primitive_bounds`.
     """
@@ -538,7 +538,7 @@ def boxes_of(a, b, c):
 
 @jit_internal(forceinline=True)
 def _corner(p, i, some):
-    """Corners of the triangles from ``i`` on, where the mask is set."""
+    """Load a corner of the eight triangles from ``i`` on where the mask is set, as float64."""
     n, none = p.shape[1], splat(_ZERO, 8)
     x, y, z = (
         load_masked(p, i, some, none),
@@ -550,19 +550,19 @@ def _corner(p, i, some):
 
 @jit()
 def triangle_tables(p0, p1, p2, count, planes, boxes, ids):
-    """Planes of the first ``count`` primitives, and boxes of those that can be hit.
+    """Compute the planes of the first ``count`` primitives, and the boxes of those that can be hit.
 
     Args:
         p0: ``(3, P)`` float32 corners.
         p1: ``(3, P)``.
         p2: ``(3, P)``.
-        count: how many of the primitives are triangles.
+        count: number of triangles among the primitives.
         planes: ``(count, 4)`` float32, filled: unit normal and distance; zeros where a triangle has no area.
         boxes: ``(count, 6)`` float32, filled from the front.
         ids: ``(count,)`` int32, filled alike.
 
     Returns:
-        How many can be hit.
+        The number of triangles that can be hit.
     """
     kept = 0
     row, box, none = np.empty(32, np.float32), np.empty(48, np.float32), splat(_ZERO, 8)
@@ -597,7 +597,7 @@ def triangle_tables(p0, p1, p2, count, planes, boxes, ids):
 
 @jit()
 def leaf_ids(first, ids, slots):
-    """Fills ``slots (L, 8)`` with the primitives of leaves that span ``first (L, 2)`` of ``ids``, rising, -1 after them."""
+    """Fill ``slots (L, 8)`` with the sorted primitives of leaves, which span ``first (L, 2)`` of ``ids``; -1 behind them."""
     for leaf in range(len(first)):
         start, count = first[leaf, 0], first[leaf, 1] - first[leaf, 0]
         for k in range(8):
@@ -610,7 +610,7 @@ def leaf_ids(first, ids, slots):
             slots[leaf, j] = q
 
 
-# ---- Trees for the CPU's search: binary over boxes, then of eight children a node, then blocks of cache lines
+# ---- The whole build
 
 
 Floats = NDArray[np.float32]
@@ -618,14 +618,14 @@ Ints = NDArray[np.int32]
 
 
 class WideTree:
-    """A tree of boxes, before it is laid out.
+    """A wide tree before its memory layout.
 
     Attributes:
-        boxes: ``(M * 48,)``: low x, y, z, high x, y, z of eight children a node; infinite where there is none.
+        boxes: ``(M * 48,)``: low x, y, z, high x, y, z of eight children a node; infinite for none.
         child: ``(M * 8,)``: a node, or ``~leaf``, or 0 for none.
-        ids: ``(L * 8,)``: what the leaves hold, in rising order, -1 where there is nothing.
-        depth: nodes on the longest way down.
-        cost: expected work of a ray, 1 a node; see :mod:`torchpt.search.tree_build`.
+        ids: ``(L * 8,)``: primitives of the leaves in rising order, -1 for none.
+        depth: nodes on the longest path from the root.
+        cost: expected cost of a random ray through the root's box, 1 a node; see :func:`choose_collapse`.
     """
 
     def __init__(self, boxes: Floats, child: Ints, ids: Ints, depth: int, cost: float) -> None:
@@ -633,28 +633,28 @@ class WideTree:
 
     @property
     def nodes(self) -> int:
-        """How many nodes there are."""
+        """Return the number of nodes."""
         return len(self.child) // WIDTH
 
     @property
     def leaves(self) -> int:
-        """How many leaves there are."""
+        """Return the number of leaves."""
         return len(self.ids) // WIDTH
 
 
 class NonTriangles:
-    """The K primitives of a geometry that are no triangles.
+    """The K primitives of a geometry that are not triangles.
 
     Attributes:
-        area: ``(K,)`` bool: the primitive can be hit.
-        boxes: ``(K, 6)`` float32: low x, y, z, high x, y, z; a box that ends before it begins where it cannot be hit.
-        tensors: what the search's kernels take of them: corners ``(K, 12)`` float32, affine rows ``(K, 12)`` float32 and
-            quadrics ``(Q, 19)`` float64; NaN, which no ray meets, where a primitive cannot be hit.
+        area: ``(K,)`` bool: True if the primitive can be hit.
+        boxes: ``(K, 6)`` float32: low x, y, z, high x, y, z; an empty box if the primitive cannot be hit.
+        tensors: tables for the search: corners ``(K, 12)`` float32, affine rows ``(K, 12)`` float32 and quadrics ``(Q, 19)``
+            float64; NaN if a primitive cannot be hit.
     """
 
     def __init__(self, geometry: Geometry) -> None:
         rest = _without_triangles(geometry)
-        if not rest.size:  # the operations below would take longer than the tree of a small mesh
+        if not rest.size:  # the operations below take longer than the build for a small mesh
             self.area, self.boxes = np.zeros(0, bool), np.zeros((0, 6), np.float32)
             self.tensors = [torch.zeros(0, 12), torch.zeros(0, 12), torch.zeros(0, QUADRIC, dtype=torch.float64)]
             return
@@ -670,9 +670,9 @@ class NonTriangles:
 
 
 def wide_tree(boxes: Floats, ids: Ints, counts: tuple[int, ...] = (0, 0)) -> WideTree:
-    """Builds over boxes ``(L, 6)`` of ``ids (L,)``; both are permuted.
+    """Build a wide tree over boxes ``(L, 6)`` of primitives ``ids (L,)``; both arrays are permuted.
 
-    ``counts`` says how many triangles there are and how many rectangles, whose ids come first in this order.
+    ``counts`` begins with the numbers of triangles and of rectangles, whose ids come first in this order.
     """
     n = len(ids)
     if n == 0:
@@ -698,26 +698,26 @@ def wide_tree(boxes: Floats, ids: Ints, counts: tuple[int, ...] = (0, 0)) -> Wid
 
 
 def line_count(tree: WideTree, counts: tuple[int, ...]) -> int:
-    """Cache lines that a tree takes over primitives of which there are ``counts`` of each kind."""
+    """Return the size of a tree in cache lines; ``counts`` are the numbers of primitives of each kind."""
     ids = tree.ids.reshape(-1, WIDTH)
     ruled = ((ids >= counts[0]) & (ids < counts[0] + counts[1])).any(1).sum() if counts[1] else 0
     return NODE * tree.nodes + LEAF * tree.leaves + MORE * int(ruled)
 
 
 def stack_size(depth: int) -> int:
-    """Entries of a stack for trees of that depth: seven a level stay, and eight are written at once."""
+    """Return the stack size for a tree of a depth: each level leaves up to seven entries, and eight are written at once."""
     return depth * (WIDTH - 1) + 2 * WIDTH
 
 
 def aligned_buffer(count: int) -> Floats:
-    """Memory for ``count`` float32 that begins with a cache line."""
+    """Allocate ``count`` float32, aligned to a cache line."""
     raw = np.zeros(count * 4 + LINE * 4, np.uint8)
     skip = -raw.ctypes.data % (LINE * 4)
     return raw[skip : skip + count * 4].view(np.float32)
 
 
 def primitive_tables(geometry: Geometry) -> tuple[Floats, Floats, Ints, NonTriangles]:
-    """Planes ``(T, 4)`` of the triangles, boxes ``(K, 6)`` and rising ids ``(K,)`` of those with an area, and the others."""
+    """Return planes ``(T, 4)`` of the triangles, boxes ``(K, 6)`` and ids ``(K,)`` of those with an area, and the others."""
     count = geometry.counts[0]
     planes, boxes, ids = np.empty((count, 4), np.float32), np.empty((count, 6), np.float32), np.empty(count, np.int32)
     kept = triangle_tables(*corners(geometry), count, planes, boxes, ids)
@@ -725,7 +725,7 @@ def primitive_tables(geometry: Geometry) -> tuple[Floats, Floats, Ints, NonTrian
 
 
 def mesh_tree(geometry: Geometry) -> tuple[WideTree, Floats, NonTriangles]:
-    """The tree over a geometry's primitives, the planes ``(T, 4)`` of its triangles, and what there is of others."""
+    """Build the tree of a geometry; return it with the planes ``(T, 4)`` of its triangles and its other primitives."""
     planes, boxes, ids, non_triangles = primitive_tables(geometry)
     if non_triangles.area.size:
         keep = np.flatnonzero(non_triangles.area)
@@ -737,7 +737,7 @@ def mesh_tree(geometry: Geometry) -> tuple[WideTree, Floats, NonTriangles]:
 def write_tree(
     tree: WideTree, geometry: Geometry, planes: Floats, non_triangles: NonTriangles, line: int, memory: Floats
 ) -> None:
-    """Lays a tree out in ``memory`` from a line on."""
+    """Write a tree to ``memory`` from a line on."""
     codes, triangles = memory.view(np.int32), geometry.counts[0]
     disk = triangles + geometry.counts[1]
     tables = (planes, non_triangles.tensors[0].numpy(), non_triangles.tensors[1].numpy())
@@ -745,7 +745,7 @@ def write_tree(
 
 
 def corners(geometry: Geometry) -> tuple[Floats, Floats, Floats]:
-    """The three corners ``(3, P)`` as arrays."""
+    """Return the three corners ``(3, P)`` as arrays."""
     return tuple(p.contiguous().numpy() for p in (geometry.p0, geometry.p1, geometry.p2))  # type: ignore[return-value]
 
 

@@ -1,4 +1,4 @@
-"""Copies of meshes as a second level, by vectors (numba): a tree over their boxes above the trees of their meshes."""
+"""Instances of meshes as a second level of search (numba): a tree over their boxes above the trees of their meshes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from torchpt.search.tree_single import SCRATCH, pop, trace_single
 __all__ = ["InstancedWideBvh", "blocked", "blocked_parallel", "nearest", "nearest_parallel"]
 
 
-# ---- Copies of meshes (numba): a tree over their boxes, and for each that is met the tree of its mesh
+# ---- Kernels: traversal of the tree of instances, and for each instance that a ray hits of the tree of its mesh
 
 
 _ZERO, _INF = np.float32(0.0), np.float32(np.inf)
@@ -44,13 +44,13 @@ _ZERO, _INF = np.float32(0.0), np.float32(np.inf)
 
 @jit_internal(forceinline=True)
 def _row(table, k, x, y, z):
-    """Three float64 numbers of an affine map's row with a point, without its last number."""
+    """Multiply the linear part of a row of an affine map with a point, in float64."""
     return item(table, k) * x + item(table, k + 1) * y + item(table, k + 2) * z
 
 
 @jit_internal()
 def _moved(table, copy, o, d):
-    """A ray in the place of a copy's mesh: moved in float64, rounded to float32."""
+    """Transform a ray to the space of an instance's mesh, in float64, rounded to float32."""
     k = 12 * copy
     px, py, pz = np.float64(o[0]), np.float64(o[1]), np.float64(o[2])
     rx, ry, rz = np.float64(d[0]), np.float64(d[1]), np.float64(d[2])
@@ -69,7 +69,7 @@ def _moved(table, copy, o, d):
 
 @jit_internal()
 def _ray(o, d, best, prim, upper, lower, copies, work, any_hit):
-    """The nearest hit of one ray among the copies where it is nearer than ``best``, or any such hit: ``t, prim, u, v``."""
+    """Find the nearest hit of one ray with instances nearer than ``best``, or any such hit: ``t, prim, u, v``."""
     tree, codes = upper
     table, shift, roots = copies
     keys, parents, scratch = work
@@ -150,33 +150,33 @@ def _search(
             if found != prim[i]:
                 put(prim, i, found)
                 t[i], u[i], v[i] = best, a, b
-    keys[0], parents[0], scratch[0], none[0] = 0, 0, 0, 0  # what pointers point to lives until here
+    keys[0], parents[0], scratch[0], none[0] = 0, 0, 0, 0  # keeps the arrays alive: pointers hold no references
 
 
 @jit()
 def nearest(
     first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, t, prim, u, v
 ):
-    """Takes the copies into the hits of the rays ``first <= i < last``.
+    """Update the hits of rays ``first <= i < last`` by nearer hits with instances.
 
     Args:
-        first: ray.
-        last: ray.
+        first: first ray.
+        last: ray after the last one.
         o: origins ``(3, N)``.
         d: directions ``(3, N)``.
         t_max: ``(N,)``.
-        upper: blocks of the tree over the copies' boxes.
+        upper: blocks of the tree over the instances' boxes.
         upper_codes: the same memory as int32.
-        lower: blocks of the trees of all meshes, one after the other.
+        lower: blocks of the trees of all meshes, concatenated.
         lower_codes: the same memory as int32.
-        table: ``(I, 12)`` float64 maps from the world to the meshes.
-        shift: ``(I,)`` int32 from a triangle's number in its mesh to its id in the copy.
+        table: ``(I, 12)`` float64 transforms from the world to the meshes.
+        shift: ``(I,)`` int32, added to a triangle's number in its mesh to get its id in the instance.
         roots: ``(I,)`` int64 codes of the meshes' roots.
-        stack_length: entries of the stack.
-        t: found so far, inf for none.
-        prim: found so far, -1 for none.
-        u: found so far.
-        v: found so far.
+        stack_length: size of the stack.
+        t: nearest hits so far, inf for none; updated.
+        prim: their primitives, -1 for none; updated.
+        u: updated likewise.
+        v: updated likewise.
     """
     _search(
         first,
@@ -204,7 +204,7 @@ def nearest(
 def nearest_parallel(
     chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, t, prim, u, v
 ):
-    """:func:`nearest` over the rays in equal pieces, which the threads take in turn."""
+    """Run :func:`nearest` on several threads, over equal pieces of the rays."""
     pieces = chunks * PIECES
     for c in prange(chunks):
         for k in range(c, pieces, chunks):
@@ -232,7 +232,7 @@ def nearest_parallel(
 
 @jit()
 def blocked(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out):
-    """Puts 1 in ``out (N,)`` for rays that hit a copy; those that have it already are left alone."""
+    """Write 1 to ``out (N,)`` for rays that hit an instance; rays that have 1 already are skipped."""
     _search(
         first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length,
         t_max, out, t_max, t_max, True,
@@ -243,7 +243,7 @@ def blocked(first, last, o, d, t_max, upper, upper_codes, lower, lower_codes, ta
 def blocked_parallel(
     chunks, items, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out
 ):
-    """:func:`blocked` over the rays in equal pieces, which the threads take in turn."""
+    """Run :func:`blocked` on several threads, over equal pieces of the rays."""
     pieces = chunks * PIECES
     for c in prange(chunks):
         for k in range(c, pieces, chunks):
@@ -251,18 +251,18 @@ def blocked_parallel(
             blocked(a, b, o, d, t_max, upper, upper_codes, lower, lower_codes, table, shift, roots, stack_length, out)
 
 
-# ---- Copies on the CPU: a tree over their boxes above the trees of their meshes (numba)
+# ---- The search
 
 
-_GRAIN = 256  # rays that repay another thread
+_GRAIN = 256  # rays that are worth another thread
 
 
 class InstancedWideBvh(Accel):
-    """The primitives in one wide tree, and two levels of them for the copies.
+    """A search by wide trees with instances: one tree for the primitives, two levels of trees for the instances (numba, CPU).
 
     Args:
-        geometry: with copies, on the CPU.
-        threads: CPU threads; ``None`` is torch's number, as it is when rays are searched.
+        geometry: the primitives, with instances, on the CPU.
+        threads: CPU threads; None: torch's number at the time of a search.
     """
 
     name, refits = "numba", True
@@ -275,7 +275,7 @@ class InstancedWideBvh(Accel):
         self._take(geometry, WideBvh(geometry, threads), tables, lower, start)
 
     def _take(self, geometry: Geometry, base: WideBvh, tables: CopyTables, lower: np.ndarray, start: float) -> None:
-        """Builds the upper level."""
+        """Set all attributes; builds the upper level."""
         assert geometry.copies is not None
         self.base, self.threads, self.places = base, base.threads, geometry.copies[12:]
         some = np.flatnonzero([tables.meshes[k].size > 0 for k in tables.mesh.tolist()]).astype(np.int32)
@@ -296,7 +296,7 @@ class InstancedWideBvh(Accel):
         self.build_seconds = time.perf_counter() - start
 
     def refit(self, geometry: Geometry, threads: int | None = None) -> InstancedWideBvh | None:
-        """See :meth:`Accel.refit`; the upper level, of a few boxes beside the primitives', is always built anew."""
+        """See :meth:`Accel.refit`; the upper level, which is small, is always rebuilt."""
         start = time.perf_counter()
         if geometry.copies is None or not torch.equal(geometry.copies[12:], self.places):
             return None
@@ -306,7 +306,7 @@ class InstancedWideBvh(Accel):
         tables, before, found = CopyTables(geometry), self.arrays[2], []
         lower = aligned_buffer(len(before))
         for refit_state, mesh in zip(self.refit_states, tables.meshes, strict=True):
-            # no copy of an empty mesh is in the upper level
+            # instances of empty meshes are not in the upper level
             moved = refit_state if not mesh.size else refit_state.refit(mesh, NonTriangles(mesh), before, lower)
             if moved is None:
                 return None
@@ -339,14 +339,14 @@ class InstancedWideBvh(Accel):
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
     ) -> None:
-        """See :meth:`Accel.blocked`; where there are non_opaque, every ray that meets anything is to be looked at closer."""
+        """See :meth:`Accel.blocked`; with ``non_opaque`` every ray that hits anything gets 2."""
         self.base.blocked(o, d, t_max, count, out)
         args = (o, d, t_max, *self.arrays, out)
         ensure_compiled(blocked, 0, 0, *args)(0, count, *args)
         mark_non_opaque(out[:count], non_opaque)
 
     def describe(self) -> dict[str, Any]:
-        """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost is that of what is no copy."""
+        """See :meth:`Accel.describe`; nodes, leaves and bytes count each mesh once, the cost leaves instances out."""
         base = self.base.describe()
         upper, _, lower, _, *tables = self.arrays[:-1]
         return base | {
@@ -361,13 +361,13 @@ class InstancedWideBvh(Accel):
 
 
 def _nothing() -> Geometry:
-    """No primitive: what leaves of copies have for triangles."""
+    """Return a geometry without primitives, for the leaves of the upper level."""
     none = torch.zeros(3, 0)
     return Geometry(none, none, none, (0, 0, 0, 0, 0))
 
 
 def _meshes(meshes: list[Geometry]) -> tuple[list[WideTree], list[RefitState], np.ndarray]:
-    """The trees of all meshes, where they lie, and their blocks one after the other."""
+    """Build the trees of all meshes in one buffer; return the trees, their topologies and the buffer."""
     built = [mesh_tree(mesh) for mesh in meshes]
     lines = [line_count(tree, mesh.counts) for (tree, _, _), mesh in zip(built, meshes, strict=True)]
     lines = np.cumsum([0, *lines]).tolist()

@@ -1,18 +1,18 @@
-"""A tree in blocks of cache lines (numba), and one ray against the eight boxes or the eight triangles of a block.
+"""The memory layout of a wide tree (numba), and tests of one ray with a node's eight boxes or a leaf's eight triangles.
 
-Everything lies in one buffer of 64-byte lines of 16 float32. A *node* is 4 lines: the lower x, y, z and the upper x, y, z
-of eight children, their eight codes, eight numbers not used. A *leaf* is 7 lines: the nine components of eight
-triangles' corners, their planes' four numbers, eight ids. A leaf that holds rectangles has 8 lines more: the twelve
-components of eight corners and fourth corners, their planes. The leaves of a node follow it.
+A tree is one buffer of 64-byte cache lines of 16 float32. A *node* has 4 lines: lower x, y, z and upper x, y, z of eight
+children, eight codes, eight unused numbers. A *leaf* has 7 lines: nine components of eight triangles' corners, four numbers of
+their planes, eight ids. A leaf with rectangles has 8 more lines: twelve components of eight rectangles' four corners, and
+their planes. The leaves of a node follow it.
 
-A *code* is ``4 line`` for a node and ``~(4 line + kinds)`` for a leaf, where ``kinds`` is 2 for rectangles plus 1 for
-primitives of other kinds. A primitive that is no triangle has NaN for corners and ``-2 - id`` for an id; empty places have
-NaN and -1.
+A *code* is ``4 line`` for a node and ``~(4 line + kinds)`` for a leaf, where ``kinds`` is 2 for rectangles plus 1 for other
+primitives that are not triangles. Among a leaf's triangles an unused entry has NaN corners and id -1, and a primitive that is
+not a triangle has NaN corners and ``-2 - id``.
 
-An *entry* is the distance at which a ray enters a box. Every hit in a leaf is taken to lie at ``FLOOR`` times its leaf's
-entry or beyond, and boxes are passed over only from ``SLACK`` times the best hit on. Boxes within boxes are entered no
-earlier, rounding included, so the hit found does not depend on the order in which boxes are visited, nor on the rays
-beside it in a packet. Entries lose their last three bits where they are sorted; ``FLOOR`` and ``SLACK`` leave room for it.
+An *entry* is the distance at which a ray enters a box. Hits in a leaf are clamped to at least ``FLOOR`` times the leaf's
+entry, and a box is skipped only if its entry is beyond ``SLACK`` times the best hit. A child's box is never entered before its
+parent's, rounding included, so the result depends neither on the order of traversal nor on the other rays of a packet.
+Sorting overwrites the last three bits of entries; ``FLOOR`` and ``SLACK`` allow for that.
 """
 
 from __future__ import annotations
@@ -58,50 +58,50 @@ __all__ = [
     "triangles_alone",
 ]
 
-LINE = 16  # float32 numbers a cache line
-NODE, LEAF, MORE = 4, 7, 8  # lines of a node, of a leaf, and of the rectangles that it holds
-CHILDREN = 48  # where a node's codes begin
-PLANES, IDS = 72, 104  # where a leaf's planes and ids begin
+LINE = 16  # float32 in a cache line
+NODE, LEAF, MORE = 4, 7, 8  # lines of a node, of a leaf, and of a leaf's rectangles
+CHILDREN = 48  # offset of the codes in a node
+PLANES, IDS = 72, 104  # offsets of planes and ids in a leaf
 SLACK = np.float32(1.0 + 2.0**-16)
 FLOOR = np.float32(1.0 - 2.0**-17)
-#: In place of an id: an any-hit ray has met surfaces that may let light pass, and no others yet.
+#: Instead of an id: an any-hit ray has so far hit only surfaces that may let light pass.
 MAY_PASS = np.int32(-2)
 _ZERO = np.float32(0.0)
 
 
 @jit_internal(forceinline=True)
 def block_offset(code):
-    """Where a code's block begins in the buffer."""
+    """Return the offset of a code's block in the buffer."""
     return ((code ^ (code >> 63)) & ~3) * (LINE // 4)
 
 
 @jit_internal(forceinline=True)
 def triangles_alone(code):
-    """Whether a leaf's code says that it holds nothing else."""
+    """Return True if a leaf holds only triangles, by its code."""
     return code & 3 == 3
 
 
 @jit_internal(forceinline=True)
 def blocking(scene, prim):
-    """The id of a primitive that any-hit rays end at, or :data:`MAY_PASS`.
+    """Return the id of a primitive if it is opaque, else :data:`MAY_PASS`.
 
-    ``scene`` ends with a uint8 for each primitive, not 0 where light may pass, and how many there are: none where all block.
+    ``scene`` ends with one uint8 a primitive, nonzero if light may pass, and their number: 0 if all primitives are opaque.
     """
     return MAY_PASS if scene[5] > 0 and item(scene[4], prim) != 0 else prim
 
 
 @jit_internal(forceinline=True)
 def is_valid_ray(ox, oy, oz, dx, dy, dz, t_max):
-    """Whether a ray can hit anything: finite, and ``t_max > 0``."""
+    """Return True if a ray can hit anything: it is finite and ``t_max > 0``."""
     zero = ox * _ZERO + oy * _ZERO + oz * _ZERO + dx * _ZERO + dy * _ZERO + dz * _ZERO
     return t_max > _ZERO and zero == _ZERO
 
 
 @jit_internal(forceinline=True)
 def boxes(tree, base, nx, ny, nz, ox, oy, oz, ix, iy, iz, far):
-    """Entries of a node's eight boxes, and the mask of those met before ``far``.
+    """Return the entries of a node's eight boxes, and the mask of those hit before ``far``.
 
-    ``nx, ny, nz`` say where the planes that face the ray begin; origin, reciprocal direction and ``far`` are splats.
+    ``nx, ny, nz`` are the offsets of the near planes; origin, reciprocal direction and ``far`` are splats.
     """
     ax, bx = (load(tree, base + nx, 8) - ox) * ix, (load(tree, base + (24 - nx), 8) - ox) * ix
     ay, by = (load(tree, base + ny, 8) - oy) * iy, (load(tree, base + (40 - ny), 8) - oy) * iy
@@ -113,10 +113,10 @@ def boxes(tree, base, nx, ny, nz, ox, oy, oz, ix, iy, iz, far):
 
 @jit_internal(forceinline=True)
 def push(keys, parents, top, base, a, met):
-    """Puts the boxes that were met on the stack, the nearest on top; returns the new top.
+    """Push the boxes that were hit on the stack, the nearest on top; return the new top.
 
-    A key is an entry whose last three bits are the child's place. Eight are always written: there is no branch that
-    depends on how many were met.
+    A key is an entry whose last three bits are the child's number. Eight keys are always written, which avoids a branch on the
+    number of hits.
     """
     key = select(met, (as_int(a) & splat(np.int32(-8), 8)) | lane_numbers(8), splat(np.int32(-1), 8))
     store(keys, top, sort_descending(key))
@@ -126,10 +126,10 @@ def push(keys, parents, top, base, a, met):
 
 @jit_internal(forceinline=True)
 def crossed_triangles(tree, base, kx, ky, kz, px, py, pz, sx, sy):
-    """Which of a leaf's triangles the ray's line crosses, the corners' depths, and what ``u`` and ``v`` come from.
+    """Return the mask of a leaf's triangles that the ray's line crosses, corners' depths, two edge functions, determinant.
 
     Edge functions of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (2013), without any tolerance. Origin
-    and shear are splats, in the order of the axes that the ray's direction asks for.
+    and shear are splats, their axes in the order of :func:`torchpt.search.tree_leaf.setup_ray`.
     """
     x, y, z = base + kx * 8, base + ky * 8, base + kz * 8
     za, zb, zc = load(tree, z, 8) - pz, load(tree, z + 24, 8) - pz, load(tree, z + 48, 8) - pz
@@ -144,7 +144,7 @@ def crossed_triangles(tree, base, kx, ky, kz, px, py, pz, sx, sy):
 
 @jit_internal(forceinline=True)
 def planes(tree, base, o, d, za, zb, zc, sz, floor):
-    """``t`` of a leaf's planes, held within the corners' depths and beyond ``floor``; and where it is a distance."""
+    """Return ``t`` of a leaf's planes, clamped to the corners' depths and to at least ``floor``, and the mask of valid ones."""
     zero = splat(_ZERO, 8)
     n0, n1, n2 = load(tree, base + PLANES, 8), load(tree, base + PLANES + 8, 8), load(tree, base + PLANES + 16, 8)
     away = n0 * splat(o[0], 8) + n1 * splat(o[1], 8) + n2 * splat(o[2], 8) + load(tree, base + PLANES + 24, 8)
@@ -157,10 +157,10 @@ def planes(tree, base, o, d, za, zb, zc, sz, floor):
 
 @jit_internal(forceinline=True)
 def prefetch_block(tree, code):
-    """Asks for the lines of a block.
+    """Prefetch the cache lines of a block.
 
-    Nodes and leaves take one path with computed addresses: a branch would be mispredicted as often as the one that
-    follows. The ids of a leaf are left out, which few rays look at.
+    Nodes and leaves share one path with computed addresses: a branch would be mispredicted as often as the one that follows.
+    The ids of a leaf are left out, as few rays read them.
     """
     leaf = code >> 63
     base = ((code ^ leaf) & ~3) * (LINE // 4)

@@ -1,4 +1,4 @@
-"""Rays against the primitives of a leaf: triangles, rectangles, disks, spheres, quadrics (numba)."""
+"""Intersect one ray with the primitives of a leaf that are not triangles: rectangles, disks, spheres, quadrics (numba)."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ __all__ = [
 ]
 
 
-# ---- The distance to a sphere (numba), shared by the packet and the tree kernels
+# ---- Spheres
 
 
 @jit_internal(forceinline=True)
 def sphere_distance(ox, oy, oz, dx, dy, dz, cx, cy, cz, radius):
-    """Nearest positive ``t`` at which ``o + t d`` meets the sphere, as float32; NaN where it does not.
+    """Return the nearest positive ``t`` at which ``o + t d`` hits the sphere, as float32; NaN for a miss.
 
     Haines et al., "Precision Improvements for Ray/Sphere Intersection", Ray Tracing Gems, ch. 7: the discriminant comes
     from the perpendicular from the centre to the ray, the roots from ``q = b + sign(b) sqrt(a disc)``. In float64, so
-    that rays that start on the sphere, offset by a few float32 ulps, know their side exactly.
+    that rays that start on the sphere, offset by a few float32 ulps, start on the right side of it.
     """
     fx, fy, fz = np.float64(ox) - cx, np.float64(oy) - cy, np.float64(oz) - cz
     ex, ey, ez = np.float64(dx), np.float64(dy), np.float64(dz)
@@ -49,7 +49,7 @@ def sphere_distance(ox, oy, oz, dx, dy, dz, cx, cy, cz, radius):
     return np.float32(low if low > 0.0 else high)
 
 
-# ---- One ray against one quadric in its own space (numba): the operations of ``leaf.quadric``, in the same order
+# ---- Quadrics, in their own space: the operations of ``leaf.quadric``, in the same order
 
 
 _INFINITE = np.float64(np.inf)
@@ -63,7 +63,7 @@ def _sign(x):
 
 @jit_internal(forceinline=True)
 def _diamond(x, y):
-    """Way along the square ``|x| + |y| = 1`` from +x to a direction: in [-2, 2], monotonic in the angle."""
+    """Return the distance along the square ``|x| + |y| = 1`` from +x to a direction: in [-2, 2], monotonic in the angle."""
     s = abs(x) + abs(y)
     c = abs(x) / s if s > 0.0 else 1.0
     return (1.0 - c if x >= 0.0 else 1.0 + c) * _sign(y)
@@ -71,9 +71,9 @@ def _diamond(x, y):
 
 @jit_internal()
 def quadric_hit(table, k, ox, oy, oz, dx, dy, dz):
-    """``t, u, v`` as float32 of the nearest positive root on quadric ``k`` of ``table (Q, 19)``; ``t`` is NaN for a miss.
+    """Return ``t, u, v`` as float32 of the nearest hit on quadric ``k`` of ``table (Q, 19)``; ``t`` is NaN for a miss.
 
-    See :func:`torchpt.search.leaf.quadric` for the formulas and what ``u, v`` are.
+    See :func:`torchpt.search.leaf.quadric` for the formulas and the definition of ``u, v``.
     """
     px, py, pz = np.float64(ox), np.float64(oy), np.float64(oz)
     rx, ry, rz = np.float64(dx), np.float64(dy), np.float64(dz)
@@ -130,9 +130,7 @@ def quadric_hit(table, k, ox, oy, oz, dx, dy, dz):
     return np.float32(t), np.float32(u), np.float32(v)
 
 
-# ---- One ray against one primitive that is no triangle (numba): the operations of :mod:`torchpt.search.leaf`, none fused
-#
-# Triangles are met eight at a time, see :mod:`torchpt.search.tree_layout`.
+# ---- Any primitive but triangles (see :mod:`torchpt.search.tree_layout`): the operations of :mod:`torchpt.search.leaf`
 
 
 _NAN = np.float32(np.nan)
@@ -143,7 +141,7 @@ _ONE = np.float32(1.0)
 
 @jit_internal(forceinline=True)
 def setup_ray(dx, dy, dz):
-    """Axes with the largest component last, the shear, and reciprocals that are never infinite."""
+    """Return the axes, that of the largest component last, the shear, and reciprocals of the direction, which are finite."""
     x, y, z = abs(dx), abs(dy), abs(dz)
     kz = 0 if x >= y and x >= z else (1 if y >= z else 2)
     kx, ky = (1, 2) if kz == 0 else ((2, 0) if kz == 1 else (0, 1))
@@ -157,10 +155,10 @@ def setup_ray(dx, dy, dz):
 
 @jit_internal()
 def intersect_primitive(prim, corner, rows, quadrics, n2, n3, n4, o, d):
-    """``t, u, v`` of ray ``o, d`` (tuples) at a disk, sphere or quadric; ``t`` is NaN where it misses.
+    """Return ``t, u, v`` of ray ``o, d`` (tuples) at a disk, sphere or quadric; ``t`` is NaN for a miss.
 
-    Primitives are rectangles first; ``n2`` to ``n4`` are the numbers of the first disk, sphere and quadric. ``corner`` is
-    ``(K, 12)``: centre and radius of spheres.
+    ``prim`` counts from the first rectangle; ``n2`` to ``n4`` are the numbers of the first disk, sphere and quadric. ``corner``
+    is ``(K, 12)``; its first four numbers are centre and radius of a sphere.
     """
     if prim >= n3:
         if prim >= n4:
@@ -195,17 +193,17 @@ def intersect_primitive(prim, corner, rows, quadrics, n2, n3, n4, o, d):
     return (plane if u * u + v * v <= _ONE else _NAN), u, v
 
 
-# ---- One ray against the primitives of a leaf that are no triangles (numba): eight rectangles at once, others one by one
+# ---- A leaf: eight rectangles at once, other primitives one by one
 
 
-#: Where the rectangles of a leaf begin: three corners as in a leaf, then the fourth ones, then planes.
+#: Offset of the rectangles in a leaf: three corners as for triangles, then the fourth corners, then planes.
 RECTANGLES = LEAF * LINE
 FOURTH, RULED = 72, 96
 
 
 @jit_internal(forceinline=True)
 def _corner(tree, at, axes, p, s):
-    """A corner of eight rectangles in the ray's sheared place; see :func:`torchpt.search.tree_layout.crossed_triangles`."""
+    """Return a corner of eight rectangles in sheared space; see :func:`torchpt.search.tree_layout.crossed_triangles`."""
     z = load(tree, at + axes[2] * 8, 8) - p[2]
     x = (load(tree, at + axes[0] * 8, 8) - p[0]) - s[0] * z
     return x, (load(tree, at + axes[1] * 8, 8) - p[1]) - s[1] * z, z * s[2]
@@ -213,7 +211,7 @@ def _corner(tree, at, axes, p, s):
 
 @jit_internal(forceinline=True)
 def _rectangles(tree, at, axes, o, d, p, s):
-    """Eight rectangles: which are met, ``t``, u and v; the operations of :func:`torchpt.search.leaf.distances`."""
+    """Intersect eight rectangles: mask of hits, ``t``, u and v, by the operations of :func:`torchpt.search.leaf.distances`."""
     zero = splat(_ZERO, 8)
     n0, n1 = load(tree, at + RULED, 8), load(tree, at + RULED + 8, 8)
     n2, n3 = load(tree, at + RULED + 16, 8), load(tree, at + RULED + 24, 8)
@@ -236,25 +234,25 @@ def _rectangles(tree, at, axes, o, d, p, s):
 
 @jit_internal()
 def intersect_others(scene, code, base, o, d, axes, shear, floor, best, prim, scratch, any_hit):
-    """The best hit so far of one ray after a leaf's primitives that are no triangles, with ``u`` and ``v``.
+    """Update the nearest hit of one ray by a leaf's primitives that are not triangles.
 
     Args:
         scene: the tree as float32 and as int32; corners, affine rows and quadrics of all primitives but triangles; ids of the
-            first rectangle, disk, sphere and quadric; what :func:`torchpt.search.tree_layout.blocking` takes.
-        code: the leaf's.
-        base: where the leaf begins.
+            first rectangle, disk, sphere and quadric; the tables of :func:`torchpt.search.tree_layout.blocking`.
+        code: code of the leaf.
+        base: offset of the leaf.
         o: origin.
         d: direction.
         axes: order of the axes.
         shear: see :func:`torchpt.search.tree_leaf.setup_ray`.
         floor: least distance of a hit here.
-        best: the best distance so far.
-        prim: its primitive, or -1; of any hit see :func:`torchpt.search.tree_layout.blocking`.
+        best: distance of the nearest hit so far.
+        prim: primitive of that hit, or -1; for any-hit rays see :func:`torchpt.search.tree_layout.blocking`.
         scratch: 24 float32.
-        any_hit: stop at the first hit that blocks; the rest of what is returned means nothing then.
+        any_hit: stop at the first opaque hit; of the results only ``prim`` is defined then.
 
     Returns:
-        ``best, prim, u, v``; the last two mean nothing where ``prim`` is the one that came in.
+        ``best, prim, u, v``; ``u`` and ``v`` are undefined if ``prim`` has not changed.
     """
     tree, codes, tables, kinds = scene[0], scene[1], scene[2], scene[3]
     u, v = _ZERO, _ZERO
@@ -283,7 +281,7 @@ def intersect_others(scene, code, base, o, d, axes, shear, floor, best, prim, sc
         first, disk, sphere, quadric = item(kinds, 0), item(kinds, 1), item(kinds, 2), item(kinds, 3)
         for k in range(8):
             q = np.int32(-2 - item(codes, base + IDS + k))
-            if q < disk:  # a triangle's or an empty place is below 0
+            if q < disk:  # triangles and unused entries give negative numbers
                 continue
             t, a, b = intersect_primitive(
                 q - first, tables[0], tables[1], tables[2], disk - first, sphere - first, quadric - first, o, d

@@ -1,4 +1,4 @@
-"""Packets of sixteen rays through the wide tree, and single rays where packets fall apart (numba)."""
+"""Traverse a wide tree by packets of sixteen rays, and by single rays where rays are not coherent (numba)."""
 
 from __future__ import annotations
 
@@ -76,24 +76,24 @@ __all__ = [
 ]
 
 
-# ---- Rays as the search takes them (numba): sixteen at a time, in columns
+# ---- Rays in rows of memory, sixteen of them loaded at a time
 
 
-#: Rays that are held at a time; the length of a row.
+#: Length of a row: most rays that are held at a time.
 COLUMNS = 256
-#: Rows of float32: origin, direction, reciprocal direction, shear, best distance (-1: nothing is to be found), u, v.
+#: Rows of float32: origin, direction, reciprocal direction, shear, best distance (-1: the ray is finished), u, v.
 ORIGIN, DIRECTION, INVERSE, SHEAR, BEST, U, V = (k * COLUMNS for k in (0, 3, 6, 9, 12, 13, 14))
 FLOATS = 15 * COLUMNS
-#: Rows of int32: the axes with the direction's longest last, where the planes that face the ray begin, the primitive hit.
+#: Rows of int32: axes (the longest of the direction last), offsets of the near planes, primitive hit.
 AXIS, NEAR, RAY_IDS = 0, 3 * COLUMNS, 6 * COLUMNS
 NUMBERS = 7 * COLUMNS
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
-_LEAST, _TINY = np.float32(1e-20), np.float32(1e-37)  # as in kernels_leaf.setup
+_LEAST, _TINY = np.float32(1e-20), np.float32(1e-37)  # as in tree_leaf.setup
 
 
 @jit_internal(forceinline=True)
 def _inverse(d, least):
-    """Reciprocals that are never infinite."""
+    """Compute reciprocals that are never infinite."""
     sign = as_int(d) & splat(np.int32(-(2**31)), 16)
     return splat(_ONE, 16) / select(absolute(d) >= least, d, as_float(as_int(least) | sign))
 
@@ -105,7 +105,7 @@ def _facing(inverse, at):
 
 @jit_internal(forceinline=True)
 def load_rays(i, rays, c, rows, ids):
-    """Fills columns ``c`` to ``c + 15`` with rays ``i`` to ``i + 15``; returns the mask of those that can hit anything."""
+    """Fill columns ``c`` to ``c + 15`` with rays ``i`` to ``i + 15``; return the mask of those that can hit anything."""
     o, d, t_max, n = rays
     ox, oy, oz = load(o, i, 16), load(o, n + i, 16), load(o, 2 * n + i, 16)
     dx, dy, dz = load(d, i, 16), load(d, n + i, 16), load(d, 2 * n + i, 16)
@@ -145,14 +145,14 @@ def load_rays(i, rays, c, rows, ids):
     return bits(good)
 
 
-# ---- Several single rays in turn, one block each (numba): while the block of one is on its way from memory, others work
+# ---- Interleaved single rays: each advances by one block in turn, while the next blocks of the others are prefetched
 
 
 RAYS_IN_FLIGHT = 16  # rays in flight
 _ROW = 4
 STATE = RAYS_IN_FLIGHT * _ROW
 _ZERO = np.float32(0.0)
-#: Places in a row of int64: column of the ray, next code, its key, top of the stack (below 0: no ray is left).
+#: Columns of a row of int64: column of the ray, next code, its key, top of the stack (negative: no ray is left).
 _RAY, _CODE, _KEY, _TOP = 0, 1, 2, 3
 
 
@@ -168,7 +168,7 @@ def _scalars(rows, at):
 
 @jit_internal(forceinline=True)
 def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
-    """Tests a leaf and writes down what is nearer; returns whether an any-hit ray is settled."""
+    """Test a leaf and store nearer hits; return True if an any-hit ray is finished."""
     tree, codes = scene[0], scene[1]
     base, mixed = block_offset(code), not triangles_alone(code)
     kx, ky, kz = _scalars(ids, AXIS + c)
@@ -214,16 +214,17 @@ def _leaf(scene, code, key, c, rows, ids, scratch, any_hit):
 
 @jit_internal(forceinline=True)
 def trace_interleaved(count, scene, stack_length, rows, ids, work, any_hit):
-    """The nearest hits of the rays in the first ``count`` columns, or any hits.
+    """Find the nearest hits of the rays in the first ``count`` columns, or any hits.
 
     Args:
-        count: how many columns.
-        scene: the tree as float32 and as int32, tables of other primitives, where their kinds begin.
-        stack_length: entries of a ray's stack.
-        rows: rays, see :mod:`torchpt.search.tree_packet`.
-        ids: likewise.
-        work: memory: keys and parents of the stacks (``RAYS_IN_FLIGHT * stack_length`` int32 each), ``STATE`` int64, ``SCRATCH`` float32.
-        any_hit: whether any hit will do.
+        count: number of columns.
+        scene: the tree as float32 and as int32, tables of other primitives, first ids of their kinds.
+        stack_length: stack size of a ray.
+        rows: rows of float32, see the constants above.
+        ids: rows of int32, likewise.
+        work: memory: keys and parents of the stacks (``RAYS_IN_FLIGHT * stack_length`` int32), ``STATE`` int64, ``SCRATCH``
+            float32.
+        any_hit: stop at the first opaque hit.
     """
     tree, codes = scene[0], scene[1]
     keys, parents, slots, scratch = work
@@ -278,25 +279,25 @@ def trace_interleaved(count, scene, stack_length, rows, ids, work, any_hit):
             prefetch_block(tree, code)
 
 
-# ---- Sixteen rays at a time (numba): intervals of the packet cull a node's boxes, each box left is tested by every ray
+# ---- Packets of sixteen rays: interval arithmetic culls a node's boxes, the remaining ones are tested with every ray
 #
 # After Wald, Slusallek, Benthin and Wagner, "Interactive Rendering with Coherent Ray Tracing" (2001), and the interval
 # tests of Boulos, Wald and Shirley, "Geometric and Arithmetic Culling Methods for Entire Ray Packets" (2006).
 
 
 RAYS = 16
-#: Numbers of memory that a packet needs.
+#: Float32 of scratch memory that a packet needs.
 SPARE = 10 * RAYS
-#: Rays that repay a packet.
+#: Fewest active rays of a packet.
 FEWEST = 4
 _ZERO, _INF = np.float32(0.0), np.float32(np.inf)
 
 
 @jit_internal(forceinline=True)
 def is_coherent(c, good, rows):
-    """Whether the rays in columns ``c`` to ``c + 15`` go as a packet: those in the mask ``good`` are many, and of one octant.
+    """Return True if the rays in columns ``c`` to ``c + 15`` form a packet: enough are in the mask ``good``, all of one octant.
 
-    Returns also whether directions rise along x, y and z. Signs are those of the sign bit, as -0 counts as falling.
+    Also returns, for x, y and z, True if directions are positive, by the sign bit: -0 is negative.
     """
     none = splat(np.int32(0), 16)
     ux = bits(as_int(load(rows, DIRECTION + c, 16)) >= none) & good
@@ -308,7 +309,7 @@ def is_coherent(c, good, rows):
 
 @jit_internal(forceinline=True)
 def _filled(rows, c, first, whole):
-    """Three rows of columns ``c`` to ``c + 15``, those of column ``first`` where a ray is none that can hit."""
+    """Load three rows of columns ``c`` to ``c + 15``, with column ``first`` in place of inactive rays."""
     return (
         select(whole, load(rows, c, 16), splat(item(rows, first), 16)),
         select(whole, load(rows, c + COLUMNS, 16), splat(item(rows, first + COLUMNS), 16)),
@@ -318,7 +319,7 @@ def _filled(rows, c, first, whole):
 
 @jit_internal(forceinline=True)
 def _interval(o, inverse, up):
-    """What the culling test takes of 16 rays on one axis: origins for near and far planes, least and greatest reciprocal."""
+    """Return the intervals of 16 rays on one axis: origins for near and far planes, least and greatest reciprocal."""
     low, high = lowest(o), highest(o)
     near, far = (high, low) if up else (low, high)
     return splat(near, 8), splat(far, 8), splat(lowest(inverse), 8), splat(highest(inverse), 8)
@@ -326,7 +327,7 @@ def _interval(o, inverse, up):
 
 @jit_internal(forceinline=True)
 def _met(tree, base, nx, ny, nz, x, y, z, limit):
-    """Entries no later than those of any ray, and the mask of the boxes that some ray may meet before ``limit``."""
+    """Return lower bounds of all rays' entries into eight boxes, and the mask of boxes that a ray may hit before ``limit``."""
     ax, bx = load(tree, base + nx, 8) - x[0], load(tree, base + (24 - nx), 8) - x[1]
     ay, by = load(tree, base + ny, 8) - y[0], load(tree, base + (40 - ny), 8) - y[1]
     az, bz = load(tree, base + nz, 8) - z[0], load(tree, base + (56 - nz), 8) - z[1]
@@ -343,7 +344,7 @@ def _met(tree, base, nx, ny, nz, x, y, z, limit):
 
 @jit_internal(forceinline=True)
 def _box(tree, at, nx, ny, nz, o, inverse, best):
-    """Every ray's entry into one box, whose first number lies at ``at``, and the mask of those that meet it."""
+    """Return every ray's entry into one box, whose first number is at ``at``, and the mask of rays that hit it."""
     ax = (splat(item(tree, at + nx), 16) - o[0]) * inverse[0]
     bx = (splat(item(tree, at + (24 - nx)), 16) - o[0]) * inverse[0]
     ay = (splat(item(tree, at + ny), 16) - o[1]) * inverse[1]
@@ -356,7 +357,7 @@ def _box(tree, at, nx, ny, nz, o, inverse, best):
 
 @jit_internal(forceinline=True)
 def _corner(tree, at, m, p, s):
-    """A corner in the sheared place of every ray, see kernels_blocks.crossed; ``m`` says whose longest axis is x, whose y."""
+    """Return a corner in the sheared space of every ray; ``m`` has the masks of rays whose longest axis is x, and y."""
     x = splat(item(tree, at), 16) - p[0]
     y = splat(item(tree, at + 8), 16) - p[1]
     z = splat(item(tree, at + 16), 16) - p[2]
@@ -370,7 +371,7 @@ def _corner(tree, at, m, p, s):
 
 @jit_internal(forceinline=True)
 def _triangle(tree, at, axes, s, o, d, floor):
-    """16 rays against one triangle, whose first number lies at ``at``: mask, ``t``, and what ``u`` and ``v`` come from."""
+    """Intersect 16 rays with the triangle whose first number is at ``at``: mask, ``t``, two edge functions, determinant."""
     zero = splat(_ZERO, 16)
     ax, ay, za = _corner(tree, at, axes, o, s)
     bx, by, zb = _corner(tree, at + 24, axes, o, s)
@@ -393,7 +394,7 @@ def _triangle(tree, at, axes, s, o, d, floor):
 
 @jit_internal(forceinline=True)
 def _rectangle(tree, at, axes, s, o, d):
-    """16 rays against one rectangle: mask, ``t``, u and v; the operations of :func:`torchpt.search.tree_leaf.intersect_others`."""
+    """Intersect 16 rays with one rectangle: mask, ``t``, u, v; see :func:`torchpt.search.tree_leaf.intersect_others`."""
     zero = splat(_ZERO, 16)
     n0, n1 = splat(item(tree, at + RULED), 16), splat(item(tree, at + RULED + 8), 16)
     n2, n3 = splat(item(tree, at + RULED + 16), 16), splat(item(tree, at + RULED + 24), 16)
@@ -415,9 +416,9 @@ def _rectangle(tree, at, axes, s, o, d):
 
 @jit_internal(forceinline=True)
 def _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_hit):
-    """Every ray of the mask, one by one, against a leaf's primitives that are neither triangles nor rectangles.
+    """Intersect the rays of a mask, one by one, with a leaf's primitives that are neither triangles nor rectangles.
 
-    ``memory`` is for what lanes hold.
+    ``memory`` is scratch memory for the values of the lanes.
     """
     spare, ids, scratch = memory
     for k in range(3):
@@ -453,7 +454,7 @@ def _rest(scene, code, base, memory, o, d, floor, lanes, best, prim, u, v, any_h
 
 @jit_internal(forceinline=True)
 def _packet_leaf(scene, code, memory, axes, s, o, d, floor, lanes, best, prim, u, v, any_hit):
-    """Takes a leaf into the hits of the packet's rays that are in the mask; a ray that any hit settles gets ``best`` -1."""
+    """Update the hits of a packet's rays in the mask by a leaf; any-hit rays with an opaque hit get ``best`` -1."""
     tree, codes = scene[0], scene[1]
     base = block_offset(code)
     ruled = code & 2 == 0
@@ -485,7 +486,7 @@ def _packet_leaf(scene, code, memory, axes, s, o, d, floor, lanes, best, prim, u
 
 @jit_internal(forceinline=True)
 def store_hits(i, out, best, prim, u, v, any_hit):
-    """Writes the hits of 16 rays, or for each 1 where it is blocked, 2 where it met what may let light pass, else 0."""
+    """Write the hits of 16 rays; of any-hit rays 1 if blocked, 2 if light may pass all that they hit, else 0."""
     missed = prim < splat(np.int32(0), 16)
     if any_hit:
         open_ = select(prim == splat(MAY_PASS, 16), splat(np.int32(2), 16), splat(np.int32(0), 16))
@@ -499,7 +500,7 @@ def store_hits(i, out, best, prim, u, v, any_hit):
 
 @jit_internal(forceinline=True)
 def trace_packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, any_hit):
-    """The hits of rays ``i`` to ``i + 15`` in columns ``c`` to ``c + 15``, which :func:`is_coherent` has found to go together."""
+    """Trace rays ``i`` to ``i + 15``, in columns ``c`` to ``c + 15``, as a packet; :func:`is_coherent` must hold for them."""
     tree, codes = scene[0], scene[1]
     keys, parents = stack
     first, whole = c + trailing_zeros(good), mask(good, 16)
@@ -541,16 +542,16 @@ def trace_packet(i, c, good, ux, uy, uz, rows, axis, scene, stack, memory, out, 
     store_hits(i, out, best, prim, u, v, any_hit)
 
 
-# ---- Closest and any hits of a range of rays (numba): packets where sixteen rays go together, the others in turn
+# ---- Kernels: nearest and any hits of a range of rays, coherent ones as packets, the others as interleaved single rays
 
 
-#: Pieces of work a thread: rays of one place may take longer than those of another.
+#: Pieces of work a thread, as the cost of rays varies over the picture.
 PIECES = 8
 
 
 @jit_internal(inline="always")
 def _trace(first, last, rays, scene, stack_length, groups, columns, work, spare, out, any_hit):
-    """Rays ``first`` to ``last``, a multiple of 16."""
+    """Trace rays ``first`` to ``last``; their number is a multiple of 16."""
     rows, ids = columns
     i, count = first, np.int64(0)
     while i < last:
@@ -577,7 +578,7 @@ def _none():
 
 @jit_internal(inline="always")
 def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, t, prim, u, v, any_hit):
-    """:func:`_trace` with its memory; the rays beyond the last sixteen in memory of their own."""
+    """Allocate memory and run :func:`_trace`; a remainder of fewer than 16 rays is padded in separate memory."""
     stack_length = kinds[4]
     keys, parents = np.empty(RAYS_IN_FLIGHT * stack_length, np.int32), np.empty(RAYS_IN_FLIGHT * stack_length, np.int32)
     slots, scratch, groups = np.empty(STATE, np.int64), np.empty(SCRATCH, np.float32), np.empty(COLUMNS >> 4, np.int64)
@@ -590,7 +591,7 @@ def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
     spare = (pointer(lanes), pointer(kept), pointer(scratch))
     given = (pointer(o), pointer(d), pointer(t_max), d.shape[1])
     found = (pointer(t), pointer(prim), pointer(u), pointer(v))
-    # rays beyond the last sixteen, with others that can hit nothing
+    # the remainder of fewer than 16 rays, padded with rays that hit nothing
     end = last - (last - first) % RAYS
     edge, number = np.zeros(10 * RAYS, np.float32), np.zeros(RAYS, np.int32)
     for j in range(last - end):
@@ -599,7 +600,7 @@ def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
             edge[k * RAYS + j], edge[(3 + k) * RAYS + j] = o[k, end + j], d[k, end + j]
     given_edge = (pointer(edge), pointer(edge[3 * RAYS :]), pointer(edge[6 * RAYS :]), RAYS)
     found_edge = (pointer(edge[7 * RAYS :]), pointer(number), pointer(edge[8 * RAYS :]), pointer(edge[9 * RAYS :]))
-    for k in range(2):  # one place of call: what is inlined is compiled once
+    for k in range(2):  # a single call, which is inlined and compiled once
         rays, out = (given, found) if k == 0 else (given_edge, found_edge)
         start, stop = (first, end) if k == 0 else (0, RAYS if end < last else 0)
         _trace(start, stop, rays, scene, stack_length, pointer(groups), ray_rows, work, spare, out, any_hit)
@@ -607,27 +608,27 @@ def _search(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
         prim[end + j] = number[j]
         if not any_hit:
             t[end + j], u[end + j], v[end + j] = edge[7 * RAYS + j], edge[8 * RAYS + j], edge[9 * RAYS + j]
-    # what pointers point to lives until here
+    # keeps the arrays alive: pointers hold no references
     keys[0], parents[0], slots[0], scratch[0], groups[0] = 0, 0, 0, 0, 0
     columns[0], numbers[0], lanes[0], kept[0], edge[0], number[0] = 0, 0, 0, 0, 0, 0
 
 
 @jit()
 def nearest(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v):
-    """The nearest hits of rays ``first <= i < last``.
+    """Find the nearest hits of rays ``first <= i < last``.
 
     Args:
-        first: ray.
-        last: ray.
+        first: first ray.
+        last: ray after the last one.
         o: origins ``(3, N)`` float32.
         d: directions ``(3, N)``.
-        t_max: where each ray ends ``(N,)``.
+        t_max: ends of the rays ``(N,)``.
         tree: blocks of nodes and leaves, see :mod:`torchpt.search.tree_layout`.
         codes: the same memory as int32.
-        corner: ``(K, 12)`` corners of the primitives that are no triangles.
-        rows: ``(K, 12)`` their affine rows.
+        corner: ``(K, 12)`` corners of the primitives that are not triangles.
+        rows: ``(K, 12)`` affine rows of these primitives.
         quadrics: ``(Q, 19)`` float64.
-        kinds: ``(5,)`` int64: ids of the first rectangle, disk, sphere and quadric; room of a stack.
+        kinds: ``(5,)`` int64: ids of the first rectangle, disk, sphere and quadric; stack size of a ray.
         t: ``(N,)`` float32, filled; inf for a miss.
         prim: ``(N,)`` int32, filled; -1 for a miss.
         u: ``(N,)`` float32, filled.
@@ -638,7 +639,7 @@ def nearest(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
 
 @jit(parallel=True)
 def nearest_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, t, prim, u, v):
-    """:func:`nearest` over the rays in equal pieces, which the threads take in turn."""
+    """Run :func:`nearest` on several threads, over equal pieces of the rays."""
     pieces = chunks * PIECES
     for c in prange(chunks):
         for k in range(c, pieces, chunks):
@@ -648,10 +649,10 @@ def nearest_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quad
 
 @jit()
 def blocked(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, out):
-    """What stands in the way of rays ``first <= i < last``: 1 in ``out`` ``(N,)`` int32 for what blocks, 0 for nothing.
+    """Write 1 to ``out`` ``(N,)`` int32 for rays ``first <= i < last`` that hit an opaque primitive, else 0.
 
-    Where ``non_opaque`` is not empty it holds a uint8 for each primitive, not 0 where light may pass: 2 in ``out`` is
-    for rays that meet such primitives alone.
+    ``non_opaque`` is empty, or holds a uint8 for each primitive, nonzero if light may pass: rays that hit only such primitives
+    get 2.
     """
     _search(
         first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, t_max, out, t_max, t_max, True
@@ -660,7 +661,7 @@ def blocked(first, last, o, d, t_max, tree, codes, corner, rows, quadrics, kinds
 
 @jit(parallel=True)
 def blocked_parallel(chunks, items, o, d, t_max, tree, codes, corner, rows, quadrics, kinds, non_opaque, out):
-    """:func:`blocked` over the rays in equal pieces, which the threads take in turn."""
+    """Run :func:`blocked` on several threads, over equal pieces of the rays."""
     pieces = chunks * PIECES
     for c in prange(chunks):
         for k in range(c, pieces, chunks):

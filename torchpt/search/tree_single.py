@@ -1,4 +1,4 @@
-"""One ray through a tree from one of its nodes (numba): for trees below trees, where rays meet few boxes together."""
+"""Traverse a tree of triangles from one of its nodes by a single ray (numba): the lower level of instances."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from torchpt.search.tree_leaf import setup_ray
 __all__ = ["SCRATCH", "nearest_triangle", "occluding_triangle", "pop", "trace_single"]
 
 _ZERO = np.float32(0.0)
-#: Numbers of a kernel's scratch row: ``t``, ``u``, ``v`` of eight triangles.
+#: Length of a kernel's scratch row: ``t``, ``u``, ``v`` of eight triangles.
 SCRATCH = 24
 
 
 @jit_internal(forceinline=True)
 def pop(codes, keys, parents, top, bottom, limit):
-    """The next box that is entered before ``limit``: top of the stack (below ``bottom`` if there is none), code, key."""
+    """Pop the next box with an entry below ``limit``; return top of the stack (below ``bottom`` if none is left), code, key."""
     code, key = np.int64(0), np.int32(0)
     while True:
         top -= 1
@@ -44,10 +44,9 @@ def pop(codes, keys, parents, top, bottom, limit):
 
 @jit_internal(forceinline=True)
 def nearest_triangle(tree, codes, base, met, sz, o, d, floor, best, prim, shift, scratch):
-    """The nearest of a leaf's triangles that :func:`crossed_triangles` has found.
+    """Update the nearest hit by a leaf's triangles that :func:`crossed_triangles` has found.
 
-    Returns ``best``, ``prim`` (ids count from ``shift``) and the lane of ``scratch`` where u and v are, -1 where no triangle is
-    nearer than what came in.
+    Returns ``best``, ``prim`` (ids plus ``shift``) and the lane of ``scratch`` that holds u and v, -1 if no triangle is nearer.
     """
     m, za, zb, zc, f, g, det = met
     lane = np.int64(-1)
@@ -68,7 +67,7 @@ def nearest_triangle(tree, codes, base, met, sz, o, d, floor, best, prim, shift,
 
 @jit_internal(forceinline=True)
 def occluding_triangle(scene, base, met, sz, o, d, floor, best, prim, shift):
-    """The id of a triangle that :func:`crossed_triangles` has found and that lets no light pass; else :data:`MAY_PASS` or ``prim``."""
+    """Return the id of an opaque triangle of those that the ray hits, else :data:`MAY_PASS` for a hit, or ``prim``."""
     tree, codes = scene[0], scene[1]
     t, ahead = planes(tree, base, o, d, met[1], met[2], met[3], splat(sz, 8), floor)
     w = bits(met[0] & ahead & (t < splat(best, 8)))
@@ -80,24 +79,24 @@ def occluding_triangle(scene, base, met, sz, o, d, floor, best, prim, shift):
 
 @jit_internal()
 def trace_single(scene, root, o, d, best, prim, shift, keys, parents, bottom, scratch, any_hit):
-    """The nearest hit of a ray below a node of triangles alone where it is nearer than ``best``, or any such hit.
+    """Find the nearest hit of a ray in a subtree of triangles, nearer than ``best``, or any such hit.
 
     Args:
-        scene: the buffer, the same as int32; and as :func:`torchpt.search.tree_layout.blocking` takes it.
-        root: the node's code.
+        scene: the tree as float32 and as int32, and the tables of :func:`torchpt.search.tree_layout.blocking`.
+        root: code of the node.
         o: origin, a tuple.
         d: direction.
-        best: distance of the best hit so far, or where the ray ends.
-        prim: its id, or -1.
-        shift: added to the ids below the node.
-        keys: the stack.
-        parents: the stack.
-        bottom: where this call's part of the stack begins.
+        best: distance of the nearest hit so far, or ``t_max`` of the ray.
+        prim: id of that hit, or -1.
+        shift: added to the ids of the subtree.
+        keys: keys of the stack.
+        parents: parent nodes of the stack.
+        bottom: first free entry of the stack.
         scratch: ``(SCRATCH,)`` float32.
-        any_hit: whether any hit will do.
+        any_hit: stop at the first opaque hit.
 
     Returns:
-        ``t, prim, u, v``; ``u`` and ``v`` mean nothing where ``prim`` is the one that came in.
+        ``t, prim, u, v``; ``u`` and ``v`` are undefined if ``prim`` has not changed.
     """
     tree, codes = scene[0], scene[1]
     kx, ky, kz, sx, sy, sz, ix, iy, iz = setup_ray(d[0], d[1], d[2])

@@ -1,7 +1,7 @@
-"""Elementary functions, without branches and without calls: argument reduction and a polynomial.
+"""Elementary functions as LLVM IR, without branches and calls: argument reduction and a polynomial.
 
 The polynomials are those of Moshier's Cephes library (*Methods and Programs for Mathematical Functions*, 1989) unless
-something else is said. ``tests/compiler/test_functions.py`` states the error of each in units of the last place.
+stated otherwise. ``tests/compiler/test_functions.py`` bounds the error of each in units of the last place (ulp).
 """
 
 from __future__ import annotations

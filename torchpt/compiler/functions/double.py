@@ -1,4 +1,4 @@
-"""Sums and products of float64 with what rounding took from them (Dekker 1971)."""
+"""Double-double arithmetic: sums and products of float64 with their rounding errors (Dekker 1971)."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ __all__ = ["double_product", "two_product", "two_sum"]
 
 
 def two_sum(b: Block, x: str, y: str) -> tuple[str, str]:
-    """A sum and its rounding error, where ``x`` is the larger, or 0."""
+    """Return a sum and its rounding error; ``x`` must be the larger in magnitude, or 0."""
     s = b.add("d", x, y)
     return s, b.sub("d", y, b.sub("d", s, x))
 
 
 def two_product(b: Block, x: str, y: str) -> tuple[str, str]:
-    """A product and its rounding error."""
+    """Return a product and its rounding error."""
     p = b.mul("d", x, y)
     return p, b.fma("d", x, y, b.negative("d", p))
 
 
 def double_product(b: Block, x: tuple[str, str], y: tuple[str, str]) -> tuple[str, str]:
-    """The product of two sums of two."""
+    """Multiply two double-double numbers."""
     p, rest = two_product(b, x[0], y[0])
     rest = b.fma("d", x[0], y[1], b.fma("d", x[1], y[0], rest))
     return two_sum(b, p, rest)

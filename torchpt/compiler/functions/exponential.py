@@ -1,4 +1,4 @@
-"""Powers of e and of two, and the functions that are made of them."""
+"""Exponentials to base e and 2, hyperbolic functions and the sigmoid."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LN2 = math.log(2.0)
 
 
 def _scaled(b: Block, ty: str, p: str, q: str) -> str:
-    """``p 2^q`` for a whole number ``q`` in floating point, by two factors so that neither overflows before it must."""
+    """Compute ``p 2^q`` for an integer ``q`` held as a float, by two factors, which avoids early overflow."""
     n = b.convert("fptosi", ty, "i", q)
     half = b.binary("ashr", "i", n, b.constant("i", 1))
     for k in (half, b.sub("i", n, half)):
@@ -28,7 +28,7 @@ def _scaled(b: Block, ty: str, p: str, q: str) -> str:
 
 
 def _power_of_two(b: Block, ty: str, q: str, r: str) -> str:
-    """``2^q e^r`` for whole ``q`` and ``|r| <= ln 2 / 2``; not for NaN."""
+    """Compute ``2^q e^r`` for integer ``q`` and ``|r| <= ln 2 / 2``; not for NaN."""
     if ty == "f":
         p = b.polynomial(
             ty,
@@ -46,7 +46,7 @@ def _finish_exponential(b: Block, ty: str, x: str, value: str) -> str:
 
 
 def exp(b: Block, ty: str, x: str, rest: str | None = None) -> str:
-    """``e^x``, or ``e^(x + rest)`` for a rest below the last place of ``x``."""
+    """Compute ``e^x``, or ``e^(x + rest)`` for a rest below one ulp of ``x``."""
     q, r = _reduced(b, ty, x, *((-104.0, 89.0) if ty == "f" else (-746.0, 710.0)))
     if rest is not None:
         r = b.add(ty, r, rest)
@@ -54,7 +54,7 @@ def exp(b: Block, ty: str, x: str, rest: str | None = None) -> str:
 
 
 def _reduced(b: Block, ty: str, x: str, low: float, high: float) -> tuple[str, str]:
-    """Whole ``q`` and ``r`` for ``x = q ln 2 + r`` within limits; 0 for NaN."""
+    """Reduce ``x``, clamped to limits, to integer ``q`` and ``r`` with ``x = q ln 2 + r``; NaN gives 0."""
     y = clamped(b, ty, x, low, high)
     y = b.select(ty, b.compare("uno", ty, x, x), b.constant(ty, 0.0), y)
     q = b.call("llvm.rint", ty, b.mul(ty, y, b.constant(ty, 1.0 / _LN2)))
@@ -64,7 +64,7 @@ def _reduced(b: Block, ty: str, x: str, low: float, high: float) -> tuple[str, s
 
 
 def exp2(b: Block, ty: str, x: str) -> str:
-    """``2^x``."""
+    """Compute ``2^x``."""
     low, high = (-151.0, 129.0) if ty == "f" else (-1076.0, 1025.0)
     y = clamped(b, ty, x, low, high)
     y = b.select(ty, b.compare("uno", ty, x, x), b.constant(ty, 0.0), y)
@@ -74,7 +74,7 @@ def exp2(b: Block, ty: str, x: str) -> str:
 
 
 def expm1(b: Block, ty: str, x: str) -> str:
-    """``e^x - 1``."""
+    """Compute ``e^x - 1``."""
     if ty == "f":
         value = narrow(b, ty, b.sub("d", exp(b, "d", wide(b, ty, x)), b.constant("d", 1.0)))
         small = b.compare("olt", ty, absolute(b, ty, x), b.constant(ty, 1e-8))
@@ -86,12 +86,12 @@ def expm1(b: Block, ty: str, x: str) -> str:
     p = b.fma(ty, b.mul(ty, r, r), p, r)
     less = b.sub(ty, one, _scaled(b, ty, one, b.negative(ty, q)))
     value = _scaled(b, ty, b.add(ty, p, less), q)
-    small = b.compare("olt", ty, absolute(b, ty, x), b.constant(ty, 1e-17))  # and its zeros keep their sign
+    small = b.compare("olt", ty, absolute(b, ty, x), b.constant(ty, 1e-17))  # keeps the sign of zeros, too
     return _finish_exponential(b, ty, x, b.select(ty, small, x, value))
 
 
 def sigmoid(b: Block, ty: str, x: str) -> str:
-    """``1 / (1 + e^-x)``."""
+    """Compute the sigmoid ``1 / (1 + e^-x)``."""
     e = exp(b, ty, b.negative(ty, absolute(b, ty, x)))  # does not overflow
     one = b.constant(ty, 1.0)
     top = b.select(ty, b.compare("olt", ty, x, b.constant(ty, 0.0)), e, one)
@@ -99,7 +99,7 @@ def sigmoid(b: Block, ty: str, x: str) -> str:
 
 
 def tanh(b: Block, ty: str, x: str) -> str:
-    """The hyperbolic tangent, by ``expm1(2 |x|)``."""
+    """Compute the hyperbolic tangent, by ``expm1(2 |x|)``."""
     twice = b.mul(ty, absolute(b, ty, x), b.constant(ty, 2.0))
     twice = b.extreme("min", ty, twice, b.constant(ty, 80.0))  # 1 up to rounding
     e = expm1(b, ty, twice)
@@ -107,7 +107,7 @@ def tanh(b: Block, ty: str, x: str) -> str:
 
 
 def sinh(b: Block, ty: str, x: str) -> str:
-    """``(e + e / (e + 1)) / 2`` with ``e = expm1(|x|)``, half of the exponent at a time so that it does not overflow early."""
+    """Compute the hyperbolic sine: ``(e + e / (e + 1)) / 2`` with ``e = expm1(|x|)``; if large, ``exp(|x| / 2)`` squared."""
     size = absolute(b, ty, x)
     e = expm1(b, ty, size)
     half, one = b.constant(ty, 0.5), b.constant(ty, 1.0)
@@ -119,7 +119,7 @@ def sinh(b: Block, ty: str, x: str) -> str:
 
 
 def cosh(b: Block, ty: str, x: str) -> str:
-    """The hyperbolic cosine, from the square root of ``e^|x|`` so that it does not overflow early."""
+    """Compute the hyperbolic cosine, by ``exp(|x| / 2)`` squared, which avoids early overflow."""
     half = b.constant(ty, 0.5)
     root = exp(b, ty, b.mul(ty, half, absolute(b, ty, x)))
     large = b.mul(ty, b.mul(ty, half, root), root)

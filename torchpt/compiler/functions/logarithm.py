@@ -16,19 +16,19 @@ _LN2_PARTS = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 
 
 def log(b: Block, ty: str, x: str) -> str:
-    """The natural logarithm."""
+    """Compute the natural logarithm."""
     if ty == "f":
         return log_ends(b, ty, x, narrow(b, ty, _log_series(b, wide(b, ty, x), 5)))
     return log_ends(b, ty, x, b.add(ty, *log_parts(b, x)))
 
 
 def log_wide(b: Block, x: str) -> str:
-    """The logarithm of a float64 that need be good to 50 bits only; denormals are not meant."""
+    """Compute the logarithm of a float64 to about 50 bits; denormals are not supported."""
     return log_ends(b, "d", x, _log_series(b, x, 11))
 
 
 def log_ends(b: Block, ty: str, x: str, value: str) -> str:
-    """Put in the logarithms of what is not positive and finite."""
+    """Replace ``value`` by the logarithms of 0, negative numbers and infinity where ``x`` is one of these."""
     zero, inf = b.constant(ty, 0.0), b.constant(ty, math.inf)
     value = b.select(ty, b.compare("oeq", ty, x, zero), b.constant(ty, -math.inf), value)
     value = b.select(ty, b.compare("ult", ty, x, zero), b.constant(ty, math.nan), value)
@@ -36,7 +36,7 @@ def log_ends(b: Block, ty: str, x: str, value: str) -> str:
 
 
 def _mantissa(b: Block, y: str) -> tuple[str, str]:
-    """A positive float64 as ``m 2^e``: ``m`` between the square roots of 1/2 and 2, and ``e`` as a float64."""
+    """Split a positive float64 into ``m 2^e``: ``m`` between the square roots of 1/2 and 2, and ``e`` as a float64."""
     bits = b.convert("bitcast", "d", "L", y)
     e = b.binary("ashr", "L", b.sub("L", bits, b.constant("L", 0x3FE6A09E00000000)), b.constant("L", 52))
     m = b.convert("bitcast", "L", "d", b.sub("L", bits, b.binary("shl", "L", e, b.constant("L", 52))))
@@ -44,7 +44,7 @@ def _mantissa(b: Block, y: str) -> tuple[str, str]:
 
 
 def _log_series(b: Block, x: str, terms: int) -> str:
-    """``ln m = 2 atanh(s)``, ``s = (m - 1) / (m + 1)``, ``|s| < 0.172``: the series."""
+    """Compute a logarithm by the series of ``ln m = 2 atanh(s)``, ``s = (m - 1) / (m + 1)``, ``|s| < 0.172``."""
     m, e = _mantissa(b, x)
     f = b.sub("d", m, b.constant("d", 1.0))
     s = b.div("d", f, b.add("d", m, b.constant("d", 1.0)))
@@ -56,13 +56,13 @@ def _log_series(b: Block, x: str, terms: int) -> str:
 
 
 def log_parts(b: Block, x: str) -> tuple[str, str]:
-    """The logarithm of positive finite float64 as a sum of two, good to about 63 bits: the series of :func:`_log_series`."""
+    """Compute the logarithm of positive finite float64 as a sum of two, to about 63 bits; the series of :func:`_log_series`."""
     tiny = b.compare("olt", "d", x, b.constant("d", 2.0**-1022))
     m, e = _mantissa(b, b.select("d", tiny, b.mul("d", x, b.constant("d", 2.0**54)), x))
     e = b.select("d", tiny, b.sub("d", e, b.constant("d", 54.0)), e)
     one = b.constant("d", 1.0)
     f = b.sub("d", m, one)
-    # s = f / (2 + f), with the rest of the division.
+    # s = f / (2 + f), with its rounding error.
     d = two_sum(b, b.constant("d", 2.0), f)
     sh = b.div("d", f, d[0])
     off = b.fma("d", b.negative("d", sh), d[1], b.fma("d", b.negative("d", sh), d[0], f))
@@ -71,7 +71,7 @@ def log_parts(b: Block, x: str) -> tuple[str, str]:
     # 2 + z (2/3 + z (2/5 + ...)): the last bracket needs no more than float64 has.
     p = b.polynomial("d", z[0], tuple(2.0 / k for k in range(23, 4, -2)))
     w = two_sum(b, b.constant("d", 2.0 / 3.0), b.mul("d", z[0], p))
-    w = w[0], b.add("d", w[1], b.constant("d", 3.700743415417188e-17))  # what 2/3 lacks
+    w = w[0], b.add("d", w[1], b.constant("d", 3.700743415417188e-17))  # rounding error of 2/3
     w = double_product(b, z, w)
     h = two_sum(b, b.constant("d", 2.0), w[0])
     r = double_product(b, s, (h[0], b.add("d", h[1], w[1])))
@@ -81,7 +81,7 @@ def log_parts(b: Block, x: str) -> tuple[str, str]:
 
 
 def log_by(factor: float, rest: float) -> Callable[[Block, str, str], str]:
-    """Logarithms times ``factor + rest``."""
+    """Return the function that multiplies the natural logarithm by ``factor + rest``."""
 
     def function(b: Block, ty: str, x: str) -> str:
         if ty == "f":
@@ -93,13 +93,13 @@ def log_by(factor: float, rest: float) -> Callable[[Block, str, str], str]:
 
 
 def log1p(b: Block, ty: str, x: str) -> str:
-    """``ln(1 + x)``."""
+    """Compute ``ln(1 + x)``."""
     small = b.compare("olt", ty, absolute(b, ty, x), b.constant(ty, 1e-8 if ty == "f" else 1e-17))
     one = b.constant("d", 1.0)
     if ty == "f":
         value = narrow(b, ty, log_wide(b, b.add("d", wide(b, ty, x), one)))
         return b.select(ty, small, x, value)
-    # The logarithm of the rounded sum u, and what rounding took: ln(u + c) = ln u + c / u.
+    # With u the rounded sum 1 + x and c its rounding error: ln(u + c) = ln u + c / u.
     u = b.add("d", x, one)
     less = b.sub("d", u, x)
     c = b.add("d", b.sub("d", x, b.sub("d", u, less)), b.sub("d", one, less))

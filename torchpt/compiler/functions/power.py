@@ -13,7 +13,7 @@ __all__ = ["power"]
 
 
 def power(b: Block, ty: str, x: str, y: str) -> str:
-    """``e^(y ln |x|)`` in double, of float64 with the logarithm in two parts; whole powers of negatives have their sign."""
+    """Compute ``x^y`` as ``e^(y ln |x|)`` in float64, for float64 with a double-double logarithm."""
     p, q = wide(b, ty, x), wide(b, ty, y)
     size, zero, one, inf = absolute(b, "d", p), *(b.constant("d", v) for v in (0.0, 1.0, math.inf))
     if ty == "f":
@@ -23,13 +23,15 @@ def power(b: Block, ty: str, x: str, y: str) -> str:
         high = log_ends(b, "d", size, high)
         product = b.mul("d", q, high)
         rest = b.fma("d", q, low, b.fma("d", q, high, b.negative("d", product)))
-        ends = b.compare("ult", "d", absolute(b, "d", product), b.constant("d", 800.0))  # else 0 or infinite
+        ends = b.compare(
+            "ult", "d", absolute(b, "d", product), b.constant("d", 800.0)
+        )  # beyond, the result is 0 or infinite
         value = exp(b, "d", product, b.select("d", ends, rest, zero))
     whole = b.compare("oeq", "d", b.call("llvm.rint", "d", q), q)
     half = b.mul("d", q, b.constant("d", 0.5))
     odd = b.op(f"and {b.each('i1')} {whole}, " + b.compare("one", "d", b.call("llvm.rint", "d", half), half))
     mirrored = b.select("d", odd, b.negative("d", value), value)
-    # There is no broken power of a negative number; of -0 and of minus infinity it is that of the number without sign.
+    # A fractional power of a negative number is NaN; that of -0 and of minus infinity is the power of the absolute value.
     some = b.op(f"and {b.each('i1')} {b.compare('olt', 'd', p, zero)}, {b.compare('olt', 'd', size, inf)}")
     broken = b.compare("one", "d", b.call("llvm.rint", "d", q), q)
     missing = b.op(f"and {b.each('i1')} {broken}, {some}")

@@ -15,23 +15,23 @@ _HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879
 
 
 def _quadrant(b: Block, ty: str, x: str) -> tuple[str, str]:
-    """The multiple of pi / 2 next to ``x`` modulo 4 (int32), and what is left."""
+    """Reduce ``x`` to the number of the nearest multiple of pi / 2, modulo 4 (int32), and the remainder."""
     y = wide(b, ty, x)
     q = b.call("llvm.rint", "d", b.mul("d", y, b.constant("d", 2.0 / math.pi)))
     for part in _HALF_PI[: 2 if ty == "f" else 3]:
         y = b.fma("d", q, b.constant("d", -part), y)
-    # Modulo 4 before it becomes an integer, so that no argument is too large for that.
+    # Modulo 4 in floating point, as the quotient of a large argument overflows an integer.
     turns = b.call("llvm.floor", "d", b.mul("d", q, b.constant("d", 0.25)))
     q = b.fma("d", turns, b.constant("d", -4.0), q)
     finite = b.compare("olt", "d", absolute(b, "d", q), b.constant("d", 5.0))
     q = b.select("d", finite, q, b.constant("d", 0.0))
-    # Beyond 2^20 digits are lost, and far beyond any angle will do: one no larger than rounding leaves it.
+    # Beyond 2^20 the remainder loses digits; far beyond it is clamped to the range that rounding allows.
     y = clamped(b, "d", y, -0.79, 0.79)
     return b.convert("fptosi", "d", "i", q), narrow(b, ty, y)
 
 
 def _sine(b: Block, ty: str, x: str) -> str:
-    """On [-pi / 4, pi / 4]."""
+    """Compute the sine on [-pi / 4, pi / 4]."""
     z = b.mul(ty, x, x)
     if ty == "f":
         p = b.polynomial(ty, z, (-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1))
@@ -48,7 +48,7 @@ def _sine(b: Block, ty: str, x: str) -> str:
 
 
 def _cosine(b: Block, ty: str, x: str) -> str:
-    """On [-pi / 4, pi / 4]."""
+    """Compute the cosine on [-pi / 4, pi / 4]."""
     z = b.mul(ty, x, x)
     if ty == "f":
         p = b.polynomial(ty, z, (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2))
@@ -65,7 +65,7 @@ def _cosine(b: Block, ty: str, x: str) -> str:
 
 
 def _turned(b: Block, ty: str, q: str, s: str, c: str) -> str:
-    """Sine or cosine of the quadrant ``q``, from both of the rest."""
+    """Return the sine of an angle from its quadrant ``q`` and sine and cosine of the remainder."""
     one, zero = b.constant("i", 1), b.constant("i", 0)
     odd = b.compare("ne", "i", b.binary("and", "i", q, one), zero)
     value = b.select(ty, odd, c, s)
@@ -74,16 +74,16 @@ def _turned(b: Block, ty: str, q: str, s: str, c: str) -> str:
 
 
 def trigonometric(shift: int) -> Callable[[Block, str, str], str]:
-    """The sine; the cosine where ``shift`` is 1, a quarter of a turn."""
+    """Return the function for the sine; for the cosine if ``shift`` is 1, a quarter of a turn."""
 
     def function(b: Block, ty: str, x: str) -> str:
         q, rest = _quadrant(b, ty, x)
         if shift:
             q = b.add("i", q, b.constant("i", shift))
         value = _turned(b, ty, q, _sine(b, ty, rest), _cosine(b, ty, rest))
-        if not shift:  # its zeros keep their sign
+        if not shift:  # keeps the sign of zeros
             value = b.select(ty, b.compare("oeq", ty, x, b.constant(ty, 0.0)), x, value)
-        # Of infinity and of NaN there is none.
+        # NaN for infinity and NaN.
         none = b.compare("uge", ty, absolute(b, ty, x), b.constant(ty, math.inf))
         return b.select(ty, none, b.constant(ty, math.nan), value)
 
@@ -91,12 +91,12 @@ def trigonometric(shift: int) -> Callable[[Block, str, str], str]:
 
 
 def tan(b: Block, ty: str, x: str) -> str:
-    """The tangent."""
+    """Compute the tangent."""
     return b.div(ty, trigonometric(0)(b, ty, x), trigonometric(1)(b, ty, x))
 
 
 def _atan_positive(b: Block, ty: str, x: str) -> str:
-    """On [0, inf]."""
+    """Compute the inverse tangent on [0, inf]."""
     one = b.constant(ty, 1.0)
     steep = b.compare("ogt", ty, x, b.constant(ty, 1.0 + math.sqrt(2.0)))
     middle = b.compare("ogt", ty, x, b.constant(ty, math.sqrt(2.0) - 1.0 if ty == "f" else 0.66))
@@ -134,12 +134,12 @@ def _atan_positive(b: Block, ty: str, x: str) -> str:
 
 
 def atan(b: Block, ty: str, x: str) -> str:
-    """The inverse tangent."""
+    """Compute the inverse tangent."""
     return b.call("llvm.copysign", ty, _atan_positive(b, ty, absolute(b, ty, x)), x)
 
 
 def atan2(b: Block, ty: str, y: str, x: str) -> str:
-    """The angle of ``(x, y)``, with C's signs of zeros and infinities."""
+    """Compute the angle of ``(x, y)``, with zeros and infinities as in C."""
     u, v = absolute(b, ty, y), absolute(b, ty, x)
     inf = b.constant(ty, math.inf)
     # Both infinite: as if both were 1. Both zero: as if the quotient were 0.
@@ -153,16 +153,16 @@ def atan2(b: Block, ty: str, y: str, x: str) -> str:
 
 
 def acos(b: Block, ty: str, x: str) -> str:
-    """The inverse cosine."""
+    """Compute the inverse cosine."""
     return atan2(b, ty, _other_leg(b, ty, x), x)
 
 
 def asin(b: Block, ty: str, x: str) -> str:
-    """The inverse sine."""
+    """Compute the inverse sine."""
     return atan2(b, ty, x, _other_leg(b, ty, x))
 
 
 def _other_leg(b: Block, ty: str, x: str) -> str:
-    """``sqrt(1 - x^2)``, NaN beyond 1."""
+    """Compute ``sqrt(1 - x^2)``; NaN for ``|x| > 1``."""
     one = b.constant(ty, 1.0)
     return b.call("llvm.sqrt", ty, b.mul(ty, b.sub(ty, one, x), b.add(ty, one, x)))

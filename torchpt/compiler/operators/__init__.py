@@ -1,6 +1,6 @@
-"""What each operator of torch is as nodes of a graph.
+"""Lowerings of torch's operators to nodes of a graph.
 
-To add one: a function marked ``@register_lowering("its aten name")`` in one of the files here.
+To add one, write a function with ``@register_lowering("its aten name")`` in one of the files here.
 """
 
 from torchpt.compiler.operators import arithmetic, choices, derivatives, gathers, reductions, views

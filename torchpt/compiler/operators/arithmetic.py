@@ -1,4 +1,4 @@
-"""How arithmetic and elementary functions are lowered, number by number."""
+"""Lowerings of arithmetic and elementary functions."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from torchpt.compiler.tracing import Tracer, register_lowering
 __all__ = ["binary"]
 
 
-#: Operations after which 32 bits may no longer hold what they held before.
+#: Operations whose result may need more than 32 bits where the operands did not.
 _GROWS = ("mul", "shl")
 
 
 def binary(op: str) -> Any:
-    """How an operator of two numbers is lowered to the node ``op``."""
+    """Return the lowering of an elementwise operator of two operands to the node ``op``."""
 
     def handler(tracer: Tracer, out: Tensor, a: Any, b: Any) -> None:
         def function(x: int, y: int) -> int:
@@ -111,7 +111,7 @@ def _lerp(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor, weight: Any) -> Non
 
     def function(x: int, y: int, w: int) -> int:
         x, y, w = (graph.cast(v, ty) for v in (x, y, w))
-        # As torch has it: from the end that is nearer, so that both ends are met.
+        # As in torch: from the nearer end, so that both ends are exact.
         length, one = graph.binary("sub", ty, y, x), graph.constant(ty, 1.0)
         low = graph.binary("add", ty, x, graph.binary("mul", ty, w, length))
         high = graph.binary("sub", ty, y, graph.binary("mul", ty, length, graph.binary("sub", ty, one, w)))

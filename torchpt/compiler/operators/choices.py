@@ -1,4 +1,4 @@
-"""How comparisons, choices by them, casts and constants are lowered."""
+"""Lowerings of comparisons, selection, casts and constants."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _where(tracer: Tracer, out: Tensor, condition: Tensor, a: Any, b: Any) -> No
 
 @register_lowering("masked_fill")
 def masked_fill(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any) -> None:
-    """Another number where a mask holds."""
+    """Lower ``masked_fill``."""
     _where(tracer, out, mask, value, a)
 
 
@@ -101,7 +101,7 @@ def _to_copy(tracer: Tracer, out: Tensor, a: Tensor, *_: Any, **__: Any) -> None
     def function(x: int) -> int:
         own, ty = tracer.graph.type(x), DTYPES[out.dtype]
         if ty == "l" and own in "iL":
-            ty = "L"  # products of what was 32 bits may need all 64
+            ty = "L"  # products of converted int32 lanes may need all 64 bits
         return tracer.graph.cast(x, ty)
 
     apply(tracer, out, function, a)

@@ -1,4 +1,4 @@
-"""How operators of backward passes are lowered: what autograd calls beside the operators of the stages themselves."""
+"""Lowerings of operators that only autograd's backward passes call."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _zeros(tracer: Tracer, out: Tensor) -> tuple[Any, int | None]:
 def _select_backward(tracer: Tracer, out: Tensor, given: Tensor, sizes: Any, axis: int, index: int) -> None:
     nodes, lane = _zeros(tracer, out)
     if axis % out.dim() == lane:
-        raise Unsupported("one lane taken out")
+        raise Unsupported("the selection of one lane")
     place: list[Any] = [slice(None)] * out.dim()
     place[axis] = index
     nodes[tuple(place)] = tracer.get(given).nodes
@@ -39,7 +39,7 @@ def _slice_backward(
     nodes, lane = _zeros(tracer, out)
     if axis % out.dim() == lane:
         if out.shape != given.shape:
-            raise Unsupported("a part of the lanes")
+            raise Unsupported("a slice of the lanes' axis")
         return tracer.alias(out, given)
     place: list[Any] = [slice(None)] * out.dim()
     place[axis] = slice(start, None if end > 1 << 40 else end, step)
@@ -49,7 +49,7 @@ def _slice_backward(
 
 @register_lowering("logical_and_")
 def _logical_and_(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
-    """In place: what the derivative of a clamp makes of a comparison that nobody else reads."""
+    """Lower the in-place operator, which the derivative of a clamp calls on a mask that nothing else reads."""
     binary("and")(tracer, out, a, b)
     if out is not a:
         tracer.alias(a, out)
@@ -57,7 +57,7 @@ def _logical_and_(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
 
 @register_lowering("masked_fill_")
 def _masked_fill_(tracer: Tracer, out: Tensor, a: Tensor, mask: Tensor, value: Any) -> None:
-    """In place: what the derivative of a maximum makes of a number that nobody else reads."""
+    """Lower the in-place operator, which the derivative of a maximum calls on a tensor that nothing else reads."""
     masked_fill(tracer, out, a, mask, value)
     if out is not a:
         tracer.alias(a, out)
@@ -103,7 +103,7 @@ def _sigmoid_backward(tracer: Tracer, out: Tensor, given: Tensor, y: Tensor) -> 
 
 
 def sum_over_lanes(tracer: Tracer, nodes: Any, axis: int, ty: str) -> Any:
-    """A sum over lanes: numbers that no lane knows, which kernels give away as rows of what they are sums of."""
+    """Return ``total`` nodes, which stand for sums over lanes; kernels output the summands instead."""
     graph = tracer.graph
     nodes = cast_all(tracer, nodes, ty)
     summed = np.empty((*nodes.shape[:axis], *nodes.shape[axis + 1 :]), object)
@@ -117,10 +117,10 @@ def sum_over_lanes(tracer: Tracer, nodes: Any, axis: int, ty: str) -> Any:
 
 
 def summand_of(graph: Graph, node: int) -> int | None:
-    """The number of a lane whose sum over lanes the node is; None: 0.
+    """Return the node whose sum over lanes the given node is; None if the sum is 0.
 
     Raises:
-        Unsupported: no sum over lanes.
+        Unsupported: the node is no sum over lanes.
     """
     op, ty, arguments, _ = graph.nodes[node]
     if op == "total":
@@ -136,7 +136,7 @@ def summand_of(graph: Graph, node: int) -> int | None:
     if op == "neg":
         a = summand_of(graph, arguments[0])
         return None if a is None else graph.node("neg", ty, a)
-    if op in ("mul", "div"):  # by what all lanes share
+    if op in ("mul", "div"):  # by a factor that all lanes share
         whole = [_holds_total(graph, x) for x in arguments]
         if whole[0] and not whole[1]:
             a = summand_of(graph, arguments[0])

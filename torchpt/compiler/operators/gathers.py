@@ -1,4 +1,4 @@
-"""How look-ups in tables, searches in sorted ones and products with small matrices are lowered."""
+"""Lowerings of table look-ups, binary searches and products with small matrices."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__: list[str] = []
 
 
 def _look_up(tracer: Tracer, table: Tensor, axis: int, index: int) -> np.ndarray:
-    """The nodes of entry ``index`` of a table along an axis: its shape without that axis."""
+    """Return the nodes of entry ``index`` of a table along an axis, in the table's shape without that axis."""
     graph, ty = tracer.graph, DTYPES[table.dtype]
     number = tracer.table(table, axis)
     lead = (*table.shape[:axis], *table.shape[axis + 1 :])
@@ -36,18 +36,18 @@ def _index_select(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: 
         return _from_lanes(tracer, out, table, axis, rows)
     if len(rows) == 1:
         nodes = np.expand_dims(_look_up(tracer, table, axis, rows[0]), axis)
-    else:  # several look-ups in every lane, side by side
+    else:  # several look-ups a lane
         nodes = np.stack([_look_up(tracer, table, axis, row) for row in rows], axis)
     tracer.put(out, nodes)
 
 
 def _from_lanes(tracer: Tracer, out: Tensor, table: Tensor, axis: int, rows: Any) -> None:
-    """What depends on lanes may be asked for by the lane's own number alone."""
+    """Lower a look-up in a tensor of lanes, which must be at the lane's own number."""
     value = tracer.get(table)
     if value.lane == axis and len(rows) == 1 and tracer.graph.nodes[rows[0]][0] == "iota":
         return tracer.alias(out, table)
-    if value.lane is not None and axis != value.lane:  # of a few numbers in every lane, one by its number
-        raise Unsupported("a look-up in what depends on lanes")
+    if value.lane is not None and axis != value.lane:  # selects one of a few values of each lane
+        raise Unsupported("a look-up in a tensor that depends on lanes")
     raise Unsupported("a look-up in other lanes")
 
 
@@ -71,7 +71,7 @@ def _index(tracer: Tracer, out: Tensor, table: Tensor, indices: Any) -> None:
         place = graph.binary("mul", "i", place, graph.constant("i", width))
         for k, inner in enumerate(
             np.ndindex(*rest)
-        ):  # entries of the table laid flat, where each is brought into range
+        ):  # elements of the flattened table, whose indices are clamped one by one
             one = graph.binary("add", "i", place, graph.constant("i", k))
             nodes[(*entry, *inner)] = graph.node("gather", ty, one, extra=(number, 1, 0))
     tracer.put(out, nodes)
@@ -89,7 +89,7 @@ def _index_one(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Ten
 @register_lowering("take")
 def _take(tracer: Tracer, out: Tensor, table: Tensor, index: Tensor) -> None:
     if tracer.is_traced(table):
-        raise Unsupported("a look-up in what depends on lanes")
+        raise Unsupported("a look-up in a tensor that depends on lanes")
     graph, ty, lanes = tracer.graph, DTYPES[table.dtype], tracer.get(index).nodes
     number = tracer.table(table, None)
     nodes = np.empty(lanes.shape, object)
@@ -100,7 +100,7 @@ def _take(tracer: Tracer, out: Tensor, table: Tensor, index: Tensor) -> None:
 
 @register_lowering("gather")
 def _gather(tracer: Tracer, out: Tensor, table: Tensor, axis: int, index: Tensor, sparse_grad: bool = False) -> None:
-    """One of a few numbers that every lane has: a chain of selections."""
+    """Lower the selection of one of a few values of each lane, to a chain of selects."""
     value, rows, graph = tracer.get(table), tracer.get(index).nodes, tracer.graph
     axis %= table.dim()
     if value.lane == axis:
@@ -136,14 +136,14 @@ def _searchsorted(
     sorter: Any = None,
 ) -> None:
     if tracer.is_traced(table) or table.dim() != 1 or sorter is not None:
-        raise Unsupported("a search in what is no single sorted table")
+        raise Unsupported("a search in a table with more than one axis, a sorter, or lanes")
     graph, ty = tracer.graph, DTYPES[table.dtype]
     right = right or side == "right"
     number, lanes = tracer.table(table, None), tracer.get(values).nodes
     nodes = np.empty(lanes.shape, object)
     for entry in np.ndindex(*lanes.shape):
         if graph.type(lanes[entry]) != ty and not (ty == "l" and graph.type(lanes[entry]) in "il"):
-            raise Unsupported("a search for numbers of another type than the table's")
+            raise Unsupported("a search for values of another type than the table's")
         nodes[entry] = graph.node("search", "l", lanes[entry], extra=(number, ty, right))
     tracer.put(out, nodes)
 
@@ -151,7 +151,7 @@ def _searchsorted(
 def _matrix(tracer: Tracer, tensor: Tensor) -> np.ndarray:
     nodes = tracer.get(tensor).nodes
     if nodes.ndim != 2:
-        raise Unsupported("a product of more than matrices")
+        raise Unsupported("a matrix product of tensors with more than two axes")
     return nodes
 
 
@@ -180,5 +180,5 @@ def _mm(tracer: Tracer, out: Tensor, a: Tensor, b: Tensor) -> None:
 @register_lowering("addmm")
 def _addmm(tracer: Tracer, out: Tensor, start: Tensor, a: Tensor, b: Tensor, beta: float = 1, alpha: float = 1) -> None:
     if beta != 1 or alpha != 1:
-        raise Unsupported("addmm with factors")
+        raise Unsupported("addmm with alpha or beta")
     _product(tracer, out, a, b, start)

@@ -1,4 +1,4 @@
-"""What lowerings of operators share: applying a function of nodes to broadcast operands, and types."""
+"""Helpers of lowerings: elementwise application with broadcasting, and types."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Nodes = Callable[..., int]
 
 
 def apply(tracer: Tracer, out: Tensor, function: Nodes, *operands: Any) -> None:
-    """``out`` is ``function`` of the operands' nodes, which are broadcast; operands that are numbers become constants."""
+    """Set ``out`` to ``function`` of the operands' broadcast nodes; Python numbers become constants."""
     graph = tracer.graph
     columns = [tracer.get(x).nodes if isinstance(x, Tensor) else np.array(_number(graph, x), object) for x in operands]
     shape = np.broadcast_shapes(*(c.shape for c in columns))
@@ -37,13 +37,13 @@ def _number(graph: Any, x: float | int | bool) -> int:
 
 
 def type_of(tracer: Tracer, dtype: torch.dtype, *nodes: int) -> str:
-    """The type in which numbers of a dtype are computed from nodes."""
+    """Return the node type of a result of ``dtype``: ``L`` for int64 if an operand may need 64 bits."""
     ty = DTYPES[dtype]
     return "L" if ty == "l" and any(tracer.graph.type(node) in "iL" for node in nodes) else ty
 
 
 def cast_all(tracer: Tracer, nodes: Any, ty: str) -> Any:
-    """Nodes as numbers of a type; indices that have grown to 64 bits stay."""
+    """Cast an array of nodes to a type; ``L`` nodes stay if the type is ``l``."""
     cast = np.empty(nodes.shape, object)
     for entry in np.ndindex(*nodes.shape):
         node = nodes[entry]

@@ -1,4 +1,4 @@
-"""How sums, products and extremes over other axes than the lanes' are lowered."""
+"""Lowerings of reductions: over axes other than the lanes', and in backward passes of sums over lanes."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ def _reduce(op: str, boolean: bool = False) -> Any:
 
 
 def _sums(op: str, out: Tensor) -> str:
-    """The type in which a reduction is computed."""
+    """Return the node type in which a reduction is computed."""
     return "L" if out.dtype == torch.int64 and op in ("add", "mul") else DTYPES[out.dtype]
 
 
 def _nothing(graph: Any, op: str, ty: str) -> int:
-    """What a reduction of no numbers gives."""
+    """Return the result of a reduction of no elements."""
     if op not in ("add", "mul", "and", "or"):
-        raise Unsupported("the largest or smallest of no numbers")
+        raise Unsupported("the maximum or minimum of no elements")
     return graph.constant(ty, 1 if op in ("mul", "and") else 0)
 
 

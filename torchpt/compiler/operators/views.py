@@ -1,4 +1,4 @@
-"""How operators that move numbers about without changing them are lowered: they cost nothing in a kernel."""
+"""Lowerings of views and other rearrangements, which cost nothing in a kernel."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _same(tracer: Tracer, out: Tensor, a: Tensor, *_: Any, **__: Any) -> None:
 def _select(tracer: Tracer, out: Tensor, a: Tensor, axis: int, index: int) -> None:
     value = tracer.get(a)
     if axis % a.dim() == value.lane:
-        raise Unsupported("one lane taken out")
+        raise Unsupported("the selection of one lane")
     tracer.put(out, np.take(value.nodes, index, axis % a.dim()))
 
 
@@ -41,7 +41,7 @@ def _slice(
     value, axis = tracer.get(a), axis % a.dim()
     if axis == value.lane:
         if out.shape != a.shape:
-            raise Unsupported("a part of the lanes")
+            raise Unsupported("a slice of the lanes' axis")
         return tracer.alias(out, a)
     part: list[Any] = [slice(None)] * a.dim()
     part[axis] = slice(start, None if end is not None and end > 1 << 40 else end, step)
@@ -92,14 +92,14 @@ def _transpose(tracer: Tracer, out: Tensor, a: Tensor, i: int, j: int) -> None:
 @register_lowering("flip")
 def _flip(tracer: Tracer, out: Tensor, a: Tensor, axes: Any) -> None:
     if tracer.get(a).lane in [k % a.dim() for k in axes]:
-        raise Unsupported("lanes turned around")
+        raise Unsupported("a flip of the lanes' axis")
     tracer.put(out, np.flip(tracer.get(a).nodes, axes))
 
 
 @register_lowering("roll")
 def _roll(tracer: Tracer, out: Tensor, a: Tensor, shifts: Any, axes: Any = ()) -> None:
     if not axes or tracer.get(a).lane in [k % a.dim() for k in axes]:
-        raise Unsupported("lanes rolled")
+        raise Unsupported("a roll along the lanes' axis")
     tracer.put(out, np.roll(tracer.get(a).nodes, shifts, axes))
 
 
@@ -112,14 +112,14 @@ def _expand(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any, implicit: bool =
 def _view(tracer: Tracer, out: Tensor, a: Tensor, sizes: Any) -> None:
     value, lane = tracer.get(a), tracer.lane_axis(out.shape)
     if value.lane is not None and lane is not None:
-        # Lanes are next to each other along their axis: what follows it must stay what follows.
+        # Lanes are contiguous along their axis, so the axes behind it must hold the same number of elements.
         if math.prod(a.shape[value.lane + 1 :]) != math.prod(out.shape[lane + 1 :]):
             raise Unsupported(f"lanes of shape {tuple(a.shape)} mixed into shape {tuple(out.shape)}")
     tracer.put(out, value.nodes.reshape(tracer.inner(out.shape, lane)))
 
 
 def _cast(tracer: Tracer, tensor: Tensor, out: Tensor) -> np.ndarray:
-    """The nodes of a part in the type of the whole."""
+    """Return the nodes of a tensor, cast to the type of ``out``."""
     return cast_all(tracer, tracer.get(tensor).nodes, DTYPES[out.dtype])
 
 
@@ -132,7 +132,7 @@ def _stack(tracer: Tracer, out: Tensor, tensors: Any, axis: int = 0) -> None:
 @register_lowering("cat", "concat")
 def _cat(tracer: Tracer, out: Tensor, tensors: Any, axis: int = 0) -> None:
     if tracer.lane_axis(out.shape) == axis % out.dim():
-        raise Unsupported("lanes joined")
+        raise Unsupported("a concatenation along the lanes' axis")
     rank = out.dim()
     parts = [_cast(tracer, tensor, out) for tensor in tensors if tensor.dim() == rank]
     tracer.put(out, np.concatenate(parts, axis))

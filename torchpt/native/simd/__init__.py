@@ -1,9 +1,8 @@
-"""Vectors of 4, 8 or 16 lanes as values in numba kernels.
+"""SIMD vectors of 4, 8 or 16 lanes as values in numba kernels.
 
-``x = load(a, i, 8)`` is an LLVM vector ``<8 x float>`` (or int32); control flow stays Python. LLVM turns one source into
-AVX-512, AVX2, SSE or NEON code, in several instructions where the machine's vectors are shorter. No operation is fused
-and none is reordered: each lane has the bits that the scalar operation gives. Indices are taken as they are: neither
-bounds nor negative numbers are looked at.
+``x = load(a, i, 8)`` is an LLVM vector ``<8 x float>`` (or int32); control flow stays Python. LLVM compiles the same code to
+AVX-512, AVX2, SSE or NEON, with several instructions a vector if the machine's are shorter. No operation is fused or reordered:
+each lane has the bits of the scalar operation. Indices are not checked: neither bounds nor negative ones.
 """
 
 from torchpt.native.simd.arithmetic import (

@@ -1,4 +1,4 @@
-"""Operators of vectors, lane by lane, and the choice between two vectors."""
+"""Operators of vectors, lane by lane, and the selection between two vectors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _is_float(kind: Any) -> bool:
 
 
 def _binary(symbol: Any, for_floats: str | None, for_others: str | None) -> None:
-    """Gives an operator to vectors; the arguments are names of LLVM's instructions."""
+    """Define an operator of vectors, by the names of its LLVM instructions for floats and for other elements."""
 
     def typed(a, b):
         if isinstance(a, Vector) and a == b and (for_floats if _is_float(a) else for_others):
@@ -43,7 +43,7 @@ def _compare(symbol: Any, code: str) -> None:
     def _(context, builder, signature, args):
         if not _is_float(signature.args[0]):
             return builder.icmp_signed(code, *args)
-        # NaN differs from everything, itself included, and compares in no other way
+        # comparisons with NaN are False, except !=
         return (builder.fcmp_unordered if code == "!=" else builder.fcmp_ordered)(code, *args)
 
 
@@ -77,7 +77,7 @@ _unary(operator.invert, lambda builder, x: builder.not_(x), lambda kind: not _is
 
 @intrinsic
 def select(context, m, a, b):
-    """``select(m, a, b)``: lanes of ``a`` where the mask is set, else of ``b``."""
+    """Select lanes of ``a`` where the mask is set, else of ``b``: ``select(m, a, b)``."""
     if not (isinstance(a, Vector) and a == b and m == Vector(types.boolean, a.lanes)):
         return None
     return a(m, a, b), lambda context, builder, signature, args: builder.select(*args)
@@ -90,7 +90,7 @@ def _chosen(builder: Any, code: str, kind: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def minimum(context, a, b):
-    """The smaller lanes, those of ``b`` where either is NaN or both are equal (as 0 and -0 are)."""
+    """Return the smaller lanes; ``b`` if either is NaN or both are equal (as 0 and -0 are)."""
     if not (isinstance(a, Vector) and a == b):
         return None
     return a(a, b), lambda context, builder, signature, args: _chosen(builder, "<", signature.args[0], *args)
@@ -98,7 +98,7 @@ def minimum(context, a, b):
 
 @intrinsic
 def maximum(context, a, b):
-    """The larger lanes, those of ``b`` where either is NaN or both are equal (as 0 and -0 are)."""
+    """Return the larger lanes; ``b`` if either is NaN or both are equal (as 0 and -0 are)."""
     if not (isinstance(a, Vector) and a == b):
         return None
     return a(a, b), lambda context, builder, signature, args: _chosen(builder, ">", signature.args[0], *args)
@@ -106,7 +106,7 @@ def maximum(context, a, b):
 
 @intrinsic
 def as_int(context, x):
-    """The bits of float32, of a vector or a scalar, as int32."""
+    """Reinterpret the bits of float32, of a vector or a scalar, as int32."""
     if x == types.float32:
         return types.int32(x), lambda context, builder, signature, args: builder.bitcast(args[0], I32)
     if not (isinstance(x, Vector) and x.element == types.float32):
@@ -117,7 +117,7 @@ def as_int(context, x):
 
 @intrinsic
 def as_float(context, x):
-    """int32 lanes, or the low half of an integer, as the bits of float32."""
+    """Reinterpret int32 lanes, or the low 32 bits of an integer, as float32."""
     if isinstance(x, types.Integer):  # arithmetic of int32 scalars is int64 in numba
         return types.float32(types.int32), lambda context, builder, signature, args: builder.bitcast(
             args[0], ir.FloatType()
@@ -130,7 +130,7 @@ def as_float(context, x):
 
 @intrinsic
 def absolute(context, x):
-    """Float lanes without their sign bit."""
+    """Clear the sign bit of float lanes."""
     if not (isinstance(x, Vector) and _is_float(x)):
         return None
     return x(x), lambda context, builder, signature, args: _of_floats(builder, "fabs", x, args[0])
@@ -138,7 +138,7 @@ def absolute(context, x):
 
 @intrinsic
 def square_root(context, x):
-    """The square root of float lanes, NaN of negative ones."""
+    """Compute the square root of float lanes; NaN for negative ones."""
     if not (isinstance(x, Vector) and _is_float(x)):
         return None
     return x(x), lambda context, builder, signature, args: _of_floats(builder, "sqrt", x, args[0])
@@ -151,7 +151,7 @@ def _of_floats(builder: Any, name: str, kind: Vector, x: Any) -> Any:
 
 @intrinsic
 def widen(context, x):
-    """float32 lanes as float64."""
+    """Convert float32 lanes to float64."""
     if not (isinstance(x, Vector) and x.element == types.float32):
         return None
     kind = ir.VectorType(ir.DoubleType(), x.lanes)
@@ -160,7 +160,7 @@ def widen(context, x):
 
 @intrinsic
 def narrow(context, x):
-    """float64 lanes as the nearest float32."""
+    """Round float64 lanes to float32."""
     if not (isinstance(x, Vector) and x.element == types.float64):
         return None
     kind = ir.VectorType(ir.FloatType(), x.lanes)

@@ -1,4 +1,4 @@
-"""From lanes to scalars and back: masks as integers, extremes, sorting."""
+"""Operations across lanes: masks as integers, minimum and maximum, sorting."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _I64 = ir.IntType(64)
 
 @intrinsic
 def bits(context, m):
-    """A mask as an int64, lane 0 in the lowest bit."""
+    """Convert a mask to an int64, lane 0 in the lowest bit."""
     if not (isinstance(m, Vector) and m.element == types.boolean):
         return None
 
@@ -28,7 +28,7 @@ def bits(context, m):
 
 @intrinsic(prefer_literal=True)
 def mask(context, x, n):
-    """``mask(x, n)``: the lowest ``n`` bits of an int64 as a mask."""
+    """Convert the lowest ``n`` bits of an int64 to a mask: ``mask(x, n)``."""
     lanes = lanes_of(n)
 
     def generate(context, builder, signature, args):
@@ -39,20 +39,20 @@ def mask(context, x, n):
 
 @intrinsic(prefer_literal=True)
 def lane_numbers(context, n):
-    """``lane_numbers(n)``: int32 0, 1, 2, ..."""
+    """Return the int32 vector 0, 1, 2, ...: ``lane_numbers(n)``."""
     lanes = lanes_of(n)
     return Vector(types.int32, lanes)(n), lambda context, builder, signature, args: numbers(range(lanes))
 
 
 @intrinsic
 def trailing_zeros(context, x):
-    """The place of the lowest bit set in an int64 that is not 0."""
+    """Return the index of the lowest set bit of an int64 that is not 0."""
     return types.int64(types.int64), lambda context, builder, signature, args: builder.cttz(args[0], ir.IntType(1)(1))
 
 
 @intrinsic
 def popcount(context, x):
-    """How many bits of an int64 are set."""
+    """Count the set bits of an int64."""
     return types.int64(types.int64), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
@@ -79,7 +79,7 @@ def _extreme(code: str) -> Any:
 
 @intrinsic
 def lowest(context, x):
-    """The least lane of a vector without NaN."""
+    """Return the least lane of a vector without NaN."""
     if not isinstance(x, Vector) or x.element == types.boolean:
         return None
     return x.element(x), _extreme("<")
@@ -87,14 +87,14 @@ def lowest(context, x):
 
 @intrinsic
 def highest(context, x):
-    """The greatest lane of a vector without NaN."""
+    """Return the greatest lane of a vector without NaN."""
     if not isinstance(x, Vector) or x.element == types.boolean:
         return None
     return x.element(x), _extreme(">")
 
 
 def _network(lanes: int) -> list[list[int]]:
-    """Which lane each lane is compared with, layer by layer (Batcher 1968, bitonic merging)."""
+    """Return a sorting network: the partner of each lane in each layer (Batcher 1968, bitonic merging)."""
     layers, size = [], 2
     while size <= lanes:
         layers.append([k ^ (size - 1) for k in range(lanes)])
@@ -108,7 +108,7 @@ def _network(lanes: int) -> list[list[int]]:
 
 @intrinsic
 def sort_descending(context, x):
-    """Int32 lanes, the greatest first, without a branch."""
+    """Sort int32 lanes, the greatest first, without branches."""
     if not (isinstance(x, Vector) and x.element == types.int32):
         return None
 
@@ -117,7 +117,7 @@ def sort_descending(context, x):
         for partner in _network(lanes):
             other = _shuffled(builder, value, value, partner)
             high, low = (_ordered(builder, x, code, value, other) for code in (">", "<"))
-            # the lower place of each pair keeps the greater number
+            # the lower lane of each pair keeps the greater number
             value = _shuffled(builder, high, low, [k if k < partner[k] else lanes + k for k in range(lanes)])
         return value
 

@@ -1,4 +1,4 @@
-"""Vectors in and out of contiguous arrays, or of pointers to their memory. Addresses need not be aligned."""
+"""Loads and stores of vectors, in contiguous arrays or by pointers. Addresses need not be aligned."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchpt.native.simd.types import ELEMENTS, I32, Vector, intrinsic, lanes_of
 
 __all__ = ["gather", "item", "load", "load_masked", "pointer", "prefetch", "put", "store", "store_masked"]
 
-_BYTES = 4  # of an element, and the alignment that is taken for granted
+_BYTES = 4  # of an element, and alignment of all accesses
 _I64 = ir.IntType(64)
 
 
@@ -41,10 +41,10 @@ def _holds(array: Any) -> bool:
 
 @intrinsic
 def pointer(context, array):
-    """The memory of a contiguous array, for everything here that takes an array.
+    """Return a pointer to the memory of a contiguous array, which all functions here accept in place of the array.
 
-    A pointer may be passed on and kept in tuples at no cost, where numba counts references to an array in the innermost loop.
-    It does not keep the array alive: the function that made an array must mention it after the last use of its pointer.
+    A pointer can be passed on and put into tuples at no cost, while numba counts references of arrays even in inner loops. It
+    does not keep the array alive: the function that allocated an array must use it after the last use of its pointer.
     """
     if not (isinstance(array, types.Array) and array.layout == "C"):
         return None
@@ -54,7 +54,7 @@ def pointer(context, array):
 
 @intrinsic(prefer_literal=True)
 def load(context, array, i, n):
-    """``load(a, i, n)``: ``n`` elements of a C-contiguous float32 or int32 array, the first at place ``i`` of its memory."""
+    """Load ``n`` elements of a C-contiguous float32 or int32 array from flat index ``i`` on: ``load(a, i, n)``."""
     if not _holds(array):
         return None
     kind = Vector(array.dtype, lanes_of(n))
@@ -69,7 +69,7 @@ def load(context, array, i, n):
 
 @intrinsic
 def store(context, array, i, x):
-    """``store(a, i, x)`` writes the lanes of ``x`` from place ``i`` on."""
+    """Store the lanes of ``x`` from flat index ``i`` on: ``store(a, i, x)``."""
     if not (_holds(array) and isinstance(x, Vector) and x.element == array.dtype):
         return None
 
@@ -83,7 +83,7 @@ def store(context, array, i, x):
 
 @intrinsic
 def item(context, array, i):
-    """``item(a, i)``: one element at place ``i`` of a contiguous array's memory."""
+    """Load one element at flat index ``i`` of a contiguous array: ``item(a, i)``."""
     if not _contiguous(array):
         return None
 
@@ -96,7 +96,7 @@ def item(context, array, i):
 
 @intrinsic
 def put(context, array, i, x):
-    """``put(a, i, x)`` writes one element, converted to the array's own type."""
+    """Store one element at flat index ``i``, converted to the type of the array: ``put(a, i, x)``."""
     if not _contiguous(array):
         return None
 
@@ -109,7 +109,7 @@ def put(context, array, i, x):
 
 @intrinsic
 def load_masked(context, array, i, m, other):
-    """Elements from place ``i`` on where the mask is set, which alone are read; lanes of ``other`` elsewhere."""
+    """Load elements from flat index ``i`` on where the mask is set, and only those; else return lanes of ``other``."""
     if not (_holds(array) and isinstance(other, Vector) and other.element == array.dtype):
         return None
 
@@ -124,7 +124,7 @@ def load_masked(context, array, i, m, other):
 
 @intrinsic
 def store_masked(context, array, i, m, x):
-    """Writes the lanes of ``x`` where the mask is set; other elements are not touched."""
+    """Store the lanes of ``x`` where the mask is set; other elements are not accessed."""
     if not (_holds(array) and isinstance(x, Vector) and x.element == array.dtype):
         return None
 
@@ -140,7 +140,7 @@ def store_masked(context, array, i, m, x):
 
 @intrinsic
 def gather(context, array, places, m, other):
-    """Elements at int32 ``places`` where the mask is set, which alone are read; lanes of ``other`` elsewhere."""
+    """Load elements at int32 indices ``places`` where the mask is set, and only those; else return lanes of ``other``."""
     if not (_holds(array) and isinstance(other, Vector) and other.element == array.dtype):
         return None
     if places != Vector(types.int32, other.lanes):
@@ -163,7 +163,7 @@ def gather(context, array, places, m, other):
 
 @intrinsic
 def prefetch(context, array, i):
-    """Asks for the cache line of place ``i``; any address is allowed."""
+    """Prefetch the cache line of flat index ``i``; any address is allowed."""
     if not _contiguous(array):
         return None
 

@@ -1,4 +1,4 @@
-"""The vector type of numba: elements of float32, float64, int32 or bool, known number of lanes."""
+"""The vector type for numba: elements of float32, float64, int32 or bool, and a fixed number of lanes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numba.extending import models, register_model
 
 __all__ = ["ELEMENTS", "I32", "Vector", "intrinsic", "lanes_of", "numbers", "splat", "splatted"]
 
-#: Kernels call what this makes without its first parameter, which no checker of types can know.
+#: Typed as Any: kernels call an intrinsic without its first parameter, which type checkers cannot express.
 intrinsic: Any = extending.intrinsic
 
 I32 = ir.IntType(32)
-#: What a vector may hold, and how LLVM has it.
+#: LLVM type of each element type.
 ELEMENTS = {
     types.float32: ir.FloatType(),
     types.float64: ir.DoubleType(),
@@ -26,11 +26,11 @@ ELEMENTS = {
 
 
 class Vector(types.Type):
-    """``lanes`` numbers (or truths) side by side, one LLVM value.
+    """A numba type: an LLVM vector of ``lanes`` numbers or booleans.
 
     Args:
-        element: float32, float64, int32 or boolean of numba.
-        lanes: how many.
+        element: numba's float32, float64, int32 or boolean.
+        lanes: number of lanes.
     """
 
     def __init__(self, element: Any, lanes: int) -> None:
@@ -39,7 +39,7 @@ class Vector(types.Type):
 
     @property
     def code(self) -> str:
-        """How LLVM's functions name the type: ``v8f32``."""
+        """Return the type suffix of LLVM's intrinsics, such as ``v8f32``."""
         return f"v{self.lanes}{'f' if isinstance(self.element, types.Float) else 'i'}{self.element.bitwidth}"
 
 
@@ -50,20 +50,20 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def lanes_of(n: Any) -> int:
-    """The number of lanes that a call asks for, which the compiler must know."""
+    """Return the number of lanes of a call, which must be a constant."""
     if not isinstance(n, types.IntegerLiteral):
         raise RequireLiteralValue("the number of lanes must be a constant")
     return int(n.literal_value)
 
 
 def numbers(values: Any) -> Any:
-    """A constant vector of int32."""
+    """Return a constant vector of int32."""
     values = list(values)
     return ir.Constant(ir.VectorType(I32, len(values)), values)
 
 
 def splatted(builder: Any, x: Any, lanes: int) -> Any:
-    """The same scalar in every lane."""
+    """Broadcast an LLVM scalar to a vector."""
     some = ir.Constant(ir.VectorType(x.type, lanes), ir.Undefined)
     one = builder.insert_element(some, x, ir.Constant(I32, 0))
     return builder.shuffle_vector(one, some, numbers([0] * lanes))
@@ -71,7 +71,7 @@ def splatted(builder: Any, x: Any, lanes: int) -> Any:
 
 @intrinsic(prefer_literal=True)
 def splat(context, x, n):
-    """``splat(x, n)``: a float32, float64, int32 or bool in each of ``n`` lanes."""
+    """Broadcast a float32, float64, int32 or bool to ``n`` lanes: ``splat(x, n)``."""
     element = x.literal_type if isinstance(x, types.Literal) else x
     if element not in ELEMENTS:
         return None
