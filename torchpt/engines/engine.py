@@ -20,7 +20,7 @@ from torchpt.paths.walk import Engine, Population
 from torchpt.paths.wave import Wave
 
 if TYPE_CHECKING:  # the way back is imported where somebody goes it
-    from torchpt.math.sums import ChunkSums, Sums
+    from torchpt.math.sums import ChunkGradientSums, GradientSums
     from torchpt.paths.adjoint import Tape
 
 __all__ = [
@@ -204,7 +204,7 @@ class BackwardKernels(Protocol):
 
     eager_vjps: dict[tuple[Any, ...], str]
 
-    def engine(self) -> Backward[Any, Any, ChunkSums]:
+    def engine(self) -> Backward[Any, Any, ChunkGradientSums]:
         """Return an engine for one more thread."""
         ...
 
@@ -218,7 +218,7 @@ def packets_of(wave: Wave) -> bool:
     return wave.accel.name == "brute" and not wave.context.world.geometry.counts[4]
 
 
-def backward_tensors(tape: Tape, cotangent: Tensor | None) -> Backward[Any, Any, Sums]:
+def backward_tensors(tape: Tape, cotangent: Tensor | None) -> Backward[Any, Any, GradientSums]:
     """Return the way back by tensor operations.
 
     Args:

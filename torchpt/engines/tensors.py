@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.tree import map_leaves
-from torchpt.math.vectors import joined, rows, take
+from torchpt.math.vectors import concatenate_lanes, rows, take
 from torchpt.paths import layers as aov
 from torchpt.paths.integrators.base import check_fields, check_output
 from torchpt.paths.integrators.path import Ends, follows_shape, partition
@@ -253,8 +253,8 @@ class Tensors:
             if self.keeps:
                 after.outputs.append((model, take(paths.state.lane, index), output))
             start += len(index)
-        after.state = joined(leaving)
-        after.hit = joined(next_hit) if next_hit else None
+        after.state = concatenate_lanes(leaving)
+        after.hit = concatenate_lanes(next_hit) if next_hit else None
         return after
 
     def occlude(self, paths: Paths) -> None:

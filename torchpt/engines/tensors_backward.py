@@ -15,7 +15,7 @@ from torch import Tensor
 from torchpt.core.memory import Span
 from torchpt.engines.tensors import Paths, Tensors, escaped
 from torchpt.math.gathers import recording_gathers
-from torchpt.math.sums import Sums
+from torchpt.math.sums import GradientSums
 from torchpt.math.vectors import rows, take
 from torchpt.paths import adjoint
 from torchpt.paths.adjoint import Tape, VertexCotangents
@@ -42,7 +42,7 @@ class TensorsBackward(Tensors):
         self._under_tape = Tensors(replace(tape.wave, context=tape.taped.context), 0)
         self._rows = ("throughput", "o", "d") if self.plan.attached else ("throughput",)
 
-    def begin(self, span: Span, sums: Sums) -> Paths:
+    def begin(self, span: Span, sums: GradientSums) -> Paths:
         """See :class:`torchpt.engines.engine.Backward`."""
         self.sums, self._span = sums, span
         state = self.wave.rays(*span)

@@ -35,7 +35,7 @@ from torchpt.core.memory import Span
 from torchpt.engines.engine import hits, trace
 from torchpt.gradients.parameters import SceneTape, attached
 from torchpt.gradients.tape import chunk_by_chunk, counted
-from torchpt.math.sums import Sums
+from torchpt.math.sums import GradientSums
 from torchpt.math.vectors import dot, normalize, take
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.paths.state import PathState
@@ -74,7 +74,7 @@ def needs_direction_gradients(scene: Scene, wanted: Iterable[str]) -> bool:
     return bent or attached(scene, [name for name in wanted if not name.startswith("camera.")])
 
 
-def film_space_backward(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
+def film_space_backward(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums) -> None:
     """Reverse mode in this form, a chunk at a time.
 
     Args:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchpt.core.memory import Budget, Span
 from torchpt.core.tree import map_leaves
-from torchpt.math.sums import Sums
+from torchpt.math.sums import GradientSums
 from torchpt.paths.adjoint import Tape
 from torchpt.paths.wave import Wave
 from torchpt.ranks import Group, blocks
@@ -118,11 +118,11 @@ class SceneTape(Tape):
             for _ in budget.through(moved, count, 0, samples):
                 pass
 
-    def sums(self) -> Sums:
+    def sums(self) -> GradientSums:
         """Sums of the gradients of the leaves, and of what is held."""
-        return Sums(self.tables)
+        return GradientSums(self.tables)
 
-    def gradients(self, sums: Sums) -> list[Tensor]:
+    def gradients(self, sums: GradientSums) -> list[Tensor]:
         """Gradients of the parameters, of rays, and of what is held, from those of the leaves."""
         found = sums.gradients()
         pairs = [(y, g) for y, g in zip(self._outputs, found, strict=False) if g is not None]

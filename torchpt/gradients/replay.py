@@ -19,11 +19,11 @@ from torch import Tensor
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import warn_once
 from torchpt.core.memory import Budget, Span, is_out_of_memory
-from torchpt.core.threads import deal
+from torchpt.core.threads import map_in_order
 from torchpt.engines.engine import LANES_OF_KERNELS, Backward, BackwardKernels, backward_kernels, backward_tensors
 from torchpt.gradients.parameters import SceneTape
 from torchpt.gradients.tape import sample_cotangents
-from torchpt.math.sums import ChunkSums, Sums
+from torchpt.math.sums import ChunkGradientSums, GradientSums
 from torchpt.paths.walk import KEPT, Counts, Observer, Population, walk
 from torchpt.scene import Scene
 from torchpt.scene.prepare import own_models
@@ -82,7 +82,9 @@ class Chunk:
         sums: what is added to.
     """
 
-    def __init__(self, engine: Backward[Any, Any, Any], settings: Settings, span: Span, sums: Sums | ChunkSums) -> None:
+    def __init__(
+        self, engine: Backward[Any, Any, Any], settings: Settings, span: Span, sums: GradientSums | ChunkGradientSums
+    ) -> None:
         self.engine, self.settings, self.span, self.sums = engine, settings, span, sums
 
     def run(self, pixels: Tensor) -> None:
@@ -117,7 +119,7 @@ class Chunk:
 # ---- All chunks: over threads by kernels, where these can be made; else one after the other by tensor operations
 
 
-def replay_paths(scene: Scene, assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
+def replay_paths(scene: Scene, assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums) -> None:
     """Reverse mode by replaying paths; as :func:`torchpt.gradients.tape.tape`, but memory hardly grows with depth.
 
     Sums are joined in the order of chunks, whichever thread took them. Chunks of tensor operations have fewer lanes only
@@ -157,7 +159,7 @@ def replay_paths(scene: Scene, assembly: SceneTape, settings: Settings, cotangen
     assembly.through(budget, whole, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
-def piece(assembly: SceneTape, settings: Settings, cotangent: Tensor, share: Tensor | None, span: Span) -> Sums:
+def piece(assembly: SceneTape, settings: Settings, cotangent: Tensor, share: Tensor | None, span: Span) -> GradientSums:
     """Return the sums of a chunk of tensor operations."""
     sums = assembly.sums()
     engine = backward_tensors(assembly, share)
@@ -166,7 +168,7 @@ def piece(assembly: SceneTape, settings: Settings, cotangent: Tensor, share: Ten
 
 
 def _over_threads(
-    kernels: BackwardKernels, assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums
+    kernels: BackwardKernels, assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums
 ) -> str:
     """Take all chunks by kernels; return why that cannot be, or ""."""
     wave, cotangent = assembly.wave, cotangent.float()
@@ -175,23 +177,23 @@ def _over_threads(
     engines: list[Backward[Any, Any, Any]] = []
     lock = threading.Lock()
 
-    def task(span: Span) -> ChunkSums:
+    def task(span: Span) -> ChunkGradientSums:
         with lock:
             engine = engines.pop() if engines else kernels.engine()
-        found = ChunkSums(assembly.tables, sums if budget.threads == 1 else None)
+        found = ChunkGradientSums(assembly.tables, sums if budget.threads == 1 else None)
         Chunk(engine, settings, span, found).run(cotangent)
         with lock:
             engines.append(engine)
         return found
 
-    def merge(part: ChunkSums | None) -> bool:
+    def merge(part: ChunkGradientSums | None) -> bool:
         if part is not None:
             sums.merge(part)
         return False
 
     while True:
         try:
-            deal(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
+            map_in_order(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
             return ""
         except Unsupported as error:
             return f"no kernel can be made of {error}"

@@ -12,7 +12,7 @@ from torchpt.core.threads import one_thread
 from torchpt.engines.engine import radiance as radiance_of
 from torchpt.gradients.parameters import SceneTape
 from torchpt.math.gathers import recording_gathers
-from torchpt.math.sums import Sums
+from torchpt.math.sums import GradientSums
 from torchpt.math.vectors import take
 from torchpt.paths.wave import clamp_scale
 from torchpt.physics.film.splats import Splats
@@ -70,7 +70,7 @@ LONGEST = 64
 Part = Callable[[Span], tuple[Tensor, Tensor]]
 
 
-def tape(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums) -> None:
+def tape(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: GradientSums) -> None:
     """Reverse mode on a plain tape, a chunk of pixels at a time: memory grows with depth, not with the picture.
 
     Args:
@@ -102,7 +102,9 @@ def tape(assembly: SceneTape, settings: Settings, cotangent: Tensor, sums: Sums)
     chunk_by_chunk(assembly, settings, sums, part, wave.crop[2] * wave.crop[3], settings.render.spp)
 
 
-def chunk_by_chunk(assembly: SceneTape, settings: Settings, sums: Sums, part: Part, count: int, samples: int) -> None:
+def chunk_by_chunk(
+    assembly: SceneTape, settings: Settings, sums: GradientSums, part: Part, count: int, samples: int
+) -> None:
     """Add the derivatives of a part of a loss, chunk by chunk.
 
     Args:
@@ -123,7 +125,7 @@ def chunk_by_chunk(assembly: SceneTape, settings: Settings, sums: Sums, part: Pa
     assembly.through(_budget(settings, assembly), add, count, samples)
 
 
-def piece(assembly: SceneTape, part: Part, span: Span) -> Sums:
+def piece(assembly: SceneTape, part: Part, span: Span) -> GradientSums:
     """Return the sums of a chunk."""
     found = assembly.sums()
     with torch.enable_grad(), recording_gathers(found):
@@ -141,7 +143,7 @@ def _budget(settings: Settings, assembly: SceneTape) -> Budget:
     lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE // each, 1))
     limit = settings.render.max_memory
     budget = Budget(device, lanes, what="the tape of a single lane", limit=limit, per_lane=each)
-    budget.steady()
+    budget.drop_unneeded_limit()
     return budget
 
 

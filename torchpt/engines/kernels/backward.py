@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY
 from torchpt.compiler.graph import Unsupported
-from torchpt.compiler.operators.derivatives import summands
+from torchpt.compiler.operators.derivatives import summand_of
 from torchpt.compiler.sinks import Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
 from torchpt.core.memory import Span
@@ -26,7 +26,7 @@ from torchpt.engines.kernels.engine import Chunk, Paths, Worker
 from torchpt.engines.kernels.layout import HIT, Fields, Layout, Memory, Rows, Trace, path_state
 from torchpt.engines.kernels.programs import Kernel, Kernels
 from torchpt.math.gathers import recording_gathers
-from torchpt.math.sums import ChunkSums
+from torchpt.math.sums import ChunkGradientSums
 from torchpt.paths import adjoint
 from torchpt.paths.adjoint import InputCotangents, Tape, VertexCotangents
 from torchpt.paths.integrators.path import follows_shape
@@ -234,7 +234,7 @@ def _ended(trace: Trace, noted: _Noted, state: PathState, before: InputCotangent
         if gradient is None:
             continue
         nodes = np.broadcast_to(tracer.get(gradient).nodes, tuple(kernels.plain[number].shape)).reshape(-1)
-        lanes = [summands(graph, int(node)) for node in nodes]
+        lanes = [summand_of(graph, int(node)) for node in nodes]
         if any(node is not None for node in lanes):
             if len(lanes) > 64:
                 raise Unsupported("a derivative by all of a table in every lane")
@@ -334,7 +334,7 @@ class KernelsBackward(Worker):
         self._sorted = Memory(2), np.zeros(CAPACITY, np.uint8)  # slots of a list's lanes, and what sorting takes
         self._first = 1
 
-    def begin(self, span: Span, sums: ChunkSums) -> Paths:
+    def begin(self, span: Span, sums: ChunkGradientSums) -> Paths:
         """See :class:`torchpt.engines.engine.Backward`."""
         self.sums, self._chunk, self._first = sums, Chunk(*span), 1
         paths = self.spawn(self._chunk)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpt.compiler.form import CAPACITY
 from torchpt.compiler.graph import DTYPES
-from torchpt.compiler.sinks import Note, Scatter, Sinks
+from torchpt.compiler.sinks import AppendIndex, Scatter, Sinks
 from torchpt.compiler.tracing import Tracer
 from torchpt.paths.state import EXTRA, PathState
 from torchpt.paths.wave import camera_state
@@ -331,7 +331,9 @@ class Trace:
         rows = tuple(enumerate(self.tracer.nodes(radiance)))
         return Scatter(mask, self.node(lane), rows, slots=True)
 
-    def sorted(self, sinks: Sinks, state: PathState, prim: Tensor, unseen: dict[str, Tensor]) -> tuple[int, list[Note]]:
+    def sorted(
+        self, sinks: Sinks, state: PathState, prim: Tensor, unseen: dict[str, Tensor]
+    ) -> tuple[int, list[AppendIndex]]:
         """Sort the lanes by the surfaces that they met, and end those that do not go on.
 
         Returns:
@@ -351,6 +353,6 @@ class Trace:
             lists.append((layout.emissive, shining))
         if layout.has_environment:
             lists.append((layout.missed, out))
-        notes = [Note(self.node(mask), number, number + 1) for number, mask in lists]
+        appends = [AppendIndex(self.node(mask), number, number + 1) for number, mask in lists]
         sinks.scatter.append(self.ended(self.node(off), state.lane, state.radiance, unseen))
-        return self.node(on), notes
+        return self.node(on), appends

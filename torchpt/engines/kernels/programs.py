@@ -19,10 +19,10 @@ from torch import Tensor
 
 from torchpt.compiler import cache, operators  # noqa: F401  (the operators register how they are lowered)
 from torchpt.compiler.graph import Unsupported
-from torchpt.compiler.program import Program, Tables, TracedStage, bound
-from torchpt.compiler.prologue import Name, pruned
+from torchpt.compiler.program import Program, Tables, TracedStage, bind_tables
+from torchpt.compiler.prologue import StepKey, without_unused_steps
 from torchpt.compiler.sinks import Sinks
-from torchpt.compiler.tracing import Tracer, lanes_for
+from torchpt.compiler.tracing import Tracer, choose_lane_count
 from torchpt.core.tree import fingerprint, named_leaves, signature
 from torchpt.engines.kernels import stages
 from torchpt.engines.kernels.layout import Layout, Trace
@@ -88,13 +88,13 @@ class KernelCache:
     def __init__(self) -> None:
         self._kernels: dict[Any, tuple[Kernel, dict[str, State]]] = {}
         self._tables: dict[tuple[str, Any], tuple[State, Tensor]] = {}
-        self._results: dict[frozenset[str], tuple[dict[str, State], dict[Name, Tensor]]] = {}
+        self._results: dict[frozenset[str], tuple[dict[str, State], dict[StepKey, Tensor]]] = {}
         self._lock = threading.Lock()
 
     def kernel(self, key: Any, program: Program, leaves: Leaves) -> Kernel | None:
         """The kernel of a stage where it was made of the same program and tensors; None where there is none such."""
         found = self._kernels.get(key)
-        if found is None or found[0].program is not program or program.held:
+        if found is None or found[0].program is not program or program.constants:
             return None
         same = all(leaves.has(path, state) for path, state in found[1].items())
         return found[0] if same else None
@@ -104,9 +104,9 @@ class KernelCache:
         with self._lock:
             return {key: table for key, (state, table) in self._tables.items() if leaves.has(key[0], state)}
 
-    def results(self, leaves: Leaves) -> dict[Name, Tensor]:
+    def results(self, leaves: Leaves) -> dict[StepKey, Tensor]:
         """Return what steps of prologues came to on a render's tensors, those that were taken, by name."""
-        found: dict[Name, Tensor] = {}
+        found: dict[StepKey, Tensor] = {}
         with self._lock:
             for states, results in self._results.values():
                 if all(leaves.has(path, state) for path, state in states.items()):
@@ -118,11 +118,11 @@ class KernelCache:
         key: Any,
         kernel: Kernel,
         tables: dict[Any, Tensor],
-        results: dict[Name, Tensor],
+        results: dict[StepKey, Tensor],
         leaves: Leaves,
     ) -> None:
         """Hand a kernel on, and all tables and results of steps of its render."""
-        groups: dict[frozenset[str], dict[Name, Tensor]] = {}
+        groups: dict[frozenset[str], dict[StepKey, Tensor]] = {}
         for name, result in results.items():
             groups.setdefault(name.leaves, {})[name] = result
         with self._lock:
@@ -152,18 +152,18 @@ def program_of(
 
 
 def _traced(leaves: Leaves, layout: Layout, build: Callable[[Trace], Sinks], listed: bool) -> TracedStage:
-    tracer = Tracer(lanes_for(leaves.tensors.values()), leaves.ids)
+    tracer = Tracer(choose_lane_count(leaves.tensors.values()), leaves.ids)
     trace = Trace(tracer, layout)
     with torch.no_grad():
         sinks = build(trace)
-    tables, steps, guards = pruned(tracer.tables, tracer.steps, tracer.guards)
+    tables, steps, guards = without_unused_steps(tracer.tables, tracer.steps, tracer.guards)
     searches = any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes)
     return TracedStage(
         graph=tracer.graph,
         sinks=sinks,
         tables=tables,
         steps=steps,
-        held=tuple(tracer.held),
+        constants=tuple(tracer.constants),
         guards=guards,
         uniforms=tuple(trace.uniforms),
         tensors=trace.tensors,
@@ -352,8 +352,8 @@ class Kernels(Layout):
         if old is not None:
             return old
         leaves = self._leaves.tensors
-        tables = bound(
-            program.tables, program.steps, program.held, leaves, self._laid_out, program.names, self._results
+        tables = bind_tables(
+            program.tables, program.steps, program.constants, leaves, self._laid_out, program.names, self._results
         )
         made = Kernel(program, tables)
         self.handed.keep(key, made, self._laid_out, self._results, self._leaves)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchpt.compiler.packet import KINDS
-from torchpt.compiler.sinks import Note, Pack, Scatter, Sinks, Store
+from torchpt.compiler.sinks import AppendIndex, Compact, Scatter, Sinks, Store
 from torchpt.compiler.tracing import Tracer
 from torchpt.engines.kernels.layout import Trace, path_state
 from torchpt.paths import layers as aov
@@ -179,8 +179,8 @@ def settle(trace: Trace, shadow: bool) -> Sinks:
                 radiance = state.radiance + torch.where(arrived["blocked"] != 0, 0.0, light)
         state = replace(state, radiance=radiance)
         sinks.write += rows.nodes(tracer, radiance=radiance)
-    _, notes = trace.sorted(sinks, state, prim, unseen)
-    sinks.notes += notes
+    _, appends = trace.sorted(sinks, state, prim, unseen)
+    sinks.appends += appends
     return sinks
 
 
@@ -242,10 +242,10 @@ def bounce(trace: Trace, model: int, roulette: float) -> Sinks:
 def _searched(trace: Trace, sinks: Sinks, state: PathState, unseen: dict[str, Tensor]) -> None:
     """Search inside the kernel: the lanes that go on are packed together, the others end."""
     hit = nearest(trace.tracer, state.o, state.d, state.t_max)
-    on, notes = trace.sorted(sinks, state, hit.prim, unseen)
+    on, appends = trace.sorted(sinks, state, hit.prim, unseen)
     rows = trace.kept(state, unseen)
     rows += trace.layout.state.nodes(trace.tracer, t=hit.t, prim=hit.prim, u=hit.u, v=hit.v)
-    sinks.pack.append(Pack(on, tuple(rows), 0, tuple(notes)))
+    sinks.compact.append(Compact(on, tuple(rows), 0, tuple(appends)))
 
 
 def _with_shadow(
@@ -298,7 +298,7 @@ def sift(trace: Trace) -> Sinks:
             held_up = given["t_max"] > 0
         else:
             held_up = non_opaque(layout.world, given["prim"]) & (given["prim"] >= 0)
-    return Sinks(notes=[Note(trace.node(held_up), 0, 0)])
+    return Sinks(appends=[AppendIndex(trace.node(held_up), 0, 0)])
 
 
 def transmit(trace: Trace, again: bool) -> Sinks:
@@ -330,7 +330,7 @@ def transmit(trace: Trace, again: bool) -> Sinks:
     onward = layout.passed.nodes(
         tracer, pass_o=after.o, pass_d=after.d, pass_t=after.t_max, before=start, home=home, key=state.key
     )
-    sinks = Sinks(pack=[Pack(trace.node(on), tuple(onward), 0)])
+    sinks = Sinks(compact=[Compact(trace.node(on), tuple(onward), 0)])
     if again:
         stopped = layout.state.nodes(tracer, t=whole, prim=hit.prim, u=hit.u, v=hit.v)
         sinks.scatter.append(Scatter(trace.node(met), trace.node(home), tuple(stopped), slots=True))
@@ -378,7 +378,7 @@ def _passed(trace: Trace, on: Tensor, onward: list[tuple[int, int]], off: Tensor
     """Shadow rays that go on are packed; of those that do not, what is clear goes home to their paths."""
     known = tuple(trace.layout.state.nodes(trace.tracer, clear=clear))
     done = Scatter(trace.node(off), trace.node(home), known, slots=True)
-    return Sinks(pack=[Pack(trace.node(on), tuple(onward), 0)], scatter=[done])
+    return Sinks(compact=[Compact(trace.node(on), tuple(onward), 0)], scatter=[done])
 
 
 # ---- What leaves a chunk, as kernels: layers of first surfaces, and samples added to the film

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from torchpt.core.threads import sum_all
 from torchpt.images.texels import TEXELS, check_source, radiance_of, read_texels, texels_of
-from torchpt.math.sampling import Cells, invert_linear
+from torchpt.math.sampling import Distribution2D, invert_linear
 from torchpt.math.vectors import azimuth, dot, luminance, safe_reciprocal, take
 from torchpt.physics.ibl.equirect import Cell, angles
 from torchpt.physics.lights.base import Environment, Row, Setting, Surroundings, bright
@@ -58,7 +58,7 @@ class Grid:
         factor: ``()`` from the interpolated difference to the density in solid angle.
     """
 
-    cells: Cells
+    cells: Distribution2D
     floor: Tensor
     factor: Tensor
 
@@ -163,7 +163,7 @@ def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
 
 def _grid(weights: Tensor, floor: Tensor) -> Grid:
     """From integrals over the cells; the sphere counts as 1 in them, and as 4 pi in the density."""
-    return Grid(Cells.of(weights), floor, (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype))
+    return Grid(Distribution2D.of(weights), floor, (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype))
 
 
 def _place(map: EnvironmentMap, d: Tensor) -> Cell:
