@@ -24,7 +24,7 @@ from torchpt.compiler.program import Program, Tables, TracedStage, bind_tables
 from torchpt.compiler.prologue import without_unused_steps
 from torchpt.compiler.sinks import Sinks, Store
 from torchpt.compiler.tracing import Tracer, choose_lane_count, tracing
-from torchpt.core.threads import share, thread_count
+from torchpt.core.threads import parallel_for, thread_count
 from torchpt.core.tree import leaves, signature
 from torchpt.native import compile_time
 
@@ -224,7 +224,7 @@ class _CompiledFunction:
             self.program.call(ctypes.addressof(block), end - start)
 
         blocks = -(-count // BLOCK)
-        share(part, blocks, min(threads, max(blocks // self.grain, 1)))
+        parallel_for(part, blocks, min(threads, max(blocks // self.grain, 1)))
         return outputs[0] if isinstance(self.results, Tensor) else tuple(outputs)
 
 

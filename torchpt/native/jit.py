@@ -23,8 +23,8 @@ from numba.core.compiler import CompileResult
 from numba.core.event import Event, Listener, register
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import MARGIN, check_room
-from torchpt.core.threads import share
+from torchpt.core.memory import MARGIN, check_address_space
+from torchpt.core.threads import parallel_for
 from torchpt.native import cache, compile_time
 from torchpt.native.content import code_of_function
 
@@ -131,7 +131,7 @@ def ensure_compiled(kernel: Any, *args: Any) -> Any:
     """Compile a kernel by a call without work, and return it; a long compilation prints a message to stderr, once."""
     if not kernel.overloads:
         # LLVM aborts the process without memory, and so does the BLAS that numba loads with its first kernel.
-        check_room(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN)
+        check_address_space(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN)
         timer = threading.Timer(_PATIENCE, _say)
         timer.daemon = True
         timer.start()
@@ -204,4 +204,4 @@ def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, arg
             numba.set_num_threads(before)
     else:
         ensure_compiled(serial, 0, 0, *args)
-        share(lambda first, last: serial(first, last, *args), items, threads)
+        parallel_for(lambda first, last: serial(first, last, *args), items, threads)
