@@ -1,4 +1,4 @@
-"""One forward render: takes chunks, adds them up in films, and says what they come to."""
+"""One forward render: passes of samples, stop rules, checkpoints and the error estimate."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ from torchpt.scene.settings import Settings
 __all__ = ["Run", "render_scene"]
 
 
-# ---- One forward render: takes chunks and adds them up in films
+# ---- One forward render
 
 
-#: A last round of adaptive sampling of less than this part of the samples is not kept: the checkpoint before serves any spp.
+#: A last adaptive round of less than 1 / SMALL_ROUND of the samples is not kept: the checkpoint before it serves any spp.
 SMALL_ROUND = 8
 
 
 def _most(known: ErrorEstimate | None) -> float:
-    """The upper end of an interval; infinite where there is none that is to be trusted."""
+    """Return the upper end of the estimate's interval; infinite if there is none, or it is not to be trusted."""
     return math.inf if known is None or known.interval is None or known.heavy_tailed else known.interval[1]
 
 
 class Run:
-    """One forward render: accumulates chunks into films; by several ranks where there is a ``group`` of them.
+    """One forward render, by one process or by the ranks of ``group``.
 
-    ``like``, ``rays``: see :func:`torchpt.scene.prepare.make_wave`. ``threads``: that will take samples; None: torch's number.
+    ``like``, ``rays``: see :func:`torchpt.scene.prepare.make_wave`. ``threads``: number of worker threads; None: torch's.
     """
 
     def __init__(
@@ -68,9 +68,9 @@ class Run:
     ) -> None:
         self.start = time.perf_counter()
         self._others = compile_time.seconds()
-        self._kernels = 0.0  # seconds of kernels that were given up
+        self._kernels = 0.0  # seconds of compiling for an engine that was given up
         self.split = None if group is None or group.size == 1 else Split(group)
-        self.shared: tuple[int, int] = 0, 1  # samples before this pass, and how many ranks take it
+        self.shared: tuple[int, int] = 0, 1  # samples before this pass, and the number of ranks that share it
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
         meter, limit = Meter(self.device), settings.render.max_memory
@@ -89,7 +89,7 @@ class Run:
         self.eager: list[str] = []
         self.unsupported: Unsupported | None = None
         self.keeper: Keeper | None = None
-        self.warned = False  # that it cannot write
+        self.warned = False  # of a checkpoint that cannot be written
         self.keeps = settings.render.checkpoint is not None
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
             self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
@@ -115,7 +115,7 @@ class Run:
         return forward_tensors(self.wave, Budget(self.device, lanes, what=what, limit=limit, per_lane=BYTES_PER_LANE))
 
     def _begin(self) -> None:
-        """Nothing is sampled yet."""
+        """Set films and counts to zero."""
         device, streams = self.device, self.wave.sampler.streams
         splats, channels = self.integrator.splats, [len(x.channels) for x in self.seen.values()]
         check_film(self.width, self.height, streams.count, channels, device, splats)
@@ -126,22 +126,22 @@ class Run:
         self.picture = PixelSet(film, layers, streams)
         self.twice = error_probes(self.wave, self.settings, device) if self.settings.pilots else None
         self.tally, self.done, self.left, self.taken, self.ended = RayCounts(), 0, 0, 0, False
-        self._keeps_no_more = False  # what follows is done again by whoever goes on
-        self.cut = False  # whether a round of adaptive sampling was shortened
-        self.before = 0.0  # seconds of sampling up to the checkpoint that this goes on from
-        bounded = self.keeps or self.split is not None  # a rank that is gone is noticed after a pass
+        self._keeps_no_more = False  # later samples are taken again after a resume
+        self.cut = False  # True once spp or the time limit shortened an adaptive round
+        self.before = 0.0  # seconds of sampling before the checkpoint that was resumed
+        bounded = self.keeps or self.split is not None  # a lost rank is noticed between passes
         self.stop = Stop(self.settings.render, streams.count, EVERY if bounded else None)
         if self.twice is not None:
             self.stop.after = self.twice.looks(self.width * self.height)
         if self.split is not None:
             self.split.begin()
         self.lost = NonFinite()
-        self._unlooked: tuple[dict[str, Any], Tensor] = {}, torch.empty(0)  # counted before pixels were looked at again
+        self._unlooked: tuple[dict[str, Any], Tensor] = {}, torch.empty(0)  # counts before outliers were resampled
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.begun: float | None = None
 
     def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
-        """Take all samples, or as many as the rules or ``on_progress`` let."""
+        """Take all samples, until a stop rule or ``on_progress`` ends the render, and return the rendering."""
         self.on_progress = on_progress
         self.stop.watched = on_progress is not None or self.settings.adaptive or self.keeps or self.split is not None
         try:
@@ -155,9 +155,9 @@ class Run:
         return self._final()
 
     def at_once(self) -> list[tuple[PixelSet, int, int]] | None:
-        """All samples, to be handed to :meth:`took` as they come, and then :meth:`completed`.
+        """Return the spans of the whole render; their results go to :meth:`took`, and then :meth:`completed` ends it.
 
-        None where that cannot be: there are no kernels, something but their number may end them, or memory is bounded.
+        None if it must run by :meth:`go`: without kernels, with stop rules besides ``spp``, or in bounded memory.
         """
         ends = self.keeps or self.stop.open or self.twice is not None or self.split is not None
         if self.tasks is None or ends or self.settings.render.max_memory is not None:
@@ -166,7 +166,7 @@ class Run:
         return [(self.picture, 0, self.settings.render.spp)]
 
     def completed(self, rest: list[Block]) -> Rendering:
-        """The picture of samples that were taken at once, but for the blocks for which there was no memory."""
+        """Return the rendering of :meth:`at_once`, after taking the blocks in ``rest``, put back when memory ran out."""
         with needing("a render"):
             if self.unsupported is not None:
                 self._eagerly(self.unsupported)
@@ -184,7 +184,7 @@ class Run:
         return final(self)
 
     def _all(self) -> None:
-        """All samples, by tensor operations where there can be no kernels."""
+        """Take all samples; by tensor operations if kernels cannot be made."""
         try:
             self._complete()
         except Unsupported as error:
@@ -193,10 +193,10 @@ class Run:
             self._eagerly(error)
 
     def _eagerly(self, error: Unsupported) -> None:
-        """All samples, once more, by tensor operations.
+        """Take all samples again from the start, by tensor operations.
 
         Raises:
-            SceneError: kernels alone were asked for.
+            SceneError: ``render.compile`` is ``on``.
         """
         if self.settings.render.compile == "on":
             raise SceneError("render.compile", "on", f"auto or off (no kernel can be made of {error})")
@@ -207,10 +207,10 @@ class Run:
         self._begin()
         self._complete()
 
-    # -- which samples
+    # -- passes
 
     def _complete(self) -> None:
-        """The picture, and then what it takes to know its error."""
+        """Take the samples of the picture, and then those of outliers for the error estimate."""
         self._resume()
         self._sample()
         self._join()
@@ -218,7 +218,7 @@ class Run:
             self._look_again()
 
     def _look_again(self) -> None:
-        """Sample what it takes to know the picture's error better, unless that was done with as many samples."""
+        """Resample outliers for the error estimate, unless that was done at this number of samples."""
         if self.twice is None or self.twice.looked == self._mean():
             return
         self._unlooked = self._counted()
@@ -228,7 +228,7 @@ class Run:
         self._join()
 
     def _sample(self) -> None:
-        """Pass by pass, until a rule says that it is enough."""
+        """Take passes until a rule ends the render."""
         self.begun = time.perf_counter()
         while not self._adapts() and (size := self.stop.step(self.taken)):
             if self.settings.adaptive:  # the first round is the same whatever spp and the seconds of a pass
@@ -247,11 +247,11 @@ class Run:
             self._keep(last=True)
 
     def _adapts(self) -> bool:
-        """Return True where pilots say from now on where samples go."""
+        """Return True once error probes decide where samples go."""
         return self.twice is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
 
     def _adapt(self) -> None:
-        """Rounds that double the samples there are, each where pilots say."""
+        """Take adaptive rounds, each of which doubles the samples."""
         assert self.twice is not None
         self._join()
         shares = Shares(self.twice.pilots, self.picture.film, None if self.split is None else self.split.places)
@@ -261,10 +261,10 @@ class Run:
             more = self.stop.affordable(wish)
             last = more == wish and more < mean and mean + more >= self.settings.render.spp
             spans = shares.spans(self.picture, self.twice, mean + more, last)
-            if not spans:  # a sample of one block's pixels is more than what is left
+            if not spans:  # not enough samples are left for one block
                 self.stop.reason = "spp" if more == wish else "time_limit"
                 break
-            if last and SMALL_ROUND * more < mean and not self.cut:  # quickly done again, and then for any spp
+            if last and SMALL_ROUND * more < mean and not self.cut:  # cheap to repeat, with any spp
                 self._keep(last=True)
                 self._keeps_no_more = True
             self.cut |= more < mean
@@ -277,16 +277,16 @@ class Run:
             self._reached(mean, self.seconds_of_sampling())
             self._keep()
 
-    # -- what a killed render goes on from
+    # -- checkpoints
 
     def films(self) -> dict[str, Film]:
-        """Return all that samples are added to, by name."""
+        """Return all films by name."""
         films = {"picture": self.picture.film}
         films |= {f"layers.{name}": film for name, film in self.picture.layers.items()}
         return films if self.twice is None else films | {"pilots": self.twice.pixel_set.film}
 
     def _keep(self, last: bool = False) -> None:
-        """Write a checkpoint where it is time for one."""
+        """Write a checkpoint if one is due."""
         if not self.keeps or self._keeps_no_more:
             return
         due = self.keeper is not None and (last or self.keeper.due())
@@ -296,7 +296,7 @@ class Run:
                 self._write(self.keeper)
 
     def _write(self, keeper: Keeper) -> None:
-        """Write a checkpoint; where that fails the render goes on, as its picture may have a better place."""
+        """Write a checkpoint; if that fails, warn and go on: the picture may still be written elsewhere."""
         try:
             keeper.write(self._state())
         except OutputError as problem:
@@ -305,24 +305,24 @@ class Run:
             self.warned = True
 
     def _state(self) -> State:
-        """Return where the render is."""
-        looked = self.twice is not None and self.twice.looked == self._mean()  # whoever goes on looks once more
+        """Return the state for a checkpoint."""
+        looked = self.twice is not None and self.twice.looked == self._mean()  # outliers are resampled after a resume
         counted, light = self._unlooked if looked else self._counted()
         facts = {"taken": self.taken, "seconds": self.seconds_of_sampling(), "cut": int(self.cut), **counted}
         arrays = {f"{name}.{key}": value for name, film in self.films().items() for key, value in film.state().items()}
         return State(facts, arrays | {"light": light})
 
     def _counted(self) -> tuple[dict[str, Any], Tensor]:
-        """Return what is counted beside the films, by name, and the light before and after the clamp."""
+        """Return the counts by name, and the light before and after the clamp."""
         counts = {"done": self.done, "rays": self.tally.rays, "truncated": self.tally.truncated}
         return {**counts, "lost": self.lost.plain()}, self.light.clone()
 
     def _mean(self) -> float:
-        """Samples a pixel that the picture holds."""
+        """Return the mean samples a pixel of the picture."""
         return float(self.picture.film.counts.double().mean())
 
     def _resume(self) -> None:
-        """Go on from the checkpoint, where that is wished and there is one."""
+        """Restore the checkpoint if ``render.resume`` is set and there is one."""
         if not self.keeps or not self.settings.render.resume:
             return
         state = None if self.keeper is None else self._kept(self.keeper)
@@ -342,14 +342,14 @@ class Run:
         self._reached(mean, self.before)
 
     def _kept(self, keeper: Keeper) -> State | None:
-        """Return the checkpoint, once it is known to be one that this render can go on from; None where there is none."""
+        """Return the validated checkpoint; None if there is none."""
         state = keeper.read(self._state(), lambda state: check_samples(self, state, keeper.path))
         if state is not None:
             check_whole(self, state, keeper.path)
         return state
 
     def _reached(self, mean: float, seconds: float) -> None:
-        """Tell the rules what was reached; where ranks share a render, as the first one sees it."""
+        """Update the stop rules with the samples, seconds and error so far, as the first rank has them."""
         if self.settings.render.target_error is not None:
             self._join()
         error = self._by_pilots() if self.stop.asks(mean, self._adapts()) else None
@@ -365,24 +365,24 @@ class Run:
         self.stop.told(mean, seconds, error)
 
     def _join(self) -> None:
-        """Let the films hold what all ranks took."""
+        """Make the films whole on every rank."""
         if self.split is not None:
             self.split.join()
 
     def _by_pilots(self) -> float:
-        """The relMSE that pilots alone hold possible: the upper end of its interval."""
+        """Return the upper end of the interval of relMSE that the error probes give."""
         assert self.twice is not None
         return _most(self.twice.alone(self.picture.film))
 
     def _certain(self) -> float:
-        """The relMSE that the picture itself holds possible, once suspects were looked at again; it takes some samples."""
+        """Return the upper end of the interval of relMSE after resampling outliers, which takes samples."""
         assert self.twice is not None
         self._look_again()
         known, unknown = known_of(self, self.twice.picture(self.picture.film))
         return math.inf if self.ended or unknown else _most(known)
 
     def _forget_look(self) -> None:
-        """Count as if no pixel had been looked at again: the picture gets more samples, and will be then."""
+        """Restore the counts before outliers were resampled: the picture gets more samples, and they will be again."""
         assert self.twice is not None
         counts, self.light = self._unlooked
         self.done, self.tally = counts["done"], RayCounts(counts["rays"], counts["truncated"])
@@ -390,29 +390,29 @@ class Run:
         self.twice.third, self.twice.looked = None, None
 
     def geometry(self) -> Geometry:
-        """The primitives as the search sees them."""
+        """Return the primitives that the search structure was built from."""
         moved = {name: value for name, value in (self.params or {}).items() if not name.startswith("camera.")}
         return self.scene.world(torch.float32, moved)[1]
 
     def seconds_of_sampling(self) -> float:
-        """Since the first sample, without what was spent on kernels and checkpoints."""
+        """Return the seconds of sampling, without compiling kernels and writing checkpoints."""
         if self.begun is None:
             return 0.0
         made = self.compile_seconds() - self._compiled
         return self.before + max(time.perf_counter() - self.begun - made - self.write_seconds(), 0.0)
 
     def compile_seconds(self) -> float:
-        """Since the start, for kernels: those of stages, and others that a first call makes, such as those of searches."""
+        """Return the seconds of compiling kernels since the start: of stages and of the search."""
         return self._kernels + self.engine.seconds + compile_time.seconds() - self._others
 
     def write_seconds(self) -> float:
-        """For checkpoints."""
+        """Return the seconds of writing checkpoints."""
         return 0.0 if self.keeper is None else self.keeper.seconds
 
-    # -- how they are taken
+    # -- samples of a pass
 
     def _take(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
-        """Samples of plates, with the first one and how many; returns whether all were taken."""
+        """Take the samples of spans (pixels, first sample, count); return True if all were taken."""
         if not spans:
             return True
         if self.split is None:
@@ -424,12 +424,12 @@ class Run:
         return whole
 
     def take_alone(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
-        """The same by this process alone."""
+        """Take the samples of spans in this process; return True if all were taken."""
         self.left = sum(pixel_set.film.width * pixel_set.film.height * samples for pixel_set, _, samples in spans)
         return self.engine.run(spans, self.took)
 
     def took(self, share: Share | None) -> bool:
-        """Count what a task brought; returns whether the render is to stop."""
+        """Add the counts of a finished task; return True if the render is to stop."""
         if share is None:
             return self._advanced(0, False)
         self.tally.rays += share.tally.rays
@@ -441,43 +441,43 @@ class Run:
         return self._advanced(share.samples, self.left == 0 and self.split is None)
 
     def _advanced(self, samples: int, ends: bool) -> bool:
-        """Tell of progress; returns whether to stop."""
+        """Count samples and call ``on_progress``; return True if the render is to stop."""
         self.done += samples
-        if self.on_progress is None or self.ended:  # tasks of other threads still come in after the wish to stop
+        if self.on_progress is None or self.ended:  # other threads' tasks still finish after a stop
             return self.ended
         seconds = time.perf_counter() - self.start
-        before, ranks = self.shared  # the others are about as far
+        before, ranks = self.shared  # other ranks have taken about as many
         done = before + ranks * (self.done - before)
         state = Progress(done, max(self._total(), done), self.tally.rays, seconds, ends, self.result)
         wish = bool(self.on_progress(state))
-        if samples or ranks > 1 or self.split is None:  # between passes ranks do not part
+        if samples or ranks > 1 or self.split is None:  # ranks stop together, after a pass
             self.ended = wish and self.done < self.asked()
         return self.ended
 
     def _total(self) -> int:
-        """Camera samples that there will be, as far as one can tell: fewer where time or error end the render."""
+        """Return the expected number of paths: fewer than ``spp`` gives where time or error end the render."""
         asked = self.asked()
         if not self.stop.open or self.stop.share <= 0.0:
             return max(asked, self.done)
         return max(min(asked, round(self.done / self.stop.share)), self.done)
 
     def asked(self) -> int:
-        """Camera samples that ``render.spp`` comes to."""
+        """Return the number of paths of ``render.spp`` samples, error probes included."""
         pixels = self.width * self.height + (0 if self.twice is None else len(self.twice.pilots))
         return pixels * self.settings.render.spp
 
     def _count(self, lost: NonFinite) -> None:
-        """Count samples that are not finite; with ``integrator.strict`` the first one ends the render."""
+        """Count non-finite samples; with ``integrator.strict`` raise RenderError at the first one."""
         if lost.count and self.integrator.strict:
             raise RenderError(f"integrator.strict: {told(self.scene, self.wave, lost.places[0])}")
         self.lost.add(lost)
 
     def result(self) -> Rendering:
-        """The picture so far."""
+        """Return the rendering so far."""
         return rendering_of(self)
 
 
-# ---- One render with complete settings: what every way to a picture comes down to
+# ---- One render with complete settings, for all callers
 
 
 def render_scene(
@@ -489,22 +489,22 @@ def render_scene(
     ranks: Group | None = None,
     rays: tuple[Tensor, Tensor] | None = None,
 ) -> Rendering:
-    """Render with complete settings.
+    """Render a scene with complete settings.
 
     Args:
-        scene: what.
-        settings: how.
-        on_progress: called after every chunk; returning True stops early with the picture so far.
+        scene: the scene.
+        settings: the complete settings.
+        on_progress: called after every chunk; a return value of True ends the render with the picture so far.
         params: tensors in place of the scene's, without gradients.
-        dtype: of the lanes.
-        ranks: those that share the work; each gets all of the picture.
-        rays: in place of the camera's, see :func:`torchpt.scene.prepare.make_wave`; by one process.
+        dtype: dtype of the picture and of all lanes.
+        ranks: processes that share the work; each returns the whole picture.
+        rays: rays in place of the camera's, see :func:`torchpt.scene.prepare.make_wave`; by one process only.
 
     Raises:
-        SceneError: settings that this scene cannot be rendered with.
+        SceneError: this scene cannot be rendered with these settings.
         RenderError: with ``integrator.strict``, the first sample that is not finite.
-        AssetError: a checkpoint that is damaged, or of another render.
-        OutputError: a checkpoint that cannot be written, or that is there although nobody wishes to go on from it.
+        AssetError: the checkpoint is damaged, or is of another render.
+        OutputError: the checkpoint cannot be written, or exists without ``render.resume``.
     """
     with without_autocast(scene.device), limited_threads(settings.render.threads):
         with together(ranks, "what is rendered", lambda: stamp(scene, settings, params, dtype)):
