@@ -1,4 +1,4 @@
-"""The page of a study: its pictures and tables as one HTML file."""
+"""Render the page of a study: its pictures and tables in one HTML file."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from torchpt.reports.study import Study
 __all__ = ["Figure", "Panel", "Sheet", "hardest", "page", "sheet_of", "step_near"]
 
 
-# ---- Pictures of the report: at equal time, where errors are largest, and maps of the errors
+# ---- Pictures of the report: crops at equal time, where errors are largest, and maps of the errors
 
 
-#: Widest map, in pixels; larger ones are means over squares.
+#: Largest side of a map in pixels; larger maps are averaged over squares.
 _WIDE = 400
-#: A crop is so much of the smaller side, within these bounds in pixels.
-_PART, _LEAST, _MOST = 5, 16, 64  # 64 pixels are shown at three times their size or more
+#: A crop has 1 / _PART of the smaller side, within these bounds in pixels.
+_PART, _LEAST, _MOST = 5, 16, 64  # crops are enlarged three times or more
 
 
 @dataclass
 class Panel:
-    """One setting at the common time.
+    """One curve at the common time.
 
     Attributes:
-        line: its curve.
-        step: the step nearest in time.
-        crop: PNG of the crop.
-        errors: PNG of the map.
+        line: the curve.
+        step: the step whose time is closest.
+        crop: PNG of the cropped picture.
+        errors: PNG of the error map.
     """
 
     line: Line
@@ -53,16 +53,16 @@ class Panel:
 
 @dataclass
 class Sheet:
-    """A scene's pictures.
+    """The pictures of a scene.
 
     Attributes:
         seconds: the common time.
-        place: x, y, width, height of the crop in pixels.
+        place: x, y, width and height of the crop in pixels.
         whole: PNG of the reference.
-        crop: PNG of its crop.
-        size: width and height of the picture.
-        panels: one a curve.
-        scale: least and greatest error of the maps' colours.
+        crop: PNG of the cropped reference.
+        size: width and height of the picture in pixels.
+        panels: one for each curve.
+        scale: smallest and largest error of the colour map.
     """
 
     seconds: float
@@ -75,14 +75,14 @@ class Sheet:
 
 
 def step_near(line: Line, seconds: float) -> Step:
-    """The step of a curve whose time is nearest, as a ratio."""
+    """Return the step of a curve whose time is closest to ``seconds``, by ratio."""
     return min(line.steps, key=lambda step: abs(math.log(step.seconds / seconds)))
 
 
 def hardest(errors: Tensor, side: int) -> tuple[int, int]:
-    """Where a square of ``side`` pixels holds most error: x and y of its corner in a map ``(H, W)``.
+    """Return x and y of the corner of the ``side``-pixel square with the largest errors in a map ``(H, W)``.
 
-    Errors count by their root, so that a single firefly does not choose.
+    Square roots of errors are summed, so that a single firefly does not decide.
     """
     sums = torch.nn.functional.avg_pool2d(errors.sqrt()[None, None], side, stride=1)[0, 0]
     place = int(sums.argmax())
@@ -90,9 +90,9 @@ def hardest(errors: Tensor, side: int) -> tuple[int, int]:
 
 
 def sheet_of(topic: Topic) -> Sheet | None:
-    """The pictures of all curves that have the first one's film, at the longest time that each of them has.
+    """Return pictures of all curves with the first one's film, at the longest time that all of them have.
 
-    Denoised ones have no say in where the crop lies.
+    The position of the crop does not depend on denoised curves.
     """
     truth, film = topic.lines[0].truth, topic.film
     lines = [line for line in topic.lines if line.truth.image.shape == truth.image.shape]
@@ -125,7 +125,7 @@ def _reduced(errors: Tensor) -> Tensor:
 
 
 def _scale(maps: Sequence[Tensor]) -> tuple[float, float]:
-    """Whole powers of ten about most values."""
+    """Return powers of ten that enclose most values."""
     values = torch.cat([found.flatten() for found in maps])
     values = values[values > 0].log10()
     if not len(values):
@@ -137,7 +137,7 @@ def _scale(maps: Sequence[Tensor]) -> tuple[float, float]:
 
 
 def _coloured(errors: Tensor, scale: tuple[float, float]) -> np.ndarray:
-    """A map in colours, by the logarithm."""
+    """Return an error map in false colours, on a logarithmic scale."""
     low, top = (math.log10(x) for x in scale)
     level = (errors.clamp_min(1e-30).log10() - low) / (top - low)
     return (false_colour(level, 1.0).numpy() * 255 + 0.5).astype(np.uint8)
@@ -151,27 +151,27 @@ def _png(levels: np.ndarray) -> bytes:
     return encoded.getvalue()
 
 
-# ---- The report as one file: every picture inside, no script, nothing asked of any server
+# ---- The page: self-contained HTML, without scripts
 
 
-#: As the curves' marks are drawn.
+#: Characters for the markers of curves.
 _MARKS = "●■▲◆▼✚✖★"
 _HOLLOW = "○□△◇▽✛✕☆"
-#: Name -> PNG and SVG.
+#: PNG and SVG.
 Figure = tuple[bytes, bytes]
 
 
 def page(
     study: Study, topics: Sequence[Topic], sheets: Sequence[Sheet | None], plots: Sequence[dict[str, Figure]], made: str
 ) -> str:
-    """The text of ``report.html``.
+    """Return the text of ``report.html``.
 
     Args:
-        study: what was asked.
-        topics: a scene each.
-        sheets: their pictures.
-        plots: their figures: ``seconds``, ``spp`` (where there is one) and ``measures``.
-        made: when and on what.
+        study: the study.
+        topics: the analysed scenes.
+        sheets: pictures of each scene.
+        plots: figures of each scene: ``seconds``, ``spp`` (if it has one) and ``measures``.
+        made: version, date and machine.
     """
     template = (Path(__file__).parent / "report.html").read_text(encoding="utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, undefined=jinja2.StrictUndefined)
@@ -206,7 +206,7 @@ def _scene(study: Study, topic: Topic, sheet: Sheet | None, plots: dict[str, Fig
 
 
 def _headline(topic: Topic, main: str) -> str:
-    """Who is first, and by how much, among settings without bias; or that the runs do not tell."""
+    """Return a sentence on the fastest unbiased setting and its lead, or that it is not significant; "" for a single one."""
     able = [line for line in topic.lines if line.estimates and not (line.bias and line.bias["biased"])]
     lines = sorted(
         (line for line in able if line.times and line.times[-1]["seconds"]), key=lambda line: line.times[-1]["seconds"]
@@ -345,7 +345,7 @@ def _sheet(sheet: Sheet, main: str) -> dict[str, Any]:
 
 
 def _plot(figure: Figure, alt: str) -> dict[str, Any]:
-    """The vector form, with the size in pixels that keeps its place while it loads."""
+    """Return an SVG and its size in pixels, which reserves its space while it loads."""
     text = figure[1].decode()
     wide, high = (float(text.partition(f'{name}="')[2].partition("pt")[0]) for name in ("width", "height"))
     return {"data": _data(figure[1], "svg+xml"), "alt": alt, "width": round(wide), "height": round(high)}
@@ -363,7 +363,7 @@ def _ramp() -> str:
 
 
 def _method(study: Study) -> list[str]:
-    """What a reader must know to trust the figures."""
+    """Return paragraphs on the method of measurement."""
     seeds, steps = study.asked["seeds"], ", ".join(map(words.count, study.asked["spp"]))
     denoised = (
         "Denoised curves, of loose dashes and hollow marks, show the pictures of the same runs, denoised by what first "
@@ -386,7 +386,7 @@ def _method(study: Study) -> list[str]:
 
 
 def _settings(topics: Sequence[Topic]) -> str:
-    """What ran, as a scene file would state it."""
+    """Return the complete settings as YAML."""
     import yaml
 
     shown: dict[str, Any] = {}
