@@ -578,14 +578,14 @@ def test_nothing_piles_up():
 
 
 def test_what_watches_may_raise():
-    class Stop(Exception):
+    class StopRules(Exception):
         pass
 
     def stop(done: int, total: int | None) -> None:
         if done == 2:
-            raise Stop
+            raise StopRules
 
-    with pytest.raises(Stop):
+    with pytest.raises(StopRules):
         torchpt.render_batch([room(0.1 * k) for k in range(4)], on_progress=stop, threads=2)
 
 

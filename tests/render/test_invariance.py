@@ -25,7 +25,7 @@ from torchpt.engines.kernels import threads
 from torchpt.physics.film import FILTERS
 from torchpt.physics.samplers import KINDS as SAMPLERS
 from torchpt.rendering.api import Rendering, render_scene
-from torchpt.rendering.stopping import Stop
+from torchpt.rendering.stopping import StopRules
 from torchpt.scene.formats.description import settings
 
 #: Nothing here is a whole number of vectors, and five samples are passes of 2, 2 and 1.
@@ -182,7 +182,7 @@ def same(a: Rendering, b: Rendering) -> bool:
     )
 
 
-def one_by_one(self: Stop, taken: int) -> int:
+def one_by_one(self: StopRules, taken: int) -> int:
     """Passes of one sample each."""
     return int(taken < self.render.spp)
 
@@ -214,10 +214,10 @@ def test_the_same_bits(scene_of, monkeypatch, name, mode):
         assert same(shot(scene, wish, mode, **changed), whole), column
     if mode == "compiled":
         with monkeypatch.context() as patched:
-            patched.setattr(Stop, "step", one_by_one)
+            patched.setattr(StopRules, "step", one_by_one)
             assert same(shot(scene, wish, mode), whole), "passes"
     else:
-        monkeypatch.setattr(Stop, "step", one_by_one)
+        monkeypatch.setattr(StopRules, "step", one_by_one)
     part = shot(scene, wish, mode, {"crop": [4, 2, 11, 9]})
     assert torch.equal(part.image, whole.image[2:11, 4:15]), "crop"
     assert all(torch.equal(part.layers[layer], whole.layers[layer][2:11, 4:15]) for layer in part.layers), "crop"

@@ -56,7 +56,7 @@ def box() -> torchpt.Scene:
 
 
 @contextmanager
-def in_pieces(which: Callable[[int], bool], error: Callable[[], Exception]) -> Iterator[list[int]]:
+def map_in_pieces(which: Callable[[int], bool], error: Callable[[], Exception]) -> Iterator[list[int]]:
     """Context in which operations within pieces of passes fail, counted over the whole render; gives how many there were."""
     from torchpt.engines.tensors_forward import TensorsForward
 
@@ -98,14 +98,14 @@ def same(a: Any, b: Any) -> bool:
 @pytest.mark.slow
 def test_a_failure_at_any_operation_of_a_piece_changes_no_bit(box, step):
     """Each operation of a render fails once, the copies into the films included."""
-    with in_pieces(lambda k: False, MemoryError) as counted:
+    with map_in_pieces(lambda k: False, MemoryError) as counted:
         whole = eager(box)
     count = counted[0]
     assert count > 300 and whole.lanes is None
     kinds = list(FAILURES.values())
     # The last ones are those that put the piece into the films.
     for number in (*range(0, count - 25, step), *range(count - 25, count)):
-        with in_pieces(lambda k, number=number: k == number, kinds[number % len(kinds)]):
+        with map_in_pieces(lambda k, number=number: k == number, kinds[number % len(kinds)]):
             found = eager(box)
         assert same(found, whole), number
 
@@ -115,7 +115,7 @@ def test_a_failure_at_any_operation_of_a_piece_changes_no_bit(box, step):
 def test_failures_again_and_again_halve_waves_further(box, kind, capsys):
     warn_once.cache_clear()
     whole = eager(box, 24, pilots=True)
-    with in_pieces(lambda k: k in (299, 1010, 1300, 1700), FAILURES[kind]):
+    with map_in_pieces(lambda k: k in (299, 1010, 1300, 1700), FAILURES[kind]):
         found = eager(box, 24, pilots=True)
     assert same(found, whole) and found.lanes is not None and found.lanes < 13
     assert found.summary()["lanes"] == found.lanes
@@ -125,7 +125,7 @@ def test_failures_again_and_again_halve_waves_further(box, kind, capsys):
 @pytest.mark.slow
 def test_where_a_single_lane_does_not_fit_it_is_one_line(box):
     with (
-        in_pieces(lambda k: True, MemoryError),
+        map_in_pieces(lambda k: True, MemoryError),
         pytest.raises(RenderError, match="not enough memory for a wave") as told,
     ):
         eager(box)
@@ -136,7 +136,7 @@ def test_other_errors_are_not_taken_for_it(box):
     def other() -> Exception:
         return RuntimeError("shapes do not match")
 
-    with in_pieces(lambda k: k == 40, other), pytest.raises(RuntimeError, match="shapes"):
+    with map_in_pieces(lambda k: k == 40, other), pytest.raises(RuntimeError, match="shapes"):
         eager(box)
     assert not is_out_of_memory(RenderError("not enough memory for it")) and not is_out_of_memory(ValueError("memory"))
     assert is_out_of_memory(OSError(12, "Cannot allocate memory"))

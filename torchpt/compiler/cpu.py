@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchpt.compiler.form import VECTORS, Form
-from torchpt.core.memory import check_room
+from torchpt.core.memory import check_address_space
 from torchpt.native import cache
 
 __all__ = [
@@ -71,7 +71,7 @@ def _llvm() -> Any:
 def host() -> Target:
     """This machine."""
     if "host" not in _state:
-        check_room()
+        check_address_space()
         llvm = _llvm()
         _state["host"] = Target(llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
     return _state["host"]
@@ -90,7 +90,7 @@ def compiled(ir: str, target: Target | None = None) -> Function:
         function = _functions.get(key)
         if function is None:
             code = cache.read(f"{key[:40]}.o")
-            check_room()  # LLVM ends the process where it finds no memory
+            check_address_space()  # LLVM ends the process where it finds no memory
             if code is None:
                 code = _object(ir, target)
                 _state["compiled"] += 1
@@ -107,7 +107,7 @@ def kept(key: str) -> Function | None:
         function = _functions.get(key)
         code = cache.read(f"{key[:40]}.o") if function is None else None
         if code is not None:
-            check_room()
+            check_address_space()
             _state["loaded"] += 1
             function = _functions[key] = _loaded(code, host(), key)
         return function

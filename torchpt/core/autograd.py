@@ -14,7 +14,7 @@ from torch._C._functorch import get_unwrapped, is_batchedtensor, is_functorch_wr
 from torchpt.core.errors import TorchptError
 from torchpt.core.threads import without_autocast
 
-__all__ = ["Backward", "Forward", "custom_vjp", "in_batch", "in_transform", "outside_transforms", "wants_gradients"]
+__all__ = ["Backward", "Forward", "custom_vjp", "is_batched", "is_transformed", "outside_transforms", "wants_gradients"]
 
 Forward = Callable[..., tuple[Tensor, ...]]
 Backward = Callable[..., Sequence[Tensor | None]]
@@ -33,23 +33,24 @@ _BATCHES = (
 
 
 def custom_vjp(
-    forward: Forward, backward: Backward, tensors: tuple[Tensor, ...], held: tuple[Tensor, ...] = ()
+    forward: Forward, backward: Backward, tensors: tuple[Tensor, ...], captured: tuple[Tensor, ...] = ()
 ) -> tuple[Tensor, ...]:
-    """Return ``forward(*tensors)``, differentiable in ``tensors`` and ``held`` by ``backward``.
+    """Return ``forward(*tensors)``, differentiable in ``tensors`` and ``captured`` by ``backward``.
 
     Both functions get plain tensors, unwrapped from transforms of ``torch.func``. Under ``vmap``, and for batches of
     cotangents (``jacrev``), they are called once for each element.
 
     Args:
         forward: returns a tuple of tensors, given ``tensors``.
-        backward: the VJP: returns cotangents of ``tensors`` and ``held``, given those of the results (a tuple) and ``tensors``.
+        backward: the VJP: returns cotangents of ``tensors`` and ``captured``, given those of the results (a tuple) and
+            ``tensors``.
         tensors: arguments of both.
-        held: tensors that both functions capture, such as weights of modules; they may change before the backward pass.
+        captured: tensors that both functions capture, such as weights of modules; they may change before the backward pass.
 
     Raises:
         TorchptError: forward-mode derivatives; in the backward pass, second derivatives.
     """
-    return _Taped.apply(forward, backward, len(held), *tensors, *held)  # pyright: ignore[reportReturnType]
+    return _CustomVjp.apply(forward, backward, len(captured), *tensors, *captured)  # pyright: ignore[reportReturnType]
 
 
 def wants_gradients(value: Tensor) -> bool:
@@ -57,12 +58,12 @@ def wants_gradients(value: Tensor) -> bool:
     return any(level.requires_grad for level in _levels(value))
 
 
-def in_batch(value: Tensor) -> bool:
+def is_batched(value: Tensor) -> bool:
     """Return True if a tensor is batched by ``vmap``, at any level of nested transforms of ``torch.func``."""
     return any(is_batchedtensor(level) for level in _levels(value))
 
 
-def in_transform(value: Tensor) -> bool:
+def is_transformed(value: Tensor) -> bool:
     """Return True if a transform of ``torch.func`` wraps a tensor, so that its values cannot be read."""
     return is_functorch_wrapped_tensor(value)
 
@@ -80,19 +81,19 @@ def _levels(value: Tensor) -> Iterator[Tensor]:
         yield value
 
 
-class _Taped(torch.autograd.Function):
+class _CustomVjp(torch.autograd.Function):
     @staticmethod
-    def forward(forward: Forward, backward: Backward, held: int, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(forward(*(t.detach() for t in tensors[: len(tensors) - held])))
+    def forward(forward: Forward, backward: Backward, captured: int, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return tuple(forward(*(t.detach() for t in tensors[: len(tensors) - captured])))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _, ctx.work, ctx.held, *tensors = inputs
-        ctx.save_for_backward(*tensors[: len(tensors) - ctx.held])
+        _, ctx.work, ctx.captured, *tensors = inputs
+        ctx.save_for_backward(*tensors[: len(tensors) - ctx.captured])
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        found = _Back.apply(ctx.work, len(cotangents), *cotangents, *ctx.saved_tensors)
+        found = _CustomVjpBackward.apply(ctx.work, len(cotangents), *cotangents, *ctx.saved_tensors)
         assert found is not None
         return (None, None, None, *found)
 
@@ -102,10 +103,10 @@ class _Taped(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
-        return _each(_Taped.apply, info.batch_size, in_dims, arguments)
+        return _each(_CustomVjp.apply, info.batch_size, in_dims, arguments)
 
 
-class _Back(torch.autograd.Function):
+class _CustomVjpBackward(torch.autograd.Function):
     """The backward pass as a function of its own, on which ``torch.func`` may call ``vmap`` or differentiate again."""
 
     @staticmethod
@@ -131,7 +132,7 @@ class _Back(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
-        return _each(_Back.apply, info.batch_size, in_dims, arguments)
+        return _each(_CustomVjpBackward.apply, info.batch_size, in_dims, arguments)
 
 
 def _each(

@@ -29,20 +29,20 @@ from torchpt.core.errors import RenderError, SceneError, TorchptError, warn_once
 __all__ = [
     "FEWEST",
     "Budget",
-    "Meter",
+    "MemoryMeter",
     "Span",
     "after_import",
+    "check_address_space",
     "check_limit",
     "check_memory",
-    "check_room",
+    "explain_out_of_memory",
     "fits_in_memory",
     "free_memory",
     "is_out_of_memory",
     "mb",
-    "needing",
     "on_low_memory",
     "release_memory",
-    "retried",
+    "retry_out_of_memory",
 ]
 
 #: Lanes of the first wave under a limit. After it all code is loaded, whose memory must not count as that of lanes.
@@ -78,7 +78,7 @@ Span = tuple[int, int, int, int]
 # -- used and free memory
 
 
-class Meter:
+class MemoryMeter:
     """Memory in use on a device, in bytes: resident pages of the process on a CPU, tensors on CUDA.
 
     Args:
@@ -164,7 +164,7 @@ def _of_group() -> int | None:
         return None
 
 
-def check_room(size: int = MARGIN) -> None:
+def check_address_space(size: int = MARGIN) -> None:
     """Raise if the process cannot get ``size`` more bytes of address space.
 
     Called before libraries that would abort the process then (LLVM, OpenMP, BLAS).
@@ -244,7 +244,7 @@ def fits_in_memory(work: Callable[[], object]) -> bool:
 
 
 @contextmanager
-def needing(what: str | Callable[[], str]) -> Iterator[None]:
+def explain_out_of_memory(what: str | Callable[[], str]) -> Iterator[None]:
     """Turn out-of-memory errors within into a line that names ``what``: a text, or a function that returns it.
 
     Raises:
@@ -258,10 +258,10 @@ def needing(what: str | Callable[[], str]) -> Iterator[None]:
     else:
         return
     told = what if isinstance(what, str) else what()
-    raise RenderError(f"not enough memory for {told}, with {mb(Meter(torch.device('cpu')).above())} held already")
+    raise RenderError(f"not enough memory for {told}, with {mb(MemoryMeter(torch.device('cpu')).above())} held already")
 
 
-def retried(what: str | Callable[[], str], work: Callable[[], T]) -> T:
+def retry_out_of_memory(what: str | Callable[[], str], work: Callable[[], T]) -> T:
     """Return ``work()``; if memory runs out, release memory and try once more.
 
     Raises:
@@ -270,7 +270,7 @@ def retried(what: str | Callable[[], str], work: Callable[[], T]) -> T:
     found: list[T] = []
     if not fits_in_memory(lambda: found.append(work())):
         release_memory()
-        with needing(what):
+        with explain_out_of_memory(what):
             return work()
     return found[0]
 
@@ -304,7 +304,7 @@ def check_memory(limit: int, device: torch.device, least: Callable[[int], int], 
         SceneError: the limit is too small; the message gives the least.
     """
     release_memory()
-    enough = max(least(Meter(device).above()), loading)
+    enough = max(least(MemoryMeter(device).above()), loading)
     check_limit(limit, enough, f"at least {mb(enough)} for this scene and film")
 
 
@@ -339,7 +339,7 @@ class Budget:
         per_lane: int = 0,
         fewest: int = 1,
     ) -> None:
-        self.meter, self.threads, self.fewest, self.per_lane = Meter(device), threads, fewest, per_lane
+        self.meter, self.threads, self.fewest, self.per_lane = MemoryMeter(device), threads, fewest, per_lane
         self.what, self.instead, self.short = what, instead, False
         self.limit = None if limit is None else self.meter.base() + limit
         self._most = max(lanes, 1)

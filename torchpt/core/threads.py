@@ -1,13 +1,13 @@
 """Threads: the thread pool of the process, and torch's number of threads and modes while it works.
 
 A caller takes idle threads of the pool and starts the missing ones, so overlapping renders never wait for each other's threads.
-There are three ways to use them: :func:`deal` runs a task for each item and passes results on in the order of items; a
-:class:`Crew` runs tasks of a queue that may grow; :func:`share` splits a range into a part for each thread. Idle threads end
-before the process forks; a child has a pool of its own.
+There are three ways to use them: :func:`map_in_order` runs a task for each item and passes results on in the order of items; a
+:class:`TaskQueue` runs tasks of a queue that may grow; :func:`share` splits a range into a part for each thread. Idle threads
+end before the process forks; a child has a pool of its own.
 
 On a CPU torch splits a tensor of more than 32,768 elements among its threads. The last elements of a part do not fill a vector,
 and functions whose scalar code differs from their vector code (``atan2``, ``pow``) round them differently. A sum over all
-elements becomes a sum of the threads' sums. :func:`in_pieces`, :func:`sum_all` and :func:`mean_all` have on any number of
+elements becomes a sum of the threads' sums. :func:`map_in_pieces`, :func:`sum_all` and :func:`mean_all` have on any number of
 threads the bits of one thread.
 """
 
@@ -28,21 +28,21 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import check_room, fits_in_memory
+from torchpt.core.memory import check_address_space, fits_in_memory
 
 __all__ = [
-    "Crew",
-    "deal",
-    "in_pieces",
-    "lasting",
+    "TaskQueue",
     "limited_threads",
+    "map_in_order",
+    "map_in_pieces",
     "mean_all",
     "one_thread",
-    "settle",
+    "outside_inference_mode",
     "share",
-    "start_team",
+    "start_torch_threads",
     "sum_all",
     "thread_count",
+    "warm_up",
     "without_autocast",
 ]
 
@@ -127,17 +127,17 @@ def _before_fork() -> None:
 
 def _after_fork() -> None:
     """Forget all threads after a fork: the child has neither its parent's nor torch's, and would wait forever."""
-    global _wish, _starting
+    global _torch_threads, _starting
     _idle.clear()
     _starting = threading.Lock()
-    _wish = _Wish(forked=True)
+    _torch_threads = _TorchThreads(forked=True)
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_before_fork, after_in_child=_after_fork)
 
 
-class Crew(Generic[T, R]):
+class TaskQueue(Generic[T, R]):
     """Threads of the pool that run the tasks of one queue.
 
     Args:
@@ -204,7 +204,7 @@ class Crew(Generic[T, R]):
             del job, tag, task
 
 
-def deal(
+def map_in_order(
     items: Iterable[T],
     task: Callable[[T], R],
     threads: int,
@@ -229,7 +229,7 @@ def deal(
         Exception: the exception of a task or of ``each``; of several tasks that of the first in order.
     """
     halt = halt or threading.Event()
-    crew, left = Crew[int, R](threads), enumerate(items)
+    queue, left = TaskQueue[int, R](threads), enumerate(items)
     found: dict[int, R | BaseException] = {}
     begun = told = 0
 
@@ -253,11 +253,11 @@ def deal(
                 item = next(left, None)
                 if item is None:
                     break
-                crew.add(item[0], functools.partial(task, item[1]))
+                queue.add(item[0], functools.partial(task, item[1]))
                 begun += 1
             if told == begun:
                 return
-            came = crew.next(wait=True)
+            came = queue.next(wait=True)
             if came is not None:
                 found[came[0]] = came[1]
             tell()
@@ -267,8 +267,8 @@ def deal(
         halt.set()
         raise
     finally:
-        crew.close()
-    while (came := crew.next(wait=False)) is not None:  # tasks that were running
+        queue.close()
+    while (came := queue.next(wait=False)) is not None:  # tasks that were running
         found[came[0]] = came[1]
     late = [found[number] for number in sorted(found)]
     for result in late:
@@ -325,23 +325,23 @@ def thread_count(threads: int | None) -> int:
     return max(1, int(threads)) if threads else max(1, torch.get_num_threads())
 
 
-class _Wish:
+class _TorchThreads:
     """Torch's number of threads before the first of overlapping renders, and the number of those."""
 
     def __init__(self, forked: bool) -> None:
         self.forked, self.lock = forked, threading.Lock()
         self.before, self.renders = 0, 0
 
-    def enter(self, wish: int | str) -> None:
+    def enter(self, threads: int | str) -> None:
         with self.lock:
             if self.renders == 0:
                 self.before = torch.get_num_threads()
             self.renders += 1
             # Torch's thread pool does not survive a fork: the child would wait for it forever.
-            now = 1 if self.forked else self.before if wish == "auto" else int(wish)
+            now = 1 if self.forked else self.before if threads == "auto" else int(threads)
             if now != torch.get_num_threads():
                 torch.set_num_threads(now)
-            start_team()
+            start_torch_threads()
 
     def leave(self) -> None:
         with self.lock:
@@ -352,18 +352,18 @@ class _Wish:
 
 
 #: One for the process, as torch's number of threads is.
-_wish = _Wish(forked=False)
+_torch_threads = _TorchThreads(forked=False)
 
 
 @contextmanager
-def limited_threads(wish: int | str) -> Iterator[None]:
-    """Let torch use ``wish`` threads within, also in overlapping renders."""
-    here = _wish
-    here.enter(wish)
+def limited_threads(threads: int | str) -> Iterator[None]:
+    """Let torch use ``threads`` threads within, also in overlapping renders."""
+    here = _torch_threads
+    here.enter(threads)
     try:
         yield
     finally:
-        if here is _wish:  # otherwise this is the child of a fork, where another thread may hold the lock
+        if here is _torch_threads:  # otherwise this is the child of a fork, where another thread may hold the lock
             here.leave()
 
 
@@ -381,7 +381,7 @@ def one_thread() -> Iterator[None]:
 
 
 @functools.cache
-def settle() -> None:
+def warm_up() -> None:
     """Call MKL's vector functions once, before several threads do.
 
     MKL selects code for the processor at its first call. If two threads do so at once, half a tensor may be computed by less
@@ -397,14 +397,14 @@ def settle() -> None:
 _started: set[int] = set()
 
 
-def start_team() -> None:
+def start_torch_threads() -> None:
     """Start torch's threads for the calling thread; without memory for them set torch to one thread.
 
     OpenMP aborts the process if it cannot start a thread, which happens at the first large tensor.
     """
     count = torch.get_num_threads()
     if count > 1 and count not in _started:
-        if fits_in_memory(lambda: check_room(count * _STACK)):
+        if fits_in_memory(lambda: check_address_space(count * _STACK)):
             torch.zeros(count * _GRAIN).add_(1.0)
             _started.add(count)
         else:
@@ -412,7 +412,7 @@ def start_team() -> None:
 
 
 @contextmanager
-def lasting() -> Iterator[None]:
+def outside_inference_mode() -> Iterator[None]:
     """Leave ``torch.inference_mode`` within: tensors made in that mode cannot be used outside of it."""
     if torch.is_inference_mode_enabled():
         with torch.inference_mode(False), torch.no_grad():  # inference_mode(False) alone enables gradients
@@ -424,14 +424,14 @@ def lasting() -> Iterator[None]:
 @contextmanager
 def without_autocast(device: torch.device) -> Iterator[None]:
     """Disable gradients, ``torch.autocast`` (which would round products to half precision) and inference mode."""
-    with lasting(), torch.no_grad(), torch.autocast(device.type, enabled=False):
+    with outside_inference_mode(), torch.no_grad(), torch.autocast(device.type, enabled=False):
         yield
 
 
 # -- results that do not depend on the number of threads
 
 
-def in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
+def map_in_pieces(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
     """Return an elementwise ``function`` of tensors of one shape, computed in pieces of one thread each."""
     first = given[0]
     if first.device.type != "cpu" or first.numel() <= PIECE:

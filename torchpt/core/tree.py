@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["UNPRINTED", "fingerprint", "leaves", "map_leaves", "named_leaves", "rebuild", "signature"]
+__all__ = ["NOT_FINGERPRINTED", "fingerprint", "leaves", "map_leaves", "named_leaves", "rebuild", "signature"]
 
 T = TypeVar("T")
 
-#: ``field(metadata=UNPRINTED)`` for a dataclass field on which no picture depends, such as the path of a file.
-UNPRINTED = {"fingerprint": False}
+#: ``field(metadata=NOT_FINGERPRINTED)`` for a dataclass field on which no picture depends, such as the path of a file.
+NOT_FINGERPRINTED = {"fingerprint": False}
 
 _TENSOR, _MAPPING, _SEQUENCE, _STATIC = range(4)
 #: For each class, how its instances are walked: one of the above, or the names of dataclass fields.
@@ -194,16 +194,17 @@ _LIBRARIES = {"torchpt", "torch", "numpy", "builtins", *sys.stdlib_module_names}
 def fingerprint(record: Any) -> bytes:
     """Return a hash of 16 bytes, the same for equal records in any process and on any device.
 
-    It covers types, values, and the bytes of tensors and arrays, but no field marked :data:`UNPRINTED`. Classes and functions
-    of a user count by their code without comments, with the functions and plain values of their module that the code names.
+    It covers types, values, and the bytes of tensors and arrays, but no field marked :data:`NOT_FINGERPRINTED`. Classes and
+    functions of a user count by their code without comments, with the functions and plain values of their module that the
+    code names.
 
     Raises:
         TypeError: an object whose contents cannot be read, such as a lock or an open file.
     """
-    return _Printer().digest(record)
+    return _Fingerprinter().digest(record)
 
 
-class _Printer:
+class _Fingerprinter:
     """One call of :func:`fingerprint`."""
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import warn_once
 from torchpt.core.memory import Budget, Span, is_out_of_memory
-from torchpt.core.threads import deal
+from torchpt.core.threads import map_in_order
 from torchpt.engines.engine import LANES_OF_KERNELS, Backward, BackwardKernels, backward_kernels, backward_tensors
 from torchpt.gradients.parameters import SceneTape
 from torchpt.gradients.tape import sample_cotangents
@@ -191,7 +191,7 @@ def _over_threads(
 
     while True:
         try:
-            deal(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
+            map_in_order(_spans(blocks, settings.render.spp), task, budget.threads, merge, ahead=2 * budget.threads)
             return ""
         except Unsupported as error:
             return f"no kernel can be made of {error}"

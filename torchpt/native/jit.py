@@ -23,7 +23,7 @@ from numba.core.compiler import CompileResult
 from numba.core.event import Event, Listener, register
 
 from torchpt.core.errors import RenderError
-from torchpt.core.memory import MARGIN, check_room
+from torchpt.core.memory import MARGIN, check_address_space
 from torchpt.core.threads import share
 from torchpt.native import cache, compile_time
 from torchpt.native.content import code_of_function
@@ -130,7 +130,7 @@ def compiled(kernel: Any, *args: Any) -> Any:
     """The kernel, compiled for arguments with which it does nothing; says so on stderr, once, where that takes long."""
     if not kernel.overloads:
         # LLVM ends the process where it finds no memory, and so does the BLAS that numba brings along with its first kernel.
-        check_room(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN)
+        check_address_space(MARGIN if "numba.np.arraymath" in sys.modules else 4 * MARGIN)
         timer = threading.Timer(_PATIENCE, _say)
         timer.daemon = True
         timer.start()

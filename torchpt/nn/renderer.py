@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchpt.core.errors import SceneError
-from torchpt.nn.ranges import range_of
+from torchpt.nn.parametrizations import parametrization_of
 from torchpt.rendering.api import render
 from torchpt.scene import Scene
 from torchpt.scene.devices import device_of
@@ -25,9 +25,10 @@ __all__ = ["Renderer"]
 class Renderer(nn.Module):
     """A module that renders a scene and optimizes its parameters.
 
-    The parameters are unconstrained ``nn.Parameter`` tensors, which :mod:`torchpt.nn.ranges` maps to their ranges; ``values()``
-    returns the mapped ones. As long as they are finite the scene can be rendered, with two exceptions: positions too far away,
-    and parameters that do not fit together, such as a ``beam_width`` above the ``cutoff_angle``: the render refuses them.
+    The parameters are unconstrained ``nn.Parameter`` tensors, which :mod:`torchpt.nn.parametrizations` maps to their ranges;
+    ``values()`` returns the mapped ones. As long as they are finite the scene can be rendered, with two exceptions: positions
+    too far away, and parameters that do not fit together, such as a ``beam_width`` above the ``cutoff_angle``: the render
+    refuses them.
 
     Each ``forward`` in training mode draws new samples: with the same ones in every step an optimizer would fit their noise.
     The seed is ``seed + steps``, where the buffer ``steps`` counts calls in training mode; with ``torch.distributed``
@@ -45,7 +46,7 @@ class Renderer(nn.Module):
         rigid: True: poses move rigidly (six numbers each); False: their 16 numbers are optimized, except for poses that must
             keep angles, as those of spheres and cameras.
         full: True makes calls return a :class:`torchpt.Rendering`.
-        wishes: further arguments of ``torchpt.render`` for all calls.
+        options: further arguments of ``torchpt.render`` for all calls.
 
     Raises:
         SceneError: no scene, a name or pattern that matches no parameter, or an argument that ``forward`` or this class has.
@@ -63,22 +64,23 @@ class Renderer(nn.Module):
         seed: int = 0,
         rigid: bool = True,
         full: bool = False,
-        **wishes: Unpack[Common],
+        **options: Unpack[Common],
     ) -> None:
         super().__init__()
-        check_names("Renderer", wishes, RenderOptions, ("names", "rigid"))
+        check_names("Renderer", options, RenderOptions, ("names", "rigid"))
         if type(rigid) is not bool:
             raise SceneError("rigid", rigid, "True or False")
-        if "params" in wishes:
-            raise SceneError("params", wishes["params"], "an argument of Renderer.forward")
+        if "params" in options:
+            raise SceneError("params", options["params"], "an argument of Renderer.forward")
         if type(seed) is not int or seed < 0:
             raise SceneError("seed", seed, "a whole number >= 0")
-        self.scene, self.seed, self.full, self.wishes = as_scene(scene), seed, full, wishes
+        self.scene, self.seed, self.full, self.options = as_scene(scene), seed, full, options
         self.names = () if names is None else _chosen(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
             ranges = [
-                range_of(scene.spec(n), start, rigid, scene.length) for n, start in zip(self.names, starts, strict=True)
+                parametrization_of(scene.spec(n), start, rigid, scene.length)
+                for n, start in zip(self.names, starts, strict=True)
             ]
             free = {
                 _key(name): nn.Parameter(found.inverse(start).clone())
@@ -94,7 +96,7 @@ class Renderer(nn.Module):
         *,
         seed: int | None = None,
         full: bool | None = None,
-        **wishes: Unpack[Common],
+        **options: Unpack[Common],
     ) -> Any:
         """Render the scene with the current parameters.
 
@@ -102,12 +104,12 @@ class Renderer(nn.Module):
             params: tensors in place of parameters of the scene or of this module, by dotted name, such as those of the camera.
             seed: seed in place of the counted one.
             full: in place of the constructor's ``full``.
-            wishes: arguments of ``torchpt.render``, in place of the constructor's.
+            options: arguments of ``torchpt.render``, in place of the constructor's.
 
         Returns:
             The picture ``(H, W, 3)``; with ``full=True`` a :class:`torchpt.Rendering`.
         """
-        given: Common = {**self.wishes, **wishes}
+        given: Common = {**self.options, **options}
         if seed is None:
             seed = self._next_seed(given.get("ranks") is not None)
         full = self.full if full is None else full

@@ -13,7 +13,7 @@ from typing import Any
 from torchpt.core.errors import LostRankError, RenderError, TorchptError
 from torchpt.ranks.group import TIMEOUT, Group
 
-__all__ = ["Started"]
+__all__ = ["LaunchedProcess"]
 
 #: Seconds between two checks for signals.
 PAUSE = 0.02
@@ -21,14 +21,14 @@ PAUSE = 0.02
 NAMES = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 
-class Started:
+class LaunchedProcess:
     """A process that was started as one of several ranks.
 
     Args:
         timeout: seconds until a missing or silent rank is given up.
 
     Attributes:
-        group: the ranks, after :meth:`meet`.
+        group: the ranks, after :meth:`connect`.
 
     Raises:
         RenderError: a variable of the environment is missing, or PyTorch was built without gloo.
@@ -49,7 +49,7 @@ class Started:
         self._timeout = timeout
         self._store: Any = None
 
-    def meet(self, check: Callable[[], None]) -> None:
+    def connect(self, check: Callable[[], None]) -> None:
         """Connect to the other ranks.
 
         Args:
@@ -62,7 +62,7 @@ class Started:
 
         def work() -> None:
             try:
-                self._meet()
+                self._connect()
             except TorchptError as error:
                 failed.append(error)
             except (RuntimeError, ValueError) as error:
@@ -78,7 +78,7 @@ class Started:
         if failed:
             raise failed[0]
 
-    def _meet(self) -> None:
+    def _connect(self) -> None:
         import torch
         import torch.distributed as dist
         from torch.distributed.distributed_c10d import PrefixStore
@@ -102,7 +102,7 @@ class Started:
             return self._store is None or self._store.add(f"said/{zlib.crc32(line.encode())}", 1) == 1
         return True
 
-    def leave(self) -> None:
+    def disconnect(self) -> None:
         """Close the connections; all ranks must call it."""
         import torch.distributed as dist
 

@@ -25,7 +25,7 @@ from torchpt.core.version import __version__
 from torchpt.images.write import check_writable, place_of, reason_of, temporary_beside
 from torchpt.paths.nonfinite import NonFinite, Place
 from torchpt.rendering.error import FIRST_ROUND
-from torchpt.rendering.stopping import BLOCK, Stop
+from torchpt.rendering.stopping import BLOCK, StopRules
 from torchpt.scene.fingerprint import fingerprints
 from torchpt.scene.scene import Scene
 from torchpt.scene.settings import Settings, having
@@ -34,7 +34,17 @@ from torchpt.spec import Role
 if TYPE_CHECKING:
     from torchpt.rendering.run import Run
 
-__all__ = ["EVERY", "FREE", "Keeper", "State", "check_samples", "check_whole", "ends_a_pass", "identity", "read_arrays"]
+__all__ = [
+    "EVERY",
+    "FREE",
+    "CheckpointFile",
+    "RenderState",
+    "check_samples",
+    "check_whole",
+    "ends_a_pass",
+    "identity",
+    "read_arrays",
+]
 
 
 # ---- Read an ``.npz`` archive from an untrusted source: arrays of numbers only, none larger than the file
@@ -109,7 +119,7 @@ _FORMAT = 3
 
 
 @dataclass
-class State:
+class RenderState:
     """The state of a render between two passes.
 
     Attributes:
@@ -136,7 +146,7 @@ def identity(
     }
 
 
-class Keeper:
+class CheckpointFile:
     """The checkpoint file of one render.
 
     Args:
@@ -166,7 +176,7 @@ class Keeper:
         """Return True if it is time for another checkpoint."""
         return time.perf_counter() - self._last >= max(EVERY, PATIENCE * self._took)
 
-    def write(self, state: State) -> None:
+    def write(self, state: RenderState) -> None:
         """Replace the checkpoint.
 
         Raises:
@@ -180,7 +190,7 @@ class Keeper:
             self._took = self._last - begun
             self.seconds += self._took
 
-    def _write(self, state: State) -> None:
+    def _write(self, state: RenderState) -> None:
         destination = place_of(self.path, (self.path.suffix.lower(),))
         temporary = temporary_beside(destination)
         text = json.dumps({"format": _FORMAT, "of": self._of, **state.facts})
@@ -197,7 +207,7 @@ class Keeper:
             with suppress(OSError):  # it is only there after a failure
                 temporary.unlink()
 
-    def read(self, like: State, check: Callable[[State], None] | None = None) -> State | None:
+    def read(self, like: RenderState, check: Callable[[RenderState], None] | None = None) -> RenderState | None:
         """Return the checkpoint, its ``render.spp`` among the facts; None if there is no file.
 
         Args:
@@ -235,7 +245,7 @@ class Keeper:
         for key, there, here in _differences(facts.pop("of"), of):
             said = f"its {key} are others" if key.startswith("scene.") else f"{key}: {there} there, {here} here"
             raise AssetError(self.path, f"is the checkpoint of another render ({said})")
-        state = State(facts, {name: torch.from_numpy(value) for name, value in arrays.items()})
+        state = RenderState(facts, {name: torch.from_numpy(value) for name, value in arrays.items()})
         _check_facts(state, like, self.path)
         if check is not None:
             check(state)
@@ -243,7 +253,7 @@ class Keeper:
         return state
 
 
-def _check_facts(state: State, like: State, path: Path) -> None:
+def _check_facts(state: RenderState, like: RenderState, path: Path) -> None:
     """Raise AssetError where a fact is missing or has another type than in ``like``."""
     for name, value in like.facts.items():
         there: Any = state.facts.get(name)
@@ -258,7 +268,7 @@ def _check_facts(state: State, like: State, path: Path) -> None:
             raise AssetError(path, f"is no whole checkpoint ({name} is {str(there)[:40]})")
 
 
-def _check_arrays(state: State, like: State, path: Path) -> None:
+def _check_arrays(state: RenderState, like: RenderState, path: Path) -> None:
     """Raise AssetError where an array is missing or has another shape or dtype than in ``like``."""
     for name, value in like.arrays.items():
         found = state.arrays.get(name)
@@ -282,7 +292,7 @@ def _differences(a: Any, b: Any, key: str = "") -> Iterator[tuple[str, str, str]
 # ---- Decide whether a render may resume from a checkpoint
 
 
-def check_samples(run: Run, state: State, path: Path) -> None:
+def check_samples(run: Run, state: RenderState, path: Path) -> None:
     """Refuse a checkpoint of another ``render.spp`` from which the picture would not get the bits of an uninterrupted render.
 
     Raises:
@@ -311,14 +321,14 @@ def check_samples(run: Run, state: State, path: Path) -> None:
 
 def ends_a_pass(run: Run, taken: int) -> bool:
     """Return True if ``target_error`` is checked after ``taken`` samples a pixel in a render without a time limit."""
-    stop = Stop(run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.streams.count)
+    stop = StopRules(run.settings.render.but(spp=taken + BLOCK, time_limit=None), run.picture.streams.count)
     end = taken - taken % (4 * BLOCK)  # passes from here on are whole blocks
     while end < taken:
         end += stop.step(end)
     return end == taken
 
 
-def check_whole(run: Run, state: State, path: Path) -> None:
+def check_whole(run: Run, state: RenderState, path: Path) -> None:
     """Refuse a checkpoint whose numbers no render of these settings can have.
 
     Sums may be negative (signed filters); AOVs of a user's models may be non-finite.
@@ -344,13 +354,13 @@ def check_whole(run: Run, state: State, path: Path) -> None:
     seen = counts["picture"] if run.integrator.light else next(iter(c for n, c in counts.items() if n != "picture"))
     total = int(seen.sum())
     if rounds:
-        assert run.twice is not None and run.twice.pixel_set.places is not None
-        pilots = seen.sum(0)[run.twice.pixel_set.places.cpu()]
+        assert run.probes is not None and run.probes.pixel_set.places is not None
+        pilots = seen.sum(0)[run.probes.pixel_set.places.cpu()]
         problems["pilots.counts"] |= bool((counts["pilots"].sum(0) != pilots).any())
         for name in run.picture.layers:
             problems[f"layers.{name}.counts"] |= bool((counts[f"layers.{name}"].sum(0) != seen.sum(0)).any())
         problems["picture.counts"] |= total > (facts["spp"] + BLOCK) * seen.shape[1]
-    if run.twice is not None:
+    if run.probes is not None:
         total += int(counts["pilots"].sum())
     problems["done"] = done != total
     problems["truncated"] = facts["truncated"] > done
@@ -367,7 +377,7 @@ def _finite(values: Iterable[Tensor]) -> bool:
 def _is_there(run: Run, place: Place, samples: int) -> bool:
     """Return True if the render takes this sample, in the picture or in its error probes."""
     x, y, width, height = run.wave.crop
-    pixel_sets = [run.picture] if run.twice is None else [run.picture, run.twice.pixel_set]
+    pixel_sets = [run.picture] if run.probes is None else [run.picture, run.probes.pixel_set]
     inside = x <= place.x < x + width and y <= place.y < y + height and place.sample < samples
     return inside and (place.first, place.streams) in [
         (pixel_set.streams.first, pixel_set.streams.count) for pixel_set in pixel_sets

@@ -25,7 +25,7 @@ from torchpt.physics.film.error import (
 from torchpt.physics.samplers import Streams
 from torchpt.scene.settings import Settings
 
-__all__ = ["FIRST_ROUND", "ErrorProbes", "Shares", "error_probes"]
+__all__ = ["FIRST_ROUND", "ErrorProbes", "SampleAllocation", "error_probes"]
 
 
 # ---- Error probes: pixels that are sampled a second time with independent random numbers
@@ -43,15 +43,15 @@ class ErrorProbes:
         pilots: the pixels.
         pixel_set: films of the second values.
         counted: True if the picture includes the second values.
-        third: third values of outliers and of uncertain pixels, and the number of outliers; None: not sampled yet.
-        looked: samples a pixel of the picture when third values were taken; None: not yet.
+        resampled: third values of outliers and of uncertain pixels, and the number of outliers; None: not sampled yet.
+        resampled_at: samples a pixel of the picture when third values were taken; None: not yet.
     """
 
     pilots: Pilots
     pixel_set: PixelSet
     counted: bool
-    third: tuple[PixelSet, int] | None = None
-    looked: float | None = None
+    resampled: tuple[PixelSet, int] | None = None
+    resampled_at: float | None = None
 
     def picture(self, film: Film) -> Tensor:
         """Return the picture ``(H, W, 3)`` in float64, with the second values where they count."""
@@ -76,15 +76,15 @@ class ErrorProbes:
         if not len(self.pilots) or int(self.pixel_set.film.counts.min()) == 0:
             return None
         again = None
-        if self.third is not None:
-            pixel_set, suspects = self.third
+        if self.resampled is not None:
+            pixel_set, suspects = self.resampled
             values = torch.stack(pixel_set.film.streams()).cpu()
             assert pixel_set.places is not None
             again = Again(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
         first = self._first(film)
         return known_error(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
 
-    def looks(self, pixels: int) -> float:
+    def resampling_share(self, pixels: int) -> float:
         """Return the samples that third values take, as a share of the samples of a picture of ``pixels`` pixels."""
         return STREAMS * sum(again_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
 
@@ -104,12 +104,12 @@ class ErrorProbes:
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
         streams = Streams(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
         pixel_set = PixelSet(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
-        self.third = pixel_set, len(suspects)
-        self.looked = float(film.counts.double().mean())
-        samples = round(self.looked)
+        self.resampled = pixel_set, len(suspects)
+        self.resampled_at = float(film.counts.double().mean())
+        samples = round(self.resampled_at)
         return [(pixel_set, 0, STREAMS * samples)]
 
-    def alone(self, film: Film) -> ErrorEstimate | None:
+    def probe_estimate(self, film: Film) -> ErrorEstimate | None:
         """Return the error estimate that the probes give without third values; None without probes."""
         if not len(self.pilots):
             return None
@@ -146,7 +146,7 @@ def error_probes(wave: Wave, settings: Settings, device: torch.device) -> ErrorP
 FIRST_ROUND = 16
 
 
-class Shares:
+class SampleAllocation:
     """Allocates the samples of adaptive rounds to the 4 x 4 blocks of a picture.
 
     Args:
@@ -164,7 +164,7 @@ class Shares:
         self.pixels = torch.bincount(self.block, minlength=rows * columns)
         self._parts: list[tuple[Film, Tensor, Film]] = []
 
-    def spans(self, picture: PixelSet, twice: ErrorProbes, mean: float, last: bool) -> list[tuple[PixelSet, int, int]]:
+    def spans(self, picture: PixelSet, probes: ErrorProbes, mean: float, last: bool) -> list[tuple[PixelSet, int, int]]:
         """Return the next round's spans (pixels, first sample, count), after which the picture has ``mean`` samples a pixel.
 
         Pixels of one span have the same number of samples. ``last``: no round follows, see
@@ -172,7 +172,7 @@ class Shares:
         """
         device = picture.film.sums.device
         counts = self._of_blocks(picture.film.counts.cpu())
-        aims = shared_out(self._errors(twice), counts, self.pixels, mean, last)
+        aims = shared_out(self._errors(probes), counts, self.pixels, mean, last)
         spans: list[tuple[PixelSet, int, int]] = []
         if self._agreed is not None:
             aims = self._agreed(aims)
@@ -185,11 +185,11 @@ class Shares:
             spans.append((self._part(picture, places, places), have, aim - have))
             seconds = chosen[pilot_blocks].nonzero()[:, 0]
             if len(seconds):
-                part = self._part(twice.pixel_set, seconds.to(device), self.pilots.places[seconds].to(device))
+                part = self._part(probes.pixel_set, seconds.to(device), self.pilots.places[seconds].to(device))
                 spans.append((part, have, aim - have))
         return spans
 
-    def put_back(self) -> None:
+    def merge(self) -> None:
         """Add the samples of the round to the films that its pixels were taken from."""
         for whole, places, part in self._parts:
             whole.put(places, part)
@@ -209,9 +209,9 @@ class Shares:
         found[self.block] = counts
         return found
 
-    def _errors(self, twice: ErrorProbes) -> Tensor:
+    def _errors(self, probes: ErrorProbes) -> Tensor:
         """Return the relative variance of each block's pixels, up to a factor, from the second values alone."""
-        a, b = (x.cpu() for x in twice.pixel_set.film.streams())
+        a, b = (x.cpu() for x in probes.pixel_set.film.streams())
         errors, known = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
         at = tuple(self.pilots.block)
         errors[at], known[at] = error_by_pilots(self.pilots, a, b), True

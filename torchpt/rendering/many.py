@@ -10,19 +10,19 @@ from functools import partial
 import torch
 
 from torchpt.compiler.graph import Unsupported
-from torchpt.core.threads import Crew, one_thread, without_autocast
+from torchpt.core.threads import TaskQueue, one_thread, without_autocast
 from torchpt.engines.engine import Block, Share
 from torchpt.rendering.result import Rendering
 from torchpt.rendering.run import Run
 
-__all__ = ["Entry", "render_many"]
+__all__ = ["QueuedRender", "render_many"]
 
 #: Renders for each thread that are prepared in advance.
-AHEAD = 2
+PREFETCH = 2
 
 
 @dataclass
-class Entry:
+class QueuedRender:
     """One render of a batch.
 
     Attributes:
@@ -44,7 +44,7 @@ class Entry:
     rest: list[Block] = field(init=False, default_factory=list)
 
 
-def render_many(entries: Iterable[Entry], tasks: int) -> None:
+def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
     """Render all entries; each picture has the bits that it has alone.
 
     Compiled renders that only ``spp`` ends share the threads and one queue of tasks. Others are rendered one after another:
@@ -57,19 +57,19 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
     Raises:
         Exception: the error that an entry's ``failed`` raises; all other renders are cancelled.
     """
-    crew = Crew[Entry, Share](torch.get_num_threads())
-    waiting, begun = iter(entries), dict[int, Entry]()
+    queue = TaskQueue[QueuedRender, Share](torch.get_num_threads())
+    waiting, begun = iter(entries), dict[int, QueuedRender]()
     try:
         while True:
-            with _beside(crew):
+            with _beside(queue):
                 entry = next(waiting, None)
             if entry is None:
                 break
-            with without_autocast(entry.device), _blamed(entry), _beside(crew):
-                entry.run = entry.make(crew.threads)
+            with without_autocast(entry.device), _blamed(entry), _beside(queue):
+                entry.run = entry.make(queue.threads)
                 spans = entry.run.at_once()
             if spans is None:
-                _drain(crew, begun, 0)
+                _drain(queue, begun, 0)
                 with without_autocast(entry.device), _blamed(entry):
                     entry.done(entry.run.go(None))
                 del entry.run
@@ -81,25 +81,25 @@ def render_many(entries: Iterable[Entry], tasks: int) -> None:
                 blocks = engine.blocks(spans, tasks)
                 entry.left = len(blocks)
                 for block in blocks:
-                    crew.add(entry, partial(engine.task, block))
-            _drain(crew, begun, AHEAD * crew.threads * tasks)
-        _drain(crew, begun, 0)
+                    queue.add(entry, partial(engine.task, block))
+            _drain(queue, begun, PREFETCH * queue.threads * tasks)
+        _drain(queue, begun, 0)
     finally:
         for entry in begun.values():  # unfinished renders stop at their next kernel
             if entry.run.tasks is not None:
                 entry.run.tasks.halt()
-        crew.close()
+        queue.close()
 
 
 @contextmanager
-def _beside(crew: Crew[Entry, Share]) -> Iterator[None]:
+def _beside(queue: TaskQueue[QueuedRender, Share]) -> Iterator[None]:
     """Let tensor operations use one thread while the pool traces: torch's team would wait for busy cores, and spin."""
-    with one_thread() if crew.pending else nullcontext():
+    with one_thread() if queue.pending else nullcontext():
         yield
 
 
 @contextmanager
-def _blamed(entry: Entry) -> Iterator[None]:
+def _blamed(entry: QueuedRender) -> Iterator[None]:
     """Pass errors raised within to the entry's ``failed``."""
     try:
         yield
@@ -108,17 +108,17 @@ def _blamed(entry: Entry) -> Iterator[None]:
         raise
 
 
-def _drain(crew: Crew[Entry, Share], begun: dict[int, Entry], most: int) -> None:
+def _drain(queue: TaskQueue[QueuedRender, Share], begun: dict[int, QueuedRender], most: int) -> None:
     """Collect results of the pool until at most ``most`` tasks are pending."""
     while True:
-        found = crew.next(wait=crew.pending > most)
+        found = queue.next(wait=queue.pending > most)
         if found is None:
-            if crew.pending <= most:
+            if queue.pending <= most:
                 return
             continue
         entry, share = found
         entry.left -= 1
-        with without_autocast(entry.device), _blamed(entry), _beside(crew):
+        with without_autocast(entry.device), _blamed(entry), _beside(queue):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
                 assert entry.run.tasks is not None

@@ -27,7 +27,7 @@ from torchpt.scene.scene import Scene
 from torchpt.search import Accel
 from torchpt.search.bounds import primitive_bounds
 
-__all__ = ["MissingLight", "unlit"]
+__all__ = ["MissingLight", "find_missing_light"]
 
 #: Largest share of dark pixels at which the rest still gives an error estimate.
 DARK = 0.05
@@ -51,7 +51,9 @@ class MissingLight:
 
 
 @torch.no_grad()
-def unlit(scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: Tensor, relmse: float) -> MissingLight:
+def find_missing_light(
+    scene: Scene, wave: Wave, geometry: Callable[[], Geometry], picture: Tensor, relmse: float
+) -> MissingLight:
     """Look for light that no sample of a picture met.
 
     Args:

@@ -22,14 +22,14 @@ from torchpt.scene.names import Names
 from torchpt.scene.prepare import make_wave
 from torchpt.scene.settings import Settings
 
-__all__ = ["Chosen", "Emission", "Path", "Scattered", "Vertex", "one_path"]
+__all__ = ["BsdfSampleRecord", "EmissionRecord", "LightSampleRecord", "Path", "Vertex", "one_path"]
 
 #: Three numbers: a colour, a point or a direction.
 Triple = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Emission:
+class EmissionRecord:
     """Emission of a light that a camera ray or a BSDF sample hit.
 
     Attributes:
@@ -48,7 +48,7 @@ class Emission:
 
 
 @dataclass(frozen=True)
-class Chosen:
+class LightSampleRecord:
     """Light sample at a vertex, and its contribution.
 
     Attributes:
@@ -73,7 +73,7 @@ class Chosen:
 
 
 @dataclass(frozen=True)
-class Scattered:
+class BsdfSampleRecord:
     """BSDF sample at a vertex.
 
     Attributes:
@@ -124,9 +124,9 @@ class Vertex:
     normal: Triple | None = None
     geometric_normal: Triple | None = None
     wo: Triple
-    emission: Emission | None = None
-    light: Chosen | None = None
-    scattered: Scattered | None = None
+    emission: EmissionRecord | None = None
+    light: LightSampleRecord | None = None
+    scattered: BsdfSampleRecord | None = None
     radiance: Triple
 
 
@@ -188,10 +188,10 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         state = wave.rays_of(x, y, number)
         explainer.began(state)
         radiance = brought(wave, state, observer=explainer)
-        return _Story(scene, explainer).told(settings, pixel, sample, radiance)
+        return _PathBuilder(scene, explainer).told(settings, pixel, sample, radiance)
 
 
-class _Story:
+class _PathBuilder:
     """Builds a :class:`Path` from the events that an observer recorded."""
 
     def __init__(self, scene: Scene, explainer: Explainer) -> None:
@@ -265,7 +265,7 @@ class _Story:
             radiance=_three(radiance),
         )
 
-    def _emission(self, shone: EmitterHit) -> Emission:
+    def _emission(self, shone: EmitterHit) -> EmissionRecord:
         lights = self.world.lights
         assert lights is not None
         row = len(lights.area) - 1  # the environment
@@ -273,7 +273,7 @@ class _Story:
             assert lights.row_of_prim is not None
             row = int(lights.row_of_prim[shone.slot])
         light = shone.light
-        return Emission(
+        return EmissionRecord(
             self.names.light(row),
             _three(light.radiance),
             float(light.pdf),
@@ -281,9 +281,9 @@ class _Story:
             _three(light.brought),
         )
 
-    def _chosen(self, direct: DirectLight, brought: Tensor, clear: Tensor) -> Chosen:
+    def _chosen(self, direct: DirectLight, brought: Tensor, clear: Tensor) -> LightSampleRecord:
         sample, reflected = direct.sample, direct.reflected
-        return Chosen(
+        return LightSampleRecord(
             light=self.names.light(0 if sample.row is None else int(sample.row)),
             wi=_three(sample.wi),
             pdf=float(sample.pdf),
@@ -308,13 +308,13 @@ class _Story:
         return "absorbed"
 
 
-def _scattered(output: VertexOutput) -> Scattered:
+def _scattered(output: VertexOutput) -> BsdfSampleRecord:
     drawn, carried, chance, after = output.drawn, output.carried, output.chance, output.leaving
     assert drawn is not None and carried is not None and output.surface is not None
     goes_on, weight, relief = float(after.t_max) > 0.0, drawn.weight, output.surface.relief
     if relief is not None:
         weight = weight * relief.shadowing(drawn.d)
-    return Scattered(
+    return BsdfSampleRecord(
         wi=_three(drawn.d),
         pdf=float(drawn.pdf),
         weight=_three(weight),

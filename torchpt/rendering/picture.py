@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchpt.core.memory import Meter, mb, retried
+from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory
 from torchpt.images.denoiser import GUIDES
 from torchpt.paths.layers import LAYERS
 from torchpt.physics.film import ErrorEstimate
@@ -18,13 +18,15 @@ from torchpt.rendering.result import Rendering
 if TYPE_CHECKING:
     from torchpt.rendering.run import Run
 
-__all__ = ["final", "known_of", "rendering_of"]
+__all__ = ["error_estimate_of", "finished_rendering", "rendering_of"]
 
 
-def final(run: Run) -> Rendering:
+def finished_rendering(run: Run) -> Rendering:
     """Return the finished rendering, with the causes of its non-finite samples."""
     size = mb(run.need.picture)
-    return retried(lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}", lambda: _told(run))
+    return retry_out_of_memory(
+        lambda: f"the picture of {run.width} x {run.height} pixels, which takes {size}", lambda: _told(run)
+    )
 
 
 def _told(run: Run) -> Rendering:
@@ -39,8 +41,8 @@ def rendering_of(run: Run) -> Rendering:
     layers = _layers(run)
     known, unknown = None, ""
     if radiant:
-        values = film.mean() if run.twice is None else run.twice.picture(film)
-        image, (known, unknown) = values.to(run.dtype), known_of(run, values)
+        values = film.mean() if run.probes is None else run.probes.picture(film)
+        image, (known, unknown) = values.to(run.dtype), error_estimate_of(run, values)
     else:
         shown = layers[next(iter(run.seen))]
         blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
@@ -51,7 +53,7 @@ def rendering_of(run: Run) -> Rendering:
         clamped = 1.0 - after / before if before > 0 else 0.0
     counts = (film if radiant else next(iter(run.picture.layers.values()))).counts
     names = run.settings.film.aovs or run.integrator.layers
-    meter = Meter(run.device)
+    meter = MemoryMeter(run.device)
     return Rendering(
         image=image,
         layers={name: layers[name] for name in names},
@@ -81,19 +83,19 @@ def rendering_of(run: Run) -> Rendering:
     )
 
 
-def known_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, str]:
+def error_estimate_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, str]:
     """Return the error estimate of the picture (None: not estimated), and why it cannot be trusted ("": it can)."""
     film = run.picture.film
-    if run.twice is not None:
-        known = run.twice.known(film, picture)
+    if run.probes is not None:
+        known = run.probes.known(film, picture)
     else:
         relmse = film.relmse()
         known = None if relmse is None else ErrorEstimate(relmse, None, False)
     if known is None or not run.done:
         return known, ""
-    from torchpt.rendering.missing_light import unlit
+    from torchpt.rendering.missing_light import find_missing_light
 
-    lacks = unlit(run.scene, run.wave, run.geometry, picture, known.relmse)
+    lacks = find_missing_light(run.scene, run.wave, run.geometry, picture, known.relmse)
     if lacks.reason:
         return known, lacks.reason
     if known.interval is not None:
@@ -113,6 +115,6 @@ def _layers(run: Run) -> dict[str, Tensor]:
     for name in run.settings.film.aovs:
         if name not in run.seen:
             made: Any = LAYERS[name]  # a FilmLayer
-            counts = film.counts if run.twice is None else run.twice.counts(film)
+            counts = film.counts if run.probes is None else run.probes.counts(film)
             layers[name] = made.of(film, counts).to(run.dtype)
     return layers

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchpt.compiler.graph import Unsupported
 from torchpt.core.errors import LostRankError, OutputError, RenderError, SceneError, warn_once
-from torchpt.core.memory import Budget, Meter, check_memory, mb, needing, retried
+from torchpt.core.memory import Budget, MemoryMeter, check_memory, explain_out_of_memory, mb, retry_out_of_memory
 from torchpt.core.threads import limited_threads, without_autocast
 from torchpt.engines.engine import Block, Forward, Share, Tasks, forward_tensors
 from torchpt.native import compile_time
@@ -22,13 +22,13 @@ from torchpt.paths.wave import PixelSet, RayCounts, Wave
 from torchpt.physics.film import ErrorEstimate, Film
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.ranks import Group, together
-from torchpt.rendering.checkpoint import EVERY, Keeper, State, check_samples, check_whole, identity
-from torchpt.rendering.error import FIRST_ROUND, Shares, error_probes
+from torchpt.rendering.checkpoint import EVERY, CheckpointFile, RenderState, check_samples, check_whole, identity
+from torchpt.rendering.error import FIRST_ROUND, SampleAllocation, error_probes
 from torchpt.rendering.nonfinite import told
-from torchpt.rendering.picture import final, known_of, rendering_of
+from torchpt.rendering.picture import error_estimate_of, finished_rendering, rendering_of
 from torchpt.rendering.result import Progress, Rendering
-from torchpt.rendering.split import Split, stamp
-from torchpt.rendering.stopping import Stop
+from torchpt.rendering.split import DistributedRender, render_fingerprint
+from torchpt.rendering.stopping import StopRules
 from torchpt.scene import Scene
 from torchpt.scene.memory_estimate import BYTES_PER_LANE, FEWEST_OF_LOOP, LANES, check_film, loaded, memory_estimate
 from torchpt.scene.prepare import loop_of, looped, make_wave, surface_layers
@@ -69,14 +69,14 @@ class Run:
         self.start = time.perf_counter()
         self._others = compile_time.seconds()
         self._kernels = 0.0  # seconds of compiling for an engine that was given up
-        self.split = None if group is None or group.size == 1 else Split(group)
+        self.split = None if group is None or group.size == 1 else DistributedRender(group)
         self.shared: tuple[int, int] = 0, 1  # samples before this pass, and the number of ranks that share it
         self.settings, self.device, self.unit = settings, scene.device, scene.space.unit
         self.scene, self.name, self.load_seconds = scene, scene.name, scene.load_seconds
-        meter, limit = Meter(self.device), settings.render.max_memory
+        meter, limit = MemoryMeter(self.device), settings.render.max_memory
         before = 0 if limit is None else meter.peak()
         compiled = looped(settings, self.device, dtype)
-        self.wave = retried(
+        self.wave = retry_out_of_memory(
             lambda: f"a scene of {scene.told}",
             lambda: make_wave(scene, settings, params, dtype, like=like, rays=rays),
         )
@@ -88,12 +88,12 @@ class Run:
         self.on_progress: Callable[[Progress], bool | None] | None = None
         self.eager: list[str] = []
         self.unsupported: Unsupported | None = None
-        self.keeper: Keeper | None = None
+        self.checkpoint_file: CheckpointFile | None = None
         self.warned = False  # of a checkpoint that cannot be written
         self.keeps = settings.render.checkpoint is not None
         if settings.render.checkpoint is not None and (group is None or group.rank == 0):
-            self.keeper = Keeper(settings.render.checkpoint, identity(scene, settings, params, dtype))
-            self.keeper.check(settings.render.resume)
+            self.checkpoint_file = CheckpointFile(settings.render.checkpoint, identity(scene, settings, params, dtype))
+            self.checkpoint_file.check(settings.render.resume)
         self.tasks: Tasks | None = loop_of(scene, self.wave, self.eager, threads) if compiled else None
         self.engine: Forward = self._by_tensors() if self.tasks is None else self.tasks
         rows = self.engine.rows(self.seen)
@@ -105,7 +105,7 @@ class Run:
             if self.engine.compiled:
                 self.engine.budget.fit(self.need.left(limit, meter.above()), 4 * rows, FEWEST_OF_LOOP)
         films = mb(self.need.films)
-        retried(lambda: f"films of {self.width} x {self.height} pixels, which take {films}", self._begin)
+        retry_out_of_memory(lambda: f"films of {self.width} x {self.height} pixels, which take {films}", self._begin)
         self._compiled = self.compile_seconds()
         self.build_seconds = time.perf_counter() - self.start - self._compiled
 
@@ -124,15 +124,15 @@ class Run:
             name: Film(self.width, self.height, 1, device, len(layer.channels)) for name, layer in self.seen.items()
         }
         self.picture = PixelSet(film, layers, streams)
-        self.twice = error_probes(self.wave, self.settings, device) if self.settings.pilots else None
+        self.probes = error_probes(self.wave, self.settings, device) if self.settings.pilots else None
         self.tally, self.done, self.left, self.taken, self.ended = RayCounts(), 0, 0, 0, False
         self._keeps_no_more = False  # later samples are taken again after a resume
         self.cut = False  # True once spp or the time limit shortened an adaptive round
         self.before = 0.0  # seconds of sampling before the checkpoint that was resumed
         bounded = self.keeps or self.split is not None  # a lost rank is noticed between passes
-        self.stop = Stop(self.settings.render, streams.count, EVERY if bounded else None)
-        if self.twice is not None:
-            self.stop.after = self.twice.looks(self.width * self.height)
+        self.stop = StopRules(self.settings.render, streams.count, EVERY if bounded else None)
+        if self.probes is not None:
+            self.stop.after = self.probes.resampling_share(self.width * self.height)
         if self.split is not None:
             self.split.begin()
         self.lost = NonFinite()
@@ -145,7 +145,7 @@ class Run:
         self.on_progress = on_progress
         self.stop.watched = on_progress is not None or self.settings.adaptive or self.keeps or self.split is not None
         try:
-            with needing("a render"):
+            with explain_out_of_memory("a render"):
                 self._all()
                 self._join()
         except LostRankError as error:
@@ -159,7 +159,7 @@ class Run:
 
         None if it must run by :meth:`go`: without kernels, with stop rules besides ``spp``, or in bounded memory.
         """
-        ends = self.keeps or self.stop.open or self.twice is not None or self.split is not None
+        ends = self.keeps or self.stop.open or self.probes is not None or self.split is not None
         if self.tasks is None or ends or self.settings.render.max_memory is not None:
             return None
         self.begun = time.perf_counter()
@@ -167,7 +167,7 @@ class Run:
 
     def completed(self, rest: list[Block]) -> Rendering:
         """Return the rendering of :meth:`at_once`, after taking the blocks in ``rest``, put back when memory ran out."""
-        with needing("a render"):
+        with explain_out_of_memory("a render"):
             if self.unsupported is not None:
                 self._eagerly(self.unsupported)
             else:
@@ -181,7 +181,7 @@ class Run:
     def _final(self) -> Rendering:
         loaded("compiled" if self.engine.compiled else "eager")
         self.engine.dismiss(keeps=self.settings.render.max_memory is None)
-        return final(self)
+        return finished_rendering(self)
 
     def _all(self) -> None:
         """Take all samples; by tensor operations if kernels cannot be made."""
@@ -219,12 +219,12 @@ class Run:
 
     def _look_again(self) -> None:
         """Resample outliers for the error estimate, unless that was done at this number of samples."""
-        if self.twice is None or self.twice.looked == self._mean():
+        if self.probes is None or self.probes.resampled_at == self._mean():
             return
         self._unlooked = self._counted()
-        again = self.twice.resample_outliers(self.picture.film, None if self.split is None else self.split.places)
+        again = self.probes.resample_outliers(self.picture.film, None if self.split is None else self.split.places)
         if not self._take(again):
-            self.twice.third = None
+            self.probes.resampled = None
         self._join()
 
     def _sample(self) -> None:
@@ -234,8 +234,8 @@ class Run:
             if self.settings.adaptive:  # the first round is the same whatever spp and the seconds of a pass
                 size = min(size, FIRST_ROUND - self.taken)
             spans = [(self.picture, self.taken, size)]
-            if self.twice is not None:
-                spans.append((self.twice.pixel_set, self.taken, size))
+            if self.probes is not None:
+                spans.append((self.probes.pixel_set, self.taken, size))
             if not self._take(spans):
                 return
             self.taken += size
@@ -248,21 +248,23 @@ class Run:
 
     def _adapts(self) -> bool:
         """Return True once error probes decide where samples go."""
-        return self.twice is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
+        return self.probes is not None and self.settings.adaptive and self.taken >= FIRST_ROUND
 
     def _adapt(self) -> None:
         """Take adaptive rounds, each of which doubles the samples."""
-        assert self.twice is not None
+        assert self.probes is not None
         self._join()
-        shares = Shares(self.twice.pilots, self.picture.film, None if self.split is None else self.split.places)
+        allocation = SampleAllocation(
+            self.probes.pilots, self.picture.film, None if self.split is None else self.split.places
+        )
         mean = self._mean()
-        while self.stop.going(mean):
-            wish = min(2.0 * mean, float(self.settings.render.spp)) - mean
-            more = self.stop.affordable(wish)
-            last = more == wish and more < mean and mean + more >= self.settings.render.spp
-            spans = shares.spans(self.picture, self.twice, mean + more, last)
+        while self.stop.should_continue(mean):
+            requested = min(2.0 * mean, float(self.settings.render.spp)) - mean
+            more = self.stop.affordable(requested)
+            last = more == requested and more < mean and mean + more >= self.settings.render.spp
+            spans = allocation.spans(self.picture, self.probes, mean + more, last)
             if not spans:  # not enough samples are left for one block
-                self.stop.reason = "spp" if more == wish else "time_limit"
+                self.stop.reason = "spp" if more == requested else "time_limit"
                 break
             if last and SMALL_ROUND * more < mean and not self.cut:  # cheap to repeat, with any spp
                 self._keep(last=True)
@@ -270,7 +272,7 @@ class Run:
             self.cut |= more < mean
             whole = self._take(spans)
             self._join()
-            shares.put_back()
+            allocation.merge()
             if not whole:
                 break
             mean = self._mean()
@@ -283,34 +285,36 @@ class Run:
         """Return all films by name."""
         films = {"picture": self.picture.film}
         films |= {f"layers.{name}": film for name, film in self.picture.layers.items()}
-        return films if self.twice is None else films | {"pilots": self.twice.pixel_set.film}
+        return films if self.probes is None else films | {"pilots": self.probes.pixel_set.film}
 
     def _keep(self, last: bool = False) -> None:
         """Write a checkpoint if one is due."""
         if not self.keeps or self._keeps_no_more:
             return
-        due = self.keeper is not None and (last or self.keeper.due())
+        due = self.checkpoint_file is not None and (last or self.checkpoint_file.due())
         if due if self.split is None else self.split.due(due):
             self._join()
-            if self.keeper is not None:
-                self._write(self.keeper)
+            if self.checkpoint_file is not None:
+                self._write(self.checkpoint_file)
 
-    def _write(self, keeper: Keeper) -> None:
+    def _write(self, checkpoint_file: CheckpointFile) -> None:
         """Write a checkpoint; if that fails, warn and go on: the picture may still be written elsewhere."""
         try:
-            keeper.write(self._state())
+            checkpoint_file.write(self._state())
         except OutputError as problem:
             if not self.warned:
                 print(f"torchpt: {problem}; the render goes on without it", file=sys.stderr, flush=True)
             self.warned = True
 
-    def _state(self) -> State:
+    def _state(self) -> RenderState:
         """Return the state for a checkpoint."""
-        looked = self.twice is not None and self.twice.looked == self._mean()  # outliers are resampled after a resume
-        counted, light = self._unlooked if looked else self._counted()
+        resampled_at = (
+            self.probes is not None and self.probes.resampled_at == self._mean()
+        )  # outliers are resampled after a resume
+        counted, light = self._unlooked if resampled_at else self._counted()
         facts = {"taken": self.taken, "seconds": self.seconds_of_sampling(), "cut": int(self.cut), **counted}
         arrays = {f"{name}.{key}": value for name, film in self.films().items() for key, value in film.state().items()}
-        return State(facts, arrays | {"light": light})
+        return RenderState(facts, arrays | {"light": light})
 
     def _counted(self) -> tuple[dict[str, Any], Tensor]:
         """Return the counts by name, and the light before and after the clamp."""
@@ -325,9 +329,9 @@ class Run:
         """Restore the checkpoint if ``render.resume`` is set and there is one."""
         if not self.keeps or not self.settings.render.resume:
             return
-        state = None if self.keeper is None else self._kept(self.keeper)
-        if state is None and self.keeper is not None:
-            warn_once(f"torchpt: there is no checkpoint {self.keeper.path} yet: the render starts anew")
+        state = None if self.checkpoint_file is None else self._kept(self.checkpoint_file)
+        if state is None and self.checkpoint_file is not None:
+            warn_once(f"torchpt: there is no checkpoint {self.checkpoint_file.path} yet: the render starts anew")
         if self.split is not None:
             state = self.split.state(state, self._state())
         if state is None:
@@ -341,18 +345,18 @@ class Run:
         mean = self._mean() if self._adapts() else self.taken
         self._reached(mean, self.before)
 
-    def _kept(self, keeper: Keeper) -> State | None:
+    def _kept(self, checkpoint_file: CheckpointFile) -> RenderState | None:
         """Return the validated checkpoint; None if there is none."""
-        state = keeper.read(self._state(), lambda state: check_samples(self, state, keeper.path))
+        state = checkpoint_file.read(self._state(), lambda state: check_samples(self, state, checkpoint_file.path))
         if state is not None:
-            check_whole(self, state, keeper.path)
+            check_whole(self, state, checkpoint_file.path)
         return state
 
     def _reached(self, mean: float, seconds: float) -> None:
         """Update the stop rules with the samples, seconds and error so far, as the first rank has them."""
         if self.settings.render.target_error is not None:
             self._join()
-        error = self._by_pilots() if self.stop.asks(mean, self._adapts()) else None
+        error = self._by_pilots() if self.stop.checks_error(mean, self._adapts()) else None
         if self.split is not None:
             seconds, error = self.split.decide(seconds, error)
         target = self.settings.render.target_error
@@ -371,23 +375,23 @@ class Run:
 
     def _by_pilots(self) -> float:
         """Return the upper end of the interval of relMSE that the error probes give."""
-        assert self.twice is not None
-        return _most(self.twice.alone(self.picture.film))
+        assert self.probes is not None
+        return _most(self.probes.probe_estimate(self.picture.film))
 
     def _certain(self) -> float:
         """Return the upper end of the interval of relMSE after resampling outliers, which takes samples."""
-        assert self.twice is not None
+        assert self.probes is not None
         self._look_again()
-        known, unknown = known_of(self, self.twice.picture(self.picture.film))
+        known, unknown = error_estimate_of(self, self.probes.picture(self.picture.film))
         return math.inf if self.ended or unknown else _most(known)
 
     def _forget_look(self) -> None:
         """Restore the counts before outliers were resampled: the picture gets more samples, and they will be again."""
-        assert self.twice is not None
+        assert self.probes is not None
         counts, self.light = self._unlooked
         self.done, self.tally = counts["done"], RayCounts(counts["rays"], counts["truncated"])
         self.lost = NonFinite.read(counts["lost"])
-        self.twice.third, self.twice.looked = None, None
+        self.probes.resampled, self.probes.resampled_at = None, None
 
     def geometry(self) -> Geometry:
         """Return the primitives that the search structure was built from."""
@@ -407,7 +411,7 @@ class Run:
 
     def write_seconds(self) -> float:
         """Return the seconds of writing checkpoints."""
-        return 0.0 if self.keeper is None else self.keeper.seconds
+        return 0.0 if self.checkpoint_file is None else self.checkpoint_file.seconds
 
     # -- samples of a pass
 
@@ -449,9 +453,9 @@ class Run:
         before, ranks = self.shared  # other ranks have taken about as many
         done = before + ranks * (self.done - before)
         state = Progress(done, max(self._total(), done), self.tally.rays, seconds, ends, self.result)
-        wish = bool(self.on_progress(state))
+        requested = bool(self.on_progress(state))
         if samples or ranks > 1 or self.split is None:  # ranks stop together, after a pass
-            self.ended = wish and self.done < self.asked()
+            self.ended = requested and self.done < self.asked()
         return self.ended
 
     def _total(self) -> int:
@@ -463,7 +467,7 @@ class Run:
 
     def asked(self) -> int:
         """Return the number of paths of ``render.spp`` samples, error probes included."""
-        pixels = self.width * self.height + (0 if self.twice is None else len(self.twice.pilots))
+        pixels = self.width * self.height + (0 if self.probes is None else len(self.probes.pilots))
         return pixels * self.settings.render.spp
 
     def _count(self, lost: NonFinite) -> None:
@@ -507,5 +511,5 @@ def render_scene(
         OutputError: the checkpoint cannot be written, or exists without ``render.resume``.
     """
     with without_autocast(scene.device), limited_threads(settings.render.threads):
-        with together(ranks, "what is rendered", lambda: stamp(scene, settings, params, dtype)):
+        with together(ranks, "what is rendered", lambda: render_fingerprint(scene, settings, params, dtype)):
             return Run(scene, settings, params, dtype, group=ranks, rays=rays).go(on_progress)

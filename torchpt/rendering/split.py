@@ -20,7 +20,7 @@ from torchpt.paths.nonfinite import NonFinite
 from torchpt.paths.wave import PixelSet, RayCounts
 from torchpt.physics.film import Film
 from torchpt.ranks import Group, dealt
-from torchpt.rendering.checkpoint import State
+from torchpt.rendering.checkpoint import RenderState
 from torchpt.scene import Scene
 from torchpt.scene.fingerprint import fingerprints
 from torchpt.scene.settings import Settings, having
@@ -29,13 +29,13 @@ from torchpt.spec import Role
 if TYPE_CHECKING:
     from torchpt.rendering.run import Run
 
-__all__ = ["Span", "Split", "stamp"]
+__all__ = ["DistributedRender", "Span", "render_fingerprint"]
 
 #: Pixels, first sample, number of samples.
 Span = tuple[PixelSet, int, int]
 
 
-class Split:
+class DistributedRender:
     """The share of this rank in a render.
 
     Args:
@@ -101,7 +101,7 @@ class Split:
         """Return the integers of the first rank; other processors may have rounded differently."""
         return self.group.first(own)
 
-    def state(self, own: State | None, like: State) -> State | None:
+    def state(self, own: RenderState | None, like: RenderState) -> RenderState | None:
         """Return the state that the first rank read from a checkpoint, of the form of ``like``; None if it read none."""
         text = "" if own is None else json.dumps(own.facts)
         sent = bytes(self.group.first(torch.tensor(list(text.encode()), dtype=torch.uint8)).tolist())
@@ -111,7 +111,7 @@ class Split:
         for name, value in like.arrays.items():
             values = value if own is None else own.arrays[name]
             arrays[name] = self.group.first(values.reshape(-1)).view(value.shape)
-        return State(json.loads(sent), arrays)
+        return RenderState(json.loads(sent), arrays)
 
     def _part(self, pixel_set: PixelSet) -> PixelSet:
         """Return the pixels of a pixel set that this rank samples."""
@@ -152,7 +152,9 @@ def _films(pixel_set: PixelSet) -> list[Film]:
     return [pixel_set.film, *pixel_set.layers.values()]
 
 
-def stamp(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype) -> bytes:
+def render_fingerprint(
+    scene: Scene, settings: Settings, params: Mapping[str, Tensor] | None, dtype: torch.dtype
+) -> bytes:
     """Return a hash of everything that ranks must have in common to share a render."""
     free = having(Role.FREE, but=Role.FILES)  # ranks must have the same file settings
     free["render"] = (*free["render"], "device")

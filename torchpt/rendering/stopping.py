@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from torchpt.scene.settings import Render
 
-__all__ = ["BLOCK", "Stop"]
+__all__ = ["BLOCK", "StopRules"]
 
 #: Largest number of samples a pixel of a pass.
 LARGEST_PASS = 64
@@ -31,7 +31,7 @@ FADING = 0.75
 
 
 @dataclass
-class Stop:
+class StopRules:
     """The stop rules of one render, and its progress toward them.
 
     Attributes:
@@ -59,7 +59,7 @@ class Stop:
         """True if anything besides ``spp`` may end the render."""
         return bool(self.render.stops)
 
-    def asks(self, taken: float, adaptive: bool = False) -> bool:
+    def checks_error(self, taken: float, adaptive: bool = False) -> bool:
         """Return True if the target error is checked at ``taken`` samples a pixel; adaptive rounds are few: always."""
         if self.render.target_error is None or taken < FEWEST:
             return False
@@ -114,7 +114,7 @@ class Stop:
                 return 0
         return min(size, left)
 
-    def going(self, mean: float) -> bool:
+    def should_continue(self, mean: float) -> bool:
         """Return True if adaptive sampling goes on at a mean of ``mean`` samples a pixel."""
         if not self.reason and mean >= self.render.spp:
             self.reason = "spp"

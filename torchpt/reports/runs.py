@@ -38,10 +38,10 @@ __all__ = [
     "Curve",
     "Job",
     "Measured",
+    "ReferencePicture",
     "Run",
     "Stopped",
     "Store",
-    "Truth",
     "film_size",
     "from_file",
     "from_runs",
@@ -177,7 +177,7 @@ def _source() -> str:
 
 
 @dataclass(frozen=True)
-class Truth:
+class ReferencePicture:
     """The reference of a scene.
 
     Attributes:
@@ -215,7 +215,7 @@ class Truth:
         return float((self.variance * self.weight).mean())
 
 
-def from_runs(runs: Sequence[Run]) -> Truth:
+def from_runs(runs: Sequence[Run]) -> ReferencePicture:
     """Return the mean of independent runs, with the variance of that mean."""
     images = tuple(run.image() for run in runs)
     stack = torch.stack(images)
@@ -226,10 +226,10 @@ def from_runs(runs: Sequence[Run]) -> Truth:
         "seconds": sum(run.seconds for run in runs),
         "settings": runs[0].facts["settings"],
     }
-    return Truth(stack.mean(0), stack.var(0) / len(runs), images, told)
+    return ReferencePicture(stack.mean(0), stack.var(0) / len(runs), images, told)
 
 
-def from_file(path: str, size: tuple[int, int]) -> Truth:
+def from_file(path: str, size: tuple[int, int]) -> ReferencePicture:
     """Return a reference from a file; its layer ``variance`` (as ``film.aovs=[variance]`` writes it) is that of the mean.
 
     Args:
@@ -254,7 +254,7 @@ def from_file(path: str, size: tuple[int, int]) -> Truth:
     variance = layers.get("variance")
     usable = variance is not None and variance.shape == image.shape and bool(torch.isfinite(variance).all())
     spread = variance.double().clamp_min(0.0) if variance is not None and usable else torch.zeros_like(image).double()
-    return Truth(image.double(), spread, (), {"made": False, "file": path, "variance": usable})
+    return ReferencePicture(image.double(), spread, (), {"made": False, "file": path, "variance": usable})
 
 
 # ---- The runs of a study: which there are, and how they are timed
@@ -292,14 +292,14 @@ class Job:
 
     Attributes:
         scene: the loaded scene.
-        wishes: complete settings; spp and seed are replaced for each run.
+        settings: complete settings; spp and seed are replaced for each run.
         facts: everything that runs depend on besides spp and seed.
         purpose: ``run`` or ``reference``, whose seeds differ.
         left: the scene's cache after the latest of these runs, while other settings use the scene.
     """
 
     scene: Scene
-    wishes: Settings
+    settings: Settings
     facts: dict[str, Any]
     purpose: str
     left: SceneCache | None = None
@@ -307,7 +307,7 @@ class Job:
     @property
     def pixels(self) -> int:
         """Number of pixels of the picture."""
-        wide, high = film_size(self.wishes)
+        wide, high = film_size(self.settings)
         return wide * high
 
 
@@ -347,9 +347,9 @@ class Measured:
     curves: list[Curve]
 
 
-def film_size(wishes: Settings) -> tuple[int, int]:
+def film_size(settings: Settings) -> tuple[int, int]:
     """Return width and height of the picture."""
-    film = wishes.film
+    film = settings.film
     return (film.width, film.height) if film.crop is None else film.crop[2:]
 
 
@@ -365,7 +365,7 @@ def prepare(study: Study) -> list[Measured]:
     Raises:
         TorchptError: a scene or setting cannot be used, or the denoiser is missing.
     """
-    if study.asked["denoise"]:
+    if study.options["denoise"]:
         check_denoiser()
     found = []
     for name in study.scenes:
@@ -374,10 +374,10 @@ def prepare(study: Study) -> list[Measured]:
         curves = []
         for variant in study.variants:
             curve = Curve(variant, _job(description, study.overrides(variant), loaded, "run"))
-            if study.asked["denoise"]:
+            if study.options["denoise"]:
                 curve.denoised = _denoised(curve.job)
             if not study.reference.files:
-                curve.reference = _job(description, study.truth(variant), loaded, "reference")
+                curve.reference = _job(description, study.reference_overrides(variant), loaded, "reference")
             curves.append(curve)
         found.append(Measured(name, curves))
     return found
@@ -389,25 +389,25 @@ def _job(
     loaded: dict[str, tuple[Scene, str]],
     purpose: str,
 ) -> Job:
-    description, wishes = overridden(description, overrides)
+    description, settings = overridden(description, overrides)
     # These settings of a scene concern files.
-    film, render = wishes.film.but(denoise=False, aovs=()), wishes.render.without(Role.FILES)
-    wishes = replace(wishes, film=film, render=render)
-    if not wishes.integrator.light:
-        raise SceneError("integrator.type", wishes.integrator.name, "an integrator that carries light")
-    device = str(device_of(wishes.render.device))
+    film, render = settings.film.but(denoise=False, aovs=()), settings.render.without(Role.FILES)
+    settings = replace(settings, film=film, render=render)
+    if not settings.integrator.light:
+        raise SceneError("integrator.type", settings.integrator.name, "an integrator that carries light")
+    device = str(device_of(settings.render.device))
     if device not in loaded:
         scene = Scene(description, device_of(device))
         loaded[device] = scene, fingerprint_of(scene)
     scene, named = loaded[device]
-    return Job(scene, wishes, {"scene": named, "device": device, "settings": wishes.plain(_FREE)}, purpose)
+    return Job(scene, settings, {"scene": named, "device": device, "settings": settings.plain(_FREE)}, purpose)
 
 
 def _denoised(job: Job) -> Job:
     """Return the job of the same runs with the AOVs that the denoiser needs."""
-    wishes = replace(job.wishes, film=job.wishes.film.but(denoise=True))
-    facts = {**job.facts, "settings": wishes.plain(_FREE), "denoiser": denoiser_version()}
-    return Job(job.scene, wishes, facts, job.purpose)
+    settings = replace(job.settings, film=job.settings.film.but(denoise=True))
+    facts = {**job.facts, "settings": settings.plain(_FREE), "denoiser": denoiser_version()}
+    return Job(job.scene, settings, facts, job.purpose)
 
 
 def measure(
@@ -438,7 +438,7 @@ def measure(
         if run is None:
             if job is not latest:  # other settings: warm up, so that caches are filled
                 _turn(latest, job)
-                thrown = _render(job, min(study.asked["spp"][0], spp), seed, clock, counts=False)
+                thrown = _render(job, min(study.options["spp"][0], spp), seed, clock, counts=False)
                 if not clock.stop:
                     _denoise(job, thrown)  # the first call takes longer
                 latest = job
@@ -467,14 +467,14 @@ def _wanted(study: Study, prepared: list[Measured]) -> list[Wanted]:
     """Return all runs in order, each with the list that it is added to."""
     found: list[Wanted] = []
     for measured in prepared:
-        for number in range(study.asked["seeds"]):
+        for number in range(study.options["seeds"]):
             for curve in measured.curves:
                 pairs = [(curve.job, curve.steps)]
                 if curve.denoised is not None:
                     pairs.append((curve.denoised, curve.denoised_steps))
                 for job, steps in pairs:
-                    for spp in study.asked["spp"]:
-                        seed = seed_of(study.asked["seed"], "run", spp, number)
+                    for spp in study.options["spp"]:
+                        seed = seed_of(study.options["seed"], "run", spp, number)
                         found.append((job, spp, seed, steps.setdefault(spp, [])))
         shared: dict[str, Job] = {}
         for curve in measured.curves:
@@ -482,7 +482,7 @@ def _wanted(study: Study, prepared: list[Measured]) -> list[Wanted]:
                 continue
             job = shared.setdefault(_name(curve.reference, 0, 0), curve.reference)
             for number in range(study.reference.seeds):
-                seed = seed_of(study.asked["seed"], "reference", study.reference.spp, number)
+                seed = seed_of(study.options["seed"], "reference", study.reference.spp, number)
                 found.append((job, study.reference.spp, seed, curve.truths))
     return found
 
@@ -492,8 +492,8 @@ def _name(job: Job, spp: int, seed: int) -> str:
 
 
 def _render(job: Job, spp: int, seed: int, clock: _Clock, counts: bool = True) -> Rendering:
-    wishes = replace(job.wishes, render=job.wishes.render.but(spp=spp, seed=seed))
-    rendering = render_scene(job.scene, wishes, on_progress=clock.watch if counts else clock.glance)
+    settings = replace(job.settings, render=job.settings.render.but(spp=spp, seed=seed))
+    rendering = render_scene(job.scene, settings, on_progress=clock.watch if counts else clock.glance)
     if counts:
         clock.passed(rendering)
     return rendering
@@ -501,7 +501,7 @@ def _render(job: Job, spp: int, seed: int, clock: _Clock, counts: bool = True) -
 
 def _denoise(job: Job, rendering: Rendering) -> float | None:
     """Denoise if the job asks for it; return the seconds, or None."""
-    return denoise_rendering(rendering, job.wishes) if job.wishes.film.denoise else None
+    return denoise_rendering(rendering, job.settings) if job.settings.film.denoise else None
 
 
 def _told(job: Job, spp: int, seed: int, rendering: Rendering, denoising: float | None) -> dict[str, Any]:

@@ -24,8 +24,8 @@ __all__ = [
     "OWN_KEYS",
     "RECORDS",
     "Extra",
-    "Plan",
     "Reference",
+    "ReferencePlan",
     "Study",
     "Variant",
     "blocks_of",
@@ -256,7 +256,7 @@ def _extras(value: Any) -> tuple[dict[str, Any], ...]:
     return tuple(dict(item) for item in _list(value))
 
 
-class Asked(Valued):
+class StudyOptions(Valued):
     """Settings of a study besides ``scene`` and ``reference``."""
 
     parameters: ClassVar = {
@@ -289,13 +289,13 @@ class Reference(Valued):
     }
 
 
-OWN_KEYS = (*Asked.parameters, "scene", "reference")
+OWN_KEYS = (*StudyOptions.parameters, "scene", "reference")
 #: For the tables of the docs.
-RECORDS = {"study": Asked, "reference": Reference}
+RECORDS = {"study": StudyOptions, "reference": Reference}
 
 
 @dataclass(frozen=True)
-class Plan:
+class ReferencePlan:
     """The reference of a study: files, or runs to be made.
 
     Attributes:
@@ -318,7 +318,7 @@ class Study:
     Attributes:
         scenes: names or paths of the scenes.
         variants: the combinations of the grid.
-        asked: settings of the study: spp, seeds, seed, metrics, target, denoise, title.
+        options: settings of the study: spp, seeds, seed, metrics, target, denoise, title.
         extras: other renderers' pictures.
         reference: the reference.
         file: the study file.
@@ -326,16 +326,16 @@ class Study:
 
     scenes: tuple[str, ...]
     variants: tuple[Variant, ...]
-    asked: Any
+    options: Any
     extras: tuple[Extra, ...]
-    reference: Plan
+    reference: ReferencePlan
     file: str | None = None
 
     def overrides(self, variant: Variant) -> dict[str, dict[str, Any]]:
         """Return the overrides of a variant by block."""
         return blocks_of(variant.settings, self.file)
 
-    def truth(self, variant: Variant) -> dict[str, dict[str, Any]]:
+    def reference_overrides(self, variant: Variant) -> dict[str, dict[str, Any]]:
         """Return the overrides of a variant's reference: shared settings, its film, no clamp; then those of ``reference``."""
         own = {k: v for k, v in variant.settings.items() if k not in variant.axes or k.partition(".")[0] == "film"}
         return blocks_of({**own, "integrator.clamp": None, **self.reference.settings}, self.file)
@@ -400,32 +400,34 @@ def study_of(raw: Mapping[str, Any], file: str | None = None) -> Study:
         raise SceneError(
             "scene", raw.get("scene"), "the name of a scene, a path ending in .yaml, or a list of them", file
         )
-    asked = values_of(Asked, {key: raw[key] for key in Asked.parameters if key in raw}, "", file, "a study")
-    if "flip" in asked["metrics"] and find_spec("flip_evaluator") is None:
-        if "metrics" in asked.given:
+    options = values_of(
+        StudyOptions, {key: raw[key] for key in StudyOptions.parameters if key in raw}, "", file, "a study"
+    )
+    if "flip" in options["metrics"] and find_spec("flip_evaluator") is None:
+        if "metrics" in options.given:
             expected = "measures that are there (flip: pip install 'torchpt-renderer[compare]')"
-            raise SceneError("metrics", list(asked["metrics"]), expected, file)
-        asked.values["metrics"] = tuple(name for name in asked["metrics"] if name != "flip")
+            raise SceneError("metrics", list(options["metrics"]), expected, file)
+        options.values["metrics"] = tuple(name for name in options["metrics"] if name != "flip")
     settings: dict[str, Any] = {}
     for key, value in raw.items():
         if key not in OWN_KEYS and not key.startswith("reference."):
             settings |= flat({key: value})
     variants = tuple(variants_of(settings, file))
     labels = {variant.label for variant in variants}
-    labels |= {denoised_label(label) for label in labels if asked["denoise"]}
+    labels |= {denoised_label(label) for label in labels if options["denoise"]}
     extras = []
-    for index, item in enumerate(asked["extra"]):
+    for index, item in enumerate(options["extra"]):
         scene = item.get("scene", scenes[0] if len(scenes) == 1 else None)
         if scene not in scenes:
             raise SceneError(f"extra.{index}.scene", scene, f"one of {', '.join(scenes)}", file)
         if item["name"] in labels:
             raise SceneError(f"extra.{index}.name", item["name"], "a name that no curve has", file)
         extras.append(Extra(item["name"], float(item["seconds"]), item["file"], scene, item.get("spp")))
-    plan = _plan(raw.get("reference"), scenes, asked["spp"][-1], file)
-    return Study(scenes, variants, asked.values, tuple(extras), plan, file)
+    plan = _plan(raw.get("reference"), scenes, options["spp"][-1], file)
+    return Study(scenes, variants, options.values, tuple(extras), plan, file)
 
 
-def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> Plan:
+def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> ReferencePlan:
     """Return the reference of a path, of a mapping with ``file``, or of one with ``spp``, ``seeds`` and settings."""
     if raw is None or isinstance(raw, str):
         raw = {} if raw is None else {"file": raw}
@@ -438,7 +440,7 @@ def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> Pla
         files = {scenes[0]: files} if isinstance(files, str) and len(scenes) == 1 else files
         if not isinstance(files, Mapping) or set(files) != set(scenes):
             raise SceneError("reference.file", files, f"a file for each of {', '.join(scenes)}", file)
-        return Plan(dict(files), 0, 0, {})
+        return ReferencePlan(dict(files), 0, 0, {})
     own = {key: value for key, value in raw.items() if key in parameters_of(Reference)}
     made = values_of(Reference, own, "reference", file, "a reference")
     settings = flat({key: value for key, value in raw.items() if key not in own})
@@ -446,4 +448,4 @@ def _plan(raw: Any, scenes: tuple[str, ...], most: int, file: str | None) -> Pla
         if isinstance(value, list) and key not in LISTS:
             raise SceneError(f"reference.{key}", value, "one value: there is one reference", file)
     variants_of(settings, file)  # refuses what is no setting
-    return Plan({}, made["spp"] or 4 * most, made["seeds"], settings)
+    return ReferencePlan({}, made["spp"] or 4 * most, made["seeds"], settings)

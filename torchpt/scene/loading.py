@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from torchpt.core.memory import needing
-from torchpt.core.threads import lasting
+from torchpt.core.memory import explain_out_of_memory
+from torchpt.core.threads import outside_inference_mode
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.scene.devices import device_of
 from torchpt.scene.formats.description import Source, read_description, settings
@@ -50,10 +50,10 @@ def load(
 def _load(source: Source, device: str | torch.device | None, bsdfs: Mapping[str, Bsdf] | None) -> Scene:
     start = time.perf_counter()
     tensors = Tensors()
-    with needing("the scene file"):
+    with explain_out_of_memory("the scene file"):
         description = read_description(source, bsdfs, tensors.taken_from if isinstance(source, Mapping) else None)
     chosen = device_of(settings(description).render.device if device is None else device)
-    with lasting():
+    with outside_inference_mode():
         scene = Scene(widened(description, tensors), chosen, tuple((bsdfs or {}).values()), corners_in(tensors))
     scene.params |= traced(tensors, scene.description, scene.built, scene.params)
     scene.load_seconds = time.perf_counter() - start

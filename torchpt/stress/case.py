@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from torchpt.stress.bench import Bench
+    from torchpt.stress.harness import Harness
 
-__all__ = ["Case", "Outcome", "Reading", "powers"]
+__all__ = ["Case", "Measurement", "Outcome", "powers"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Case:
     name: str
     measures: str
     bound: float
-    figure: Callable[[Bench, float], float]
+    figure: Callable[[Harness, float], float]
     axis: str = ""
     places: tuple[float, ...] = (0.0,)
     quick: tuple[float, ...] = ()
@@ -45,7 +45,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Reading:
+class Measurement:
     """The figure at one point of a sweep.
 
     Attributes:
@@ -72,11 +72,11 @@ class Outcome:
     """
 
     case: Case
-    readings: tuple[Reading, ...] = field(default=())
+    readings: tuple[Measurement, ...] = field(default=())
     seconds: float = 0.0
 
     @property
-    def worst(self) -> Reading:
+    def worst(self) -> Measurement:
         """Reading that decides: a failure, else the largest figure; a refusal if there is nothing else."""
         measured = [one for one in self.readings if not one.refused] or self.readings
         return max(measured, key=lambda one: math.inf if math.isnan(one.figure) else one.figure)

@@ -14,8 +14,8 @@ import torch
 
 from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD
-from torchpt.core.memory import Budget, is_out_of_memory, needing, on_low_memory
-from torchpt.core.threads import deal
+from torchpt.core.memory import Budget, explain_out_of_memory, is_out_of_memory, on_low_memory
+from torchpt.core.threads import map_in_order
 from torchpt.engines.kernels.engine import LANES, Chunk, Halted, Worker
 from torchpt.engines.kernels.programs import Kernels
 from torchpt.engines.work import TASKS, Block, Share
@@ -163,7 +163,7 @@ class Loop:
                 rest.extend(share.rest)
             return each(share)
 
-        deal(blocks, self.task, self.budget.threads, told, self._halt)
+        map_in_order(blocks, self.task, self.budget.threads, told, self._halt)
         return rest
 
     def _smaller(self, blocks: list[Block]) -> list[Block]:
@@ -249,7 +249,7 @@ class Loop:
             share.tally.truncated += tally.truncated
             rays += tally.rays
         # From here on a failure would leave half a chunk: what little is allocated must be there, or the render ends.
-        with needing("the sums of a film"):
+        with explain_out_of_memory("the sums of a film"):
             if light:
                 self._radiance(worker, chunk, pixel_set, share)
                 self._splats(worker, chunk, pixel_set.film, share)

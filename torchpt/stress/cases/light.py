@@ -10,9 +10,9 @@ from typing import Any
 import torch
 
 from torchpt.images import write_image
-from torchpt.stress.bench import Bench, relative
 from torchpt.stress.case import Case, powers
 from torchpt.stress.cases._scenes import SKY, facing, floor_seen, furnace, room
+from torchpt.stress.harness import Harness, relative
 
 __all__ = ["CASES"]
 
@@ -25,61 +25,63 @@ def lamp(kind: str, height: float, **keys: Any) -> dict[str, Any]:
     return {"lamp": {"type": kind, "emission": 1.0, "transform": [*turn, {"translate": [0, 0, height]}], **keys}}
 
 
-def disk_above(bench: Bench, height: float) -> float:
+def disk_above(harness: Harness, height: float) -> float:
     """Compare a one-sided disk of radius 1 with E = π / (1 + h²)."""
     expected = ALBEDO / (1.0 + height**2)
     scene = floor_seen(None, lamp("disk", height), near=min(1e-3, height / 2))
-    return relative(bench.render(scene, spp=256, max_depth=2), expected)
+    return relative(harness.render(scene, spp=256, max_depth=2), expected)
 
 
-def ball_above(bench: Bench, height: float) -> float:
+def ball_above(harness: Harness, height: float) -> float:
     """Compare a ball of radius 1, its lowest point at ``height``, with E = π / (1 + h)²."""
     expected = ALBEDO / (1.0 + height) ** 2
     scene = floor_seen(None, lamp("sphere", 1.0 + height), near=min(1e-3, height / 2))
-    return relative(bench.render(scene, spp=256, max_depth=2), expected)
+    return relative(harness.render(scene, spp=256, max_depth=2), expected)
 
 
-def point_above(bench: Bench, height: float) -> float:
+def point_above(harness: Harness, height: float) -> float:
     """Compare a point light with E = I / h²."""
     light = {"it": {"type": "point", "position": [0, 0, height], "intensity": 1.0}}
-    return relative(bench.render(floor_seen(light), max_depth=2), ALBEDO / math.pi / height**2)
+    return relative(harness.render(floor_seen(light), max_depth=2), ALBEDO / math.pi / height**2)
 
 
-def inside_a_light(bench: Bench, radius: float) -> float:
+def inside_a_light(harness: Harness, radius: float) -> float:
     """Compare a floor inside an emissive ball with E = π."""
     ball = {"type": "sphere", "radius": radius, "emission": 1.0, "flip_normals": True}
-    return relative(bench.render(floor_seen(None, {"ball": ball}), spp=256, max_depth=2), ALBEDO)
+    return relative(harness.render(floor_seen(None, {"ball": ball}), spp=256, max_depth=2), ALBEDO)
 
 
-def radiance(bench: Bench, value: float) -> float:
+def radiance(harness: Harness, value: float) -> float:
     """Compare a constant environment with ``value`` times the picture of radiance 1."""
     scene = furnace({"type": "diffuse", "reflectance": ALBEDO})
-    one = bench.render(scene)
+    one = harness.render(scene)
     return relative(
-        bench.render({**scene, "lights": {"sky": {"type": "constant", "radiance": value}}}), one.mean() * value
+        harness.render({**scene, "lights": {"sky": {"type": "constant", "radiance": value}}}), one.mean() * value
     )
 
 
-def area_radiance(bench: Bench, value: float) -> float:
+def area_radiance(harness: Harness, value: float) -> float:
     """Compare an emissive disk of radiance ``value`` with its closed form."""
-    return relative(bench.render(floor_seen(None, lamp("disk", 1.0, emission=value)), max_depth=2), ALBEDO * value / 2)
+    return relative(
+        harness.render(floor_seen(None, lamp("disk", 1.0, emission=value)), max_depth=2), ALBEDO * value / 2
+    )
 
 
-def many(bench: Bench, number: float) -> float:
+def many(harness: Harness, number: float) -> float:
     """Compare ``number`` point lights with one of the same power."""
     lights = {f"p{k}": {"type": "point", "position": [0, 0, 2], "intensity": 1.0 / number} for k in range(int(number))}
-    return relative(bench.render(floor_seen(lights), max_depth=2), ALBEDO / math.pi / 4)
+    return relative(harness.render(floor_seen(lights), max_depth=2), ALBEDO / math.pi / 4)
 
 
-def one_of_many(bench: Bench, number: float) -> float:
+def one_of_many(harness: Harness, number: float) -> float:
     """Compare ``number`` point lights, one of them a million times brighter, with their sum."""
     lights = {f"p{k}": {"type": "point", "position": [0, 0, 2], "intensity": 1e-6} for k in range(int(number) - 1)}
     lights["bright"] = {"type": "point", "position": [0, 0, 2], "intensity": 1.0}
     expected = (1.0 + 1e-6 * (number - 1)) * ALBEDO / math.pi / 4
-    return relative(bench.render(floor_seen(lights), max_depth=2, spp=256), expected)
+    return relative(harness.render(floor_seen(lights), max_depth=2, spp=256), expected)
 
 
-def sun(bench: Bench, value: float) -> float:
+def sun(harness: Harness, value: float) -> float:
     """Compare an environment map with one bright texel with float64."""
     height, width = 64, 128
     texels = torch.ones(height, width, 3)
@@ -91,12 +93,12 @@ def sun(bench: Bench, value: float) -> float:
         scene = furnace({"type": "diffuse", "reflectance": 1.0})
         scene["lights"] = {"sky": {"type": "envmap", "path": str(file)}}
         scene["camera"] = facing(1e-3)
-        found = bench.render(scene, spp=256, max_depth=2)
-        exact = bench.exact().render(scene, spp=256, max_depth=2)
+        found = harness.render(scene, spp=256, max_depth=2)
+        exact = harness.exact().render(scene, spp=256, max_depth=2)
     return relative(found, exact)
 
 
-def black_map(bench: Bench, lit: float) -> float:
+def black_map(harness: Harness, lit: float) -> float:
     """Compare an environment map that is black but for ``lit`` rows with float64."""
     texels = torch.zeros(16, 32, 3)
     texels[: int(lit)] = 1.0
@@ -105,27 +107,27 @@ def black_map(bench: Bench, lit: float) -> float:
         write_image(file, texels)
         scene = furnace({"type": "diffuse", "reflectance": 1.0})
         scene["lights"] = {"sky": {"type": "envmap", "path": str(file)}}
-        found, exact = (b.render(scene, max_depth=2) for b in (bench, bench.exact()))
+        found, exact = (b.render(scene, max_depth=2) for b in (harness, harness.exact()))
     return relative(found, exact)
 
 
-def closed_room(bench: Bench, depth: float) -> float:
+def closed_room(harness: Harness, depth: float) -> float:
     """Compare a closed room of albedo 0.9 with the series of ``depth`` terms."""
     expected = (1 - 0.9**depth) / 0.1
-    return relative(bench.render(room(0.9), spp=256, max_depth=int(depth)), expected)
+    return relative(harness.render(room(0.9), spp=256, max_depth=int(depth)), expected)
 
 
-def bright_room(bench: Bench, absorbed: float) -> float:
+def bright_room(harness: Harness, absorbed: float) -> float:
     """Compare a closed room of unbounded paths with 1 / ``absorbed``."""
-    return relative(bench.render(room(1.0 - absorbed), spp=64, max_depth=-1), 1.0 / absorbed)
+    return relative(harness.render(room(1.0 - absorbed), spp=64, max_depth=-1), 1.0 / absorbed)
 
 
-def white_room(bench: Bench, depth: float) -> float:
+def white_room(harness: Harness, depth: float) -> float:
     """Compare a closed room of albedo 1 with the number of its edges, ``depth``."""
-    return relative(bench.render(room(1.0), spp=16, max_depth=int(depth)), depth)
+    return relative(harness.render(room(1.0), spp=16, max_depth=int(depth)), depth)
 
 
-def nothing(bench: Bench, which: float) -> float:
+def nothing(harness: Harness, which: float) -> float:
     """Render scenes without shapes, without light, and from inside a solid: black, or the sky."""
     black = {"type": "diffuse", "reflectance": 0.0}
     scenes = (
@@ -136,7 +138,7 @@ def nothing(bench: Bench, which: float) -> float:
         ({**furnace(black, radius=50.0)}, 0.0),
     )
     scene, expected = scenes[int(which)]
-    return float((bench.render(scene) - expected).abs().max())
+    return float((harness.render(scene) - expected).abs().max())
 
 
 CASES = (
