@@ -27,7 +27,7 @@ __all__ = ["Made", "RenderDataset", "RenderStream"]
 Made = Scene | Mapping[str, Any] | tuple[Scene | Mapping[str, Any], Mapping[str, Any]]
 
 
-class _Items:
+class _ItemRenderer:
     """Renders the items of a data set."""
 
     def __init__(
@@ -148,7 +148,10 @@ class RenderDataset(Dataset):
     ) -> None:
         if type(scenes) is not int or scenes < 0:
             raise SceneError("scenes", scenes, "a whole number >= 0")
-        self._items, self.scenes = _Items("RenderDataset", make, cameras, spp, layers, seed, device, options), scenes
+        self._items, self.scenes = (
+            _ItemRenderer("RenderDataset", make, cameras, spp, layers, seed, device, options),
+            scenes,
+        )
 
     def __len__(self) -> int:
         return self.scenes * max(len(self._items.cameras), 1)
@@ -204,7 +207,7 @@ class RenderStream(IterableDataset):
             raise SceneError("start", start, "a whole number >= 0")
         if shard is not None and not 0 <= shard[0] < shard[1]:
             raise SceneError("shard", shard, "(rank, world) with 0 <= rank < world")
-        self._items = _Items("RenderStream", make, cameras, spp, layers, seed, device, options)
+        self._items = _ItemRenderer("RenderStream", make, cameras, spp, layers, seed, device, options)
         self.scenes = scenes
         self.start, self.shard = start, shard
         self.seen: tuple[int, int] | None = None  # rank and world of the process that started this worker

@@ -89,7 +89,7 @@ def test_a_limit_that_holds_all_lanes_is_forgotten(monkeypatch):
     monkeypatch.setattr(memory.MemoryMeter, "now", lambda _: 0)
     for limit, lanes in ((11_500, 8000), (20_000, 8000), (80_000, 8000), (100_000, 8000)):
         found = Budget(CPU, lanes, what="a thing", limit=limit, per_lane=10)
-        found.steady()
+        found.drop_unneeded_limit()
         assert (found.limit is None and found.lanes == lanes) == (limit == 100_000)
 
 

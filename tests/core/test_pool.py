@@ -15,7 +15,7 @@ import torch
 
 from torchpt.core import threads
 from torchpt.core.errors import RenderError
-from torchpt.core.threads import TaskQueue, map_in_order, share
+from torchpt.core.threads import TaskQueue, map_in_order, parallel_for
 
 
 def dealt(task: Callable[[int], Any], count: int, **wish: Any) -> list[Any]:
@@ -154,7 +154,7 @@ def test_tasks_that_use_threads_do_not_wait_for_each_other():
             sums[k] += last - first
 
         for _ in range(20):
-            share(work, 100, 3)
+            parallel_for(work, 100, 3)
         return k
 
     assert dealt(task, 8, threads=4) == list(range(8)) and sums == [2000] * 8
@@ -163,7 +163,7 @@ def test_tasks_that_use_threads_do_not_wait_for_each_other():
 def test_a_share_covers_its_range_once():
     for count in (1, 2, 5):
         found = SimpleQueue[tuple[int, int]]()
-        share(lambda a, b, found=found: found.put((a, b)), 17, count)
+        parallel_for(lambda a, b, found=found: found.put((a, b)), 17, count)
         parts = sorted(found.get() for _ in range(found.qsize()))
         assert len(parts) == count and parts[0][0] == 0 and parts[-1][1] == 17
         assert all(a[1] == b[0] for a, b in pairwise(parts))
@@ -173,7 +173,7 @@ def test_a_share_covers_its_range_once():
             if first:
                 raise IndexError("of the work")
 
-        share(work, 10, 3)
+        parallel_for(work, 10, 3)
 
 
 @pytest.fixture
@@ -200,7 +200,7 @@ def test_fewer_threads_where_there_is_no_memory_for_all(no_more_threads, left):
     no_more_threads(left)
     assert dealt(lambda k: k, 10, threads=4) == list(range(10))
     total = []
-    share(lambda a, b: total.append(b - a), 12, 4)
+    parallel_for(lambda a, b: total.append(b - a), 12, 4)
     assert sum(total) == 12
 
 
@@ -209,7 +209,7 @@ def test_without_memory_for_a_thread_it_is_one_line(no_more_threads):
     with pytest.raises(RenderError, match="^not enough memory for a thread that renders$"):
         dealt(lambda k: k, 10)
     total = []
-    share(lambda a, b: total.append(b - a), 12, 4)  # the calling thread does it all
+    parallel_for(lambda a, b: total.append(b - a), 12, 4)  # the calling thread does it all
     assert sum(total) == 12
 
 

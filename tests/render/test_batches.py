@@ -508,14 +508,14 @@ def test_an_error_names_its_scene(threads, compiled):
 
 @pytest.mark.parametrize("compiled", ("auto", "off"))
 def test_an_error_names_its_parameters(monkeypatch, compiled):
-    scene, took = room(), Run.took
+    scene, task_finished = room(), Run.task_finished
 
     def failing(self, share):
         if float(self.wave.camera.to_world[0, 3]) > 1.5:
             raise RenderError("broken")
-        return took(self, share)
+        return task_finished(self, share)
 
-    monkeypatch.setattr(Run, "took", failing)
+    monkeypatch.setattr(Run, "task_finished", failing)
     given = poses(scene, 3)
     given[2, 0, 3] = 2.0
     with pytest.raises(RenderError, match=r"^params\[2\]: broken"):
@@ -539,14 +539,14 @@ def test_too_many_seeds_for_what_an_iterator_gives(make):
 
 def test_a_picture_that_renders_alone_is_not_blamed_for_one_before(monkeypatch):
     bad, alone = room(render={"spp": 512, "threads": 1}), room(render={"time_limit": 5.0, "threads": 1})
-    took = Run.took
+    task_finished = Run.task_finished
 
     def failing(self, share):
         if share is not None and self.scene is bad:
             raise RenderError("broken")
-        return took(self, share)
+        return task_finished(self, share)
 
-    monkeypatch.setattr(Run, "took", failing)
+    monkeypatch.setattr(Run, "task_finished", failing)
     with pytest.raises(RenderError, match=r"^scenes\[0\]: broken"):
         torchpt.render_batch([bad, alone])
 

@@ -129,7 +129,7 @@ def test_no_error_in_doubt_ends_a_render(box, monkeypatch, doubt):
         "null": (ErrorEstimate(0.01, (0.009, 0.011), False), "a reason"),
         "wide": (ErrorEstimate(0.01, (0.002, 0.05), False), ""),
     }
-    monkeypatch.setattr("torchpt.rendering.run.known_of", lambda *_: told[doubt])
+    monkeypatch.setattr("torchpt.rendering.run.error_estimate_of", lambda *_: told[doubt])
     found = shot(box, spp=40, target_error=0.02)
     assert (found.spp, found.stopped_by) == (40, "spp") and found.summary()["stopped_by"] == "spp"
     monkeypatch.undo()

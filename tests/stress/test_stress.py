@@ -85,9 +85,9 @@ def failing(harness: Harness, at: float) -> float:
 
 
 def test_the_largest_figure_decides() -> None:
-    good = outcome_of(case(axis="x", places=(0.1, 0.9, 0.5)), Harness())
+    good = outcome_of(case(axis="x", sweep=(0.1, 0.9, 0.5)), Harness())
     assert good.passed and good.worst == Measurement(0.9, 0.9)
-    bad = outcome_of(case(axis="x", places=(0.1, 1.1)), Harness())
+    bad = outcome_of(case(axis="x", sweep=(0.1, 1.1)), Harness())
     assert not bad.passed and bad.worst.at == 1.1
     assert not outcome_of(case(figure=lambda b, at: float("nan")), Harness()).passed
     broken = outcome_of(case(figure=failing), Harness())
@@ -101,19 +101,19 @@ def refusing(harness: Harness, at: float) -> float:
 
 
 def test_a_search_may_refuse_a_scene() -> None:
-    partly = outcome_of(case(figure=refusing, places=(0.1, 1.0)), Harness(accel="brute"))
+    partly = outcome_of(case(figure=refusing, sweep=(0.1, 1.0)), Harness(accel="brute"))
     assert partly.passed and partly.refused == 1 and partly.worst == Measurement(1.0, 0.5)
     assert line(partly).endswith("passed, refused at 1 of 2 places")
-    wholly = outcome_of(case(figure=refusing, places=(0.1,)), Harness(accel="brute"))
+    wholly = outcome_of(case(figure=refusing, sweep=(0.1,)), Harness(accel="brute"))
     assert wholly.passed and "refused: SceneError: render.accel: expected numba" in line(wholly)
-    beyond = outcome_of(case(figure=refusing, places=(0.1, 1.0), bound=0.1), Harness(accel="brute"))
+    beyond = outcome_of(case(figure=refusing, sweep=(0.1, 1.0), bound=0.1), Harness(accel="brute"))
     assert not beyond.passed and "FAILED, refused at 1 of 2 places" in line(beyond)
 
 
 def test_places_of_a_quick_run() -> None:
-    sweep = case(places=tuple(float(k) for k in range(9)))
-    assert sweep.chosen(True) == (0.0, 4.0, 8.0) and len(sweep.chosen(False)) == 9
-    assert case(places=(1.0, 2.0), quick=(2.0,)).chosen(True) == (2.0,)
+    sweep = case(sweep=tuple(float(k) for k in range(9)))
+    assert sweep.points(True) == (0.0, 4.0, 8.0) and len(sweep.points(False)) == 9
+    assert case(sweep=(1.0, 2.0), quick=(2.0,)).points(True) == (2.0,)
 
 
 # -- the command

@@ -97,7 +97,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     """
     from torchpt.images import check_writable
     from torchpt.rendering.api import first_hit, render_scene
-    from torchpt.rendering.checkpoint import Keeper
+    from torchpt.rendering.checkpoint import CheckpointFile
     from torchpt.rendering.result import write_rendered
     from torchpt.scene.devices import device_of
     from torchpt.scene.scene import Scene
@@ -127,7 +127,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
         if kept is not None:
             wishes = replace(wishes, render=wishes.render.but(checkpoint=kept))
             if first:
-                Keeper(kept).check(wishes.render.resume)
+                CheckpointFile(kept).check(wishes.render.resume)
         scene = Scene(description, device_of(wishes.render.device))
     scene.load_seconds = time.perf_counter() - start
     if first:

@@ -24,7 +24,7 @@ from torchpt.compiler.program import Program, Tables, TracedStage, bound
 from torchpt.compiler.prologue import pruned
 from torchpt.compiler.sinks import Sinks, Store
 from torchpt.compiler.tracing import Tracer, lanes_for, tracing
-from torchpt.core.threads import share, thread_count
+from torchpt.core.threads import parallel_for, thread_count
 from torchpt.core.tree import leaves, signature
 from torchpt.native import compile_time
 
@@ -222,7 +222,7 @@ class _Made:
             self.program.call(ctypes.addressof(block), end - start)
 
         blocks = -(-count // BLOCK)
-        share(part, blocks, min(threads, max(blocks // self.grain, 1)))
+        parallel_for(part, blocks, min(threads, max(blocks // self.grain, 1)))
         return outputs[0] if isinstance(self.results, Tensor) else tuple(outputs)
 
 

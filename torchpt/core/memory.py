@@ -361,7 +361,7 @@ class Budget:
                 self.threads, self.lanes = threads, min(max(lanes, least), self._most)
                 return
 
-    def steady(self) -> None:
+    def drop_unneeded_limit(self) -> None:
         """Drop the limit if all lanes are expected to fit: chunks then have the same size as without one."""
         if self.limit is None or self._most * self.per_lane <= SHARE * (self.limit - self.meter.now()):
             self.limit, self.lanes = None, self._most

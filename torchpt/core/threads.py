@@ -2,8 +2,8 @@
 
 A caller takes idle threads of the pool and starts the missing ones, so overlapping renders never wait for each other's threads.
 There are three ways to use them: :func:`map_in_order` runs a task for each item and passes results on in the order of items; a
-:class:`TaskQueue` runs tasks of a queue that may grow; :func:`share` splits a range into a part for each thread. Idle threads
-end before the process forks; a child has a pool of its own.
+:class:`TaskQueue` runs tasks of a queue that may grow; :func:`parallel_for` splits a range into a part for each thread. Idle
+threads end before the process forks; a child has a pool of its own.
 
 On a CPU torch splits a tensor of more than 32,768 elements among its threads. The last elements of a part do not fill a vector,
 and functions whose scalar code differs from their vector code (``atan2``, ``pow``) round them differently. A sum over all
@@ -38,7 +38,7 @@ __all__ = [
     "mean_all",
     "one_thread",
     "outside_inference_mode",
-    "share",
+    "parallel_for",
     "start_torch_threads",
     "sum_all",
     "thread_count",
@@ -101,7 +101,7 @@ _starting = threading.Lock()
 _idle: list[_Thread] = []
 
 
-def _assigned(work: Callable[[], object], ended: SimpleQueue[None]) -> bool:
+def _run_in_pool(work: Callable[[], object], ended: SimpleQueue[None]) -> bool:
     """Run ``work``, which must not raise, on a thread of the pool; return False if no thread can be started."""
     try:
         thread = _idle.pop()
@@ -165,7 +165,7 @@ class TaskQueue(Generic[T, R]):
         self._todo.put((tag, task))
         if self._size >= min(self.threads, self.pending):
             return
-        if _assigned(self._work, self._ended):
+        if _run_in_pool(self._work, self._ended):
             self._size += 1
         elif self._size:
             self.threads = self._size
@@ -279,7 +279,7 @@ def map_in_order(
             raise result
 
 
-def share(work: Callable[[int, int], object], items: int, threads: int) -> None:
+def parallel_for(work: Callable[[int, int], object], items: int, threads: int) -> None:
     """Call ``work(first, last)`` for parts of ``range(items)``, one part for each thread, the first in this one.
 
     Args:
@@ -306,7 +306,7 @@ def share(work: Callable[[int, int], object], items: int, threads: int) -> None:
 
     ended = SimpleQueue[None]()
     first = parts.popleft()
-    helpers = sum(_assigned(take, ended) for _ in range(threads - 1))
+    helpers = sum(_run_in_pool(take, ended) for _ in range(threads - 1))
     try:
         work(*first)
         take()  # parts that no thread has begun

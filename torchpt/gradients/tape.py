@@ -141,7 +141,7 @@ def _budget(settings: Settings, assembly: SceneTape) -> Budget:
     lanes = min(LANES.get(device.type, LANES["cpu"]), max(TAPE // each, 1))
     limit = settings.render.max_memory
     budget = Budget(device, lanes, what="the tape of a single lane", limit=limit, per_lane=each)
-    budget.steady()
+    budget.drop_unneeded_limit()
     return budget
 
 

@@ -24,7 +24,7 @@ from numba.core.event import Event, Listener, register
 
 from torchpt.core.errors import RenderError
 from torchpt.core.memory import MARGIN, check_address_space
-from torchpt.core.threads import share
+from torchpt.core.threads import parallel_for
 from torchpt.native import cache, compile_time
 from torchpt.native.content import code_of_function
 
@@ -203,4 +203,4 @@ def launch(serial: Any, parallel: Any, items: int, threads: int, grain: int, arg
             numba.set_num_threads(before)
     else:
         compiled(serial, 0, 0, *args)
-        share(lambda first, last: serial(first, last, *args), items, threads)
+        parallel_for(lambda first, last: serial(first, last, *args), items, threads)

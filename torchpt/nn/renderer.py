@@ -75,7 +75,7 @@ class Renderer(nn.Module):
         if type(seed) is not int or seed < 0:
             raise SceneError("seed", seed, "a whole number >= 0")
         self.scene, self.seed, self.full, self.options = as_scene(scene), seed, full, options
-        self.names = () if names is None else _chosen(scene, (names,) if isinstance(names, str) else names)
+        self.names = () if names is None else _matching_names(scene, (names,) if isinstance(names, str) else names)
         with torch.no_grad():
             starts = [scene.params[name].detach() for name in self.names]
             ranges = [
@@ -173,7 +173,7 @@ def _key(name: str) -> str:
     return name.replace(".", "/")
 
 
-def _chosen(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
+def _matching_names(scene: Scene, names: Sequence[str]) -> tuple[str, ...]:
     """Return the parameters that match names and patterns, in the scene's order."""
     if not isinstance(names, Iterable) or isinstance(names, Mapping):
         raise SceneError("names", names, "a name of scene.params, or a sequence of names and patterns")

@@ -39,8 +39,8 @@ __all__ = [
     "FREE",
     "CheckpointFile",
     "RenderState",
+    "check_plausible",
     "check_samples",
-    "check_whole",
     "ends_a_pass",
     "identity",
     "read_arrays",
@@ -328,7 +328,7 @@ def ends_a_pass(run: Run, taken: int) -> bool:
     return end == taken
 
 
-def check_whole(run: Run, state: RenderState, path: Path) -> None:
+def check_plausible(run: Run, state: RenderState, path: Path) -> None:
     """Refuse a checkpoint whose numbers no render of these settings can have.
 
     Sums may be negative (signed filters); AOVs of a user's models may be non-finite.
@@ -364,7 +364,7 @@ def check_whole(run: Run, state: RenderState, path: Path) -> None:
         total += int(counts["pilots"].sum())
     problems["done"] = done != total
     problems["truncated"] = facts["truncated"] > done
-    problems["lost"] = lost.count > done or not all(_is_there(run, place, int(seen.max())) for place in lost.places)
+    problems["lost"] = lost.count > done or not all(_is_taken(run, place, int(seen.max())) for place in lost.places)
     for name, wrong in problems.items():
         if wrong:
             raise AssetError(path, f"is no whole checkpoint (no render comes to its {name})")
@@ -374,7 +374,7 @@ def _finite(values: Iterable[Tensor]) -> bool:
     return all(bool(torch.isfinite(value).all()) for value in values)
 
 
-def _is_there(run: Run, place: Place, samples: int) -> bool:
+def _is_taken(run: Run, place: Place, samples: int) -> bool:
     """Return True if the render takes this sample, in the picture or in its error probes."""
     x, y, width, height = run.wave.crop
     pixel_sets = [run.picture] if run.probes is None else [run.picture, run.probes.pixel_set]

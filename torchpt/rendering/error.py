@@ -82,25 +82,27 @@ class ErrorProbes:
             assert pixel_set.places is not None
             again = Again(pixel_set.places.cpu(), suspects, values.mean(0), values.var(0) / len(values))
         first = self._first(film)
-        return known_error(picture.cpu(), self.pilots, first, self._second(), self._spare(), self.counted, again)
+        return known_error(
+            picture.cpu(), self.pilots, first, self._second(), self._second_variance(), self.counted, again
+        )
 
     def resampling_share(self, pixels: int) -> float:
         """Return the samples that third values take, as a share of the samples of a picture of ``pixels`` pixels."""
         return STREAMS * sum(again_counts(pixels, len(self.pilots))) / pixels if len(self.pilots) else 0.0
 
     def resample_outliers(
-        self, film: Film, agreed: Callable[[Tensor], Tensor] | None = None
+        self, film: Film, from_first_rank: Callable[[Tensor], Tensor] | None = None
     ) -> list[tuple[PixelSet, int, int]]:
         """Choose the pixels to resample for a better error estimate, and return their spans: pixels, first sample, count.
 
-        ``agreed`` replaces integers ``(n,)`` by those of the first rank; None: one process renders.
+        ``from_first_rank`` replaces integers ``(n,)`` by those of the first rank; None: one process renders.
         """
         if not len(self.pilots):
             return []
         picture, first = self.picture(film).cpu(), self._first(film)
         suspects, doubtful = to_look_at(picture, self.pilots, first, self._second())
-        if agreed is not None:
-            suspects, doubtful = agreed(suspects), agreed(doubtful)
+        if from_first_rank is not None:
+            suspects, doubtful = from_first_rank(suspects), from_first_rank(doubtful)
         places = torch.cat((suspects, doubtful)).to(film.sums.device)
         streams = Streams(self.pixel_set.streams.first + self.pixel_set.streams.count, STREAMS)
         pixel_set = PixelSet(Film(len(places), 1, STREAMS, film.sums.device), {}, streams, places)
@@ -113,7 +115,7 @@ class ErrorProbes:
         """Return the error estimate that the probes give without third values; None without probes."""
         if not len(self.pilots):
             return None
-        return pilots_alone(self.pilots, self._first(film), self._second(), self._spare(), self.counted)
+        return pilots_alone(self.pilots, self._first(film), self._second(), self._second_variance(), self.counted)
 
     def _first(self, film: Film) -> Tensor:
         assert self.pixel_set.places is not None
@@ -122,7 +124,7 @@ class ErrorProbes:
     def _second(self) -> Tensor:
         return self.pixel_set.film.values().cpu()
 
-    def _spare(self) -> Tensor | None:
+    def _second_variance(self) -> Tensor | None:
         """Return the variance of the second values where it differs from that of the first ones; else None."""
         if self.counted:
             return None
@@ -152,11 +154,11 @@ class SampleAllocation:
     Args:
         pilots: the error probes of the picture.
         film: the film of the picture.
-        agreed: replaces integers ``(n,)`` by those of the first rank; None: one process renders.
+        from_first_rank: replaces integers ``(n,)`` by those of the first rank; None: one process renders.
     """
 
-    def __init__(self, pilots: Pilots, film: Film, agreed: Callable[[Tensor], Tensor] | None = None) -> None:
-        self.pilots, self._agreed = pilots, agreed
+    def __init__(self, pilots: Pilots, film: Film, from_first_rank: Callable[[Tensor], Tensor] | None = None) -> None:
+        self.pilots, self._from_first_rank = pilots, from_first_rank
         x, y = torch.arange(film.width) + pilots.corner[0], torch.arange(film.height) + pilots.corner[1]
         rows, columns = pilots.blocks
         #: Block index of each pixel ``(pixels,)``.
@@ -174,8 +176,8 @@ class SampleAllocation:
         counts = self._of_blocks(picture.film.counts.cpu())
         aims = shared_out(self._errors(probes), counts, self.pixels, mean, last)
         spans: list[tuple[PixelSet, int, int]] = []
-        if self._agreed is not None:
-            aims = self._agreed(aims)
+        if self._from_first_rank is not None:
+            aims = self._from_first_rank(aims)
         most = int(aims.max()) + 1
         kinds = (counts * most + aims)[aims > counts].unique().tolist()
         pilot_blocks = self.block[self.pilots.places]

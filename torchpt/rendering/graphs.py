@@ -82,7 +82,7 @@ def _in_graph(
     **options: Any,
 ) -> Any:
     """Call the operator, or ``render`` outside of the graph; ``torch.compile`` traces this function."""
-    if full or len(scene.own_models) > 0 or not _fits(params, seed, dtype, options):
+    if full or len(scene.own_models) > 0 or not _fits_graph(params, seed, dtype, options):
         with_graph_break: Any = torch.compiler.disable(render)
         return with_graph_break(scene, params=params, full=full, seed=seed, dtype=dtype, **options)
     given = dict(params) if params is not None else {}
@@ -95,7 +95,7 @@ def _in_graph(
     return torch.ops.torchpt.render(scene.number, text, -1 if seed is None else seed, list(given.values()))[0]
 
 
-def _fits(params: Any, seed: Any, dtype: Any, options: Mapping[str, Any]) -> bool:
+def _fits_graph(params: Any, seed: Any, dtype: Any, options: Mapping[str, Any]) -> bool:
     """Return True if the arguments can be part of a graph; others, also invalid ones, are rendered outside of it."""
     known = dtype is torch.float32 or dtype is torch.float64
     number = isinstance(seed, int) and not isinstance(seed, bool)
@@ -163,7 +163,7 @@ class _OperatorCall(NamedTuple):
         return torch.empty(height, width, 3, dtype=self.options["dtype"], device=self.scene.device)
 
 
-def _apart(work: Callable[[], R], made: list[Rendering], device: torch.device) -> R:
+def _in_thread(work: Callable[[], R], made: list[Rendering], device: torch.device) -> R:
     """Return ``work()``, run in another thread: in the operator's own thread autograd would not record it."""
     stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
     found: list[R] = []
@@ -197,7 +197,7 @@ def _register(render: Callable[..., Any]) -> None:
                 return render(request.scene, params=given, **request.options).contiguous()
 
         versions = request.versions().values()
-        return _apart(work, made, request.scene.device), torch.tensor([made[0].spp, *versions])
+        return _in_thread(work, made, request.scene.device), torch.tensor([made[0].spp, *versions])
 
     def like_picture(number: int, text: str, seed: int, tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         request = _OperatorCall.read(number, text, 0)
@@ -220,7 +220,7 @@ def _register(render: Callable[..., Any]) -> None:
             every = (grads.get(name, torch.zeros_like(value)) for name, value in given.items())
             return [value.detach().contiguous() for value in every]
 
-        return _apart(work, made, request.scene.device)
+        return _in_thread(work, made, request.scene.device)
 
     def like_gradients(
         number: int, text: str, seed: int, tensors: Sequence[Tensor], facts: Tensor, cotangent: Tensor

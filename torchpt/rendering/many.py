@@ -61,20 +61,20 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
     waiting, begun = iter(entries), dict[int, QueuedRender]()
     try:
         while True:
-            with _beside(queue):
+            with _single_threaded(queue):
                 entry = next(waiting, None)
             if entry is None:
                 break
-            with without_autocast(entry.device), _blamed(entry), _beside(queue):
+            with without_autocast(entry.device), _errors_to(entry), _single_threaded(queue):
                 entry.run = entry.make(queue.threads)
-                spans = entry.run.at_once()
+                spans = entry.run.all_spans()
             if spans is None:
-                _drain(queue, begun, 0)
-                with without_autocast(entry.device), _blamed(entry):
-                    entry.done(entry.run.go(None))
+                _collect(queue, begun, 0)
+                with without_autocast(entry.device), _errors_to(entry):
+                    entry.done(entry.run.sample_all(None))
                 del entry.run
                 continue
-            with _blamed(entry):
+            with _errors_to(entry):
                 engine = entry.run.tasks
                 assert engine is not None
                 begun[id(entry)] = entry
@@ -82,8 +82,8 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
                 entry.left = len(blocks)
                 for block in blocks:
                     queue.add(entry, partial(engine.task, block))
-            _drain(queue, begun, PREFETCH * queue.threads * tasks)
-        _drain(queue, begun, 0)
+            _collect(queue, begun, PREFETCH * queue.threads * tasks)
+        _collect(queue, begun, 0)
     finally:
         for entry in begun.values():  # unfinished renders stop at their next kernel
             if entry.run.tasks is not None:
@@ -92,14 +92,14 @@ def render_many(entries: Iterable[QueuedRender], tasks: int) -> None:
 
 
 @contextmanager
-def _beside(queue: TaskQueue[QueuedRender, Share]) -> Iterator[None]:
+def _single_threaded(queue: TaskQueue[QueuedRender, Share]) -> Iterator[None]:
     """Let tensor operations use one thread while the pool traces: torch's team would wait for busy cores, and spin."""
     with one_thread() if queue.pending else nullcontext():
         yield
 
 
 @contextmanager
-def _blamed(entry: QueuedRender) -> Iterator[None]:
+def _errors_to(entry: QueuedRender) -> Iterator[None]:
     """Pass errors raised within to the entry's ``failed``."""
     try:
         yield
@@ -108,7 +108,7 @@ def _blamed(entry: QueuedRender) -> Iterator[None]:
         raise
 
 
-def _drain(queue: TaskQueue[QueuedRender, Share], begun: dict[int, QueuedRender], most: int) -> None:
+def _collect(queue: TaskQueue[QueuedRender, Share], begun: dict[int, QueuedRender], most: int) -> None:
     """Collect results of the pool until at most ``most`` tasks are pending."""
     while True:
         found = queue.next(wait=queue.pending > most)
@@ -118,7 +118,7 @@ def _drain(queue: TaskQueue[QueuedRender, Share], begun: dict[int, QueuedRender]
             continue
         entry, share = found
         entry.left -= 1
-        with without_autocast(entry.device), _blamed(entry), _beside(queue):
+        with without_autocast(entry.device), _errors_to(entry), _single_threaded(queue):
             if isinstance(share, Unsupported):
                 entry.run.unsupported = share
                 assert entry.run.tasks is not None
@@ -127,8 +127,8 @@ def _drain(queue: TaskQueue[QueuedRender, Share], begun: dict[int, QueuedRender]
                 raise share
             else:
                 entry.rest += share.rest
-                entry.run.took(share)
+                entry.run.task_finished(share)
             if entry.left == 0:
                 del begun[id(entry)]
-                entry.done(entry.run.completed(entry.rest))
+                entry.done(entry.run.finish(entry.rest))
                 del entry.run

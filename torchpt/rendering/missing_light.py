@@ -32,9 +32,9 @@ __all__ = ["MissingLight", "find_missing_light"]
 #: Largest share of dark pixels at which the rest still gives an error estimate.
 DARK = 0.05
 #: Number of dark pixels for which one camera ray tests whether it meets a surface that reflects.
-ASKED = 256
+DARK_PIXELS = 256
 #: Rays traced from a light; directions traced from the surface of each dark pixel.
-RAYS, SIGHTS = 512, 8
+RAYS, DIRECTIONS = 512, 8
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,14 @@ def find_missing_light(
         return MissingLight("there is no light at all in the scene", 0.0)
     search = _Search(wave, geometry)
     if wave.integrator.lit and lights is not None:
-        for row, kind in _deltas(lights):
-            problem = _hidden(search, names, lights, row, kind)
+        for row, kind in _delta_lights(lights):
+            problem = _why_unreachable(search, names, lights, row, kind)
             if problem:
                 return MissingLight(f"lights.{names.light(row)}: {problem}", 0.0)
     black = (picture == 0.0).all(2).reshape(-1)
     if bool(black.all()):
         return MissingLight("no sample met any light", 1.0)
-    dark = _dark(search, black)
+    dark = _dark_share(search, black)
     if dark > min(DARK, relmse):
         return MissingLight(f"no sample met any light in {100.0 * dark:.2g} % of the picture", dark)
     return MissingLight("", dark)
@@ -101,7 +101,7 @@ class _Search:
         return replace(self._wave, accel=self._own)
 
 
-def _dark(search: _Search, black: Tensor) -> float:
+def _dark_share(search: _Search, black: Tensor) -> float:
     """Return the share of pixels that are ``black (pixels,)`` although their first camera ray meets a surface that reflects.
 
     With direct light only, shadows are black and their error is known: each sample evaluated a light.
@@ -111,21 +111,21 @@ def _dark(search: _Search, black: Tensor) -> float:
     if not count or not integrator.light or 0 <= integrator.limits.max_depth <= 2:
         return 0.0
     wave = search.wave
-    asked = places[torch.linspace(0, count - 1, min(count, ASKED), dtype=torch.float64).round().long()].to(
+    asked = places[torch.linspace(0, count - 1, min(count, DARK_PIXELS), dtype=torch.float64).round().long()].to(
         wave.centre.device
     )
-    state = _through(wave, asked)
+    state = _camera_rays(wave, asked)
     hit = hits(wave, state)
     reflects = hit.prim >= 0
     with suppress(NotImplementedError):  # a model of the caller's own without an albedo
         reflects = seen(wave, ("albedo",), state)["albedo"].abs().amax(0) > 0
     on = reflects.nonzero()[:, 0]
-    if not len(on) or not _in_sight(wave, rows(state, on), rows(hit, on)):
+    if not len(on) or not _any_surface_visible(wave, rows(state, on), rows(hit, on)):
         return 0.0
     return float(reflects.double().mean()) * count / len(black)
 
 
-def _through(wave: Wave, places: Tensor) -> PathState:
+def _camera_rays(wave: Wave, places: Tensor) -> PathState:
     """Return camera rays from the centre of the lens through the centres of pixels ``places (n,)``."""
     x0, y0, width, _ = wave.crop
     x, y = places % width + x0, places // width + y0
@@ -136,7 +136,7 @@ def _through(wave: Wave, places: Tensor) -> PathState:
     return camera_state(o.expand_as(d), d, key)
 
 
-def _in_sight(wave: Wave, state: PathState, hit: Hit) -> bool:
+def _any_surface_visible(wave: Wave, state: PathState, hit: Hit) -> bool:
     """Return True if any surface is visible from the surfaces that camera rays hit, or if one of them transmits light.
 
     Otherwise, as with a single ball in the sun, all paths have one vertex, and light sampling has found all there is.
@@ -147,8 +147,10 @@ def _in_sight(wave: Wave, state: PathState, hit: Hit) -> bool:
             return True
     at = interact(world, state.o, state.d, hit)
     near = torch.where(dot(at.ng, state.d) < 0.0, 1.0, -1.0) * at.ng
-    for k in range(SIGHTS):
-        d = _sphere(torch.arange(len(hit.t), device=near.device) * SIGHTS + k, len(hit.t) * SIGHTS).to(near.dtype)
+    for k in range(DIRECTIONS):
+        d = _sphere(torch.arange(len(hit.t), device=near.device) * DIRECTIONS + k, len(hit.t) * DIRECTIONS).to(
+            near.dtype
+        )
         d = torch.where(dot(d, near) < 0.0, -d, d)
         prim = wave.accel.intersect(offset_origin(world, at, d), d, torch.full_like(hit.t, math.inf))[1]
         if bool((prim >= 0).any()):
@@ -163,7 +165,7 @@ def _sphere(k: Tensor, count: int) -> Tensor:
     return torch.stack((radius * turn.cos(), radius * turn.sin(), height))
 
 
-def _deltas(lights: Lights) -> list[tuple[int, str]]:
+def _delta_lights(lights: Lights) -> list[tuple[int, str]]:
     """Return row and kind of each delta light with power."""
     kinds = [lights.kinds[0]] if lights.kind is None else [lights.kinds[k] for k in lights.kind.tolist()]
     bright = lights.radiance.abs().amax(0).tolist()
@@ -172,7 +174,7 @@ def _deltas(lights: Lights) -> list[tuple[int, str]]:
     ]
 
 
-def _hidden(search: _Search, names: Names, lights: Lights, row: int, kind: str) -> str:
+def _why_unreachable(search: _Search, names: Names, lights: Lights, row: int, kind: str) -> str:
     """Return why no path finds delta light ``row``; "" where one may.
 
     A path finds a delta light by light sampling at a surface that the light reaches directly and whose BSDF is not all deltas.

@@ -96,10 +96,10 @@ def prepare_request(scene: Scene, full: bool, **options: Unpack[CommonOptions]) 
     _check(scene, call, options.get("device"))
     settings = complete(scene.description, blocks_of(options))
     if not full:
-        settings = _of_one_picture(settings, options.get("film"))
+        settings = _without_aovs(settings, options.get("film"))
     elif settings.film.denoise:
         check_denoiser()
-    params = _given(scene, call.params, full)
+    params = _parameters(scene, call.params, full)
     textured = with_texels(scene, params)
     textured.check_own()
     request = RenderRequest(scene, textured, settings, call, params)
@@ -164,7 +164,7 @@ def _broadcast(scene: Scene, o: Tensor, d: Tensor) -> tuple[Tensor, Tensor]:
     return o, d
 
 
-def _given(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
+def _parameters(scene: Scene, params: Mapping[str, Tensor] | None, full: bool) -> dict[str, Tensor]:
     """Return tensors in place of the scene's parameters, and those of its own that require gradients.
 
     Raises:
@@ -214,7 +214,7 @@ def execute_request(request: RenderRequest, made: list[Rendering] | None = None)
     return rendering
 
 
-def _of_one_picture(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
+def _without_aovs(settings: Settings, film: Mapping[str, Any] | None) -> Settings:
     """Return settings without AOVs and denoising, which a tensor cannot hold; a scene file may ask for them.
 
     Raises:
@@ -236,11 +236,11 @@ def _check(scene: Scene, call: Call, device: str | torch.device | None) -> None:
     for name in call.params or {}:
         if not isinstance(name, str):
             raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.params))}")
-    if device not in (None, "auto") and not _same(device, scene.device):
+    if device not in (None, "auto") and not _same_device(device, scene.device):
         raise SceneError("device", str(device), f"the scene's own device {scene.device}; load the scene on the other")
 
 
-def _same(requested: str | torch.device, own: torch.device) -> bool:
+def _same_device(requested: str | torch.device, own: torch.device) -> bool:
     """Return True if ``requested`` names device ``own``."""
     try:
         device = torch.device(requested)

@@ -22,7 +22,7 @@ from torchpt.paths.wave import PixelSet, RayCounts, Wave
 from torchpt.physics.film import ErrorEstimate, Film
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.ranks import Group, together
-from torchpt.rendering.checkpoint import EVERY, CheckpointFile, RenderState, check_samples, check_whole, identity
+from torchpt.rendering.checkpoint import EVERY, CheckpointFile, RenderState, check_plausible, check_samples, identity
 from torchpt.rendering.error import FIRST_ROUND, SampleAllocation, error_probes
 from torchpt.rendering.nonfinite import told
 from torchpt.rendering.picture import error_estimate_of, finished_rendering, rendering_of
@@ -44,7 +44,7 @@ __all__ = ["Run", "render_scene"]
 SMALL_ROUND = 8
 
 
-def _most(known: ErrorEstimate | None) -> float:
+def _upper_bound(known: ErrorEstimate | None) -> float:
     """Return the upper end of the estimate's interval; infinite if there is none, or it is not to be trusted."""
     return math.inf if known is None or known.interval is None or known.heavy_tailed else known.interval[1]
 
@@ -126,7 +126,7 @@ class Run:
         self.picture = PixelSet(film, layers, streams)
         self.probes = error_probes(self.wave, self.settings, device) if self.settings.pilots else None
         self.tally, self.done, self.left, self.taken, self.ended = RayCounts(), 0, 0, 0, False
-        self._keeps_no_more = False  # later samples are taken again after a resume
+        self._final_checkpoint_written = False  # later samples are taken again after a resume
         self.cut = False  # True once spp or the time limit shortened an adaptive round
         self.before = 0.0  # seconds of sampling before the checkpoint that was resumed
         bounded = self.keeps or self.split is not None  # a lost rank is noticed between passes
@@ -136,11 +136,14 @@ class Run:
         if self.split is not None:
             self.split.begin()
         self.lost = NonFinite()
-        self._unlooked: tuple[dict[str, Any], Tensor] = {}, torch.empty(0)  # counts before outliers were resampled
+        self._before_resampling: tuple[dict[str, Any], Tensor] = (
+            {},
+            torch.empty(0),
+        )  # counts before outliers were resampled
         self.light = torch.zeros(2, dtype=torch.float64, device=device)  # before and after the clamp
         self.begun: float | None = None
 
-    def go(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
+    def sample_all(self, on_progress: Callable[[Progress], bool | None] | None) -> Rendering:
         """Take all samples, until a stop rule or ``on_progress`` ends the render, and return the rendering."""
         self.on_progress = on_progress
         self.stop.watched = on_progress is not None or self.settings.adaptive or self.keeps or self.split is not None
@@ -154,10 +157,10 @@ class Run:
             raise LostRankError(f"{error}; render.resume=true goes on from the last checkpoint") from None
         return self._final()
 
-    def at_once(self) -> list[tuple[PixelSet, int, int]] | None:
-        """Return the spans of the whole render; their results go to :meth:`took`, and then :meth:`completed` ends it.
+    def all_spans(self) -> list[tuple[PixelSet, int, int]] | None:
+        """Return the spans of the whole render; their results go to :meth:`task_finished`, and then :meth:`finish` ends it.
 
-        None if it must run by :meth:`go`: without kernels, with stop rules besides ``spp``, or in bounded memory.
+        None if it must run by :meth:`sample_all`: without kernels, with stop rules besides ``spp``, or in bounded memory.
         """
         ends = self.keeps or self.stop.open or self.probes is not None or self.split is not None
         if self.tasks is None or ends or self.settings.render.max_memory is not None:
@@ -165,15 +168,15 @@ class Run:
         self.begun = time.perf_counter()
         return [(self.picture, 0, self.settings.render.spp)]
 
-    def completed(self, rest: list[Block]) -> Rendering:
-        """Return the rendering of :meth:`at_once`, after taking the blocks in ``rest``, put back when memory ran out."""
+    def finish(self, rest: list[Block]) -> Rendering:
+        """Return the rendering of :meth:`all_spans`, after taking the blocks in ``rest``, put back when memory ran out."""
         with explain_out_of_memory("a render"):
             if self.unsupported is not None:
-                self._eagerly(self.unsupported)
+                self._restart_by_tensors(self.unsupported)
             else:
                 if rest:
                     assert self.tasks is not None
-                    self.tasks.take_rest(rest, self.took)
+                    self.tasks.take_rest(rest, self.task_finished)
                 self.taken = self.settings.render.spp
                 self.stop.told(self.taken, self.seconds_of_sampling(), None)
         return self._final()
@@ -190,9 +193,9 @@ class Run:
         except Unsupported as error:
             if not self.engine.compiled:
                 raise
-            self._eagerly(error)
+            self._restart_by_tensors(error)
 
-    def _eagerly(self, error: Unsupported) -> None:
+    def _restart_by_tensors(self, error: Unsupported) -> None:
         """Take all samples again from the start, by tensor operations.
 
         Raises:
@@ -215,13 +218,13 @@ class Run:
         self._sample()
         self._join()
         if not self.ended:
-            self._look_again()
+            self._resample_outliers()
 
-    def _look_again(self) -> None:
+    def _resample_outliers(self) -> None:
         """Resample outliers for the error estimate, unless that was done at this number of samples."""
         if self.probes is None or self.probes.resampled_at == self._mean():
             return
-        self._unlooked = self._counted()
+        self._before_resampling = self._counted()
         again = self.probes.resample_outliers(self.picture.film, None if self.split is None else self.split.places)
         if not self._take(again):
             self.probes.resampled = None
@@ -268,7 +271,7 @@ class Run:
                 break
             if last and SMALL_ROUND * more < mean and not self.cut:  # cheap to repeat, with any spp
                 self._keep(last=True)
-                self._keeps_no_more = True
+                self._final_checkpoint_written = True
             self.cut |= more < mean
             whole = self._take(spans)
             self._join()
@@ -289,7 +292,7 @@ class Run:
 
     def _keep(self, last: bool = False) -> None:
         """Write a checkpoint if one is due."""
-        if not self.keeps or self._keeps_no_more:
+        if not self.keeps or self._final_checkpoint_written:
             return
         due = self.checkpoint_file is not None and (last or self.checkpoint_file.due())
         if due if self.split is None else self.split.due(due):
@@ -311,7 +314,7 @@ class Run:
         resampled_at = (
             self.probes is not None and self.probes.resampled_at == self._mean()
         )  # outliers are resampled after a resume
-        counted, light = self._unlooked if resampled_at else self._counted()
+        counted, light = self._before_resampling if resampled_at else self._counted()
         facts = {"taken": self.taken, "seconds": self.seconds_of_sampling(), "cut": int(self.cut), **counted}
         arrays = {f"{name}.{key}": value for name, film in self.films().items() for key, value in film.state().items()}
         return RenderState(facts, arrays | {"light": light})
@@ -349,23 +352,23 @@ class Run:
         """Return the validated checkpoint; None if there is none."""
         state = checkpoint_file.read(self._state(), lambda state: check_samples(self, state, checkpoint_file.path))
         if state is not None:
-            check_whole(self, state, checkpoint_file.path)
+            check_plausible(self, state, checkpoint_file.path)
         return state
 
     def _reached(self, mean: float, seconds: float) -> None:
         """Update the stop rules with the samples, seconds and error so far, as the first rank has them."""
         if self.settings.render.target_error is not None:
             self._join()
-        error = self._by_pilots() if self.stop.checks_error(mean, self._adapts()) else None
+        error = self._probe_error_bound() if self.stop.checks_error(mean, self._adapts()) else None
         if self.split is not None:
             seconds, error = self.split.decide(seconds, error)
         target = self.settings.render.target_error
         if error is not None and target is not None and error <= target:
-            error = self._certain()
+            error = self._error_bound()
             if self.split is not None:
                 _, error = self.split.decide(seconds, error)
             if (error is None or error > target) and not self.ended:
-                self._forget_look()
+                self._undo_resampling()
         self.stop.told(mean, seconds, error)
 
     def _join(self) -> None:
@@ -373,22 +376,22 @@ class Run:
         if self.split is not None:
             self.split.join()
 
-    def _by_pilots(self) -> float:
+    def _probe_error_bound(self) -> float:
         """Return the upper end of the interval of relMSE that the error probes give."""
         assert self.probes is not None
-        return _most(self.probes.probe_estimate(self.picture.film))
+        return _upper_bound(self.probes.probe_estimate(self.picture.film))
 
-    def _certain(self) -> float:
+    def _error_bound(self) -> float:
         """Return the upper end of the interval of relMSE after resampling outliers, which takes samples."""
         assert self.probes is not None
-        self._look_again()
+        self._resample_outliers()
         known, unknown = error_estimate_of(self, self.probes.picture(self.picture.film))
-        return math.inf if self.ended or unknown else _most(known)
+        return math.inf if self.ended or unknown else _upper_bound(known)
 
-    def _forget_look(self) -> None:
+    def _undo_resampling(self) -> None:
         """Restore the counts before outliers were resampled: the picture gets more samples, and they will be again."""
         assert self.probes is not None
-        counts, self.light = self._unlooked
+        counts, self.light = self._before_resampling
         self.done, self.tally = counts["done"], RayCounts(counts["rays"], counts["truncated"])
         self.lost = NonFinite.read(counts["lost"])
         self.probes.resampled, self.probes.resampled_at = None, None
@@ -430,9 +433,9 @@ class Run:
     def take_alone(self, spans: list[tuple[PixelSet, int, int]]) -> bool:
         """Take the samples of spans in this process; return True if all were taken."""
         self.left = sum(pixel_set.film.width * pixel_set.film.height * samples for pixel_set, _, samples in spans)
-        return self.engine.run(spans, self.took)
+        return self.engine.run(spans, self.task_finished)
 
-    def took(self, share: Share | None) -> bool:
+    def task_finished(self, share: Share | None) -> bool:
         """Add the counts of a finished task; return True if the render is to stop."""
         if share is None:
             return self._advanced(0, False)
@@ -512,4 +515,4 @@ def render_scene(
     """
     with without_autocast(scene.device), limited_threads(settings.render.threads):
         with together(ranks, "what is rendered", lambda: render_fingerprint(scene, settings, params, dtype)):
-            return Run(scene, settings, params, dtype, group=ranks, rays=rays).go(on_progress)
+            return Run(scene, settings, params, dtype, group=ranks, rays=rays).sample_all(on_progress)

@@ -27,7 +27,7 @@ __all__ = [
     "analyse",
     "bias_test",
     "check_files",
-    "common_levels",
+    "common_targets",
     "error_map",
     "measures",
     "mse",
@@ -106,8 +106,13 @@ def bias_test(runs: Sequence[Tensor], reference: ReferencePicture, more: float =
     grids = [count for count in _GRIDS if count == 1 or min(high, wide) >= 2 * count]
     chances: list[float] = []
     for known_by in (0.0, more):
-        sides = [_compared(torch.stack([tiles(x, n) for x in runs]), *_known(reference, n), known_by) for n in grids]
-        found = [chance for side in sides[1:] for chance in _of_squares(side)] + _of_sums(sides[0], sides[-1])
+        sides = [
+            _difference(torch.stack([tiles(x, n) for x in runs]), *_reference_tiles(reference, n), known_by)
+            for n in grids
+        ]
+        found = [chance for side in sides[1:] for chance in _p_values_of_f(side)] + _p_values_of_means(
+            sides[0], sides[-1]
+        )
         chances = [max(pair) for pair in zip(chances, found, strict=True)] if chances else found
     chance = min(1.0, min(chances) * len(chances))
     stack = torch.stack(list(runs))
@@ -116,7 +121,7 @@ def bias_test(runs: Sequence[Tensor], reference: ReferencePicture, more: float =
     return BiasTest(chance < SIGNIFICANCE, chance, squared, *_share(runs, reference))
 
 
-def _known(reference: ReferencePicture, count: int) -> tuple[Tensor, Tensor, float]:
+def _reference_tiles(reference: ReferencePicture, count: int) -> tuple[Tensor, Tensor, float]:
     """Return tiles of the reference, their variances, and the degrees of freedom of those."""
     if len(reference.runs) > 1:
         own = torch.stack([tiles(run, count) for run in reference.runs])
@@ -135,7 +140,7 @@ class _Side:
     weight: Tensor
 
 
-def _compared(own: Tensor, reference: Tensor, known: Tensor, freedom: float, more: float) -> _Side:
+def _difference(own: Tensor, reference: Tensor, known: Tensor, freedom: float, more: float) -> _Side:
     """Compare tiles ``own (runs, C, tiles)`` with the reference's; with ``more`` > 0 the variance is the reference's alone."""
     count, rounding = len(own), (_ROUNDING * reference.abs()).square()
     if more > 0:
@@ -148,7 +153,7 @@ def _compared(own: Tensor, reference: Tensor, known: Tensor, freedom: float, mor
     return _Side(own.mean(0) - reference, total, freedoms, relative(1.0, reference))
 
 
-def _of_squares(side: _Side) -> list[float]:
+def _p_values_of_f(side: _Side) -> list[float]:
     """Return the p-value of each channel's F."""
     found = []
     for x, u, d, w in zip(side.away, side.variance, side.freedom, side.weight, strict=True):
@@ -163,7 +168,7 @@ def _of_squares(side: _Side) -> list[float]:
     return found
 
 
-def _of_sums(whole: _Side, fine: _Side) -> list[float]:
+def _p_values_of_means(whole: _Side, fine: _Side) -> list[float]:
     """Return the p-value of each channel's mean over the picture.
 
     The variance is estimated twice: from the means of runs, with few degrees of freedom, and from tiles, with many, if those
@@ -274,7 +279,7 @@ def measures(image: Tensor, reference: ReferencePicture, names: tuple[str, ...],
 _NOISY = 0.5
 #: Expensive measures that hardly differ between runs: evaluated for the first run of a step, unless curves show them.
 #: where curves show them.
-_DEAR = ("flip",)
+_EXPENSIVE = ("flip",)
 #: Runs of fewer seconds are mostly fixed cost.
 _SHORT = 0.05
 #: Largest extrapolation: logarithm of a ratio of times to the first step's.
@@ -449,7 +454,7 @@ def analyse(study: Study, measured: Measured) -> SceneReport:
     for line in scene_report.lines:
         line.look = line.look if line.of is None else line.of.look
     main = names[0]
-    scene_report.targets = list(study.options["target"] or common_levels(scene_report.lines, main))
+    scene_report.targets = list(study.options["target"] or common_targets(scene_report.lines, main))
     for line in scene_report.lines:
         _fits(line, main, scene_report.targets)
     scene_report.notes = _notes(scene_report, main)
@@ -485,7 +490,7 @@ def _step(
     names: tuple[str, ...],
     film: Any,
 ) -> Step:
-    cheap = tuple(name for name in names if name not in _DEAR or name == names[0])
+    cheap = tuple(name for name in names if name not in _EXPENSIVE or name == names[0])
     found = [measures(image, reference, cheap if index else names, film) for index, image in enumerate(images)]
     mean, count = torch.stack(list(images)).mean(0), len(images)
     spread = [float(((image - mean).square() * reference.weight).mean()) * count / (count - 1) for image in images]
@@ -536,7 +541,7 @@ def _picture(extra: Extra, size: tuple[int, int]) -> Tensor:
     return image.double()
 
 
-def common_levels(lines: Sequence[ErrorCurve], main: str) -> tuple[float, ...]:
+def common_targets(lines: Sequence[ErrorCurve], main: str) -> tuple[float, ...]:
     """Return an error that all unbiased curves reach: the largest of their least errors."""
     measured = [line for line in lines if line.estimates]
     lines = [line for line in measured if not (line.bias and line.bias["biased"])] or measured

@@ -22,7 +22,7 @@ from torchpt.reports.analysis import ErrorCurve, SceneReport, Step, error_map
 from torchpt.reports.plots import COLOURS, NAMES
 from torchpt.reports.study import Study
 
-__all__ = ["Figure", "ImageStrip", "Panel", "hardest", "page", "sheet_of", "step_near"]
+__all__ = ["Figure", "ImageStrip", "Panel", "closest_step", "largest_errors", "page", "sheet_of"]
 
 
 # ---- Pictures of the report: crops at equal time, where errors are largest, and maps of the errors
@@ -74,12 +74,12 @@ class ImageStrip:
     scale: tuple[float, float]
 
 
-def step_near(line: ErrorCurve, seconds: float) -> Step:
+def closest_step(line: ErrorCurve, seconds: float) -> Step:
     """Return the step of a curve whose time is closest to ``seconds``, by ratio."""
     return min(line.steps, key=lambda step: abs(math.log(step.seconds / seconds)))
 
 
-def hardest(errors: Tensor, side: int) -> tuple[int, int]:
+def largest_errors(errors: Tensor, side: int) -> tuple[int, int]:
     """Return x and y of the corner of the ``side``-pixel square with the largest errors in a map ``(H, W)``.
 
     Square roots of errors are summed, so that a single firefly does not decide.
@@ -97,13 +97,13 @@ def sheet_of(scene_report: SceneReport) -> ImageStrip | None:
     reference, film = scene_report.lines[0].reference, scene_report.film
     lines = [line for line in scene_report.lines if line.reference.image.shape == reference.image.shape]
     seconds = min(line.steps[-1].seconds for line in lines)
-    chosen = [step_near(line, seconds) for line in lines]
+    chosen = [closest_step(line, seconds) for line in lines]
     images = [torch.nan_to_num(step.pictures[0](), 0.0, 0.0, 0.0) for step in chosen]
     maps = [error_map(image, line.reference) for image, line in zip(images, lines, strict=True)]
     high, wide = maps[0].shape
     side = min(max(min(high, wide) // _PART, _LEAST), _MOST, high, wide)
     rendered = [found for found, line in zip(maps, lines, strict=True) if line.of is None]
-    x, y = hardest(torch.stack(rendered).mean(0), side)
+    x, y = largest_errors(torch.stack(rendered).mean(0), side)
     smaller = [_reduced(found) for found in maps]
     scale = _scale(smaller)
     panels = [

@@ -62,7 +62,7 @@ __all__ = [
 
 
 #: Packages and files on which no picture depends.
-_ABOVE = ("reports", "commands", "cli/main.py", "__main__.py", "share")
+_WITHOUT_EFFECT = ("reports", "commands", "cli/main.py", "__main__.py", "share")
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _source() -> str:
     hashed = hashlib.blake2b(digest_size=12)
     for path in sorted(root.rglob("*.py")):
         name = path.relative_to(root)
-        if name.parts[0] not in _ABOVE:
+        if name.parts[0] not in _WITHOUT_EFFECT:
             hashed.update(str(name).encode() + path.read_bytes())
     return hashed.hexdigest()
 
@@ -427,7 +427,7 @@ def measure(
     Raises:
         Stopped: ``on_progress`` returned True; finished runs are kept.
     """
-    wanted = _wanted(study, prepared)
+    wanted = _all_runs(study, prepared)
     names = [_name(job, spp, seed) for job, spp, seed, _ in wanted]
     missing = {name: job.pixels * spp for name, (job, spp, _, _) in zip(names, wanted, strict=True)}
     missing = {name: samples for name, samples in missing.items() if store.get(name) is None}
@@ -437,7 +437,7 @@ def measure(
         run = store.get(name)
         if run is None:
             if job is not latest:  # other settings: warm up, so that caches are filled
-                _turn(latest, job)
+                _swap_kernels(latest, job)
                 thrown = _render(job, min(study.options["spp"][0], spp), seed, clock, counts=False)
                 if not clock.stop:
                     _denoise(job, thrown)  # the first call takes longer
@@ -451,7 +451,7 @@ def measure(
         place.append(run)
 
 
-def _turn(latest: Job | None, job: Job) -> None:
+def _swap_kernels(latest: Job | None, job: Job) -> None:
     """Swap cached kernels when settings change: a scene has those of its latest render only, and making them takes seconds."""
     if latest is not None:
         latest.left = replace(scene_cache(latest.scene))
@@ -463,7 +463,7 @@ def _turn(latest: Job | None, job: Job) -> None:
 Wanted = tuple[Job, int, int, list[Run]]
 
 
-def _wanted(study: Study, prepared: list[Measured]) -> list[Wanted]:
+def _all_runs(study: Study, prepared: list[Measured]) -> list[Wanted]:
     """Return all runs in order, each with the list that it is added to."""
     found: list[Wanted] = []
     for measured in prepared:

@@ -43,7 +43,7 @@ __all__ = [
 #: Settings whose value is a list: of these only a list of lists is an axis.
 LISTS = ("film.crop",)
 #: Settings that a study has its own way of saying, or that have no place in one.
-_TAKEN = {
+_REFUSED = {
     **{f"render.{name}": "nothing: every run takes the samples that spp= says" for name in having(Role.ENDS)["render"]},
     **{
         f"render.{name}": "nothing: a study that was stopped resumes by itself" for name in having(Role.FILES)["render"]
@@ -99,8 +99,8 @@ def variants_of(settings: Mapping[str, Any], file: str | None) -> list[Variant]:
     """
     for key in settings:
         check_keys({key.partition(".")[0]: 0}, BLOCKS, "", "a study", file)
-        if key in _TAKEN:
-            raise SceneError(key, settings[key], _TAKEN[key], file)
+        if key in _REFUSED:
+            raise SceneError(key, settings[key], _REFUSED[key], file)
     axes = {key: _values(key, value, file) for key, value in settings.items() if _is_axis(key, value)}
     wide = tuple(key for key, values in axes.items() if len(values) > 1)
     found = [{**settings, **dict(zip(axes, chosen, strict=True))} for chosen in product(*axes.values())]
@@ -148,8 +148,8 @@ def blocks_of(settings: Mapping[str, Any], file: str | None) -> dict[str, dict[s
     for key, value in sorted(settings.items(), key=lambda item: item[0] not in BLOCKS):  # a group first
         if key in BLOCKS:
             blocks[key] = dict(value) if isinstance(value, Mapping) else _group(key, value, file)
-            if taken := next((name for name in blocks[key] if f"{key}.{name}" in _TAKEN), None):
-                raise SceneError(f"{key}.{taken}", blocks[key][taken], _TAKEN[f"{key}.{taken}"], file)
+            if taken := next((name for name in blocks[key] if f"{key}.{name}" in _REFUSED), None):
+                raise SceneError(f"{key}.{taken}", blocks[key][taken], _REFUSED[f"{key}.{taken}"], file)
             continue
         block, *inner, last = key.split(".")
         place = blocks.setdefault(block, {})

@@ -26,7 +26,7 @@ from torchpt.compiler.program import TracedStage
 from torchpt.compiler.sinks import Sinks, Store
 from torchpt.core.dispatch import dispatched
 from torchpt.core.errors import SceneError
-from torchpt.core.threads import share, thread_count
+from torchpt.core.threads import parallel_for, thread_count
 from torchpt.native import compile_time
 from torchpt.physics.shapes.geometry import Geometry
 from torchpt.search.base import Accel, Hits
@@ -138,7 +138,7 @@ class Brute(Accel):
         most = max(count * sum(self.counts) // _GRAIN, 1)
         # In threads of the pool torch has but one: loops that search there share the work already.
         threads = min(thread_count(self.threads), torch.get_num_threads(), most)
-        share(part, -(-count // _BLOCK), threads)
+        parallel_for(part, -(-count // _BLOCK), threads)
 
     def describe(self) -> dict[str, Any]:
         """See :meth:`Accel.describe`; there are no nodes, and the cost is one test a primitive."""

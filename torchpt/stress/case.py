@@ -23,7 +23,7 @@ class Case:
         bound: the largest figure that passes.
         figure: returns the figure at a point of the sweep. An exception is a failure, and is reported.
         axis: name of the swept quantity.
-        places: the points of the sweep.
+        sweep: the points of the sweep.
         quick: points of a quick run; by default the first, the middle and the last.
         backend: True if the figure depends on search and engine; else one run is enough.
     """
@@ -33,15 +33,15 @@ class Case:
     bound: float
     figure: Callable[[Harness, float], float]
     axis: str = ""
-    places: tuple[float, ...] = (0.0,)
+    sweep: tuple[float, ...] = (0.0,)
     quick: tuple[float, ...] = ()
     backend: bool = True
 
-    def chosen(self, quick: bool) -> tuple[float, ...]:
+    def points(self, quick: bool) -> tuple[float, ...]:
         """Return the points of a run."""
         if not quick:
-            return self.places
-        return self.quick or tuple(dict.fromkeys((self.places[0], self.places[len(self.places) // 2], self.places[-1])))
+            return self.sweep
+        return self.quick or tuple(dict.fromkeys((self.sweep[0], self.sweep[len(self.sweep) // 2], self.sweep[-1])))
 
 
 @dataclass(frozen=True)

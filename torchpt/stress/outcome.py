@@ -19,7 +19,7 @@ def outcome_of(case: Case, harness: Harness, quick: bool = False) -> Outcome:
     ``auto`` takes another one there.
     """
     begun, readings = time.perf_counter(), []
-    for at in case.chosen(quick):
+    for at in case.points(quick):
         try:
             figure, problem, refused = float(case.figure(harness, at)), "", False
         except (TorchptError, ArithmeticError, AssertionError, LookupError, RuntimeError, ValueError) as error:
