@@ -71,7 +71,7 @@ def test_the_variance_in_a_file_counts(tmp_path) -> None:
     write_image(tmp_path / "a.exr", image, {"variance": variance})
     write_image(tmp_path / "b.exr", image)
     truth = from_file(str(tmp_path / "a.exr"), (50, 40))
-    assert torch.equal(truth.variance, variance.double()) and truth.told["variance"] is True
+    assert torch.equal(truth.variance, variance.double()) and truth.origin["variance"] is True
     assert not from_file(str(tmp_path / "b.exr"), (50, 40)).variance.any()
     with pytest.raises(AssetError, match="expected a picture of 64 x 40 pixels as the film is, got 50 x 40"):
         from_file(str(tmp_path / "a.exr"), (64, 40))

@@ -257,8 +257,10 @@ def explain_out_of_memory(what: str | Callable[[], str]) -> Iterator[None]:
             raise
     else:
         return
-    told = what if isinstance(what, str) else what()
-    raise RenderError(f"not enough memory for {told}, with {mb(MemoryMeter(torch.device('cpu')).above())} held already")
+    subject = what if isinstance(what, str) else what()
+    raise RenderError(
+        f"not enough memory for {subject}, with {mb(MemoryMeter(torch.device('cpu')).above())} held already"
+    )
 
 
 def retry_out_of_memory(what: str | Callable[[], str], work: Callable[[], T]) -> T:

@@ -231,14 +231,14 @@ def map_in_order(
     halt = halt or threading.Event()
     queue, left = TaskQueue[int, R](threads), enumerate(items)
     found: dict[int, R | BaseException] = {}
-    begun = told = 0
+    begun = delivered = 0
 
     def tell() -> None:
         """Pass on the results that are next in order."""
-        nonlocal told
-        while told in found:
-            result = found.pop(told)
-            told += 1
+        nonlocal delivered
+        while delivered in found:
+            result = found.pop(delivered)
+            delivered += 1
             if isinstance(result, BaseException):
                 try:
                     raise result
@@ -249,13 +249,13 @@ def map_in_order(
 
     try:
         while not halt.is_set():
-            while ahead is None or begun - told < ahead:
+            while ahead is None or begun - delivered < ahead:
                 item = next(left, None)
                 if item is None:
                     break
                 queue.add(item[0], functools.partial(task, item[1]))
                 begun += 1
-            if told == begun:
+            if delivered == begun:
                 return
             came = queue.next(wait=True)
             if came is not None:

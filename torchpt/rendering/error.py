@@ -71,7 +71,7 @@ class ErrorProbes:
             counts[self.pixel_set.places] += self.pixel_set.film.counts
         return counts
 
-    def known(self, film: Film, picture: Tensor) -> ErrorEstimate | None:
+    def estimate(self, film: Film, picture: Tensor) -> ErrorEstimate | None:
         """Return the error estimate of ``picture``, which is :meth:`picture` of the film; None without probes."""
         if not len(self.pilots) or int(self.pixel_set.film.counts.min()) == 0:
             return None
@@ -214,7 +214,7 @@ class SampleAllocation:
     def _errors(self, probes: ErrorProbes) -> Tensor:
         """Return the relative variance of each block's pixels, up to a factor, from the second values alone."""
         a, b = (x.cpu() for x in probes.pixel_set.film.streams())
-        errors, known = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
+        errors, probed = a.new_zeros(self.pilots.blocks), torch.zeros(self.pilots.blocks, dtype=torch.bool)
         at = tuple(self.pilots.block)
-        errors[at], known[at] = error_by_pilots(self.pilots, a, b), True
-        return foreseen(errors, known).reshape(-1)
+        errors[at], probed[at] = error_by_pilots(self.pilots, a, b), True
+        return foreseen(errors, probed).reshape(-1)

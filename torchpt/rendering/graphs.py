@@ -27,7 +27,7 @@ from torchpt.scene.scene import numbered
 from torchpt.scene.settings import BLOCKS
 from torchpt.scene.versions import AFTER, check_unchanged
 
-__all__ = ["as_custom_op", "known", "with_graph_break"]
+__all__ = ["as_custom_op", "reuse_rendering", "with_graph_break"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -35,10 +35,10 @@ R = TypeVar("R")
 #: Types of arguments that can be written as text. (Older torch traces no unions of types, but tuples of them.)
 _LISTS, _PLAIN = (list, tuple), (bool, int, str)
 #: While an operator runs: the rendering of its forward pass, which its backward pass reuses.
-_known: ContextVar[list[Rendering] | None] = ContextVar("known", default=None)
+_known: ContextVar[list[Rendering] | None] = ContextVar("reuse_rendering", default=None)
 
 
-def known(make: Callable[[], Rendering]) -> Rendering:
+def reuse_rendering(make: Callable[[], Rendering]) -> Rendering:
     """Return the rendering of the forward pass inside an operator's backward pass; else call ``make``."""
     made = _known.get()
     if made:
@@ -97,13 +97,13 @@ def _in_graph(
 
 def _fits_graph(params: Any, seed: Any, dtype: Any, options: Mapping[str, Any]) -> bool:
     """Return True if the arguments can be part of a graph; others, also invalid ones, are rendered outside of it."""
-    known = dtype is torch.float32 or dtype is torch.float64
+    is_float = dtype is torch.float32 or dtype is torch.float64
     number = isinstance(seed, int) and not isinstance(seed, bool)
     if params is not None and not (
         isinstance(params, Mapping) and all([isinstance(value, Tensor) for value in params.values()])
     ):
         return False
-    return known and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(options)
+    return is_float and (seed is None or (number and 0 <= seed < 1 << 63)) and _plain(options)
 
 
 def _plain(value: Any) -> bool:

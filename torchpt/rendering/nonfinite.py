@@ -17,7 +17,7 @@ from torchpt.scene.scene import Scene
 if TYPE_CHECKING:  # what traces samples again is imported once there are such
     from torchpt.paths.explain import NonFiniteCause
 
-__all__ = ["causes_of", "told"]
+__all__ = ["causes_of", "describe_sample"]
 
 
 def causes_of(scene: Scene, wave: Wave, lost: NonFinite) -> tuple[dict[str, int], str]:
@@ -44,7 +44,7 @@ def causes_of(scene: Scene, wave: Wave, lost: NonFinite) -> tuple[dict[str, int]
     return {name: count for name, count in causes.most_common() if count}, first
 
 
-def told(scene: Scene, wave: Wave, place: Place) -> str:
+def describe_sample(scene: Scene, wave: Wave, place: Place) -> str:
     """Return a sentence about one non-finite sample and its cause."""
     from torchpt.paths.explain import causes_of_samples
 

@@ -188,7 +188,7 @@ def one_path(scene: Scene, settings: Settings, pixel: tuple[int, int], sample: i
         state = wave.rays_of(x, y, number)
         explainer.began(state)
         radiance = brought(wave, state, observer=explainer)
-        return _PathBuilder(scene, explainer).told(settings, pixel, sample, radiance)
+        return _PathBuilder(scene, explainer).build(settings, pixel, sample, radiance)
 
 
 class _PathBuilder:
@@ -199,7 +199,7 @@ class _PathBuilder:
         self.names = Names(scene.built, self.world)
         self.centre, self.unit = scene.space.centre, scene.space.unit
 
-    def told(self, settings: Settings, pixel: tuple[int, int], sample: int, brought: Tensor) -> Path:
+    def build(self, settings: Settings, pixel: tuple[int, int], sample: int, brought: Tensor) -> Path:
         left = self.events[0]
         assert isinstance(left, CameraRay)
         vertices = tuple(self._vertices())

@@ -39,10 +39,10 @@ def rendering_of(run: Run) -> Rendering:
     """Return the rendering of the films as they are; of several ranks they must have been joined."""
     radiant, film = run.integrator.light, run.picture.film
     layers = _layers(run)
-    known, unknown = None, ""
+    estimate, unknown = None, ""
     if radiant:
         values = film.mean() if run.probes is None else run.probes.picture(film)
-        image, (known, unknown) = values.to(run.dtype), error_estimate_of(run, values)
+        image, (estimate, unknown) = values.to(run.dtype), error_estimate_of(run, values)
     else:
         shown = layers[next(iter(run.seen))]
         blank = torch.zeros_like(shown[..., :1]).expand(-1, -1, max(3 - shown.shape[2], 0))
@@ -69,10 +69,10 @@ def rendering_of(run: Run) -> Rendering:
         nonfinite_samples=run.lost.count,
         truncated_paths=run.tally.truncated,
         clamped=clamped,
-        relmse=None if known is None or unknown else known.relmse,
-        relmse_interval=None if known is None or unknown else known.interval,
+        relmse=None if estimate is None or unknown else estimate.relmse,
+        relmse_interval=None if estimate is None or unknown else estimate.interval,
         relmse_unknown=unknown,
-        heavy_tailed=known is not None and known.heavy_tailed,
+        heavy_tailed=estimate is not None and estimate.heavy_tailed,
         stopped_by=run.stop.reason,
         complete=bool(run.stop.reason) and not run.ended,
         peak_memory=max(meter.peak() - meter.base(), 0),
@@ -87,21 +87,21 @@ def error_estimate_of(run: Run, picture: Tensor) -> tuple[ErrorEstimate | None, 
     """Return the error estimate of the picture (None: not estimated), and why it cannot be trusted ("": it can)."""
     film = run.picture.film
     if run.probes is not None:
-        known = run.probes.known(film, picture)
+        estimate = run.probes.estimate(film, picture)
     else:
         relmse = film.relmse()
-        known = None if relmse is None else ErrorEstimate(relmse, None, False)
-    if known is None or not run.done:
-        return known, ""
+        estimate = None if relmse is None else ErrorEstimate(relmse, None, False)
+    if estimate is None or not run.done:
+        return estimate, ""
     from torchpt.rendering.missing_light import find_missing_light
 
-    lacks = find_missing_light(run.scene, run.wave, run.geometry, picture, known.relmse)
+    lacks = find_missing_light(run.scene, run.wave, run.geometry, picture, estimate.relmse)
     if lacks.reason:
-        return known, lacks.reason
-    if known.interval is not None:
-        low, high = known.interval
-        known = replace(known, interval=(low, high + lacks.dark))
-    return known, ""
+        return estimate, lacks.reason
+    if estimate.interval is not None:
+        low, high = estimate.interval
+        estimate = replace(estimate, interval=(low, high + lacks.dark))
+    return estimate, ""
 
 
 def _layers(run: Run) -> dict[str, Tensor]:

@@ -17,7 +17,7 @@ from torchpt.paths.integrators import KINDS as INTEGRATORS
 from torchpt.paths.layers import LAYERS, SurfaceLayer
 from torchpt.ranks import together
 from torchpt.rendering import Rendering, render_scene
-from torchpt.rendering.graphs import known
+from torchpt.rendering.graphs import reuse_rendering
 from torchpt.rendering.result import denoise_rendering
 from torchpt.scene import Scene
 from torchpt.scene.entry import as_scene
@@ -197,7 +197,7 @@ def execute_request(request: RenderRequest, made: list[Rendering] | None = None)
         with nullcontext() if call.ranks is None else call.ranks.together():
             scene.check(params)
         given = _pair(rays)
-        return known(
+        return reuse_rendering(
             lambda: render_scene(scene, settings, params=params, dtype=call.dtype, ranks=call.ranks, rays=given)
         )
 

@@ -24,7 +24,7 @@ from torchpt.physics.shapes.geometry import Geometry
 from torchpt.ranks import Group, together
 from torchpt.rendering.checkpoint import EVERY, CheckpointFile, RenderState, check_plausible, check_samples, identity
 from torchpt.rendering.error import FIRST_ROUND, SampleAllocation, error_probes
-from torchpt.rendering.nonfinite import told
+from torchpt.rendering.nonfinite import describe_sample
 from torchpt.rendering.picture import error_estimate_of, finished_rendering, rendering_of
 from torchpt.rendering.result import Progress, Rendering
 from torchpt.rendering.split import DistributedRender, render_fingerprint
@@ -44,9 +44,9 @@ __all__ = ["Run", "render_scene"]
 SMALL_ROUND = 8
 
 
-def _upper_bound(known: ErrorEstimate | None) -> float:
+def _upper_bound(estimate: ErrorEstimate | None) -> float:
     """Return the upper end of the estimate's interval; infinite if there is none, or it is not to be trusted."""
-    return math.inf if known is None or known.interval is None or known.heavy_tailed else known.interval[1]
+    return math.inf if estimate is None or estimate.interval is None or estimate.heavy_tailed else estimate.interval[1]
 
 
 class Run:
@@ -178,7 +178,7 @@ class Run:
                     assert self.tasks is not None
                     self.tasks.take_rest(rest, self.task_finished)
                 self.taken = self.settings.render.spp
-                self.stop.told(self.taken, self.seconds_of_sampling(), None)
+                self.stop.update(self.taken, self.seconds_of_sampling(), None)
         return self._final()
 
     def _final(self) -> Rendering:
@@ -369,7 +369,7 @@ class Run:
                 _, error = self.split.decide(seconds, error)
             if (error is None or error > target) and not self.ended:
                 self._undo_resampling()
-        self.stop.told(mean, seconds, error)
+        self.stop.update(mean, seconds, error)
 
     def _join(self) -> None:
         """Make the films whole on every rank."""
@@ -385,8 +385,8 @@ class Run:
         """Return the upper end of the interval of relMSE after resampling outliers, which takes samples."""
         assert self.probes is not None
         self._resample_outliers()
-        known, unknown = error_estimate_of(self, self.probes.picture(self.picture.film))
-        return math.inf if self.ended or unknown else _upper_bound(known)
+        estimate, unknown = error_estimate_of(self, self.probes.picture(self.picture.film))
+        return math.inf if self.ended or unknown else _upper_bound(estimate)
 
     def _undo_resampling(self) -> None:
         """Restore the counts before outliers were resampled: the picture gets more samples, and they will be again."""
@@ -476,7 +476,7 @@ class Run:
     def _count(self, lost: NonFinite) -> None:
         """Count non-finite samples; with ``integrator.strict`` raise RenderError at the first one."""
         if lost.count and self.integrator.strict:
-            raise RenderError(f"integrator.strict: {told(self.scene, self.wave, lost.places[0])}")
+            raise RenderError(f"integrator.strict: {describe_sample(self.scene, self.wave, lost.places[0])}")
         self.lost.add(lost)
 
     def result(self) -> Rendering:

@@ -66,7 +66,7 @@ class StopRules:
         whole = int(taken)
         return adaptive or (whole == taken and whole % (1 << max(whole.bit_length() - 3, 0)) == 0)
 
-    def told(self, taken: float, seconds: float, error: float | None) -> None:
+    def update(self, taken: float, seconds: float, error: float | None) -> None:
         """Update the rules after a pass with samples a pixel, seconds of sampling, and relMSE (None: not checked).
 
         An ``error`` at or below the target ends the render, so it should be an upper bound.

@@ -371,7 +371,7 @@ class ErrorCurve:
             "measured": self.measured,
             "denoised": self.of is not None,
             "settings": self.settings,
-            "reference": {**self.reference.told, "relmse": self.reference.noise},
+            "reference": {**self.reference.origin, "relmse": self.reference.noise},
             "slope_over_spp": asdict(self.by_spp.slope) if self.by_spp else None,
             "slope_over_seconds": asdict(self.by_seconds.slope) if self.by_seconds else None,
             "bias": self.bias,
@@ -476,8 +476,8 @@ def _line(
         steps.append(_step(spp, runs, images, reference, names, film))
         if of is not None:
             steps[-1].variance = []  # low variance does not make a denoised picture better
-    last, told = steps[-1], reference.told
-    more = told["spp"] * told["seeds"] / ((last.spp or 1) * len(images)) if told["made"] else 0.0
+    last, origin = steps[-1], reference.origin
+    more = origin["spp"] * origin["seeds"] / ((last.spp or 1) * len(images)) if origin["made"] else 0.0
     verdict = bias_test(images, reference, more)
     return ErrorCurve(label, steps, reference, settings=job.facts["settings"], of=of, bias=verdict.plain())
 
@@ -557,18 +557,18 @@ def _fits(line: ErrorCurve, main: str, targets: Sequence[float]) -> None:
     line.by_seconds = fit([step.seconds for step in line.steps], values)
     for target in targets:
         found = line.by_seconds.reach(math.log(target)) if line.by_seconds else None
-        told: dict[str, Any] = {"error": target, "seconds": None}
+        reached: dict[str, Any] = {"error": target, "seconds": None}
         if found is not None:
             place, beyond = found
             inside = abs(place.mean - math.log(line.steps[0].seconds)) < _FARTHEST
             if beyond and line.of is not None:  # denoised curves are not extrapolated
                 pass
             elif beyond and line.floor >= target:  # bias keeps the error above the target
-                told["never"] = True
+                reached["never"] = True
             elif inside or not beyond:
                 bounds = [None if x is None else _exp(x) for x in (place.mean, place.low, place.high)]
-                told |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
-        line.times.append(told)
+                reached |= dict(zip(("seconds", "low", "high"), bounds, strict=True)) | {"extrapolated": beyond}
+        line.times.append(reached)
     if line.of is not None:
         line.by_spp = line.by_seconds = None
 
@@ -591,22 +591,20 @@ def _notes(scene_report: SceneReport, main: str) -> list[str]:
     shortest = min(step.seconds for line in scene_report.lines if line.measured for step in line.steps)
     if shortest < _SHORT:
         notes.append(
-            f"The shortest runs take {1e3 * shortest:.2g} ms, of which a part is the same for any number of samples: "
-            "slopes over seconds come out too steep. A larger film, or steps of more samples, tell more."
+            f"The shortest runs take {1e3 * shortest:.2g} ms, part of which does not depend on the number of samples: slopes "
+            "over seconds are too steep. Use a larger film, or steps of more samples."
         )
-    told = scene_report.lines[0].reference.told
-    if not told["made"] and not told["variance"]:
-        notes.append(
-            "The reference file says nothing of its variance, so it is taken to be exact; its noise counts as error."
-        )
+    origin = scene_report.lines[0].reference.origin
+    if not origin["made"] and not origin["variance"]:
+        notes.append("The reference file has no variance, so it is taken to be exact; its noise counts as error.")
     drowned = [line.label for line in scene_report.lines if any(s.estimate(main).mean <= 0 for s in line.steps)]
     if any(line.of is not None for line in scene_report.lines):
         notes.append(
-            "Denoised pictures are guesses: they are biased by an amount that falls with samples by no known law. So their "
-            "curves have no slope and no efficiency, and no time to an error beyond their runs."
+            "Denoised pictures are guesses: their bias falls with samples by no known law. So their curves have no slope, no "
+            "efficiency, and no time to an error beyond their runs."
         )
     if drowned:
         notes.append(
-            f"Some steps lie below what the reference can tell and are left out of curves: {', '.join(drowned)}."
+            f"Some steps have errors below the noise of the reference and are left out of curves: {', '.join(drowned)}."
         )
     return notes

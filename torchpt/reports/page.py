@@ -226,8 +226,8 @@ def _headline(scene_report: SceneReport, main: str) -> str:
         (lines[0].times[-1]["high"], lines[1].times[-1]["low"]),
     )
     if high is None or low is None or high >= low:
-        return f"Which comes to {main} {aim} first, {first} or {second}, these runs do not tell: more would."
-    text = f"{first} comes to {main} {aim} first, in {formatting.seconds(least)}: "
+        return f"These runs do not show whether {first} or {second} reaches {main} {aim} first: more runs would."
+    text = f"{first} reaches {main} {aim} first, in {formatting.seconds(least)}: "
     text += f"{formatting.times(timed[1][0] / least)} as fast as {second}"
     return f"{text}." if len(timed) == 2 else f"{text}, {formatting.times(most / least)} as fast as {last}."
 
@@ -236,12 +236,12 @@ def _about(scene_report: SceneReport) -> str:
     reference = scene_report.lines[0].reference
     high, wide = reference.image.shape[:2]
     size = f"{wide} × {high} pixels."
-    if not reference.told["made"]:
-        return f"{size} Reference: {reference.told['file']}."
-    told, spp = reference.told, formatting.count(reference.told["spp"])
+    if not reference.origin["made"]:
+        return f"{size} Reference: {reference.origin['file']}."
+    origin, spp = reference.origin, formatting.count(reference.origin["spp"])
     return (
-        f"{size} Reference: the mean of {told['seeds']} independent runs of {spp} samples a pixel "
-        f"({formatting.seconds(told['seconds'])} in all); its own relMSE, {formatting.number(reference.noise, 2)}, "
+        f"{size} Reference: the mean of {origin['seeds']} independent runs of {spp} samples a pixel "
+        f"({formatting.seconds(origin['seconds'])} in all); its own relMSE, {formatting.number(reference.noise, 2)}, "
         "is taken off."
     )
 
@@ -266,16 +266,16 @@ def _row(scene_report: SceneReport, line: ErrorCurve, main: str) -> dict[str, An
 
 
 def _time_cell(scene_report: SceneReport, line: ErrorCurve, number: int) -> dict[str, Any]:
-    told, first = line.times[number], scene_report.lines[0].times[number]
-    if told.get("never"):
+    reached, first = line.times[number], scene_report.lines[0].times[number]
+    if reached.get("never"):
         return _cell("never", "its bias is larger", tone="bad")
-    if told["seconds"] is None:
+    if reached["seconds"] is None:
         return _cell("–", "too far to tell" if line.by_seconds else "beyond its runs" if line.of else "")
-    parts = [formatting.span(told["low"], told["high"]), "extrapolated" if told["extrapolated"] else ""]
+    parts = [formatting.span(reached["low"], reached["high"]), "extrapolated" if reached["extrapolated"] else ""]
     if line is not scene_report.lines[0] and first["seconds"]:
-        ratio = first["seconds"] / told["seconds"]
+        ratio = first["seconds"] / reached["seconds"]
         parts.insert(0, f"{formatting.times(max(ratio, 1 / ratio))} {'faster' if ratio >= 1 else 'slower'}")
-    return _cell(formatting.seconds(told["seconds"]), *parts)
+    return _cell(formatting.seconds(reached["seconds"]), *parts)
 
 
 def _efficiency_cell(scene_report: SceneReport, line: ErrorCurve) -> dict[str, Any]:
@@ -348,8 +348,8 @@ def _sheet(sheet: ImageStrip, main: str) -> dict[str, Any]:
             }
         )
     return {
-        "about": f"Of every setting the run nearest to {formatting.seconds(sheet.seconds)}, where errors are largest: "
-        f"{wide} × {high} pixels, enlarged. Times are told, since steps of samples do not meet exactly.",
+        "about": f"The run of each setting that is closest to {formatting.seconds(sheet.seconds)}, cropped to the "
+        f"{wide} × {high} pixels with the largest errors, enlarged. Times differ, as steps of samples do not match exactly.",
         "whole": _data(sheet.whole, "png"),
         "crop": _data(sheet.crop, "png"),
         "side": 3 * wide,
@@ -382,21 +382,21 @@ def _method(study: Study) -> list[str]:
     """Return paragraphs on the method of measurement."""
     seeds, steps = study.options["seeds"], ", ".join(map(formatting.count, study.options["spp"]))
     denoised = (
-        "Denoised curves, of loose dashes and hollow marks, show the pictures of the same runs, denoised by what first "
-        "surfaces are like (albedo and normals). Their times are those of the runs with these layers, and of denoising."
+        "Denoised curves (loose dashes, hollow markers) show the pictures of the same runs, denoised with albedo and normals "
+        "of first surfaces. Their times are those of the runs with these layers, and of denoising."
     )
     return [
-        f"Each step ({steps} samples a pixel) was run {seeds} times with independent seeds. Times are those of sampling, "
-        "without loading, building and compiling; a run that is thrown away goes before. Settings took turns.",
-        "Errors are means over the runs, times medians. Bands and intervals are 95 %, Student's t of the logarithm. From "
-        "relMSE, its trimmed form (without the 0.1 % of pixels that are furthest off) and MSE the reference's own variance is "
-        "taken off; the other measures include it. PSNR and SSIM look at what a screen shows. HDR-FLIP "
-        "is that of a step's first run.",
-        "A slope is that of the straight line through the logarithms of error and samples; −1 is what independent samples "
-        "give. The time to an error is read from the line over seconds, marked where that lies beyond the runs. Efficiency is "
-        "1 / (variance × seconds) at the largest step, the variance relative to the reference's square + 0.01.",
-        "Bias: the mean of the runs of the largest step differs from the reference by more than the spread of both explains, "
-        "with a chance of less than 0.1 % otherwise. A dotted line is the error at which such a curve ends.",
+        f"Each step ({steps} samples a pixel) was run {seeds} times with independent seeds. Times are of sampling alone, "
+        "without loading, building and compiling, after a warm-up run. Runs of different settings are interleaved.",
+        "Errors are means over the runs, times are medians. Bands and intervals are 95 % (Student's t of the logarithm). The "
+        "variance of the reference is subtracted from relMSE, its trimmed form (without the 0.1 % of pixels with the largest "
+        "errors) and MSE; other measures include it. PSNR and SSIM compare displayed pictures. HDR-FLIP is of each step's "
+        "first run.",
+        "A slope is of the straight line through the logarithms of error and samples; independent samples give −1. The time to "
+        "an error is read from the line over seconds, and marked if it lies outside of the runs. Efficiency is 1 / (variance × "
+        "seconds) at the largest step, with the variance relative to the reference's square + 0.01.",
+        "Biased: the mean over the runs of the largest step differs from the reference by more than their variances explain "
+        "(p < 0.1 %). A dotted line is the error at which such a curve ends.",
         *((denoised,) if study.options["denoise"] else ()),
     ]
 

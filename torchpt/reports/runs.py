@@ -184,13 +184,13 @@ class ReferencePicture:
         image: ``(H, W, 3)`` float64.
         variance: variance of ``image``, of the same shape; 0 if unknown.
         runs: independent pictures ``(H, W, 3)`` of which ``image`` is the mean; empty for a file.
-        told: its origin, for the report.
+        origin: its origin, for the report.
     """
 
     image: Tensor
     variance: Tensor
     runs: tuple[Tensor, ...]
-    told: dict[str, Any]
+    origin: dict[str, Any]
 
     @cached_property
     def weight(self) -> Tensor:
@@ -219,14 +219,14 @@ def from_runs(runs: Sequence[Run]) -> ReferencePicture:
     """Return the mean of independent runs, with the variance of that mean."""
     images = tuple(run.image() for run in runs)
     stack = torch.stack(images)
-    told = {
+    origin = {
         "made": True,
         "spp": runs[0].facts["spp"],
         "seeds": len(runs),
         "seconds": sum(run.seconds for run in runs),
         "settings": runs[0].facts["settings"],
     }
-    return ReferencePicture(stack.mean(0), stack.var(0) / len(runs), images, told)
+    return ReferencePicture(stack.mean(0), stack.var(0) / len(runs), images, origin)
 
 
 def from_file(path: str, size: tuple[int, int]) -> ReferencePicture:
