@@ -148,7 +148,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
 
         rendering = _keeping(interrupt, lambda: render_scene(scene, wishes, on_progress=on_progress, **shared))
     if group is not None:  # a signal that any of them heard
-        interrupt.signum = int(max(group.agree("signals", interrupt.signum or 0))[0]) or None
+        interrupt.signum = int(max(group.all_gather_numbers("signals", interrupt.signum or 0))[0]) or None
     if not first:
         return 0 if interrupt.signum is None else Interrupted(interrupt.signum).exit_code
     facts = _write_all([*outs, *((preview,) if preview else ())], denoised, rendering, wishes)

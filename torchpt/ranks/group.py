@@ -81,7 +81,7 @@ class Group:
 
     # -- a few numbers
 
-    def agree(self, what: str, *numbers: float) -> list[tuple[float, ...]]:
+    def all_gather_numbers(self, what: str, *numbers: float) -> list[tuple[float, ...]]:
         """Return the numbers (integers up to 2^53, or floats) of all ranks, in the order of ranks.
 
         Args:
@@ -123,17 +123,17 @@ class Group:
         self._wait(lambda: self._dist.all_gather(every, own, group=self._process_group, async_op=True))
         return [(int(said[0]), int(said[1]), tuple(said[2 : 2 + len(numbers)].tolist())) for said in every]
 
-    def decide(self, what: str, *numbers: float) -> tuple[float, ...]:
+    def broadcast_numbers(self, what: str, *numbers: float) -> tuple[float, ...]:
         """Return the numbers of the first rank; NaN is allowed."""
-        return self.agree(what, *numbers)[0]
+        return self.all_gather_numbers(what, *numbers)[0]
 
-    def same(self, what: str, content: bytes) -> None:
+    def check_same(self, what: str, content: bytes) -> None:
         """Raise unless ``content`` is the same on all ranks.
 
         Raises:
             RenderError: it differs; raised on every rank.
         """
-        if len({check for (check,) in self.agree(what, zlib.crc32(content))}) > 1:
+        if len({check for (check,) in self.all_gather_numbers(what, zlib.crc32(content))}) > 1:
             raise _mark_known(RenderError(f"ranks: {what} must be the same on every rank"))
 
     @contextmanager
@@ -156,9 +156,9 @@ class Group:
         """Return the tensors ``(n,)`` of all ranks, in order; n may differ, the dtype may not.
 
         Raises:
-            LostRankError, OtherRankError, RenderError: as :meth:`agree`.
+            LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
         """
-        sizes = [int(n) for (n,) in self.agree("gather", len(own))]
+        sizes = [int(n) for (n,) in self.all_gather_numbers("gather", len(own))]
         sent = torch.zeros(max(sizes), dtype=own.dtype)
         sent[: len(own)] = own.cpu()
         every = [torch.empty_like(sent) for _ in sizes]
@@ -169,18 +169,18 @@ class Group:
         """Return the tensor ``(n,)`` of the first rank; n may differ, the dtype may not.
 
         Raises:
-            LostRankError, OtherRankError, RenderError: as :meth:`agree`.
+            LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
         """
-        (size,) = self.decide("first", len(own))
+        (size,) = self.broadcast_numbers("first", len(own))
         return self._broadcast(own if self.rank == 0 else own.new_empty(int(size)), 0)
 
     def sum(self, own: Tensor) -> Tensor:
         """Return the sum of tensors of one shape, added in the order of ranks: the same bits on every rank.
 
         Raises:
-            LostRankError, OtherRankError, RenderError: as :meth:`agree`.
+            LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
         """
-        self.agree("sum", own.numel())
+        self.all_gather_numbers("sum", own.numel())
         total = torch.zeros_like(own)
         for rank in range(self.size):
             total += self._broadcast(own if rank == self.rank else torch.empty_like(own), rank)
@@ -190,9 +190,9 @@ class Group:
         """Wait for all ranks.
 
         Raises:
-            LostRankError, OtherRankError, RenderError: as :meth:`agree`.
+            LostRankError, OtherRankError, RenderError: as :meth:`all_gather_numbers`.
         """
-        self.agree("barrier")
+        self.all_gather_numbers("barrier")
 
     def _broadcast(self, values: Tensor, rank: int) -> Tensor:
         """Return the values of a rank."""
@@ -242,7 +242,7 @@ def together(group: Group | None, what: str, content: Callable[[], bytes]) -> It
         yield
         return
     with group.together():
-        group.same(what, content())
+        group.check_same(what, content())
         yield
 
 

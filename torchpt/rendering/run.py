@@ -53,6 +53,21 @@ class Run:
     """One forward render, by one process or by the ranks of ``group``.
 
     ``like``, ``rays``: see :func:`torchpt.scene.prepare.make_wave`. ``threads``: number of worker threads; None: torch's.
+
+    Attributes:
+        picture: films of the picture and its AOVs.
+        probes: the error probes; None without an error estimate.
+        engine: traces the paths; ``tasks`` is the same engine if it is compiled, else None.
+        taken: samples a pixel of the finished passes.
+        done: number of paths traced, by all ranks.
+        left: number of paths of this pass that are not traced yet.
+        lost: the non-finite samples.
+        light: sum of all samples before and after the firefly clamp ``(2,)`` float64.
+        stop: the stop rules.
+        ended: True once ``on_progress`` stopped the render.
+        keeps: True if the render has a checkpoint, which the first rank writes.
+        split: this rank's share; None for a single process.
+        eager: why stages run by tensor operations although kernels were requested.
     """
 
     def __init__(
@@ -67,7 +82,7 @@ class Run:
         rays: tuple[Tensor, Tensor] | None = None,
     ) -> None:
         self.start = time.perf_counter()
-        self._others = compile_time.seconds()
+        self._compiled_before = compile_time.seconds()
         self._kernels = 0.0  # seconds of compiling for an engine that was given up
         self.split = None if group is None or group.size == 1 else DistributedRender(group)
         self.shared: tuple[int, int] = 0, 1  # samples before this pass, and the number of ranks that share it
@@ -361,12 +376,12 @@ class Run:
             self._join()
         error = self._probe_error_bound() if self.stop.checks_error(mean, self._adapts()) else None
         if self.split is not None:
-            seconds, error = self.split.decide(seconds, error)
+            seconds, error = self.split.broadcast_numbers(seconds, error)
         target = self.settings.render.target_error
         if error is not None and target is not None and error <= target:
             error = self._error_bound()
             if self.split is not None:
-                _, error = self.split.decide(seconds, error)
+                _, error = self.split.broadcast_numbers(seconds, error)
             if (error is None or error > target) and not self.ended:
                 self._undo_resampling()
         self.stop.update(mean, seconds, error)
@@ -410,7 +425,7 @@ class Run:
 
     def compile_seconds(self) -> float:
         """Return the seconds of compiling kernels since the start: of stages and of the search."""
-        return self._kernels + self.engine.seconds + compile_time.seconds() - self._others
+        return self._kernels + self.engine.seconds + compile_time.seconds() - self._compiled_before
 
     def write_seconds(self) -> float:
         """Return the seconds of writing checkpoints."""

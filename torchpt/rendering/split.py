@@ -65,7 +65,7 @@ class DistributedRender:
         except Unsupported as error:
             reason = str(error) or "unsupported"
         own = run.done - done, run.tally.rays - rays, run.tally.truncated - truncated, run.lost.count
-        every = self.group.agree("a pass", *own, run.ended, bool(reason))
+        every = self.group.all_gather_numbers("a pass", *own, run.ended, bool(reason))
         if any(failed for *_, failed in every):
             raise Unsupported(reason or "what another rank met")
         run.done, run.shared = done + sum(int(n) for n, *_ in every), (0, 1)
@@ -88,14 +88,14 @@ class DistributedRender:
                 self._join(film, own)
         self._parts.clear()
 
-    def decide(self, seconds: float, error: float | None) -> tuple[float, float | None]:
+    def broadcast_numbers(self, seconds: float, error: float | None) -> tuple[float, float | None]:
         """Return seconds and error of the first rank."""
-        seconds, known, error_there = self.group.decide("seconds", seconds, error is not None, error or 0.0)
+        seconds, known, error_there = self.group.broadcast_numbers("seconds", seconds, error is not None, error or 0.0)
         return seconds, error_there if known else None
 
     def due(self, due: bool) -> bool:
         """Return True if a checkpoint is due on the first rank."""
-        return bool(self.group.decide("a checkpoint", due)[0])
+        return bool(self.group.broadcast_numbers("a checkpoint", due)[0])
 
     def places(self, own: Tensor) -> Tensor:
         """Return the integers of the first rank; other processors may have rounded differently."""
